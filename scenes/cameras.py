@@ -1,7 +1,7 @@
 """The OPENCV camera model (pinhole with radial and tangential distortion).
 
-Pixel coordinates follow COLMAP: the centre of the upper left pixel is (0.5, 0.5). Camera axes follow
-OpenCV: x right, y down, z forward. Shapes: H height, W width.
+Pixel coordinates follow COLMAP: the centre of the upper left pixel is (0.5, 0.5). Camera axes
+follow OpenCV: x right, y down, z forward. Shapes: H height, W width.
 """
 
 import dataclasses

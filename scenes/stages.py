@@ -1,0 +1,191 @@
+"""Stages of a long job: cached by the hash of what went in, resumed after an interruption.
+
+A stage writes into a work folder that carries its key. When it ends, the folder is renamed to its
+final name, so that a folder with that name is always whole. A second run with the same inputs and
+settings finds it and does nothing; one with others starts that stage and all that follow anew.
+"""
+
+import contextlib
+import dataclasses
+import errno
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich import progress as rich_progress
+
+Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is being done
+
+_RECORD = "stage.json"
+_KEY_LENGTH = 16  # hexadecimal digits of the key in a folder's name
+
+
+class StageError(ValueError):
+  """A stage could not be run; the message is one line for the user."""
+
+
+def no_progress(fraction: float, text: str) -> None:
+  """Ignores a report of progress."""
+
+
+def to_plain(value: Any) -> Any:
+  """Turns settings (dataclasses, paths, tuples) into what JSON can hold."""
+  if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+  if isinstance(value, Mapping):
+    return {str(k): to_plain(v) for k, v in value.items()}
+  if isinstance(value, (list, tuple)):
+    return [to_plain(v) for v in value]
+  if isinstance(value, Path):
+    return str(value)
+  return value
+
+
+def hash_path(path: Path) -> str:
+  """Returns the SHA-256 of a file's content, or of all files below a folder with their names."""
+  path = Path(path)
+  if not path.exists():
+    raise StageError(f"{path} does not exist; give an existing file or folder.")
+  digest = hashlib.sha256()
+  files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+  for file in files:
+    if path.is_dir():
+      digest.update(str(file.relative_to(path)).encode())
+    with file.open("rb") as stream:
+      digest.update(hashlib.file_digest(stream, "sha256").digest())
+  return digest.hexdigest()
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+  """Writes a file whole or not at all."""
+  path = Path(path)
+  temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+  try:
+    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+    temporary.replace(path)
+  finally:
+    temporary.unlink(missing_ok=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class StageResult:
+  """A finished stage."""
+
+  folder: Path  # what the stage wrote
+  key: str  # hash of its name, settings and inputs
+  seconds: float  # how long it took, summed over interrupted runs
+  cached: bool  # True where an earlier run had done it
+
+
+class Stages:
+  """Runs the stages of one job in a folder, with a progress bar for each."""
+
+  def __init__(self, folder: Path, *, show_progress: bool = True):
+    self.folder = Path(folder)
+    self.folder.mkdir(parents=True, exist_ok=True)
+    self.results: dict[str, StageResult] = {}
+    self._show_progress = show_progress
+
+  def run(
+    self,
+    name: str,
+    function: Callable[[Path, Progress], None],
+    *,
+    settings: Any,
+    inputs: Mapping[str, str],
+    version: int = 1,
+  ) -> StageResult:
+    """Runs a stage unless its result is there.
+
+    Args:
+      name: Name of the stage and of its folder.
+      function: Writes the result into the folder given; may find what an interrupted run of the
+        same key left there, and may continue from it.
+      settings: Whatever the result depends on; a dataclass or plain values.
+      inputs: Keys of the stages or files that the result depends on.
+      version: Raised when the stage's code changes what it writes.
+
+    Returns:
+      The finished stage.
+
+    Raises:
+      StageError: The disk is full.
+    """
+    description = {
+      "name": name,
+      "version": version,
+      "settings": to_plain(settings),
+      "inputs": dict(inputs),
+    }
+    key = hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
+    final = self.folder / name
+    record = self._read_record(final)
+    if record.get("key") == key:
+      result = StageResult(final, key, float(record["seconds"]), cached=True)
+      self.results[name] = result
+      with self._bar(name) as report:
+        report(1.0, "done before")
+      return result
+
+    work = self.folder / f"{name}.{key[:_KEY_LENGTH]}.partial"
+    for stale in self.folder.glob(f"{name}.*.partial"):
+      if stale != work:
+        shutil.rmtree(stale, ignore_errors=True)
+    work.mkdir(parents=True, exist_ok=True)
+    earlier = float(self._read_record(work).get("seconds", 0.0))
+    start = time.monotonic()
+    try:
+      with self._bar(name) as report:
+        function(work, report)
+        report(1.0, "done")
+    except OSError as error:
+      if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        raise StageError(
+          f"The disk that holds {self.folder} is full (stage {name}): free some space and run the "
+          "same command again, it continues here."
+        ) from error
+      raise
+    finally:
+      seconds = earlier + time.monotonic() - start
+      with contextlib.suppress(OSError):  # a full disk must not hide the error that is under way
+        self._write_record(work, {"seconds": seconds})
+    self._write_record(work, {"key": key, "seconds": seconds, **description})
+    if final.exists():
+      shutil.rmtree(final)
+    work.rename(final)
+    result = StageResult(final, key, seconds, cached=False)
+    self.results[name] = result
+    return result
+
+  @contextlib.contextmanager
+  def _bar(self, name: str) -> Iterator[Progress]:
+    if not self._show_progress:
+      yield no_progress
+      return
+    columns = (
+      rich_progress.TextColumn(f"{name:<12}"),
+      rich_progress.BarColumn(bar_width=30),
+      rich_progress.TaskProgressColumn(),
+      rich_progress.TimeElapsedColumn(),
+      rich_progress.TimeRemainingColumn(elapsed_when_finished=True),
+      rich_progress.TextColumn("{task.description}"),
+    )
+    with rich_progress.Progress(*columns) as bar:
+      task = bar.add_task("", total=1.0)
+      yield lambda fraction, text: bar.update(task, completed=fraction, description=text)
+
+  @staticmethod
+  def _read_record(folder: Path) -> dict[str, Any]:
+    try:
+      return json.loads((folder / _RECORD).read_text())
+    except (OSError, json.JSONDecodeError):
+      return {}
+
+  @staticmethod
+  def _write_record(folder: Path, record: Mapping[str, Any]) -> None:
+    write_atomically(folder / _RECORD, json.dumps(record, indent=1, sort_keys=True))

@@ -1,0 +1,97 @@
+"""Stages are cached by what went in, resume, and never leave half of a result."""
+
+import errno
+
+import pytest
+
+from scenes.stages import StageError, Stages, hash_path, write_atomically
+
+
+def make(folder):
+  return Stages(folder, show_progress=False)
+
+
+def write_number(number, calls):
+  def function(folder, report):
+    calls.append(number)
+    report(0.5, "half")
+    (folder / "number.txt").write_text(str(number))
+
+  return function
+
+
+def test_second_run_does_nothing(tmp_path):
+  calls: list[int] = []
+  first = make(tmp_path).run("a", write_number(1, calls), settings={"n": 1}, inputs={})
+  second = make(tmp_path).run("a", write_number(1, calls), settings={"n": 1}, inputs={})
+  assert calls == [1]
+  assert second.cached and not first.cached
+  assert second.key == first.key and second.seconds == first.seconds
+
+
+@pytest.mark.parametrize(
+  "changed", [{"settings": {"n": 2}}, {"inputs": {"video": "x"}}, {"version": 2}]
+)
+def test_other_inputs_make_the_stage_anew(tmp_path, changed):
+  calls: list[int] = []
+  make(tmp_path).run("a", write_number(1, calls), settings={"n": 1}, inputs={})
+  arguments = {"settings": {"n": 1}, "inputs": {}, **changed}
+  result = make(tmp_path).run("a", write_number(2, calls), **arguments)
+  assert calls == [1, 2]
+  assert (result.folder / "number.txt").read_text() == "2"
+
+
+def test_interrupted_stage_continues_from_its_own_work(tmp_path):
+  def interrupted(folder, report):
+    (folder / "part").write_text("kept")
+    raise KeyboardInterrupt
+
+  with pytest.raises(KeyboardInterrupt):
+    make(tmp_path).run("a", interrupted, settings=1, inputs={})
+  assert not (tmp_path / "a").exists()
+  found = []
+  make(tmp_path).run(
+    "a", lambda folder, report: found.append((folder / "part").read_text()), settings=1, inputs={}
+  )
+  assert found == ["kept"]
+
+
+def test_work_of_other_settings_is_not_mixed_in(tmp_path):
+  def interrupted(folder, report):
+    (folder / "part").write_text("stale")
+    raise KeyboardInterrupt
+
+  with pytest.raises(KeyboardInterrupt):
+    make(tmp_path).run("a", interrupted, settings=1, inputs={})
+  result = make(tmp_path).run("a", lambda folder, report: None, settings=2, inputs={})
+  assert not (result.folder / "part").exists()
+  assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_full_disk_is_one_clear_line(tmp_path):
+  def full(folder, report):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+  with pytest.raises(StageError, match="full.*free some space"):
+    make(tmp_path).run("a", full, settings=1, inputs={})
+  assert not (tmp_path / "a").exists()
+
+
+def test_folder_hash_sees_names_and_content(tmp_path):
+  (tmp_path / "x").write_text("1")
+  before = hash_path(tmp_path)
+  (tmp_path / "x").rename(tmp_path / "y")
+  renamed = hash_path(tmp_path)
+  (tmp_path / "y").write_text("2")
+  assert len({before, renamed, hash_path(tmp_path)}) == 3
+  with pytest.raises(StageError, match="does not exist"):
+    hash_path(tmp_path / "absent")
+
+
+def test_atomic_write_keeps_the_old_file_on_failure(tmp_path, monkeypatch):
+  target = tmp_path / "file"
+  target.write_text("old")
+  monkeypatch.setattr("pathlib.Path.write_bytes", lambda self, data: 1 / 0)
+  with pytest.raises(ZeroDivisionError):
+    write_atomically(target, "new")
+  assert target.read_text() == "old"
