@@ -1,0 +1,191 @@
+"""Filters of the sensor and action path: low-pass, action smoothing, delay with jitter.
+
+They hold state, work on float arrays of a fixed shape and know nothing of the simulator: the same
+objects run on the robot. Each has `reset()` and one call a sample.
+
+The low-pass of the IMU chip: OP3's OpenCR board carries an MPU-9250 (later boards an ICM-20648).
+Its firmware (ROBOTIS-GIT/OpenCR, libraries/IMU/MPU9250.cpp and ICM20648.cpp, `init`) turns on the
+digital low-pass filter with the settings 41 Hz for gyroscope and accelerometer (51 and 50 Hz on the
+ICM-20648). The data sheet gives bandwidth and delay only: gyroscope 41 Hz and 5.9 ms, 20 Hz and
+9.9 ms, 10 Hz and 17.85 ms. These delays are those of a first-order low-pass at that bandwidth,
+1 / (2 pi f), plus 1.9 to 2.0 ms at every setting. So the chip is modelled as a first-order low-pass
+at the bandwidth (`CHIP_BANDWIDTH_HZ`) and a constant transport delay (`CHIP_DELAY`) that the delay
+line may add.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+Array = np.ndarray
+
+CHIP_BANDWIDTH_HZ = 41.0  # OpenCR firmware, gyroscope and accelerometer of the MPU-9250
+CHIP_DELAY = 0.002  # s, data-sheet delay minus that of a first-order low-pass; see above
+ACTION_FILTER_STRENGTH = 0.8  # paper, "an exponential filter with strength 0.8"
+MIN_DELAY, MAX_DELAY = 0.010, 0.050  # s, paper, constant over an episode
+JITTER = 0.005  # s, paper
+
+
+class Coefficients(NamedTuple):
+  """y[k] = b0 x[k] + b1 x[k-1] + b2 x[k-2] - a1 y[k-1] - a2 y[k-2]."""
+
+  b0: float
+  b1: float
+  b2: float
+  a1: float
+  a2: float
+
+
+def low_pass_coefficients(cutoff_hz: float, sample_rate_hz: float, *, order: int) -> Coefficients:
+  """Returns the digital Butterworth low-pass of order 1 or 2 (bilinear, pre-warped).
+
+  Args:
+    cutoff_hz: frequency at which the gain is 1/sqrt(2), Hz, below half the sample rate.
+    sample_rate_hz: rate of the calls, Hz.
+    order: 1 or 2.
+  """
+  if not 0 < cutoff_hz < sample_rate_hz / 2:
+    raise ValueError(
+      f"Found a cutoff of {cutoff_hz} Hz at {sample_rate_hz} Hz sampling, expected between 0 and"
+      f" half the sampling rate, {sample_rate_hz / 2} Hz."
+    )
+  warped = float(np.tan(np.pi * cutoff_hz / sample_rate_hz))
+  if order == 1:
+    gain = warped / (1 + warped)
+    return Coefficients(gain, gain, 0.0, (warped - 1) / (warped + 1), 0.0)
+  if order == 2:
+    norm = 1 + np.sqrt(2) * warped + warped**2
+    b = warped**2 / norm
+    a1, a2 = 2 * (warped**2 - 1) / norm, (1 - np.sqrt(2) * warped + warped**2) / norm
+    return Coefficients(b, 2 * b, b, float(a1), float(a2))
+  raise ValueError(f"Found low-pass order {order}, expected 1 or 2.")
+
+
+class LowPass:
+  """A low-pass filter of first or second order over an array of any shape.
+
+  The first sample after a reset is taken as the steady state, so that there is no start-up ramp
+  from zero (an accelerometer reads 9.81 m/s^2 from the first sample on).
+  """
+
+  def __init__(self, cutoff_hz: float, sample_rate_hz: float, *, order: int = 1):
+    self.coefficients = low_pass_coefficients(cutoff_hz, sample_rate_hz, order=order)
+    self.reset()
+
+  def reset(self) -> None:
+    """Forgets the past: the next sample is the new steady state."""
+    self._state1: Array | None = None
+    self._state2: Array | None = None
+
+  def __call__(self, sample: Array) -> Array:
+    """Returns the filtered sample, a new array of the same shape."""
+    b0, b1, b2, a1, a2 = self.coefficients
+    x = np.asarray(sample, np.float64)
+    if self._state1 is None:
+      # Steady state of the transposed direct form II for a constant input and unit gain.
+      self._state2 = (b2 - a2) * x
+      self._state1 = (b1 - a1) * x + self._state2
+    y = b0 * x + self._state1
+    if b2 == 0 and a2 == 0:
+      self._state1 = b1 * x - a1 * y
+    else:
+      self._state1 = b1 * x - a1 * y + self._state2
+      self._state2 = b2 * x - a2 * y
+    return y
+
+
+class ExponentialFilter:
+  """Smooths actions: y = strength * y_previous + (1 - strength) * u, once a control step.
+
+  The paper says "an exponential filter with strength 0.8 ... to encourage smoother movements". Read
+  as 0.8 of the old value it smooths with a time constant of 112 ms at 40 Hz; the other reading (0.8
+  of the new one) hardly smooths, 16 ms. The first is taken.
+  """
+
+  def __init__(self, strength: float = ACTION_FILTER_STRENGTH):
+    if not 0 <= strength < 1:
+      raise ValueError(f"Found filter strength {strength}, expected at least 0 and less than 1.")
+    self.strength = strength
+    self.value: Array | None = None
+
+  def reset(self, value: Array | None = None) -> None:
+    """Starts from `value` (for instance the pose that the robot stands in), or the next action."""
+    self.value = None if value is None else np.array(value, np.float64)
+
+  def __call__(self, action: Array) -> Array:
+    """Returns the smoothed action, a copy."""
+    action = np.asarray(action, np.float64)
+    if self.value is None:
+      self.value = action.copy()
+    else:
+      self.value = self.strength * self.value + (1 - self.strength) * action
+    return self.value.copy()
+
+
+class DelayLine:
+  """Delivers samples late: a constant delay and a jitter drawn for each sample.
+
+  A sample taken at time t arrives at t + delay + uniform(-jitter, jitter), never before t. `read`
+  returns the sample with the newest time stamp of those that have arrived, so a late sample never
+  replaces a newer one. Until the first has arrived, the first one is returned (the robot was
+  standing there before the episode).
+  """
+
+  def __init__(self, delay: float = 0.0, *, jitter: float = 0.0, capacity: int = 64):
+    """Creates a delay line.
+
+    Args:
+      delay: s.
+      jitter: half width of the uniform jitter, s.
+      capacity: samples kept; at least (delay + jitter) * sampling rate + 2.
+    """
+    self._capacity = capacity
+    self._values: Array | None = None
+    self._arrivals = [0.0] * capacity
+    self._times = [0.0] * capacity
+    self._rng = np.random.default_rng(0)
+    self.reset(delay, jitter=jitter)
+
+  def reset(
+    self, delay: float, *, jitter: float = 0.0, rng: np.random.Generator | None = None
+  ) -> None:
+    """Empties the line for a new episode with its own delay [s], jitter [s] and random stream."""
+    if delay < 0 or jitter < 0:
+      raise ValueError(f"Found delay {delay} s and jitter {jitter} s, expected both at least 0.")
+    self.delay, self.jitter = delay, jitter
+    if rng is not None:
+      self._rng = rng
+    self._count = 0
+
+  def push(self, time: float, value: Array) -> None:
+    """Adds the sample taken at `time` [s]; times must not decrease."""
+    if self._values is None or self._values.shape[1:] != np.shape(value):
+      value = np.asarray(value)
+      self._values = np.empty((self._capacity, *value.shape), value.dtype)
+    slot = self._count % self._capacity
+    lateness = self.delay
+    if self.jitter:
+      lateness = max(0.0, lateness + self.jitter * (2 * self._rng.random() - 1))
+    self._values[slot] = value
+    self._times[slot] = time
+    self._arrivals[slot] = time + lateness
+    self._count += 1
+
+  def _newest_arrived(self, time: float) -> int:
+    if self._values is None or not self._count:
+      raise ValueError("Found an empty delay line, expected a push before the first read.")
+    oldest = max(0, self._count - self._capacity)
+    for index in range(self._count - 1, oldest - 1, -1):
+      if self._arrivals[index % self._capacity] <= time + 1e-9:
+        return index % self._capacity
+    return oldest % self._capacity
+
+  def read(self, time: float) -> Array:
+    """Returns a copy of the newest sample that has arrived by `time` [s]."""
+    slot = self._newest_arrived(time)
+    assert self._values is not None
+    return self._values[slot].copy()
+
+  def age(self, time: float) -> float:
+    """Returns how old [s] the sample is that `read(time)` returns."""
+    return time - self._times[self._newest_arrived(time)]

@@ -1,0 +1,150 @@
+"""Evaluation protocols of the paper, as data: which episodes are run, in which order.
+
+Paper, sections "Navigation and obstacle avoidance results" and "Ball pushing results", and the
+appendix table on the camera's gain. A protocol is a tuple of trials; a trial says where everything
+starts. The paper gives the numbers of positions and orientations but not the positions themselves:
+navigation trials name them by index, and `navigation_starts` draws positions of a scene from its
+free space with a fixed seed, so that they are the same for every policy.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+GAINS = (128, 90, 50, 10, 1)  # Logitech C920 gain settings, paper, table of the gain ablation
+DEFAULT_GAIN = 50  # paper: "50 is the default value used in the navigation experiments"
+TRIALS_PER_GAIN = 5
+NUM_GOALS, NUM_POSITIONS, NUM_ORIENTATIONS, NUM_TRIALS = 3, 3, 3, 2
+WORKSPACE_SIZE = 3.0  # m, ball pushing, paper
+CELL_SIZE = 1.0  # m, the target square; the workspace is 3 x 3 cells
+TARGET_CELL = (1, 1)  # the corner, in cells from the centre cell: +x, +y
+BALL_TIME_LIMIT = 60.0  # s, paper
+WALL_SPREAD = 0.1  # m, ours: the paper says "near the center" of the cell
+START_SEED = 20221010  # ours
+
+
+class NavigationTrial(NamedTuple):
+  """One episode of navigation."""
+
+  goal: int  # index into the scene's goals, 0 to 2
+  position: int  # index of the start position, 0 to 2
+  yaw: float  # heading of the robot in the world, rad
+  trial: int  # repetition, 0 or 1
+  camera_gain: float = 1.0  # ratio to the default gain
+  seed: int = 0  # of the episode's randomisation
+
+
+class BallTrial(NamedTuple):
+  """One episode of ball pushing. Positions are relative to the workspace's centre."""
+
+  setting: str  # "center" or "wall"
+  robot_xy: tuple[float, float]  # m
+  robot_yaw: float  # rad
+  ball_xy: tuple[float, float]  # m
+  trial: int
+  seed: int = 0
+
+
+def _orientations(count: int) -> list[float]:
+  return [2 * np.pi * index / count for index in range(count)]
+
+
+def navigation() -> tuple[NavigationTrial, ...]:
+  """Returns the 54 trials: 3 goals x 3 positions x 3 orientations x 2 trials."""
+  trials: list[NavigationTrial] = []
+  for goal in range(NUM_GOALS):
+    for position in range(NUM_POSITIONS):
+      for yaw in _orientations(NUM_ORIENTATIONS):
+        for trial in range(NUM_TRIALS):
+          trials.append(NavigationTrial(goal, position, yaw, trial, seed=len(trials)))
+  return tuple(trials)
+
+
+def camera_gain() -> tuple[NavigationTrial, ...]:
+  """Returns the 25 trials of the gain ablation: 5 gains x 5 trials, one goal, one start pose."""
+  trials: list[NavigationTrial] = []
+  for gain in GAINS:
+    for trial in range(TRIALS_PER_GAIN):
+      ratio = gain / DEFAULT_GAIN
+      trials.append(NavigationTrial(0, 0, 0.0, trial, camera_gain=ratio, seed=trial))
+  return tuple(trials)
+
+
+def _outer_cells() -> list[tuple[int, int]]:
+  return [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+
+
+def ball_center() -> tuple[BallTrial, ...]:
+  """Returns the 32 Center trials: ball in the centre cell, robot in each of 8 cells, 4 headings."""
+  trials: list[BallTrial] = []
+  for i, j in _outer_cells():
+    for yaw in _orientations(4):
+      xy = (i * CELL_SIZE, j * CELL_SIZE)
+      trials.append(BallTrial("center", xy, yaw, (0.0, 0.0), 0, seed=len(trials)))
+  return tuple(trials)
+
+
+def ball_wall(seed: int = START_SEED) -> tuple[BallTrial, ...]:
+  """Returns the 14 Wall trials: robot in the centre, facing the target; ball near a wall cell.
+
+  The ball starts within `WALL_SPREAD` of the centre of each of the 7 outer cells other than the
+  target, twice.
+  """
+  rng = np.random.default_rng(seed)
+  yaw = float(np.arctan2(TARGET_CELL[1], TARGET_CELL[0]))
+  trials: list[BallTrial] = []
+  for cell in _outer_cells():
+    if cell == TARGET_CELL:
+      continue
+    for trial in range(2):
+      dx, dy = rng.uniform(-WALL_SPREAD, WALL_SPREAD, 2)
+      xy = (cell[0] * CELL_SIZE + float(dx), cell[1] * CELL_SIZE + float(dy))
+      trials.append(BallTrial("wall", (0.0, 0.0), yaw, xy, trial, seed=100 + len(trials)))
+  return tuple(trials)
+
+
+PROTOCOLS: dict[str, Callable[[], tuple[NavigationTrial, ...] | tuple[BallTrial, ...]]] = {
+  "navigation": navigation,
+  "camera_gain": camera_gain,
+  "ball_center": ball_center,
+  "ball_wall": ball_wall,
+}
+
+
+def navigation_starts(
+  free_xy: np.ndarray,
+  goals: np.ndarray,
+  *,
+  count: int = NUM_POSITIONS,
+  min_goal_distance: float = 1.0,
+  seed: int = START_SEED,
+) -> np.ndarray:
+  """Chooses start positions for a scene, far from each other and from the goals.
+
+  Greedy farthest points: deterministic for a scene, and spread over it as the paper's three "unique
+  initial positions" are.
+
+  Args:
+    free_xy: positions [N, 2] at which the robot may stand, m.
+    goals: goal positions [G, 2], m.
+    count: how many positions.
+    min_goal_distance: wanted distance from every goal, m; less where the scene has no such place.
+    seed: of the first position.
+
+  Returns:
+    Positions [count, 2], m.
+  """
+  free = np.asarray(free_xy, np.float64).reshape(-1, 2)
+  if len(free) < count:
+    raise ValueError(f"Found {len(free)} free positions, expected at least {count}.")
+  goals = np.asarray(goals, np.float64).reshape(-1, 2)
+  if len(goals):
+    to_goal = np.linalg.norm(free[:, None] - goals, axis=-1).min(axis=1)
+    far = to_goal >= min_goal_distance
+    free = free[far] if far.sum() >= count else free[np.argsort(-to_goal, kind="stable")[:count]]
+  chosen = [int(np.random.default_rng(seed).integers(len(free)))]
+  while len(chosen) < count:
+    distance = np.linalg.norm(free[:, None] - free[chosen], axis=-1).min(axis=1)
+    chosen.append(int(np.argmax(distance)))
+  return free[chosen]
