@@ -1,0 +1,22 @@
+"""Messages for bad input: what was found, what was expected, what to do."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from dm_env import specs
+
+
+def unknown_name(kind: str, found: Any, known: Iterable[str]) -> str:
+  """Returns the message for a name that does not exist."""
+  return f"Unknown {kind} {found!r}: expected one of {', '.join(repr(name) for name in known)}."
+
+
+def bad_action(action: np.ndarray, spec: specs.BoundedArray) -> str:
+  """Returns the message for an action that cannot be applied."""
+  if action.shape != spec.shape:
+    return (
+      f"An action has shape {spec.shape}, one entry for each joint in the order of "
+      f"suite.op3.constants.JOINT_NAMES; found shape {action.shape}."
+    )
+  return f"An action must be finite, found {np.count_nonzero(~np.isfinite(action))} bad entries."

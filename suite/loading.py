@@ -1,0 +1,88 @@
+"""Builds an environment from a task's name and a scene bundle."""
+
+from pathlib import Path
+from typing import Any
+
+from suite import errors
+from suite.camera import CameraSettings, FieldRenderer, RobotCamera
+from suite.environment import Environment
+from suite.randomisation import RandomisationSettings
+from suite.tasks import nerf_nav
+from suite.tasks.base import PHYSICS_TIMESTEP, TaskSettings
+
+_TASKS: dict[str, Any] = {nerf_nav.NAME: nerf_nav}
+_CLASSES: dict[str, Any] = {nerf_nav.NAME: nerf_nav.NerfNav}
+ALL_TASKS: tuple[str, ...] = tuple(_CLASSES)
+
+
+def load(
+  task: str,
+  *,
+  scene: Any = None,
+  effects: Any = None,
+  image_size: tuple[int, int] | None = (30, 40),
+  random: Any = None,
+  camera: CameraSettings | None = None,
+  randomisation: RandomisationSettings | None = None,
+  privileged: bool = True,
+  time_limit: float | None = None,
+  physics_timestep: float = PHYSICS_TIMESTEP,
+  renderer: FieldRenderer | None = None,
+) -> Environment:
+  """Loads a task in a scene.
+
+  Args:
+    task: "nerf_nav" or "ball_push".
+    scene: Folder of a scene bundle, or an opened `scenes.bundle.Bundle`; None is the built-in room.
+    effects: An `effects.json`, or a sequence of effects: what the nominal model lacks.
+    image_size: (height, width) of the robot's camera; None for an environment without pictures.
+    random: A seed or `np.random.RandomState`: the same seed gives the same episodes.
+    camera: Settings of the robot's camera.
+    randomisation: Which parts of an episode are random; all of them if None.
+    privileged: Whether to give the observations that only the critic may see.
+    time_limit: Length of an episode [s]; the task's own if None.
+    physics_timestep: s.
+    renderer: Renders the scene instead of the bundle's field, in the bundle's unit frame.
+
+  Returns:
+    The environment, a `composer.Environment`.
+
+  Raises:
+    ValueError: If an argument is none of what is expected; the message says what would be.
+  """
+  if task not in _CLASSES:
+    raise ValueError(errors.unknown_name("task", task, ALL_TASKS))
+  camera = camera or CameraSettings()
+  lens = None if image_size is None else camera.camera(image_size)
+  bundle = open_scene(scene)
+  robot_camera = None
+  if lens is not None:
+    robot_camera = RobotCamera(
+      renderer or load_renderer(bundle), lens,
+      world_from_unit=bundle.world_from_unit, settings=camera,
+    )  # fmt: skip
+  settings = TaskSettings(
+    time_limit=_TASKS[task].TIME_LIMIT if time_limit is None else time_limit,
+    physics_timestep=physics_timestep,
+    privileged=privileged,
+    randomisation=randomisation or RandomisationSettings(),
+  )
+  built = _CLASSES[task](bundle, camera=robot_camera, settings=settings)
+  return Environment(built, time_limit=settings.time_limit, random_state=random)
+
+
+def open_scene(scene: Any) -> Any:
+  """Returns an opened bundle from a folder, None (the built-in room) or a bundle."""
+  if scene is None or isinstance(scene, str | Path):
+    from scenes.bundle import Bundle
+
+    return Bundle.load(scene)
+  return scene
+
+
+def load_renderer(bundle: Any) -> FieldRenderer:
+  """Returns a renderer of a bundle's field on this machine's CPU."""
+  from scenes.field import Field
+  from scenes.render import Renderer
+
+  return Renderer(Field.load(bundle.field_path))

@@ -1,0 +1,88 @@
+"""Navigation and obstacle avoidance: walk to one of three goals without touching the room.
+
+Byravan et al. 2022, NeRF2Real, section "Tasks" and appendix "Rewards". The goal reaches the policy
+as (x, y) in the scene's world frame; where the robot is does not: it has to see that.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from suite import rewards
+from suite.camera import RobotCamera
+from suite.op3 import constants
+from suite.tasks.base import RobotTask, Start, TaskSettings
+
+NAME = "nerf_nav"
+# s: ours, the paper names no limit for navigation; three times its median time to a goal (10.3 s).
+TIME_LIMIT = 30.0
+FALL, COLLISION = "fall", "collision"
+
+
+class NerfNav(RobotTask):
+  """Walk to a goal. Ends on a fall and on touching the room with anything but the feet."""
+
+  weights = rewards.NAVIGATION_WEIGHTS
+
+  def __init__(
+    self, scene: Any, *, camera: RobotCamera | None = None, settings: TaskSettings | None = None
+  ):
+    """Builds the task; see `RobotTask`."""
+    super().__init__(scene, camera=camera, settings=settings or TaskSettings(time_limit=TIME_LIMIT))
+    self._goals = np.asarray(scene.goals, np.float64).reshape(-1, 2)
+    if not len(self._goals):
+      raise ValueError("The scene has no goals: scene.json needs at least one (x, y) in `goals`.")
+    self.goal_index: int | None = None  # if set, every episode has this goal (evaluation)
+    self._goal = self._goals[0]
+
+  @property
+  def goals(self) -> np.ndarray:
+    """The goals [G, 2] in the world [m]."""
+    return self._goals.copy()
+
+  @property
+  def goal(self) -> np.ndarray:
+    """The present goal [2] in the world [m]."""
+    return self._goal.copy()
+
+  def set_start(self, start: Start | None, *, goal_index: int | None = None) -> None:
+    """Fixes the start pose and the goal of the episodes to come; None draws them again."""
+    if goal_index is not None and not 0 <= goal_index < len(self._goals):
+      raise ValueError(
+        f"Unknown goal {goal_index}: the scene has {len(self._goals)} goals, counted from 0."
+      )
+    self.start, self.goal_index = start, goal_index
+
+  def _place(self, random_state: np.random.RandomState) -> None:
+    drawn = random_state.randint(len(self._goals))
+    self._goal = self._goals[drawn if self.goal_index is None else self.goal_index]
+    self._stand_somewhere(lambda: self.scene.free_space.sample(random_state), random_state)
+
+  def _goal_observation(self) -> np.ndarray:
+    return self._goal
+
+  def _goal_position(self) -> np.ndarray:
+    return self._goal
+
+  def _compute_rewards(self) -> dict[str, float]:
+    return rewards.navigation_task(
+      self._state.yaw_speed,
+      self._state.feet_velocity,
+      goal=self.relative(self._goal),
+      joints=self._state.joints,
+      reference=constants.REFERENCE_POSE,
+      joint_range=self._joint_range,
+    )
+
+  @property
+  def goal_distance(self) -> float:
+    """Distance of the torso from the goal on the floor [m]."""
+    return float(np.hypot(*(self._goal - self._state.position[:2])))
+
+  def _reached(self) -> bool:
+    return self.goal_distance <= rewards.SUCCESS_DISTANCE
+
+  def _failure(self) -> str | None:
+    if self.touches_scene:
+      return COLLISION
+    return FALL if self.fallen else None
