@@ -1,0 +1,56 @@
+"""Fields whose matter is known in closed form, made by writing a distance into the hash grid."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from scenes.contraction import from_grid_coordinates
+from scenes.encoding import is_dense
+from scenes.field import Field, FieldSettings
+
+SLOPE = 40.0  # feature per unit of signed distance
+GAIN = 3.0
+
+
+def from_signed_distance(
+  signed_distance: Callable[[np.ndarray], np.ndarray],
+  *,
+  settings: FieldSettings | None = None,
+  texture: float = 0.0,
+  seed: int = 0,
+) -> Field:
+  """A field that is dense where the signed distance is negative.
+
+  Args:
+    signed_distance: Maps points [..., 3] of the unit frame to distances [...], positive outside.
+    settings: The shape; its finest dense level carries the distance.
+    texture: Amplitude of random features on all levels and of random colour weights.
+    seed: Of the random numbers.
+  """
+  settings = settings or FieldSettings(
+    levels=2, log2_table_size=15, base_resolution=31, growth=1.0001
+  )
+  random = np.random.default_rng(seed)
+  params = {
+    name: (texture * random.normal(size=shape)).astype(np.float32)
+    for name, shape in settings.shapes.items()
+  }
+  entries = 2**settings.log2_table_size
+  level = max(i for i, cells in enumerate(settings.resolutions) if is_dense(cells, entries))
+  cells = settings.resolutions[level]
+  z, y, x = np.meshgrid(*[np.arange(cells + 1) / cells] * 3, indexing="ij")
+  inner = np.clip(np.stack([x, y, z], -1), 0.01, 0.99)
+  distance = signed_distance(np.asarray(from_grid_coordinates(jnp.asarray(inner)), np.float64))
+  params["table"][level, : (cells + 1) ** 3, 0] = -SLOPE * distance.ravel()
+  feature = level * settings.features
+  # swish(x) - swish(-x) = x, and the layer norm turns it into its sign.
+  params["base_w1"][feature] = 0
+  params["base_w1"][:, :2] = 0
+  params["base_w1"][feature, :2] = 1, -1
+  params["base_b1"][:2] = 0
+  params["base_w2"][:2] = 0
+  params["base_w2"][:, 0] = 0
+  params["base_w2"][:2, 0] = GAIN, -GAIN
+  params["base_b2"][0] = 0
+  return Field(settings, params, 0.002)
