@@ -1,0 +1,493 @@
+"""Training and rendering of a field on CPU cores with the fused numba kernels.
+
+`FusedTrainer` owns the parameters, the optimiser's moments and the occupancy; one call of `step` is
+one step of AdamW. `FusedField` evaluates a trained field: pictures, distances, densities on a grid.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from scenes import fused_grid, fused_kernels, fused_march, fused_network
+from scenes.cameras import Camera
+from scenes.field import Field, FieldSettings, init_params
+from scenes.train_settings import TrainSettings
+from scenes.views import BlurPyramid, Views
+
+_CHUNK_SAMPLES = 768  # ours: a thread's activations stay in a second-level cache of 1 MB
+_DISTANCE_CELLS = 12  # ours: empty space is skipped in strides of at most this many cells
+
+
+def num_threads() -> int:
+  """Threads to use: the cores that this process may run on."""
+  return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def network_arrays(settings: FieldSettings, flat: np.ndarray) -> fused_network.Network:
+  """Lays a flat vector out as the networks' parameters (the transposes are filled by `refresh`)."""
+  shapes = {k: v for k, v in settings.shapes.items() if k != "table"}
+  pieces, at = {}, 0
+  for name, shape in shapes.items():
+    size = int(np.prod(shape))
+    pieces[name] = flat[at : at + size]
+    at += size
+  features = settings.levels * settings.features
+  outputs = 4 + settings.bottleneck
+  return fused_network.Network(
+    **pieces,
+    base_w1_t=np.zeros(settings.width * features, np.float32),
+    base_w2_t=np.zeros(outputs * settings.width, np.float32),
+    view_w1_t=np.zeros(settings.view_width * outputs, np.float32),
+  )
+
+
+def refresh(settings: FieldSettings, network: fused_network.Network) -> None:
+  """Recomputes the transposed matrices from the parameters."""
+  features = settings.levels * settings.features
+  outputs, width, view = 4 + settings.bottleneck, settings.width, settings.view_width
+  w1 = network.base_w1.reshape(features + 3, width)
+  network.base_w1_t[:] = w1[:features].T.ravel()
+  network.base_w2_t[:] = network.base_w2.reshape(width, outputs).T.ravel()
+  transposed = network.view_w1_t.reshape(view, outputs)
+  transposed[:, 4:] = network.view_w1.reshape(-1, view)[: settings.bottleneck].T
+
+
+def num_network_parameters(settings: FieldSettings) -> int:
+  """Number of parameters outside the table."""
+  return sum(int(np.prod(s)) for name, s in settings.shapes.items() if name != "table")
+
+
+def flatten(settings: FieldSettings, params: dict[str, Any]) -> np.ndarray:
+  """Packs the networks' parameters into one vector; view_w2 is transposed."""
+  parts = []
+  for name in settings.shapes:
+    if name != "table":
+      value = np.asarray(params[name], np.float32)
+      parts.append((value.T if name == "view_w2" else value).ravel())
+  return np.concatenate(parts)
+
+
+def unflatten(settings: FieldSettings, flat: np.ndarray) -> dict[str, np.ndarray]:
+  """Inverts `flatten`."""
+  params, at = {}, 0
+  for name, shape in settings.shapes.items():
+    if name != "table":
+      size = int(np.prod(shape))
+      part = flat[at : at + size].copy()
+      params[name] = part.reshape(3, -1).T.copy() if name == "view_w2" else part.reshape(shape)
+      at += size
+  return params
+
+
+def check_supported(settings: FieldSettings) -> None:
+  """Raises ValueError where the kernels cannot run a field of this shape."""
+  features = settings.levels * settings.features
+  wrong = [
+    f"{name} = {value}"
+    for name, value in (
+      ("levels * features", features),
+      ("width", settings.width),
+      ("view_width", settings.view_width),
+      ("4 + bottleneck", 4 + settings.bottleneck),
+    )
+    if value % 16
+  ]
+  if settings.features != 2:
+    wrong.append(f"features = {settings.features}")
+  if wrong:
+    raise ValueError(
+      f"The fused kernels need 2 features an entry and multiples of 16; found {', '.join(wrong)}. "
+      'Change the field\'s settings or use engine="jax".'
+    )
+
+
+def make_chunk(settings: FieldSettings, *, samples: int, stored: int) -> fused_kernels.Chunk:
+  """Allocates a thread's work arrays for chunks of `samples` and steps of `stored` samples."""
+  n, r = samples, fused_kernels.CHUNK_RAYS
+  width, view, outputs = settings.width, settings.view_width, 4 + settings.bottleneck
+  features = settings.levels * settings.features
+  sizes = {
+    "distance": n, "length": n, "x": n * (features + 3), "pre": n * width, "hidden": n * width,
+    "inverse_std": n, "out": n * outputs, "alpha": n, "view_pre": n * view,
+    "view_hidden": n * view, "color": 6 * n, "d_color": 3 * n, "d_out": n * outputs,
+    "d_hidden": n * width, "d_view": n * view, "weight": n, "through": n, "d_weight": n,
+    "rays": 13 * r, "harmonics": 9 * r, "offsets": r * view, "d_rays": r * view,
+    "coordinates": 3 * stored, "d_features": features * stored,
+  }  # fmt: skip
+  arrays = {name: np.zeros(size, np.float32) for name, size in sizes.items()}
+  return fused_kernels.Chunk(ray_of=np.zeros(n, np.int64), first=np.zeros(r + 1, np.int64), **arrays)
+
+
+def kernel_settings(
+  field: FieldSettings, pixel_angle: float, train: TrainSettings
+) -> fused_kernels.Settings:
+  """Collects the numbers that the kernels need."""
+  f = np.float32
+  return fused_kernels.Settings(
+    density_bias=f(field.density_bias),
+    density_scale=f(field.density_scale),
+    specular_bias=f(field.specular_bias),
+    paper_footprint=field.footprint_rule == "paper",
+    pixel_angle=f(pixel_angle),
+    step=f(field.march_step),
+    near=f(train.near),
+    depth_limit=f(train.depth_limit),
+    ray_samples=train.ray_samples,
+    charbonnier=f(train.charbonnier_padding),
+    distortion=f(train.distortion_weight),
+    blur_max=f(train.blur_max),
+    blur_sharp=f(train.blur_sharp_fraction),
+    blur_power=f(train.blur_power),
+    random_background=train.random_background,
+  )
+
+
+def make_pictures(views: Views, *, blur_max: float) -> fused_kernels.Pictures:
+  """Lays pictures, their blurred copies and poses out for the kernels."""
+  pyramid = BlurPyramid.build(views, blur_max=blur_max)
+  sizes = [level.size for level in pyramid.levels]
+  return fused_kernels.Pictures(
+    pixels=np.concatenate([level.ravel() for level in pyramid.levels]),
+    starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
+    heights=np.array([level.shape[1] for level in pyramid.levels], np.int64),
+    widths=np.array([level.shape[2] for level in pyramid.levels], np.int64),
+    factors=np.array(pyramid.factors, np.float32),
+    blurs=np.array(pyramid.blurs, np.float32),
+    directions=views.camera.rays().astype(np.float32).ravel(),
+    rotations=views.world_from_camera[:, :3, :3].astype(np.float32).ravel(),
+    origins=views.world_from_camera[:, :3, 3].astype(np.float32).ravel(),
+  )
+
+
+def full_occupancy(inner: int, outer: int, density: float) -> fused_march.Occupancy:
+  """Returns grids where every cell is occupied with a density."""
+  return fused_march.Occupancy(
+    inner, np.zeros(inner**3, np.uint8), np.full(inner**3, density, np.float32),
+    outer, np.zeros(outer**3, np.uint8), np.full(outer**3, density, np.float32),
+  )  # fmt: skip
+
+
+def cell_positions(cells: np.ndarray, size: int, jitter: np.ndarray, *, inner: bool) -> np.ndarray:
+  """Points [N, 3] in the unit frame inside grid cells, at `jitter` [N, 3] in [0, 1) of the cell."""
+  index = np.stack([cells // (size * size), cells // size % size, cells % size], axis=-1)
+  unit = (index + jitter) / size
+  if inner:
+    return (2 * unit - 1).astype(np.float32)
+  squashed = np.clip(4 * unit - 2, -1.98, 1.98)
+  norm = np.maximum(np.abs(squashed).max(-1, keepdims=True), 1.0)
+  return (squashed / (norm * (2 - norm))).astype(np.float32)
+
+
+@dataclasses.dataclass
+class _Engine:
+  """What training and evaluation share: arrays for the kernels and a pool of threads."""
+
+  settings: FieldSettings
+  kernel: fused_kernels.Settings
+  table: np.ndarray
+  network: fused_network.Network
+  occupancy: fused_march.Occupancy
+  chunks: list[fused_kernels.Chunk]
+  pool: ThreadPoolExecutor
+
+  @property
+  def resolutions(self) -> np.ndarray:
+    return np.array(self.settings.resolutions, np.int64)
+
+  @property
+  def entries(self) -> int:
+    return 2**self.settings.log2_table_size
+
+  def run(self, work: Callable[[int], Any]) -> list[Any]:
+    """Runs work(thread) on every thread and waits; an exception of any is raised."""
+    return list(self.pool.map(work, range(len(self.chunks))))
+
+  def densities(self, positions: np.ndarray, *, sigma: float) -> np.ndarray:
+    """Densities [N] at positions [N, 3] averaged over a standard deviation [unit]."""
+    flat = np.ascontiguousarray(positions, np.float32).ravel()
+    result = np.empty(len(flat) // 3, np.float32)
+    bounds = np.linspace(0, len(result), len(self.chunks) + 1).astype(np.int64)
+
+    def work(thread):
+      fused_kernels.densities(
+        self.kernel, self.network, self.table, self.resolutions, self.entries,
+        self.chunks[thread], flat, np.float32(sigma**2), bounds[thread], bounds[thread + 1], result,
+      )  # fmt: skip
+
+    self.run(work)
+    return result
+
+  def update_occupancy(
+    self, cells: np.ndarray, rng: np.random.Generator, *, inner: bool, decay: float
+  ) -> None:
+    """Looks at cells [N] of a grid: density = max(decay * density, field there)."""
+    occupancy = self.occupancy
+    size = occupancy.inner_size if inner else occupancy.outer_size
+    grid = occupancy.inner_density if inner else occupancy.outer_density
+    jitter = rng.random((len(cells), 3), np.float32)
+    positions = cell_positions(cells, size, jitter, inner=inner)
+    seen = self.densities(positions, sigma=self.settings.march_step / np.sqrt(12))
+    grid[cells] = np.maximum(grid[cells] * np.float32(decay), seen)
+
+  def refresh_distances(self, *, threshold: float) -> None:
+    """Recomputes which cells are occupied and how far the others are from those."""
+    occupancy = self.occupancy
+    density = -np.log1p(-threshold) / self.settings.march_step
+    occupied = (occupancy.inner_density > density).astype(np.uint8)
+    scratch = np.empty((2, occupied.size), np.uint8)
+    fused_march.chebyshev_distance(
+      occupied, occupancy.inner_size, _DISTANCE_CELLS, occupancy.inner_distance, scratch
+    )
+    # Outside, a cell spans a step whose length grows with the distance: the same threshold holds.
+    occupancy.outer_distance[:] = occupancy.outer_density <= density
+
+
+class FusedTrainer:
+  """A training run: parameters, moments, occupancy; `step` improves them."""
+
+  def __init__(
+    self, views: Views, settings: TrainSettings, *, seed: int, initial: Field | None = None
+  ):
+    check_supported(settings.field)
+    self.settings = settings
+    self.seed = seed
+    self.steps_done = 0
+    self.rays_done = 0
+    self.samples_done = 0
+    field = settings.field
+    params = initial.params if initial else init_params(jax.random.PRNGKey(seed), field)
+    self.table = np.array(params["table"], np.float32).ravel()
+    self.flat = flatten(field, params)
+    self.moments = [np.zeros_like(x) for x in (self.table, self.table, self.flat, self.flat)]
+    self.gradient = np.zeros_like(self.table)
+    self.pixel_angle = views.camera.pixel_angle
+    self.pictures = make_pictures(views, blur_max=settings.blur_max)
+    threads = num_threads()
+    self._budget = settings.batch_samples // threads
+    stored = self._budget + _CHUNK_SAMPLES
+    self._gradients = [np.zeros_like(self.flat) for _ in range(threads)]
+    self._gradient_networks = [network_arrays(field, g) for g in self._gradients]
+    network = network_arrays(field, self.flat)
+    refresh(field, network)
+    self.engine = _Engine(
+      field, kernel_settings(field, self.pixel_angle, settings), self.table, network,
+      full_occupancy(settings.inner_cells, settings.outer_cells, 0.5),
+      [make_chunk(field, samples=_CHUNK_SAMPLES, stored=stored) for _ in range(threads)],
+      ThreadPoolExecutor(threads),
+    )  # fmt: skip
+    self._levels = [
+      [level for level in range(field.levels) if level % threads == t] for t in range(threads)
+    ]
+    self._sweep = 0
+    self.step_scale = 4.0 if initial is None else 1.0
+
+  def step(self, learning_rate: float) -> dict[str, float]:
+    """Makes one step; returns rays, samples, psnr_db, charbonnier and distortion of its batch."""
+    engine, settings = self.engine, self.settings
+    threads = len(engine.chunks)
+    kernel = engine.kernel._replace(
+      step=np.float32(engine.settings.march_step * self.step_scale)
+    )
+    seed = np.uint64((self.seed * 1_000_003 + self.steps_done) & (2**63 - 1))
+    figures = np.zeros((threads, 6))
+    resolutions, entries = engine.resolutions, engine.entries
+
+    def backward(thread):
+      self._gradients[thread][:] = 0
+      fused_kernels.train_rays(
+        self.pictures, kernel, engine.occupancy, engine.network, self._gradient_networks[thread],
+        self.table, resolutions, entries, engine.chunks[thread], seed, thread << 32, self._budget,
+        np.float32(settings.transmittance_threshold), figures[thread],
+      )  # fmt: skip
+
+    def update(thread):
+      for level in self._levels[thread]:
+        for t, chunk in enumerate(engine.chunks):
+          fused_grid.scatter_level(
+            self.gradient, level, resolutions[level], entries, chunk.coordinates,
+            int(figures[t, 1]), chunk.d_features, len(resolutions),
+          )  # fmt: skip
+        fused_grid.adam(
+          self.table, self.moments[0], self.moments[1], self.gradient, level * entries * 2,
+          (level + 1) * entries * 2, learning_rate, 0.0, settings.adam_beta1,
+          settings.adam_beta2, settings.adam_epsilon, self.steps_done + 1,
+        )  # fmt: skip
+
+    engine.run(backward)
+    engine.run(update)
+    total = self._gradients[0]
+    for other in self._gradients[1:]:
+      total += other
+    fused_grid.adam(
+      self.flat, self.moments[2], self.moments[3], total, 0, len(total), learning_rate,
+      settings.weight_decay, settings.adam_beta1, settings.adam_beta2, settings.adam_epsilon,
+      self.steps_done + 1,
+    )  # fmt: skip
+    refresh(engine.settings, engine.network)
+    self.steps_done += 1
+    sums = figures.sum(0)
+    self.rays_done += int(sums[0])
+    self.samples_done += int(sums[2])
+    if self.steps_done % settings.occupancy_interval == 0:
+      self._update_occupancy()
+    return {
+      "rays": sums[0],
+      "samples": sums[2],
+      "kept_samples": sums[1],
+      "psnr_db": float(-10 * np.log10(max(sums[3] / sums[0], 1e-12))),
+      "charbonnier": sums[4] / sums[0],
+      "distortion": sums[5] / sums[0],
+    }
+
+  def _update_occupancy(self) -> None:
+    """Looks at a stretch of the cells in a scrambled order, and at some occupied ones."""
+    engine, settings = self.engine, self.settings
+    rng = np.random.default_rng((self.seed, self.steps_done))
+    occupancy = engine.occupancy
+    inner, outer = occupancy.inner_size**3, occupancy.outer_size**3
+    count = settings.occupancy_samples
+    # A stride coprime to the number of cells visits every cell once before any twice.
+    order = (self._sweep + np.arange(count)) % (inner + outer)
+    self._sweep = (self._sweep + count) % (inner + outer)
+    cells = order * 7_368_787 % (inner + outer)
+    occupied = np.flatnonzero(occupancy.inner_distance == 0)
+    if len(occupied):
+      again = rng.choice(occupied, min(count // 4, len(occupied)))
+    else:
+      again = occupied
+    in_inner = np.concatenate([cells[cells < inner], again])
+    in_outer = cells[cells >= inner] - inner
+    decay = settings.occupancy_decay
+    engine.update_occupancy(in_inner, rng, inner=True, decay=decay)
+    engine.update_occupancy(in_outer, rng, inner=False, decay=decay)
+    engine.refresh_distances(threshold=settings.occupancy_threshold)
+
+  def field(self) -> Field:
+    """Returns a copy of the field as it is now."""
+    params: dict[str, Any] = unflatten(self.settings.field, self.flat)
+    params["table"] = self.table.reshape(self.settings.field.shapes["table"]).copy()
+    return Field(self.settings.field, params, self.pixel_angle)
+
+
+class FusedField:
+  """Evaluates a trained field on CPU threads."""
+
+  def __init__(self, field: Field, *, settings: TrainSettings | None = None):
+    check_supported(field.settings)
+    settings = settings or TrainSettings(field=field.settings)
+    flat = flatten(field.settings, field.params)
+    network = network_arrays(field.settings, flat)
+    refresh(field.settings, network)
+    threads = num_threads()
+    self._engine = _Engine(
+      field.settings, kernel_settings(field.settings, field.training_pixel_angle, settings),
+      np.ascontiguousarray(field.params["table"], np.float32).ravel(), network,
+      full_occupancy(settings.inner_cells, settings.outer_cells, 0.0),
+      [
+        make_chunk(field.settings, samples=2048, stored=2048)
+        for _ in range(threads)
+      ],
+      ThreadPoolExecutor(threads),
+    )  # fmt: skip
+    self._settings = settings
+    self._has_occupancy = False
+
+  def densities(self, positions: np.ndarray, *, sigma: float) -> np.ndarray:
+    """Densities [...] [1/unit] at positions [..., 3], averaged over a standard deviation [unit]."""
+    positions = np.asarray(positions, np.float32)
+    return self._engine.densities(positions.reshape(-1, 3), sigma=sigma).reshape(
+      positions.shape[:-1]
+    )
+
+  def build_occupancy(self, *, looks: int = 4) -> None:
+    """Looks into every occupancy cell `looks` times."""
+    rng = np.random.default_rng(0)
+    occupancy = self._engine.occupancy
+    for _ in range(looks):
+      for inner, size in ((True, occupancy.inner_size), (False, occupancy.outer_size)):
+        self._engine.update_occupancy(np.arange(size**3), rng, inner=inner, decay=1.0)
+    self._engine.refresh_distances(threshold=self._settings.occupancy_threshold)
+    self._has_occupancy = True
+
+  def render_rays(
+    self, origins: np.ndarray, directions: np.ndarray, *, pixel_angle: float
+  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Renders rays.
+
+    Args:
+      origins: [N, 3] in the unit frame.
+      directions: Unit vectors [N, 3].
+      pixel_angle: Angle that a pixel of the wanted picture spans [rad].
+
+    Returns:
+      colours [N, 3] over black (not clipped), expected distances [N] and opacities [N].
+    """
+    if not self._has_occupancy:
+      self.build_occupancy()
+    engine = self._engine
+    rays = np.concatenate([origins, directions], axis=-1).astype(np.float32).ravel()
+    count = len(rays) // 6
+    colors, depths = np.zeros(3 * count, np.float32), np.zeros(count, np.float32)
+    opacities = np.zeros(count, np.float32)
+    ratio = max(pixel_angle / float(engine.kernel.pixel_angle), 1e-3)
+    if engine.kernel.paper_footprint:
+      footprint = 1.0 + np.sqrt(max(ratio**2 - 1, 0.0) / 12)
+    else:
+      footprint = ratio**2
+    bounds = np.linspace(0, count, 4 * len(engine.chunks) + 1).astype(np.int64)
+
+    def work(thread):
+      for part in range(thread, len(bounds) - 1, len(engine.chunks)):
+        fused_kernels.render_rays(
+          engine.kernel, engine.occupancy, engine.network, engine.table, engine.resolutions,
+          engine.entries, engine.chunks[thread], rays, bounds[part], bounds[part + 1],
+          np.float32(footprint), colors, depths, opacities,
+        )  # fmt: skip
+
+    engine.run(work)
+    return colors.reshape(count, 3), depths, opacities
+
+  def render(
+    self, camera: Camera, unit_from_camera: np.ndarray
+  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Renders a picture: colours uint8 [H, W, 3], z-depths [H, W] [unit], opacities [H, W]."""
+    rays = camera.rays()
+    norms = np.linalg.norm(rays, axis=-1)
+    directions = (rays / norms[..., None]) @ unit_from_camera[:3, :3].T
+    origins = np.broadcast_to(unit_from_camera[:3, 3], directions.shape)
+    colors, distances, opacities = self.render_rays(
+      origins.reshape(-1, 3), directions.reshape(-1, 3), pixel_angle=camera.pixel_angle
+    )
+    shape = norms.shape
+    picture = np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8).reshape(*shape, 3)
+    return picture, distances.reshape(shape) / norms, opacities.reshape(shape)
+
+
+def density_grid(
+  field: Field, resolution: int, lower: np.ndarray, upper: np.ndarray, *, sigma: float | None = None
+) -> np.ndarray:
+  """Samples the density on a regular grid, for marching cubes.
+
+  Args:
+    field: The field.
+    resolution: Points along an axis, R.
+    lower, upper: Corners of the box in the unit frame [3]; points lie on both.
+    sigma: Standard deviation that densities are averaged over [unit]; the deviation of a training
+      sample's interval if None.
+
+  Returns:
+    Densities float32 [R, R, R] in order x, y, z [1/unit].
+  """
+  evaluator = FusedField(field)
+  sigma = field.settings.march_step / np.sqrt(12) if sigma is None else sigma
+  axes = [np.linspace(lower[i], upper[i], resolution, dtype=np.float32) for i in range(3)]
+  grid = np.empty((resolution,) * 3, np.float32)
+  for i, x in enumerate(axes[0]):
+    points = np.stack(np.meshgrid(x, axes[1], axes[2], indexing="ij"), axis=-1)[0]
+    grid[i] = evaluator.densities(points, sigma=sigma)
+  return grid

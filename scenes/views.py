@@ -1,0 +1,119 @@
+"""Posed pictures to train and test a field on, and their blurred copies.
+
+Shapes: N pictures, H height, W width, K blur levels.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from scenes.cameras import Camera
+
+BLUR_LEVELS = (0.0, 0.7, 1.4, 2.8, 5.6, 12.0)  # ours: about an octave apart, up to the paper's 12
+_SAMPLES_PER_BLUR = 1.4  # ours: a level is stored smaller while its blur stays this many pixels
+
+
+@dataclasses.dataclass(frozen=True)
+class Views:
+  """Pictures of one camera with their poses in the unit frame."""
+
+  camera: Camera
+  images: np.ndarray  # uint8 [N, H, W, 3]
+  world_from_camera: np.ndarray  # float64 [N, 4, 4], OpenCV camera axes
+  names: tuple[str, ...]
+
+  def __post_init__(self):
+    count = len(self.images)
+    size = (self.camera.height, self.camera.width, 3)
+    if self.images.dtype != np.uint8 or self.images.shape[1:] != size:
+      raise ValueError(
+        f"Pictures are {self.images.dtype} {self.images.shape[1:]}, expected uint8 {size} as the "
+        "camera says; resize the pictures or the camera."
+      )
+    if self.world_from_camera.shape != (count, 4, 4) or len(self.names) != count:
+      raise ValueError(
+        f"Found {count} pictures, poses {self.world_from_camera.shape} and {len(self.names)} names; "
+        "expected one pose [4, 4] and one name a picture."
+      )
+    if not np.isfinite(self.world_from_camera).all():
+      raise ValueError("A camera pose is not finite; drop the pictures that were not localised.")
+
+  def __len__(self) -> int:
+    return len(self.images)
+
+  def select(self, indices: Sequence[int] | np.ndarray) -> "Views":
+    """Returns the chosen pictures."""
+    indices = np.asarray(indices, np.int64)
+    names = tuple(self.names[i] for i in indices)
+    return Views(self.camera, self.images[indices], self.world_from_camera[indices], names)
+
+  def split(self, every: int = 8) -> tuple["Views", "Views"]:
+    """Returns (training, held out): every `every`-th picture is held out, as in LLFF and Mip-NeRF."""
+    held = np.arange(len(self)) % every == every // 2
+    if held.all() or not held.any():
+      raise ValueError(
+        f"Cannot hold out every {every}th of {len(self)} pictures; expected at least {every}."
+      )
+    return self.select(np.flatnonzero(~held)), self.select(np.flatnonzero(held))
+
+  def resized(self, width: int, height: int) -> "Views":
+    """Returns the pictures averaged over the pixels of a smaller size."""
+    images = [
+      cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in self.images
+    ]
+    camera = self.camera.resized(width, height)
+    return Views(camera, np.stack(images), self.world_from_camera, self.names)
+
+  def rays(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns origin [3] and unit directions [H, W, 3] of a picture's pixels in the unit frame."""
+    pose = self.world_from_camera[index]
+    directions = self.camera.rays() @ pose[:3, :3].T
+    return pose[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class BlurPyramid:
+  """Every picture blurred by a few Gaussians; strong blurs are stored at a smaller size.
+
+  A blur between two levels is mixed from them so that the variance is right.
+  """
+
+  levels: tuple[np.ndarray, ...]  # uint8 [N, h, w, 3] each
+  blurs: tuple[float, ...]  # standard deviation [pixel of the full size]
+  factors: tuple[int, ...]  # full size / stored size
+
+  @classmethod
+  def build(cls, views: Views, *, blur_max: float) -> "BlurPyramid":
+    """Blurs the pictures by `BLUR_LEVELS` scaled so that the last is `blur_max`."""
+    if blur_max <= 0:
+      return cls((views.images,), (0.0,), (1,))
+    blurs = tuple(level * blur_max / BLUR_LEVELS[-1] for level in BLUR_LEVELS)
+    levels, factors = [], []
+    height, width = views.camera.height, views.camera.width
+    for blur in blurs:
+      factor = 1
+      while (
+        blur / (2 * factor) >= _SAMPLES_PER_BLUR
+        and height % (2 * factor) == 0
+        and width % (2 * factor) == 0
+      ):
+        factor *= 2
+      if blur == 0:
+        levels.append(views.images)
+      else:
+        size = (width // factor, height // factor)
+        # Averaging over factor^2 pixels and reading bilinearly both blur a little themselves.
+        own = (factor**2 - 1) / 12 + (factor**2 / 6 if factor > 1 else 0)
+        rest = float(np.sqrt(max(blur**2 - own, 0.01)))
+        levels.append(np.stack([_blurred(image, rest, size) for image in views.images]))
+      factors.append(factor)
+    return cls(tuple(levels), blurs, tuple(factors))
+
+
+def _blurred(image: np.ndarray, blur: float, size: tuple[int, int]) -> np.ndarray:
+  smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur, borderType=cv2.BORDER_REFLECT)
+  if size != (image.shape[1], image.shape[0]):
+    smooth = cv2.resize(smooth, size, interpolation=cv2.INTER_AREA)
+  return np.clip(np.rint(smooth), 0, 255).astype(np.uint8)
