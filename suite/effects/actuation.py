@@ -1,0 +1,200 @@
+"""What happens between the command and the torque: latency, strength, limits, heat, supply.
+
+Strength is written into the actuators' gain and bias constants, so that MuJoCo's implicit
+integration, its force limits and its actuator_force all see the weakened actuator.
+"""
+
+import math
+
+import numpy as np
+
+from suite.effects.binding import Binding
+from suite.effects.effect import Array, Kind, Operator, Parameter
+
+_LEAST_STRENGTH = 0.1  # ours: a servo that hot or starved has shut down; keeps the model regular
+
+
+class CommandDelay(Operator):
+  """The actuator receives the command `delay` seconds late.
+
+  Commands are held between control steps. A delay that is not a whole number of physics steps mixes
+  the two neighbouring commands, which is the mean of the delayed command over the step. Before the
+  first command has arrived, the first one is taken.
+  """
+
+  def bind(self, binding: Binding) -> None:
+    delay = self.per_actuator(binding)["delay"] / binding.timestep
+    whole = np.floor(delay + 1e-9)
+    self._fraction = np.maximum(delay - whole, 0.0)
+    self._fraction[self._fraction < 1e-9] = 0.0
+    self._whole = whole.astype(int)
+    self._length = int(self._whole.max(initial=0)) + 2
+    self._ring = np.zeros((self._length, binding.model.nu))
+    self._columns = np.arange(binding.model.nu)
+    self._uniform = len(set(delay.tolist())) == 1
+    self.reset()
+
+  def reset(self) -> None:
+    self._count = 0
+
+  def command(self, time: float, ctrl: Array) -> None:
+    ring, length = self._ring, self._length
+    if self._count == 0:
+      ring[:] = ctrl
+    now = self._count % length
+    ring[now] = ctrl
+    self._count += 1
+    if self._uniform:
+      whole, fraction = int(self._whole[0]), float(self._fraction[0])
+      ctrl[:] = ring[(now - whole) % length]
+      if fraction:
+        ctrl *= 1 - fraction
+        ctrl += fraction * ring[(now - whole - 1) % length]
+      return
+    newer = ring[(now - self._whole) % length, self._columns]
+    older = ring[(now - self._whole - 1) % length, self._columns]
+    ctrl[:] = np.where(self._fraction > 0, newer + self._fraction * (older - newer), newer)
+
+
+class MotorGain(Operator):
+  """The actuator's force is `gain` times the declared one, before its limits."""
+
+  def bind(self, binding: Binding) -> None:
+    gain = self.per_actuator(binding)["gain"]
+    binding.model.actuator_gainprm[:, 0] *= gain
+    binding.model.actuator_biasprm[:, :3] *= gain[:, None]
+
+
+class EncoderOffset(Operator):
+  """The encoder reads `offset` too much: measured, and used by a position servo's own loop."""
+
+  def bind(self, binding: Binding) -> None:
+    self._offset = self.per_joint(binding)["offset"]
+    model, joint = binding.model, np.maximum(binding.actuator_joint, 0)
+    if model.nu:
+      stiffness = model.actuator_biasprm[:, 1] * binding.gear
+      shift = np.where(binding.actuator_joint >= 0, stiffness * self._offset[joint], 0.0)
+      model.actuator_biasprm[:, 0] += shift
+
+  def observe(self, channel: str, value: Array, time: float) -> Array:
+    return value + self._offset if channel == "joint_positions" else value
+
+
+class TorqueLimit(Operator):
+  """The actuator gives no more than `limit` in either direction."""
+
+  def bind(self, binding: Binding) -> None:
+    model = binding.model
+    limit = self.per_actuator(binding)["limit"] / np.maximum(np.abs(binding.gear), 1e-9)
+    for index in np.flatnonzero(np.isfinite(limit)):
+      low, high = model.actuator_forcerange[index]
+      if not model.actuator_forcelimited[index]:
+        low, high = -math.inf, math.inf
+      model.actuator_forcerange[index] = max(low, -limit[index]), min(high, limit[index])
+      model.actuator_forcelimited[index] = 1
+
+
+class ThermalDerating(Operator):
+  """The actuator heats with the square of its torque and weakens as it does.
+
+  dT/dt = heating * torque^2 - T / time_constant, with T the rise above the start; its strength is
+  1 - derating * T, at least 0.1.
+  """
+
+  def bind(self, binding: Binding) -> None:
+    parameters = self.per_actuator(binding)
+    step = binding.timestep
+    self._heating = parameters["heating"] * step * binding.gear**2
+    self._cooling = 1 - step / np.maximum(parameters["time_constant"], step)
+    self._derating = parameters["derating"]
+    self.temperature_rise = np.zeros(binding.model.nu)
+    """K, [U]."""
+
+  def reset(self) -> None:
+    self.temperature_rise[:] = 0.0
+
+  def step(self, binding: Binding) -> None:
+    heat = np.square(binding.data.actuator_force)
+    heat *= self._heating
+    self.temperature_rise *= self._cooling
+    self.temperature_rise += heat
+    binding.strength *= np.maximum(1 - self._derating * self.temperature_rise, _LEAST_STRENGTH)
+
+
+class SupplySag(Operator):
+  """All actuators weaken together as the supply's voltage falls under load and with time.
+
+  Strength is 1 - droop * (sum of |torque|) - fade * time, at least 0.1; the torques are those of
+  the last step.
+  """
+
+  def bind(self, binding: Binding) -> None:
+    if len(self.effects) > 1 or self.effects[0].target is not None:
+      raise ValueError("Found a target, or more than one supply_sag; expected one, with no target.")
+    self._droop = self.value(self.effects[0], "droop")
+    self._fade = self.value(self.effects[0], "fade")
+    self._gear = np.abs(binding.gear)
+
+  def step(self, binding: Binding) -> None:
+    load = float(np.abs(binding.data.actuator_force) @ self._gear)
+    strength = 1 - self._droop * load - self._fade * binding.data.time
+    binding.strength *= max(strength, _LEAST_STRENGTH)
+
+
+KINDS = (
+  Kind(
+    "command_delay",
+    "the command reaches the actuator late",
+    "joint",
+    "command",
+    (Parameter("delay", "s", 0.0, 0.0, 0.1, "latency", minimum=0.0, maximum=2.0),),
+    CommandDelay,
+  ),
+  Kind(
+    "motor_gain",
+    "the actuator is stronger or weaker than declared",
+    "joint",
+    "model",
+    (Parameter("gain", "1", 1.0, 0.4, 1.6, "true over declared force", minimum=0.0),),
+    MotorGain,
+  ),
+  Kind(
+    "encoder_offset",
+    "the encoder reads too much by a constant",
+    "joint",
+    "model",
+    (Parameter("offset", "rad", 0.0, -0.15, 0.15, "reading minus truth"),),
+    EncoderOffset,
+  ),
+  Kind(
+    "torque_limit",
+    "the actuator saturates earlier than declared",
+    "joint",
+    "model",
+    (Parameter("limit", "N m", math.inf, 0.2, 5.0, "largest torque", minimum=0.0),),
+    TorqueLimit,
+  ),
+  Kind(
+    "thermal_derating",
+    "the actuator weakens as it heats up",
+    "joint",
+    "actuator",
+    (
+      Parameter("heating", "K/(s N^2 m^2)", 0.0, 0.0, 5.0, "heating by torque", minimum=0.0),
+      Parameter("time_constant", "s", 300.0, 20.0, 1000.0, "of cooling", minimum=1e-3, shape=True),
+      Parameter("derating", "1/K", 0.004, 0.001, 0.02, "loss per kelvin", minimum=0.0, shape=True),
+    ),
+    ThermalDerating,
+  ),
+  Kind(
+    "supply_sag",
+    "the supply's voltage falls with load and time, all actuators weaken",
+    "none",
+    "actuator",
+    (
+      Parameter("droop", "1/(N m)", 0.0, 0.0, 0.1, "loss per total torque", minimum=0.0),
+      Parameter("fade", "1/s", 0.0, 0.0, 0.01, "loss per second", minimum=0.0),
+    ),
+    SupplySag,
+  ),
+)

@@ -1,0 +1,196 @@
+"""A compiled model as effects see it: joints and actuators by name, and shared work arrays.
+
+Works for any MuJoCo model: joints are its hinge and slide joints; actuators are position, motor or
+other affine ones that drive such a joint.
+
+Shapes: J joints of the binding, U actuators of the model.
+"""
+
+import difflib
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from suite import inertia
+
+Array = np.ndarray
+_LISTED = 30  # names in an error message
+
+# Every array of the model that some effect writes, apart from the mass properties.
+_FIELDS = (
+  *inertia.MASS_FIELDS,
+  "dof_damping",
+  "dof_dampingpoly",
+  "dof_frictionloss",
+  "dof_armature",
+  "jnt_stiffness",
+  "qpos_spring",
+  "actuator_gainprm",
+  "actuator_biasprm",
+  "actuator_forcelimited",
+  "actuator_forcerange",
+  "geom_quat",
+  "geom_sameframe",
+  "geom_friction",
+  "geom_condim",
+  "geom_priority",
+  "pair_friction",
+  "pair_dim",
+)
+
+
+def unknown_name(noun: str, name: str, names: Sequence[str]) -> ValueError:
+  """Returns the error for a name that the model lacks, with the names near it."""
+  known = [n for n in names if n]
+  near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+  listed = near or known[:_LISTED]
+  what = "did you mean" if near else "expected one of"
+  return ValueError(f"Found no {noun} named {name!r} in the model, {what} {listed}?")
+
+
+class Binding:
+  """What the operators of one stack share."""
+
+  def __init__(self, model: mujoco.MjModel, joints: Sequence[str] | None = None):
+    """Looks the joints up and notes the model's values.
+
+    Args:
+      model: compiled model; effects write to it.
+      joints: names of the joints, in the order of the measured joint arrays; all hinge and slide
+        joints in the model's order if None.
+    """
+    self.model = model
+    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    every = [i for i in range(model.njnt) if int(model.jnt_type[i]) in single]
+    names = {_name(model, mujoco.mjtObj.mjOBJ_JOINT, i): i for i in every}
+    if joints is None:
+      joints = list(names)
+    for name in joints:
+      if name not in names:
+        raise unknown_name("hinge or slide joint", name, list(names))
+    self.joints = list(joints)
+    self.joint_ids = np.array([names[name] for name in joints], int)
+    self.qpos = model.jnt_qposadr[self.joint_ids]
+    self.dofs = model.jnt_dofadr[self.joint_ids]
+    self.timestep = float(model.opt.timestep)
+    self.snapshot = inertia.Snapshot(model, _FIELDS)
+    self.gravity = model.opt.gravity.copy()
+    self.masses_changed = False
+    self._find_actuators()
+
+    num_joints, num_actuators = len(self.joints), model.nu
+    self.position = np.zeros(num_joints)
+    self.velocity = np.zeros(num_joints)
+    self.force = np.zeros(num_joints)
+    """Generalised force that the effects add, N m."""
+    self.friction = np.zeros(num_joints)
+    """Dry friction that the effects add at this step, N m."""
+    self.encoder_shift = np.zeros(num_joints)
+    """What the encoder reads beyond the joint's position, rad."""
+    self.strength = np.ones(num_actuators)
+    """Factor on the actuators' force at this step."""
+    self.ctrl = np.zeros(num_actuators)
+    self.data: mujoco.MjData | None = None
+
+  def _find_actuators(self) -> None:
+    model = self.model
+    by_joint = {int(j): i for i, j in enumerate(self.joint_ids)}
+    on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    self.actuator_joint = np.array(
+      [by_joint.get(int(model.actuator_trnid[u, 0]), -1) if on_joint[u] else -1
+       for u in range(model.nu)],
+      int,
+    )  # fmt: skip
+    """Index into the joints [U], -1 for an actuator that drives none of them."""
+    self.gear = model.actuator_gear[:, 0].copy()
+    self.affine = (
+      (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED))
+      & (model.actuator_biastype != int(mujoco.mjtBias.mjBIAS_MUSCLE))
+      & (model.actuator_biastype != int(mujoco.mjtBias.mjBIAS_USER))
+    )
+
+  def joint_index(self, target: str | None) -> int | slice:
+    """Returns the index of a joint among the binding's, or all of them for None."""
+    if target is None:
+      return slice(None)
+    if target in self.joints:
+      return self.joints.index(target)
+    raise unknown_name("hinge or slide joint", target, self.joints)
+
+  def actuator_indices(self, target: str | None) -> Array:
+    """Returns the indices of the actuators of that name, or that drive the joint of that name."""
+    model = self.model
+    if target is None:
+      return np.arange(model.nu)
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, target)
+    if index >= 0:
+      found = np.array([index])
+    else:
+      found = np.flatnonzero(self.actuator_joint == self.joint_index(target))
+      if not len(found):
+        raise ValueError(f"Found no actuator that drives the joint {target!r}, expected one.")
+    if not self.affine[found].all():
+      raise ValueError(
+        f"Found an actuator of {target!r} that is not of the position, velocity or motor form"
+        " (fixed gain, affine bias), which effects on actuators expect."
+      )
+    return found
+
+  def index(self, noun: str, target: str) -> int:
+    """Returns the index of a named body or geom of the model."""
+    kind = {"body": mujoco.mjtObj.mjOBJ_BODY, "geom": mujoco.mjtObj.mjOBJ_GEOM}[noun]
+    index = mujoco.mj_name2id(self.model, kind, target)
+    if index < 0:
+      count = self.model.nbody if noun == "body" else self.model.ngeom
+      raise unknown_name(noun, target, [_name(self.model, kind, i) for i in range(count)])
+    return index
+
+  def note_actuators(self) -> None:
+    """Notes the constants of the actuators after all constant effects are written."""
+    self._gain = self.model.actuator_gainprm[:, 0].copy()
+    self._bias = self.model.actuator_biasprm[:, :3].copy()
+    self._dry_friction = self.model.dof_frictionloss[self.dofs].copy()
+    joint = np.maximum(self.actuator_joint, 0)
+    self._shift_joint = joint
+    self._shift_gain = np.where(self.actuator_joint >= 0, self._bias[:, 1] * self.gear, 0.0)
+
+  def write_actuators(self) -> None:
+    """Writes strength and encoder shift into the model's actuator constants."""
+    strength = self.strength
+    model = self.model
+    model.actuator_gainprm[:, 0] = self._gain * strength
+    bias = self._bias.copy()
+    if len(self.joints):
+      bias[:, 0] += self._shift_gain * self.encoder_shift[self._shift_joint]
+    bias *= strength[:, None]
+    model.actuator_biasprm[:, :3] = bias
+
+  def write_friction(self) -> None:
+    """Writes this step's dry friction into the model."""
+    self.model.dof_frictionloss[self.dofs] = self._dry_friction + self.friction
+
+  def actuator_force(self, position: Array, velocity: Array) -> Array:
+    """Returns the force [U] the actuators give at joint positions and velocities [J], unscaled."""
+    model = self.model
+    ctrl = self.ctrl
+    if model.actuator_ctrllimited.any():
+      limits = model.actuator_ctrlrange
+      ctrl = np.where(model.actuator_ctrllimited, np.clip(ctrl, limits[:, 0], limits[:, 1]), ctrl)
+    length = self.gear * position[self._shift_joint]
+    speed = self.gear * velocity[self._shift_joint]
+    bias = self._bias
+    force = self._gain * ctrl + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * speed
+    force = force * self.strength
+    limits = model.actuator_forcerange
+    limited = np.clip(force, limits[:, 0], limits[:, 1])
+    return np.where(model.actuator_forcelimited, limited, force)
+
+  def restore(self) -> None:
+    """Writes back every value noted when the binding was made."""
+    self.snapshot.restore(self.model)
+    self.model.opt.gravity[:] = self.gravity
+
+
+def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+  return mujoco.mj_id2name(model, kind, index) or ""

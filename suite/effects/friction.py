@@ -1,0 +1,150 @@
+"""Friction beyond the nominal model's.
+
+Dry friction of every form goes into MuJoCo's own dof_frictionloss, a constraint solved implicitly:
+a joint that sticks stays stuck at any time step, and only its magnitude changes from step to step.
+"""
+
+import numpy as np
+
+from suite.effects.binding import Binding
+from suite.effects.effect import Kind, Operator, Parameter
+
+_VELOCITY_FLOOR = 1e-6  # rad/s, against division by zero
+
+
+class CoulombFriction(Operator):
+  """Constant dry friction: magnitude `torque`, against the motion."""
+
+  def bind(self, binding: Binding) -> None:
+    binding.model.dof_frictionloss[binding.dofs] += self.per_joint(binding)["torque"]
+
+
+class ViscousFriction(Operator):
+  """Friction -coefficient * v; integrated implicitly as MuJoCo's own damping is."""
+
+  def bind(self, binding: Binding) -> None:
+    binding.model.dof_damping[binding.dofs] += self.per_joint(binding)["coefficient"]
+
+
+class StribeckFriction(Operator):
+  """Dry friction that falls from rest to motion: breakaway * exp(-(v / velocity)^2) on top.
+
+  Source: Armstrong-Helouvry, Dupont, Canudas de Wit 1994, equation of the general kinetic friction
+  model with Stribeck exponent 2. Coulomb friction itself is the model's or `coulomb_friction`.
+  """
+
+  def bind(self, binding: Binding) -> None:
+    parameters = self.per_joint(binding)
+    self._breakaway = parameters["breakaway"]
+    self._rate = 1 / np.maximum(parameters["velocity"], _VELOCITY_FLOOR)
+
+  def step(self, binding: Binding) -> None:
+    scaled = binding.velocity * self._rate
+    scaled *= scaled
+    np.negative(scaled, out=scaled)
+    np.exp(scaled, out=scaled)
+    scaled *= self._breakaway
+    binding.friction += scaled
+
+
+class LoadFriction(Operator):
+  """Dry friction in proportion to the torque that the gear transmits: coefficient * |torque|.
+
+  The torque is the actuators', of the last step.
+  """
+
+  def bind(self, binding: Binding) -> None:
+    self._coefficient = self.per_joint(binding)["coefficient"]
+
+  def step(self, binding: Binding) -> None:
+    load = np.abs(binding.data.qfrc_actuator[binding.dofs])
+    load *= self._coefficient
+    binding.friction += load
+
+
+class AsymmetricFriction(Operator):
+  """Dry friction that differs by direction: `positive` for v > 0, `negative` for v < 0.
+
+  Friction anywhere in [-positive, negative] holds the joint at rest: that is a symmetric dry
+  friction of (positive + negative) / 2 and a constant torque of (negative - positive) / 2.
+  """
+
+  def bind(self, binding: Binding) -> None:
+    parameters = self.per_joint(binding)
+    positive, negative = parameters["positive"], parameters["negative"]
+    binding.model.dof_frictionloss[binding.dofs] += (positive + negative) / 2
+    self._offset = (negative - positive) / 2
+
+  def step(self, binding: Binding) -> None:
+    binding.force += self._offset
+
+
+class QuadraticDrag(Operator):
+  """Drag -coefficient * |v| v; MuJoCo's own polynomial damping, integrated implicitly."""
+
+  def bind(self, binding: Binding) -> None:
+    binding.model.dof_dampingpoly[binding.dofs, 0] += self.per_joint(binding)["coefficient"]
+
+
+KINDS = (
+  Kind(
+    "coulomb_friction",
+    "constant dry friction beyond the declared one",
+    "joint",
+    "model",
+    (Parameter("torque", "N m", 0.0, 0.0, 0.5, "magnitude", minimum=0.0),),
+    CoulombFriction,
+  ),
+  Kind(
+    "viscous_friction",
+    "friction in proportion to speed beyond the declared one",
+    "joint",
+    "model",
+    (Parameter("coefficient", "N m s/rad", 0.0, 0.0, 2.0, "torque per speed", minimum=0.0),),
+    ViscousFriction,
+  ),
+  Kind(
+    "stribeck_friction",
+    "dry friction that is larger at rest and falls with speed",
+    "joint",
+    "force",
+    (
+      Parameter("breakaway", "N m", 0.0, 0.0, 0.5, "friction at rest minus in motion", minimum=0.0),
+      Parameter(
+        "velocity", "rad/s", 0.1, 0.01, 1.0, "speed of the fall to 1/e", minimum=0.0, shape=True
+      ),
+    ),
+    StribeckFriction,
+  ),
+  Kind(
+    "load_friction",
+    "dry friction in proportion to the actuator's torque",
+    "joint",
+    "force",
+    (Parameter("coefficient", "1", 0.0, 0.0, 0.4, "friction per torque", minimum=0.0),),
+    LoadFriction,
+  ),
+  Kind(
+    "asymmetric_friction",
+    "dry friction that differs by direction",
+    "joint",
+    "force",
+    (
+      Parameter("positive", "N m", 0.0, 0.0, 0.5, "friction in positive motion", minimum=0.0),
+      Parameter("negative", "N m", 0.0, 0.0, 0.5, "friction in negative motion", minimum=0.0),
+    ),
+    AsymmetricFriction,
+  ),
+  Kind(
+    "quadratic_drag",
+    "drag in proportion to the square of speed",
+    "joint",
+    "model",
+    (
+      Parameter(
+        "coefficient", "N m s^2/rad^2", 0.0, 0.0, 1.0, "torque per squared speed", minimum=0.0
+      ),
+    ),
+    QuadraticDrag,
+  ),
+)
