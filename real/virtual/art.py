@@ -1,11 +1,19 @@
 """Procedural pictures for the built-in room: posters, book spines and the view from the window."""
 
+import itertools
+
 import cv2
 import numpy as np
 
 from real.virtual import textures
 
 SPINES = 48  # books on one sheet of spines
+_INKS = np.array([[200, 70, 50], [30, 80, 120], [230, 170, 60], [40, 50, 60], [90, 140, 120]])
+_CLOTHS = np.array(  # colours of bindings
+  [[122, 36, 40], [36, 58, 98], [44, 84, 62], [186, 138, 58], [206, 192, 160], [52, 48, 50],
+   [112, 74, 48], [60, 112, 122], [142, 142, 140], [168, 84, 50], [92, 64, 96], [220, 212, 196]],
+  float,
+)  # fmt: skip
 
 
 def poster(rng: np.random.Generator, shape: tuple[int, int], *, style: int) -> np.ndarray:
@@ -17,8 +25,7 @@ def poster(rng: np.random.Generator, shape: tuple[int, int], *, style: int) -> n
     style: 0 hills, 1 circles, 2 shards, 3 contour lines.
   """
   height, width = shape
-  picture = _hills if style == 0 else _circles if style == 1 else _shards if style == 2 else _contours
-  art = picture(rng, shape)
+  art = (_hills, _circles, _shards, _contours)[style](rng, shape)
   art = art * (1 + 0.06 * textures.noise(rng, shape, slope=0.9))[..., None]
   border = int(0.05 * min(shape))
   framed = np.full((height, width, 3), 226.0)
@@ -51,8 +58,7 @@ def _circles(rng, shape):
   for _ in range(46):
     centre = rng.uniform(0, [width, height])
     radius = width * rng.uniform(0.02, 0.17)
-    colour = rng.choice([[200, 70, 50], [30, 80, 120], [230, 170, 60], [40, 50, 60], [90, 140, 120]])
-    colour = colour * rng.uniform(0.8, 1.2)
+    colour = _INKS[rng.integers(len(_INKS))] * rng.uniform(0.8, 1.2)
     place = (int(centre[0]), int(centre[1]))
     thickness = int(rng.choice([-1, 3, 6]))
     cv2.circle(picture, place, int(radius), colour, thickness, cv2.LINE_AA)
@@ -85,21 +91,21 @@ def spines(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
   height, width = shape
   sheet = np.zeros((height, width, 3))
   edges = np.linspace(0, width, SPINES + 1).astype(int)
-  for left, right in zip(edges[:-1], edges[1:], strict=True):
-    ground = rng.uniform(30, 190) * rng.uniform(0.5, 1.3, 3)
+  for left, right in itertools.pairwise(edges):
+    ground = _CLOTHS[rng.integers(len(_CLOTHS))] * rng.uniform(0.8, 1.15)
     ink = ground + np.where(ground.mean() > 110, -90, 100)
     book = np.tile(ground, (height, right - left, 1))
     for _ in range(int(rng.integers(1, 5))):
       top = int(rng.uniform(0.03, 0.92) * height)
-      book[top : top + int(rng.uniform(0.01, 0.07) * height)] = rng.uniform(30, 220, 3)
-    top = rng.uniform(0.12, 0.3) * height
-    while top < 0.85 * height:  # title, letter by letter along the spine
+      book[top : top + int(rng.uniform(0.01, 0.07) * height)] = _CLOTHS[rng.integers(len(_CLOTHS))]
+    letter = rng.uniform(0.12, 0.3) * height
+    while letter < 0.85 * height:  # title, letter by letter along the spine
       length = rng.uniform(0.008, 0.03) * height
       a = int(rng.uniform(0.25, 0.4) * (right - left))
       b = int(rng.uniform(0.6, 0.78) * (right - left))
       if rng.random() < 0.8:
-        book[int(top) : int(top + length), a:b] = ink
-      top += length + 0.012 * height
+        book[int(letter) : int(letter + length), a:b] = ink
+      letter += length + 0.012 * height
     book *= (1 - 0.4 * np.abs(np.linspace(-1, 1, right - left)) ** 3)[None, :, None]
     sheet[:, left:right] = book
   sheet *= (1 + 0.06 * textures.noise(rng, shape, slope=1.0))[..., None]

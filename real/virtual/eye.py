@@ -118,8 +118,8 @@ class Eye:
       supersample: Samples per pixel along each side S.
 
     Returns:
-      The mean colour of each pixel, float32 [H, W, 3] in [0, 255], and its z-depth at the pixel's
-      centre, float32 [H, W] [m].
+      The mean colour of each pixel, uint8 [H, W, 3], and the z-depth at the pixel's centre, float32
+      [H, W] [m].
     """
     key = (camera, supersample)
     if key not in self._lenses:
@@ -127,12 +127,9 @@ class Eye:
     lens = self._lenses[key]
     color, depth = self._pinhole(lens, world_from_camera)
     sampled = cv2.remap(color, *lens.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    picture = cv2.resize(
-      sampled.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA
-    )
-    nearest = cv2.remap(
-      depth, *lens.depth_maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
-    )
+    size = (camera.width, camera.height)
+    picture = cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)
+    nearest = cv2.remap(depth, *lens.depth_maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     return picture, nearest
 
   def _pinhole(self, lens: _Lens, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

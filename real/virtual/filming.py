@@ -10,7 +10,7 @@ import av
 import numpy as np
 
 from real.virtual import furniture, room, walk
-from real.virtual.eye import Eye
+from real.virtual.placing import ROOM_SIZE
 from scenes.cameras import Camera
 
 TRUTH_VERSION = 1
@@ -26,13 +26,13 @@ class FilmSettings:
 
   camera: Camera = LENS
   """The phone's lens and picture size."""
-  seconds: float = 66.0
+  seconds: float = 70.0
   """Length of the film [s]."""
   frame_rate: float = 15.0
   """Pictures a second."""
-  exposure: float = 1 / 60
+  exposure: float = 1 / 80
   """Time that the shutter is open; moving during it blurs the picture [s]."""
-  subframes: int = 4
+  subframes: int = 3
   """Instants averaged over the exposure."""
   supersample: int = 2
   """Samples a pixel along each side, at each instant."""
@@ -68,7 +68,7 @@ def shoot(seed: int, settings: FilmSettings) -> Iterator[tuple[np.ndarray, np.nd
   )  # fmt: skip
   rng = np.random.default_rng([seed, 5])
   offsets = ((np.arange(settings.subframes) + 0.5) / settings.subframes - 0.5) * settings.exposure
-  with Eye(room.build_room(seed).compile()) as eye:
+  with room.room_eye(seed) as eye:
     for index in range(settings.frames):
       middle = min((index + 0.5) / settings.frame_rate, settings.seconds)
       picture = np.zeros((settings.camera.height, settings.camera.width, 3), np.float32)
@@ -147,7 +147,7 @@ def truth(seed: int, settings: FilmSettings, world_from_camera: np.ndarray) -> d
       "size": furniture.MARKER_SIZE,
       "corners": furniture.marker_corners().tolist(),
     },
-    "room_size": list(furniture.ROOM_SIZE),
+    "room_size": list(ROOM_SIZE),
     "free_area": [list(corner) for corner in furniture.FREE_AREA],
     "world_from_camera": np.round(world_from_camera[:, :3], 7).tolist(),
   }

@@ -4,57 +4,23 @@ The room spans x in [-2.5, 2.5], y in [-2, 2], z in [0, 2.5]. Furniture stands a
 rectangle FREE_AREA of the floor stays empty for a robot and a ball.
 """
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from real.virtual import art
+from real.virtual.placing import ROOM_SIZE, Group, facing, yaw
+from real.virtual.plant import plant
 from real.virtual.solids import Solid
 
-ROOM_SIZE = (5.0, 4.0, 2.5)  # [m]
 FREE_AREA = ((-1.2, -1.68), (1.85, 1.33))  # two corners (x, y), 3.05 x 3.01 m
 MARKER_ID = 0
 MARKER_SIZE = 0.20  # edge of the black square [m]
 MARKER_MARGIN_CELLS = 1.2  # white margin [cell]
-MARKER_CENTRE = (-0.62, -0.98)  # on the floor [m]
+MARKER_CENTRE = (0.45, -0.08)  # on the floor [m]
 MARKER_YAW = 0.35  # [rad]
 _PAPER_THICKNESS = 0.0015
-
-
-def yaw(angle: float) -> np.ndarray:
-  """Returns the rotation about z by an angle [rad]."""
-  return Rotation.from_euler("z", angle).as_matrix()
-
-
-def facing(normal: tuple[float, float, float]) -> np.ndarray:
-  """Returns axes of an upright panel: local z is the horizontal normal, y is up, x to the right."""
-  z = np.asarray(normal, float)
-  up = np.array([0.0, 0.0, 1.0])
-  return np.stack([np.cross(up, z), up, z], axis=-1)
-
-
-class Group:
-  """Collects the solids of one piece of furniture, placed in the room by a position and a yaw."""
-
-  def __init__(self, name: str, position=(0.0, 0.0, 0.0), angle: float = 0.0):
-    self.solids: list[Solid] = []
-    self._name, self._position, self._rotation = name, np.asarray(position, float), yaw(angle)
-
-  def add(self, kind: str, size, position, material: str, *, rotation=None, **look) -> None:
-    """Adds a solid given in the group's frame."""
-    rotation = np.eye(3) if rotation is None else rotation
-    count = len(self.solids)
-    look.setdefault("offset", (0.381 * count % 1, 0.617 * count % 1))
-    self.solids.append(
-      Solid(
-        name=f"{self._name}_{count}",
-        kind=kind,
-        size=tuple(float(s) for s in size),
-        position=self._position + self._rotation @ np.asarray(position, float),
-        rotation=self._rotation @ rotation,
-        material=material,
-        **look,
-      )
-    )
 
 
 def shell() -> list[Solid]:
@@ -72,7 +38,7 @@ def shell() -> list[Solid]:
   ]
   for material, half, place, rotation in panels:
     group.add("box", (*half, thick), place, material, rotation=rotation, tiles=None)
-  board = {"material": "pale_wood", "tiles": 0.5, "rounding": 0.004}
+  board: dict[str, Any] = {"material": "pale_wood", "tiles": 0.5, "rounding": 0.004}
   for sign in (-1, 1):
     group.add("box", (x, 0.008, 0.045), (0, sign * (y - 0.008), 0.045), **board)
     if sign < 0:
@@ -101,7 +67,7 @@ def marker_corners() -> np.ndarray:
 def sofa() -> list[Solid]:
   """Returns a sofa on the north wall with cushions."""
   group = Group("sofa", (0.15, 1.69, 0))
-  cloth = {"material": "cloth_blue", "tiles": 0.9}
+  cloth: dict[str, Any] = {"material": "cloth_blue", "tiles": 0.9}
   group.add("box", (0.95, 0.29, 0.13), (0, 0, 0.20), rounding=0.03, **cloth)
   group.add("box", (0.95, 0.09, 0.24), (0, 0.205, 0.52), rounding=0.06, **cloth)
   for side in (-1, 1):
@@ -136,22 +102,26 @@ def table() -> list[Solid]:
   heights = 0.0
   for k, (w, d, h) in enumerate(((0.13, 0.18, 0.018), (0.12, 0.16, 0.014), (0.1, 0.15, 0.02))):
     place = (-0.05, 0.35, top + heights + h)
-    look = {"material": f"poster_{k % 4}", "tiles": 2.5, "rotation": yaw(0.3 * k - 0.2)}
+    look: dict[str, Any] = {
+      "material": f"poster_{k % 4}",
+      "tiles": 2.5,
+      "rotation": yaw(0.3 * k - 0.2),
+    }
     group.add("box", (w, d, h), place, rounding=0.004, **look)
     heights += 2 * h
   group.add("cone", (0.036, 0.04, 0.048), (0.2, 0.12, top + 0.048), "glaze", tiles=3.0)
   screen = Rotation.from_euler("xz", [np.pi / 2 - 0.2, np.pi / 2]).as_matrix()
-  group.add("box", (0.16, 0.11, 0.008), (-0.08, -0.02, top + 0.008), "slate", rotation=yaw(1.5708))
-  group.add(
-    "box", (0.16, 0.105, 0.006), (-0.215, -0.02, top + 0.115), "poster_0", rotation=screen, tiles=None
-  )
+  keys, place = (0.16, 0.11, 0.008), (-0.08, -0.02, top + 0.008)
+  group.add("box", keys, place, "slate", rotation=yaw(np.pi / 2))
+  panel, place = (0.16, 0.105, 0.006), (-0.215, -0.02, top + 0.115)
+  group.add("box", panel, place, "poster_0", rotation=screen, tiles=None)
   return group.solids
 
 
 def chair() -> list[Solid]:
   """Returns a wooden chair that is half turned from the table."""
   group = Group("chair", (-1.50, 0.30, 0), -1.25)
-  wood = {"material": "red_wood", "tiles": 0.8}
+  wood: dict[str, Any] = {"material": "red_wood", "tiles": 0.8}
   group.add("box", (0.2, 0.2, 0.014), (0, 0, 0.44), rounding=0.008, **wood)
   group.add("box", (0.18, 0.18, 0.025), (0, 0, 0.475), "cloth_ochre", rounding=0.022, tiles=1.5)
   for x in (-0.175, 0.175):
@@ -167,7 +137,7 @@ def shelves(rng: np.random.Generator) -> list[Solid]:
   """Returns a bookcase on the south wall, filled with books and small things."""
   group = Group("shelf", (0.0, -1.86, 0), np.pi)  # local -y looks into the room
   width, depth, height, board = 0.95, 0.135, 1.86, 0.012
-  wood = {"material": "dark_wood", "tiles": 0.6}
+  wood: dict[str, Any] = {"material": "dark_wood", "tiles": 0.6}
   for side in (-1, 0, 1):
     group.add("box", (board, depth, height / 2), (side * (width - board), 0, height / 2), **wood)
   group.add("box", (width, 0.004, height / 2), (0, depth - 0.004, height / 2), **wood)
@@ -225,7 +195,7 @@ def sideboard() -> list[Solid]:
     group.add("ellipsoid", (0.013, 0.016, 0.013), (side * 0.04, 0.172, 0.42), "slate", tiles=3.0)
   group.add("cone", (0.07, 0.05, 0.012), (-0.22, 0, 0.702), "slate", tiles=2.0)
   group.add("cone", (0.012, 0.012, 0.12), (-0.22, 0, 0.83), "slate", tiles=2.0)
-  shade = {"material": "cloth_ochre", "tiles": 1.5, "tint": (1.0, 0.96, 0.85)}
+  shade: dict[str, Any] = {"material": "cloth_ochre", "tiles": 1.5, "tint": (1.0, 0.96, 0.85)}
   group.add("cone", (0.13, 0.085, 0.09), (-0.22, 0, 1.03), **shade)
   group.add("cone", (0.05, 0.085, 0.11), (0.2, 0.0, 0.80), "glaze", tiles=2.0)
   return group.solids
@@ -234,11 +204,12 @@ def sideboard() -> list[Solid]:
 def boxes() -> list[Solid]:
   """Returns cardboard boxes near the walls that a robot has to go around."""
   group = Group("carton")
-  card = {"material": "cardboard", "rounding": 0.004}
+  card: dict[str, Any] = {"material": "cardboard", "rounding": 0.004}
   group.add("box", (0.26, 0.2, 0.17), (-1.98, -1.46, 0.17), rotation=yaw(0.2), tiles=1.1, **card)
   group.add("box", (0.17, 0.15, 0.12), (-2.02, -1.47, 0.46), rotation=yaw(-0.35), tiles=1.5, **card)
   group.add("box", (0.16, 0.17, 0.15), (2.2, 0.25, 0.15), rotation=yaw(0.3), tiles=1.3, **card)
-  group.add("box", (0.15, 0.15, 0.20), (-1.62, -0.66, 0.20), "rug", rotation=yaw(0.5), rounding=0.05)
+  pouf, place = (0.15, 0.15, 0.20), (-1.62, -0.66, 0.20)
+  group.add("box", pouf, place, "rug", rotation=yaw(0.5), rounding=0.05)
   return group.solids
 
 
@@ -247,52 +218,9 @@ def floor_lamp() -> list[Solid]:
   group = Group("lamp", (-2.15, 1.62, 0))
   group.add("cone", (0.15, 0.14, 0.014), (0, 0, 0.014), "slate", tiles=1.5)
   group.add("cone", (0.013, 0.013, 0.68), (0, 0, 0.7), "slate", tiles=1.5)
-  shade = {"material": "botanical", "tiles": 1.2, "tint": (1.0, 0.97, 0.88)}
+  shade: dict[str, Any] = {"material": "botanical", "tiles": 1.2, "tint": (1.0, 0.97, 0.88)}
   group.add("cone", (0.22, 0.15, 0.15), (0, 0, 1.5), **shade)
   return group.solids
-
-
-def plant(rng: np.random.Generator) -> list[Solid]:
-  """Returns a large potted plant in the north-east corner: pot, soil, stems and leaves."""
-  base = np.array([2.13, 1.62, 0.0])
-  group = Group("plant", base)
-  group.add("cone", (0.19, 0.25, 0.2), (0, 0, 0.2), "glaze", tiles=1.0, tint=(1.0, 0.72, 0.6))
-  group.add("cone", (0.265, 0.265, 0.022), (0, 0, 0.395), "glaze", tiles=1.0, tint=(1.0, 0.7, 0.58))
-  group.add("cone", (0.235, 0.235, 0.01), (0, 0, 0.415), "soil", tiles=2.0)
-  for _ in range(9):
-    foot = np.array([*rng.uniform(-0.08, 0.08, 2), 0.42])
-    lean, azimuth = rng.uniform(0.05, 0.3), rng.uniform(0, 2 * np.pi)
-    direction = np.array([np.sin(lean) * np.cos(azimuth), np.sin(lean) * np.sin(azimuth), 1.0])
-    length = rng.uniform(0.5, 1.15)
-    turn = Rotation.align_vectors([direction], [[0, 0, 1.0]])[0].as_matrix()
-    middle = foot + 0.5 * length * direction / np.linalg.norm(direction)
-    group.add("cone", (0.013, 0.008, length / 2), middle, "leaf", rotation=turn, tiles=1.0)
-    for along in np.arange(0.25, 1.01, 0.11):
-      start = foot + along * length * direction / np.linalg.norm(direction)
-      _leaf(group, rng, base, start)
-  return group.solids
-
-
-def _leaf(group: Group, rng, base: np.ndarray, start: np.ndarray) -> None:
-  """Adds an arching leaf of two blades, unless no tried direction keeps it inside the room."""
-  for _ in range(12):
-    azimuth, pitch = rng.uniform(0, 2 * np.pi), rng.uniform(-0.1, 0.7)
-    length, width = rng.uniform(0.13, 0.22), rng.uniform(0.03, 0.05)
-    tint = tuple(rng.uniform(0.75, 1.15) * np.array([1.0, 1.0, 0.9]))
-    blades, tip = [], start
-    for droop in (0.0, 0.55):
-      rotation = Rotation.from_euler("zyx", [azimuth, -(pitch - droop), rng.normal(0, 0.3)])
-      rotation = rotation.as_matrix()
-      half = 0.55 * length * (1.0 if droop == 0 else 0.8)
-      blades.append((tip + 0.85 * half * rotation[:, 0], rotation, half))
-      tip = tip + 1.5 * half * rotation[:, 0]
-    ends = np.stack([base + tip, base + start])
-    limit = np.array(ROOM_SIZE[:2]) / 2 - 0.06
-    if (np.abs(ends[:, :2]) < limit).all() and ends[:, 2].min() > 0.45:
-      for centre, rotation, half in blades:
-        size = (half, width, 0.004)
-        group.add("ellipsoid", size, centre, "leaf", rotation=rotation, tiles=None, tint=tint)
-      return
 
 
 def pictures() -> list[Solid]:
@@ -323,7 +251,8 @@ def pictures() -> list[Solid]:
       place = wall + along * tangent + [0, 0, height] + depth * np.asarray(normal)
       lift = 0.0 if material != "door" else 0.5 * grow
       size = (half_width + grow, half_height + grow - lift, depth)
-      group.add("box", size, place + [0, 0, lift], rotation=rotation, **look)
+      place[2] += lift
+      group.add("box", size, place, rotation=rotation, **look)
   return group.solids
 
 

@@ -1,22 +1,21 @@
 """The built-in room: a furnished room of 5 x 4 m whose geometry and pictures are known exactly.
 
-`build_room` returns a MuJoCo specification to which a robot and a ball can be attached. Nothing in it
-depends on the camera: the lights are fixed, the materials have no gloss.
+`build_room` returns a MuJoCo specification to which a robot and a ball can be attached. Nothing
+in it depends on the camera: the lights are fixed, the materials have no gloss.
 """
 
 import functools
+from typing import Any
 
-import cv2
 import mujoco
 import numpy as np
 
-from real.virtual import art, furniture, solids, textures
+from real.virtual import furniture, solids, surfaces
+from real.virtual.eye import Eye
+from real.virtual.placing import ROOM_SIZE
+from scenes.cameras import Camera
 
-PLANK_ROWS = 26
-_AO_HEIGHTS = (0.04, 0.10, 0.25, 0.5)  # where occlusion is probed above a surface [m]
-_AO_WEIGHTS = (0.16, 0.20, 0.24, 0.22)  # how dark each makes a corner; ours, by eye
-_AO_STEP = 0.04  # grid of the probes [m]
-_SHELL_PIXELS = 320  # texels per metre of floor and walls
+_TRUE_VIEW_ROWS = 960  # a true view is sampled with about this many rows
 _LIGHTS = (  # direction of travel, strength: a window in the west, bounce from everywhere else
   ((0.80, -0.15, -0.55), (0.40, 0.40, 0.38)),
   ((-0.20, 0.10, -1.00), (0.22, 0.215, 0.20)),
@@ -26,6 +25,7 @@ _LIGHTS = (  # direction of travel, strength: a window in the west, bounce from 
   ((0.00, 0.05, 1.00), (0.18, 0.17, 0.155)),
 )
 _AMBIENT = 0.50
+_GLOW = {"window": 0.35}  # emission by texture
 
 
 @functools.lru_cache(maxsize=4)
@@ -55,18 +55,16 @@ def sample_surface(count: int, *, seed: int = 0, margin: float = 0.02):
   """
   rng = np.random.default_rng([seed, 2])
   things = room_solids(seed)
-  corners, normals = [], []
-  for solid in things:
-    mesh = solids.tessellate(solid)
-    triangles = mesh.vertices[mesh.faces] @ solid.rotation.T + solid.position
-    corners.append(triangles)
-    normals.append(mesh.normals[mesh.faces].mean(1) @ solid.rotation.T)
-  triangles, normals = np.concatenate(corners), np.concatenate(normals)
+  meshes = [(solids.tessellate(solid), solid) for solid in things]
+  triangles = np.concatenate(
+    [m.vertices[m.faces] @ solid.rotation.T + solid.position for m, solid in meshes]
+  )
+  normals = np.concatenate([m.normals[m.faces].mean(1) @ s.rotation.T for m, s in meshes])
   area = np.linalg.norm(
     np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1
   )
   kept_points, kept_normals, found = [], [], 0
-  half = np.array(furniture.ROOM_SIZE) / 2
+  half = np.array(ROOM_SIZE) / 2
   centre = np.array([0, 0, half[2]])
   while found < count:
     pick = rng.choice(len(triangles), 2 * count, p=area / area.sum())
@@ -83,76 +81,6 @@ def sample_surface(count: int, *, seed: int = 0, margin: float = 0.02):
   return np.concatenate(kept_points)[:count], np.concatenate(kept_normals)[:count]
 
 
-def _occlusion(solid: solids.Solid, seed: int, shape: tuple[int, int]) -> np.ndarray:
-  """Brightness [H, W] of the +z face of a panel: dark in corners and beside furniture."""
-  half_x, half_y, half_z = solid.size
-  columns, rows = (max(int(round(2 * s / _AO_STEP)), 2) for s in (half_x, half_y))
-  x = (np.arange(columns) + 0.5) / columns * 2 * half_x - half_x
-  y = half_y - (np.arange(rows) + 0.5) / rows * 2 * half_y
-  grid = np.stack([*np.meshgrid(x, y), np.full((rows, columns), half_z)], -1).reshape(-1, 3)
-  points = grid @ solid.rotation.T + solid.position
-  light = np.ones(len(points))
-  things = [s for s in room_solids(seed) if not s.name.startswith(("picture", "marker"))]
-  for height, weight in zip(_AO_HEIGHTS, _AO_WEIGHTS, strict=True):
-    gap = solids.distance(things, points + height * solid.rotation[:, 2])
-    light *= 1 - weight * np.clip(1 - gap / height, 0, 1)
-  picture = light.reshape(rows, columns).astype(np.float32)
-  picture = cv2.GaussianBlur(picture, (0, 0), 1.0)
-  return cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_CUBIC)
-
-
-def _floor(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-  picture = textures.planks(rng, shape, rows=PLANK_ROWS, dark=(112, 78, 48), light=(196, 152, 106))
-  height, width = shape
-  rug = textures.rug(rng, (int(1.7 * _SHELL_PIXELS), int(2.4 * _SHELL_PIXELS)))
-  left, top = int((2.5 - 0.75) / 5 * width), int((2 - 0.72) / 4 * height)
-  picture[top : top + rug.shape[0], left : left + rug.shape[1]] = rug
-  return picture
-
-
-@functools.lru_cache(maxsize=2)
-def room_textures(seed: int = 0) -> dict[str, np.ndarray]:
-  """Returns every texture of the room by name, uint8 [H, W, 3]."""
-  rng = np.random.default_rng([seed, 3])
-  x, y, z = (int(s * _SHELL_PIXELS) for s in furniture.ROOM_SIZE)
-  small = (512, 512)
-  named = {
-    "floor": _floor(rng, (y, x)),
-    "ceiling": textures.plaster(rng, (y, x), dark=(206, 203, 196), light=(240, 238, 232)),
-    "wall_north": textures.plaster(rng, (z, x), dark=(150, 168, 172), light=(206, 216, 212)),
-    "wall_south": textures.botanical(rng, (z, x), stems=150),
-    "wall_east": textures.plaster(rng, (z, y), dark=(196, 166, 118), light=(234, 212, 170)),
-    "wall_west": textures.bricks(rng, (z, y), rows=34, columns=18),
-    "botanical": textures.botanical(rng, small, stems=24),
-    "rug": textures.rug(rng, small),
-    "pale_wood": textures.wood(rng, small, dark=(150, 114, 76), light=(216, 184, 140)),
-    "dark_wood": textures.wood(rng, small, dark=(62, 42, 30), light=(124, 88, 62)),
-    "red_wood": textures.wood(rng, small, dark=(104, 52, 32), light=(176, 104, 66)),
-    "cloth_blue": textures.fabric(rng, small, dark=(48, 74, 96), light=(118, 146, 162)),
-    "cloth_ochre": textures.fabric(rng, small, dark=(160, 112, 44), light=(224, 184, 104)),
-    "slate": textures.plaster(rng, small, dark=(36, 38, 42), light=(92, 94, 98)),
-    "glaze": textures.plaster(rng, small, dark=(120, 132, 138), light=(226, 226, 218)),
-    "plaster": textures.plaster(rng, small, dark=(180, 178, 172), light=(236, 234, 228)),
-    "soil": textures.plaster(rng, (128, 128), dark=(34, 24, 16), light=(96, 72, 50)),
-    "leaf": textures.leaf(rng, (128, 256)),
-    "cardboard": textures.cardboard(rng, small),
-    "spines": art.spines(rng, (320, 64 * art.SPINES)),
-    "window": art.window_view(rng, (480, 620)),
-    "door": art.door(rng, (900, 380)),
-    "marker": textures.marker(
-      furniture.MARKER_ID, cell=40, margin_cells=furniture.MARKER_MARGIN_CELLS
-    ),
-  }
-  shapes = [(560, 440), (380, 520), (480, 360), (640, 460), (520, 400), (640, 460), (560, 460), (390, 520)]
-  for k, shape in enumerate(shapes):
-    named[f"poster_{k}"] = art.poster(rng, shape, style=k % 4)
-  for solid in room_solids(seed):
-    if solid.name.startswith("shell") and solid.tiles is None:
-      picture = named[solid.material]
-      named[solid.material] = picture * _occlusion(solid, seed, picture.shape[:2])[..., None]
-  return {name: textures.to_uint8(picture) for name, picture in named.items()}
-
-
 def build_room(seed: int = 0) -> mujoco.MjSpec:
   """Returns the room as a MuJoCo specification: world frame z up, floor z = 0, metres.
 
@@ -167,11 +95,13 @@ def build_room(seed: int = 0) -> mujoco.MjSpec:
   spec.visual.map.znear, spec.visual.map.zfar = 0.01, 12.0
   spec.stat.extent, spec.stat.center = 1.0, [0, 0, 1]
   spec.visual.headlight.active = 0
-  for name, picture in room_textures(seed).items():
+  things = room_solids(seed)
+  for name, picture in surfaces.paint(things, np.random.default_rng([seed, 3])).items():
     texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
     texture.height, texture.width = picture.shape[:2]
     texture.data = picture.tobytes()
-    material = spec.add_material(name=name, specular=0.0, shininess=0.0, emission=0.0)
+    glow = _GLOW.get(name, 0.0)
+    material = spec.add_material(name=name, specular=0.0, shininess=0.0, emission=glow)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
   for k, (direction, strength) in enumerate(_LIGHTS):
     spec.worldbody.add_light(
@@ -179,7 +109,7 @@ def build_room(seed: int = 0) -> mujoco.MjSpec:
       pos=[0, 0, 2.4], dir=list(direction), diffuse=list(strength), specular=[0, 0, 0],
       ambient=[_AMBIENT / len(_LIGHTS)] * 3,
     )  # fmt: skip
-  for solid in room_solids(seed):
+  for solid in things:
     _add_solid(spec, solid)
   return spec
 
@@ -196,15 +126,47 @@ def _add_solid(spec: mujoco.MjSpec, solid: solids.Solid) -> None:
   )
   quaternion = np.empty(4)
   mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(solid.rotation).ravel())
-  place = {"pos": solid.position.tolist(), "quat": quaternion.tolist()}
+  place: dict[str, Any] = {"pos": solid.position.tolist(), "quat": quaternion.tolist()}
   spec.worldbody.add_geom(
     name=f"{solid.name}_visual", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=solid.name,
     material=solid.material, rgba=[*np.clip(solid.tint, 0, 1), 1], group=2, contype=0,
     conaffinity=0, **place,
   )  # fmt: skip
-  shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": solid.name}
+  shape: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": solid.name}
   if solid.kind == "box" and not solid.rounding:
     shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": list(solid.size)}
   elif solid.kind == "ellipsoid":
     shape = {"type": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "size": list(solid.size)}
   spec.worldbody.add_geom(name=f"{solid.name}_contact", group=3, **shape, **place)
+
+
+def true_view(
+  camera: Camera, world_from_camera: np.ndarray, *, seed: int = 0, eye: Eye | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+  """Renders the true picture through a lens: each pixel is the mean over its area.
+
+  Args:
+    camera: Any OPENCV camera.
+    world_from_camera: Pose [4, 4] in the room, OpenCV axes.
+    seed: Seed of the room.
+    eye: A renderer to use again; without it one is made for this call (about 1 s, and building the
+      room takes a few more the first time).
+
+  Returns:
+    Colour uint8 [H, W, 3] and z-depth float32 [H, W] [m].
+  """
+  if eye is None:
+    with room_eye(seed) as own:
+      return true_view(camera, world_from_camera, eye=own)
+  supersample = int(np.clip(np.ceil(_TRUE_VIEW_ROWS / camera.height), 2, 64))
+  return eye.render(camera, world_from_camera, supersample=supersample)
+
+
+@functools.lru_cache(maxsize=2)
+def _compiled(seed: int) -> mujoco.MjModel:
+  return build_room(seed).compile()
+
+
+def room_eye(seed: int = 0) -> Eye:
+  """Returns a renderer of the room, for many calls of `true_view`; close it after use."""
+  return Eye(_compiled(seed))

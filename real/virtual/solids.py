@@ -1,7 +1,7 @@
-"""Convex solids with an exact signed distance and a triangle mesh: what the built-in room is made of.
+"""Convex solids that the built-in room is made of, each with an exact distance and a mesh.
 
-One list of solids is at once the room's picture, its contact geometry and its truth. Shapes: P points,
-V vertices, F faces. Metres.
+One list of solids is at once the room's picture, its contact geometry and its truth.
+Shapes: P points, V vertices, F faces. Metres.
 """
 
 import dataclasses

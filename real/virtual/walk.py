@@ -1,8 +1,9 @@
 """The path of a hand-held phone through the built-in room.
 
-Four rounds: along the walls at eye height looking across the room, near the middle looking outwards,
-and the same two at the height of a small robot. The end overlaps the beginning of the low round, and
-all rounds see the same walls, so that loops can be closed. Frames: world z up; camera axes of OpenCV.
+Four rounds: along the furniture at eye height looking across the room, near the middle looking
+outwards, and the same two at the height of a small robot. Between rounds the phone moves straight
+across the room, looking ahead. All rounds see the same walls, so that loops can be closed.
+Frames: world z up; camera axes of OpenCV.
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 _RATE = 120.0  # samples of the path a second
-_SMOOTHING = 0.7  # standard deviation of the filter that rounds off the rounds' joints [s]
+_SMOOTHING = 0.5  # standard deviation of the filter that rounds off the rounds' joints [s]
 _CENTRE = np.array([0.32, -0.17])  # of the open floor [m]
 
 
@@ -32,30 +33,41 @@ class Round:
 
 
 ROUNDS = (
-  Round(share=0.28, radii=(1.3, 1.2), heights=(1.55, 1.45), start=-2.2, turns=1.0, outwards=False,
-        sway=0.5, pitch=0.26, nod=0.12),
-  Round(share=0.22, radii=(0.55, 0.5), heights=(1.35, 0.9), start=-2.2, turns=-1.0, outwards=True,
-        sway=0.15, pitch=0.34, nod=0.2),
-  Round(share=0.28, radii=(1.3, 1.2), heights=(0.5, 0.44), start=-2.2, turns=1.0, outwards=False,
-        sway=0.5, pitch=0.2, nod=0.14),
-  Round(share=0.22, radii=(0.6, 0.55), heights=(0.44, 0.55), start=-2.2, turns=-1.0, outwards=True,
-        sway=0.2, pitch=0.22, nod=0.16),
+  Round(share=0.25, radii=(1.3, 1.2), heights=(1.55, 1.45), start=-2.2, turns=1.0, outwards=False,
+        sway=0.45, pitch=0.38, nod=0.17),
+  Round(share=0.20, radii=(0.55, 0.5), heights=(1.35, 0.9), start=-2.2 + np.pi, turns=-1.0,
+        outwards=True, sway=0.12, pitch=0.34, nod=0.2),
+  Round(share=0.25, radii=(1.3, 1.2), heights=(0.5, 0.44), start=-2.2, turns=1.0, outwards=False,
+        sway=0.45, pitch=0.2, nod=0.14),
+  Round(share=0.20, radii=(0.6, 0.55), heights=(0.44, 0.55), start=-2.2 + np.pi, turns=-1.0,
+        outwards=True, sway=0.12, pitch=0.22, nod=0.16),
 )  # fmt: skip
 
 
-def _round_samples(part: Round, count: int) -> tuple[np.ndarray, np.ndarray]:
-  """Positions [T, 3] and viewing directions [T, 3] of one round."""
-  s = (np.arange(count) + 0.5) / count
+def _round_samples(part: Round, count: int) -> np.ndarray:
+  """Position (3), heading and pitch along one round, [T, 5]."""
+  s = np.linspace(0, 1, count)
   angle = part.start + 2 * np.pi * part.turns * s
-  flat = np.stack([np.cos(angle), np.sin(angle)], -1) * part.radii
+  flat = _CENTRE + np.stack([np.cos(angle), np.sin(angle)], -1) * part.radii
   height = part.heights[0] + (part.heights[1] - part.heights[0]) * s
-  position = np.column_stack([_CENTRE + flat, height])
   heading = angle + (0.0 if part.outwards else np.pi)
-  heading = heading + part.sway * np.sin(2 * np.pi * 5 * s)
-  pitch = part.pitch + part.nod * np.sin(2 * np.pi * 7 * s + 0.5)
-  level = np.cos(pitch)
-  direction = np.stack([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)], -1)
-  return position, direction
+  heading = heading + part.sway * np.sin(2 * np.pi * 2 * s)
+  pitch = part.pitch + part.nod * np.sin(2 * np.pi * 3 * s)
+  return np.column_stack([flat, height, heading, pitch])
+
+
+def _path_samples(seconds: float) -> np.ndarray:
+  """The rounds, joined by straight walks across the room, [T, 5] at _RATE."""
+  rounds = [_round_samples(r, max(int(r.share * seconds * _RATE), 2)) for r in ROUNDS]
+  crossing = (1 - sum(r.share for r in ROUNDS)) / (len(ROUNDS) - 1)
+  s = np.linspace(0, 1, max(int(crossing * seconds * _RATE), 2))[1:-1, None]
+  parts = [rounds[0]]
+  for part in rounds[1:]:
+    last, first = parts[-1][-1], part[0]
+    turn = 2 * np.pi * np.round((last[3] - first[3]) / (2 * np.pi))
+    part = part + np.array([0, 0, 0, turn, 0])
+    parts += [last + (3 - 2 * s) * s * s * (part[0] - last), part]
+  return np.concatenate(parts)
 
 
 def _shake(rng: np.random.Generator, times: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -80,17 +92,16 @@ class Walk:
       shake_angle: Standard deviation of the hand's shake about each axis [rad].
     """
     rng = np.random.default_rng([seed, 4])
-    parts = [_round_samples(r, max(int(r.share * seconds * _RATE), 2)) for r in ROUNDS]
-    position = np.concatenate([p for p, _ in parts])
-    direction = np.concatenate([d for _, d in parts])
+    samples = _path_samples(seconds)
     sigma = min(_SMOOTHING, 0.05 * seconds) * _RATE
-    position = gaussian_filter1d(position, sigma, axis=0, mode="nearest")
-    direction = gaussian_filter1d(direction, sigma, axis=0, mode="nearest")
-    times = np.linspace(0, seconds, len(position))
+    samples = gaussian_filter1d(samples, sigma, axis=0, mode="nearest")
+    position, (heading, pitch) = samples[:, :3], samples[:, 3:].T
+    times = np.linspace(0, seconds, len(samples))
     position[:, 2] += 0.008 * np.sin(2 * np.pi * 1.7 * times)  # steps
     for axis in range(3):
       position[:, axis] += shake_position * _shake(rng, times, 0.4, 4.0)
-    forward = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    level = np.cos(pitch)
+    forward = np.stack([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)], -1)
     right = np.cross(forward, [0.0, 0, 1])
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
     down = np.cross(forward, right)
