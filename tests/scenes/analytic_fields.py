@@ -9,14 +9,14 @@ from scenes.contraction import from_grid_coordinates
 from scenes.encoding import is_dense
 from scenes.field import Field, FieldSettings
 
-SLOPE = 40.0  # feature per unit of signed distance
-GAIN = 3.0
+_GAIN = 3.0  # the layer norm makes +-8 of the feature's sign; times this it is the raw density
 
 
 def from_signed_distance(
   signed_distance: Callable[[np.ndarray], np.ndarray],
   *,
   settings: FieldSettings | None = None,
+  slope: float = 40.0,
   texture: float = 0.0,
   seed: int = 0,
 ) -> Field:
@@ -25,6 +25,7 @@ def from_signed_distance(
   Args:
     signed_distance: Maps points [..., 3] of the unit frame to distances [...], positive outside.
     settings: The shape; its finest dense level carries the distance.
+    slope: Feature per unit of distance; small ones make a soft surface where there is texture.
     texture: Amplitude of random features on all levels and of random colour weights.
     seed: Of the random numbers.
   """
@@ -42,7 +43,7 @@ def from_signed_distance(
   z, y, x = np.meshgrid(*[np.arange(cells + 1) / cells] * 3, indexing="ij")
   inner = np.clip(np.stack([x, y, z], -1), 0.01, 0.99)
   distance = signed_distance(np.asarray(from_grid_coordinates(jnp.asarray(inner)), np.float64))
-  params["table"][level, : (cells + 1) ** 3, 0] = -SLOPE * distance.ravel()
+  params["table"][level, : (cells + 1) ** 3, 0] = -slope * distance.ravel()
   feature = level * settings.features
   # swish(x) - swish(-x) = x, and the layer norm turns it into its sign.
   params["base_w1"][feature] = 0
@@ -51,6 +52,6 @@ def from_signed_distance(
   params["base_b1"][:2] = 0
   params["base_w2"][:2] = 0
   params["base_w2"][:, 0] = 0
-  params["base_w2"][:2, 0] = GAIN, -GAIN
+  params["base_w2"][:2, 0] = _GAIN, -_GAIN
   params["base_b2"][0] = 0
   return Field(settings, params, 0.002)
