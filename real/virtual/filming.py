@@ -14,6 +14,7 @@ from real.virtual.placing import ROOM_SIZE
 from scenes.cameras import Camera
 
 TRUTH_VERSION = 1
+SHIPPED_VIDEO = Path(__file__).parent / "data" / "room.mp4"  # its truth is beside it
 LENS = Camera(
   width=640, height=480, fx=498.0, fy=499.1, cx=322.3, cy=237.6,
   k1=0.06, k2=-0.09, p1=0.0006, p2=-0.0004,

@@ -102,12 +102,8 @@ def table() -> list[Solid]:
   heights = 0.0
   for k, (w, d, h) in enumerate(((0.13, 0.18, 0.018), (0.12, 0.16, 0.014), (0.1, 0.15, 0.02))):
     place = (-0.05, 0.35, top + heights + h)
-    look: dict[str, Any] = {
-      "material": f"poster_{k % 4}",
-      "tiles": 2.5,
-      "rotation": yaw(0.3 * k - 0.2),
-    }
-    group.add("box", (w, d, h), place, rounding=0.004, **look)
+    turn = yaw(0.3 * k - 0.2)
+    group.add("box", (w, d, h), place, f"poster_{k}", rotation=turn, rounding=0.004, tiles=2.5)
     heights += 2 * h
   group.add("cone", (0.036, 0.04, 0.048), (0.2, 0.12, top + 0.048), "glaze", tiles=3.0)
   screen = Rotation.from_euler("xz", [np.pi / 2 - 0.2, np.pi / 2]).as_matrix()

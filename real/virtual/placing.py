@@ -40,7 +40,7 @@ class Group:
       Solid(
         name=f"{self._name}_{count}",
         kind=kind,
-        size=tuple(float(s) for s in size),
+        size=(float(size[0]), float(size[1]), float(size[2])),
         position=self._position + self._rotation @ np.asarray(position, float),
         rotation=self._rotation @ rotation,
         material=material,

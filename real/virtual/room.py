@@ -39,7 +39,7 @@ def collision_truth(points: np.ndarray, *, seed: int = 0) -> np.ndarray:
 
   Positive in free space, where it is exact; negative inside walls and furniture.
   """
-  return solids.distance(list(room_solids(seed)), points)
+  return solids.distance(room_solids(seed), points)
 
 
 def sample_surface(count: int, *, seed: int = 0, margin: float = 0.02):
@@ -74,11 +74,16 @@ def sample_surface(count: int, *, seed: int = 0, margin: float = 0.02):
     outward = normals[pick] / np.linalg.norm(normals[pick], axis=-1, keepdims=True)
     probe = points + margin * outward
     keep = (np.abs(probe - centre) < half).all(-1)
-    keep[keep] = solids.distance(list(things), probe[keep]) > 0.8 * margin
+    keep[keep] = solids.distance(things, probe[keep], limit=margin) > 0.8 * margin
     kept_points.append(points[keep])
     kept_normals.append(outward[keep])
     found += int(keep.sum())
   return np.concatenate(kept_points)[:count], np.concatenate(kept_normals)[:count]
+
+
+@functools.lru_cache(maxsize=2)
+def _textures(seed: int) -> dict[str, np.ndarray]:
+  return surfaces.paint(room_solids(seed), np.random.default_rng([seed, 3]))
 
 
 def build_room(seed: int = 0) -> mujoco.MjSpec:
@@ -96,7 +101,7 @@ def build_room(seed: int = 0) -> mujoco.MjSpec:
   spec.stat.extent, spec.stat.center = 1.0, [0, 0, 1]
   spec.visual.headlight.active = 0
   things = room_solids(seed)
-  for name, picture in surfaces.paint(things, np.random.default_rng([seed, 3])).items():
+  for name, picture in _textures(seed).items():
     texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
     texture.height, texture.width = picture.shape[:2]
     texture.data = picture.tobytes()

@@ -5,6 +5,7 @@ Shapes: P points, V vertices, F faces. Metres.
 """
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -84,14 +85,15 @@ def _ellipsoid_distance(points: np.ndarray, radii: np.ndarray) -> np.ndarray:
   return np.where(((points / radii) ** 2).sum(-1) < 1, -distance, distance)
 
 
-def distance(solids: list[Solid], points: np.ndarray) -> np.ndarray:
+def distance(solids: Iterable[Solid], points: np.ndarray, *, limit: float = np.inf) -> np.ndarray:
   """Returns the signed distance from points [P, 3] to the union of solids [P] [m].
 
   Outside it is exact. Inside it is the depth in the solid that holds the point the deepest, which
-  for overlapping solids is a bound on the depth.
+  for overlapping solids is a bound on the depth. Distances over the limit are not looked for: the
+  limit is returned.
   """
   points = np.asarray(points, np.float64).reshape(-1, 3)
-  best = np.full(len(points), np.inf)
+  best = np.full(len(points), limit)
   near_first = sorted(solids, key=lambda solid: -solid.bounding_radius)
   for solid in near_first:
     reach = np.linalg.norm(points - solid.position, axis=-1) - solid.bounding_radius

@@ -30,7 +30,7 @@ def _occlusion(
   points = grid @ solid.rotation.T + solid.position
   light = np.ones(len(points))
   for height, weight in zip(_AO_HEIGHTS, _AO_WEIGHTS, strict=True):
-    gap = solids.distance(things, points + height * solid.rotation[:, 2])
+    gap = solids.distance(things, points + height * solid.rotation[:, 2], limit=height)
     light *= 1 - weight * np.clip(1 - gap / height, 0, 1)
   picture = light.reshape(rows, columns).astype(np.float32)
   smooth = cv2.GaussianBlur(picture, (0, 0), 1.0)

@@ -1,0 +1,58 @@
+"""Films a walk through the built-in room and writes its truth beside the video.
+
+python launch/film_room.py --out out/room.mp4
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import rich.console
+import rich.progress
+import tyro
+
+from real.virtual import filming
+from real.virtual.eye import EglMissingError
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+  """Films a walk through the built-in room and writes its truth beside the video."""
+
+  out: Path
+  """The video (.mp4); its truth goes to NAME_truth.json beside it."""
+  seed: int = 0
+  """Seed of the room, the path and the noise."""
+  film: tyro.conf.OmitArgPrefixes[filming.FilmSettings] = dataclasses.field(
+    default_factory=filming.FilmSettings
+  )
+  """How it is filmed."""
+
+
+def main(arguments: Arguments) -> int:
+  """Films; returns the exit status."""
+  console = rich.console.Console(stderr=True)
+  columns = (
+    rich.progress.TextColumn("filming"),
+    rich.progress.BarColumn(),
+    rich.progress.MofNCompleteColumn(),
+    rich.progress.TimeRemainingColumn(),
+  )
+  try:
+    with rich.progress.Progress(*columns, console=console) as bar:
+      task = bar.add_task("filming", total=arguments.film.frames)
+      filming.film(
+        arguments.out,
+        seed=arguments.seed,
+        settings=arguments.film,
+        progress=lambda done, total: bar.update(task, completed=done, total=total),
+      )
+  except (EglMissingError, OSError, ValueError) as error:
+    console.print(f"[red]{error}[/red]")
+    return 1
+  console.print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB")
+  return 0
+
+
+if __name__ == "__main__":
+  sys.exit(main(tyro.cli(Arguments)))
