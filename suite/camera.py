@@ -19,7 +19,7 @@ from suite.op3 import constants, op3
 DEPTH, OVERLAY = "depth", "overlay"
 _DISPLAY_GAMMA = 2.2  # of the pictures: light = value ** 2.2
 _LIGHT_DIRECTION = np.array([0.3, 0.2, 0.933])  # towards the light, in the world; ours
-_AMBIENT, _DIFFUSE = 0.45, 0.55  # shares of light from everywhere and from the lamp; ours
+_AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; ours
 _CULLING_SLACK = 1e-3  # rad added to the cone around a geom
 # OpenCV camera axes (x right, y down, z forward) from MuJoCo's (x right, y up, z backward).
 _OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
@@ -195,6 +195,11 @@ class RobotCamera:
   def shape(self) -> tuple[int, int, int]:
     """The picture's shape (H, W, 3)."""
     return self.camera.height, self.camera.width, 3
+
+  def set_gain(self, gain: float) -> None:
+    """Changes the gain from the next picture on."""
+    self.settings = dataclasses.replace(self.settings, gain=gain)
+    self._response = self.settings.response()
 
   def bind(self, model: mujoco.MjModel, camera_id: int) -> None:
     """Takes the geoms and the mounting from a compiled model."""

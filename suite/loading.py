@@ -5,14 +5,18 @@ from typing import Any
 
 from suite import errors
 from suite.camera import CameraSettings, FieldRenderer, RobotCamera
+from suite.effects import read_effects
 from suite.environment import Environment
 from suite.randomisation import RandomisationSettings
-from suite.tasks import nerf_nav
-from suite.tasks.base import PHYSICS_TIMESTEP, TaskSettings
+from suite.tasks import ball_push, nerf_nav
+from suite.tasks.base import PHYSICS_TIMESTEP, RobotTask, TaskSettings
 
-_TASKS: dict[str, Any] = {nerf_nav.NAME: nerf_nav}
-_CLASSES: dict[str, Any] = {nerf_nav.NAME: nerf_nav.NerfNav}
-ALL_TASKS: tuple[str, ...] = tuple(_CLASSES)
+# Name to (class, length of an episode [s]).
+_TASKS: dict[str, tuple[type[RobotTask], float]] = {
+  nerf_nav.NAME: (nerf_nav.NerfNav, nerf_nav.TIME_LIMIT),
+  ball_push.NAME: (ball_push.BallPush, ball_push.TIME_LIMIT),
+}
+ALL_TASKS: tuple[str, ...] = tuple(_TASKS)
 
 
 def load(
@@ -50,7 +54,7 @@ def load(
   Raises:
     ValueError: If an argument is none of what is expected; the message says what would be.
   """
-  if task not in _CLASSES:
+  if task not in _TASKS:
     raise ValueError(errors.unknown_name("task", task, ALL_TASKS))
   camera = camera or CameraSettings()
   lens = None if image_size is None else camera.camera(image_size)
@@ -61,13 +65,15 @@ def load(
       renderer or load_renderer(bundle), lens,
       world_from_unit=bundle.world_from_unit, settings=camera,
     )  # fmt: skip
+  task_class, default_limit = _TASKS[task]
   settings = TaskSettings(
-    time_limit=_TASKS[task].TIME_LIMIT if time_limit is None else time_limit,
+    time_limit=default_limit if time_limit is None else time_limit,
     physics_timestep=physics_timestep,
     privileged=privileged,
     randomisation=randomisation or RandomisationSettings(),
+    effects=read_effects(effects) if isinstance(effects, str | Path) else tuple(effects or ()),
   )
-  built = _CLASSES[task](bundle, camera=robot_camera, settings=settings)
+  built = task_class(bundle, camera=robot_camera, settings=settings)
   return Environment(built, time_limit=settings.time_limit, random_state=random)
 
 

@@ -6,7 +6,7 @@ reading has a history of five control steps, oldest first. Shapes: J joints, S p
 control step, H history.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -48,6 +48,8 @@ class Proprioception:
     }
     self._step = 0
     self._tick = 0
+    self.observe: Callable[[str, np.ndarray, float], np.ndarray] | None = None
+    """What a reading becomes on the way: (channel, true value, time [s]); see suite.effects."""
 
   @property
   def sizes(self) -> Mapping[str, int]:
@@ -127,6 +129,10 @@ class Proprioception:
   def _sample(self, imu: np.ndarray, joints: np.ndarray) -> None:
     """Takes the sample of one 125 Hz tick."""
     time = self._tick * constants.BUS_PERIOD
+    if self.observe is not None:
+      joints = self.observe("joint_positions", joints, time)
+      gyroscope = self.observe("gyroscope", imu[:3], time)
+      imu = np.concatenate([gyroscope, self.observe("accelerometer", imu[3:], time)])
     gravity = self._madgwick.update(imu[:3], imu[3:])
     self._imu_line.push(time, np.concatenate([imu, gravity]))
     self._joint_line.push(time, np.rint(joints / constants.ENCODER_STEP) * constants.ENCODER_STEP)

@@ -29,9 +29,10 @@ _GEOMS: dict[str, list[tuple[str, tuple[float, ...], tuple[float, float, float],
   "body_link": [
     ("box", (0.040, 0.048, 0.058), (-0.012, 0.0, 0.066), _SHELL),
     ("box", (0.012, 0.034, 0.030), (0.034, 0.0, 0.080), _LIGHT),
+    ("box", (0.025, 0.046, 0.009), (-0.012, 0.0, -0.001), _LIGHT),
   ],
-  "head_pan_link": [("cylinder", (0.011, 0.008), (0.0, 0.0, 0.008), _DARK)],
-  "head_tilt_link": [("box", (0.030, 0.036, 0.026), (-0.008, -0.019, 0.038), _SHELL)],
+  "head_pan_link": [("cylinder", (0.011, 0.016), (0.0, 0.0, 0.010), _DARK)],
+  "head_tilt_link": [("box", (0.030, 0.036, 0.032), (-0.008, -0.019, 0.032), _SHELL)],
   "sho_pitch_link": [("box", (0.011, 0.010, 0.011), (0.0, 0.010, 0.0), _DARK)],
   "sho_roll_link": [("box", (0.017, 0.033, 0.020), (-0.018, 0.042, 0.0), _DARK)],
   "el_link": [
@@ -40,8 +41,8 @@ _GEOMS: dict[str, list[tuple[str, tuple[float, ...], tuple[float, float, float],
   ],
   "hip_yaw_link": [("cylinder", (0.011, 0.006), (0.0, 0.0, -0.010), _DARK)],
   "hip_roll_link": [("box", (0.030, 0.016, 0.019), (0.004, 0.0, -0.012), _DARK)],
-  "hip_pitch_link": [("box", (0.017, 0.016, 0.040), (0.0, -0.019, -0.062), _LIGHT)],
-  "knee_link": [("box", (0.013, 0.015, 0.042), (0.0, -0.021, -0.055), _LIGHT)],
+  "hip_pitch_link": [("box", (0.017, 0.016, 0.048), (0.0, -0.019, -0.054), _LIGHT)],
+  "knee_link": [("box", (0.013, 0.015, 0.048), (0.0, -0.021, -0.053), _LIGHT)],
   "ank_pitch_link": [("box", (0.028, 0.016, 0.019), (-0.020, -0.019, 0.012), _DARK)],
   "ank_roll_link": [
     ("box", size, position, _DARK) for size, position in constants.FOOT_BOXES

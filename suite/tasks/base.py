@@ -4,7 +4,7 @@ import abc
 import collections
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -16,6 +16,7 @@ from suite import filters, rewards
 from suite import randomisation as randomising
 from suite.arena import SceneArena
 from suite.camera import RobotCamera
+from suite.effects import Effect, EffectStack
 from suite.environment import Reading
 from suite.op3 import constants, op3
 from suite.proprioception import HISTORY, Proprioception
@@ -34,6 +35,7 @@ class TaskSettings:
   time_limit: float  # s
   physics_timestep: float = PHYSICS_TIMESTEP  # s; the control step is a multiple of it
   privileged: bool = True  # whether to give the observations that only the critic may see
+  effects: Sequence[Effect] = ()  # what the nominal model lacks; targets with or without "op3/"
   randomisation: randomising.RandomisationSettings = dataclasses.field(
     default_factory=randomising.RandomisationSettings
   )
@@ -203,6 +205,7 @@ class RobotTask(composer.Task):
     first = int(model.sensor_adr[gyroscope])
     self._imu_slice = slice(first, first + 6)  # the accelerometer follows the gyroscope
     self._touch_table = self._make_touch_table(root)
+    self._effects = self._bind_effects()
     self._randomiser = randomising.Randomiser(
       model, torso=self._robot.torso.full_identifier, ball=self._ball_geom(),
       imu_sites=(self._robot.imu.full_identifier,),
@@ -220,6 +223,22 @@ class RobotTask(composer.Task):
     self._camera_latency = latency
     self._substep = 0
 
+  def _bind_effects(self) -> EffectStack:
+    """Writes the constant effects into the model; the others act at every step and reading."""
+    prefix = f"{self._robot.mjcf_model.model}/"
+    robot_names = {*constants.JOINT_NAMES, *self._robot.bodies}
+    effects = [
+      dataclasses.replace(effect, target=prefix + effect.target)
+      if effect.target in robot_names
+      else effect
+      for effect in self.settings.effects
+    ]
+    joints = [prefix + name for name in constants.JOINT_NAMES]
+    stack = EffectStack(effects).bind(self._model, joints=joints)
+    self._proprioception.observe = stack.observe if effects else None
+    self._effects_act = not stack.is_constant
+    return stack
+
   def _make_touch_table(self, root: int) -> np.ndarray:
     """Returns uint8 [geoms, geoms]: what a robot part other than a foot touches in a contact."""
     model = self._model
@@ -234,10 +253,12 @@ class RobotTask(composer.Task):
       self.settings.randomisation, random_state, time_limit=self.settings.time_limit
     )
     self._randomiser.apply(self.draws)
+    self._effects.reset()
     self._place(random_state)
     self._control = self._standing.copy()
     self._action_filter.reset(self._control)
-    physics.set_control(self._middle + self._half_range * self._control)
+    self._targets = self._middle + self._half_range * self._control
+    physics.set_control(self._targets)
     self._touched = 0
     self.success, self.success_time, self.ending = False, float("nan"), None
 
@@ -259,12 +280,19 @@ class RobotTask(composer.Task):
     self, physics: Any, action: np.ndarray, random_state: np.random.RandomState
   ) -> None:
     self._control = self._action_filter(np.clip(action, -1.0, 1.0))
-    self._data.ctrl[:] = self._middle + self._half_range * self._control
+    self._targets = self._middle + self._half_range * self._control
+    self._data.ctrl[:] = self._targets
     assert self.draws is not None
     self._data.xfrc_applied[self._torso, :3] = self.draws.pushes.at(self._data.time)
     self._substep = 0
     count = self.physics_steps_per_control_step
     self._qpos_trace[:-count] = self._qpos_trace[count:]
+
+  def before_substep(
+    self, physics: Any, action: np.ndarray, random_state: np.random.RandomState
+  ) -> None:
+    if self._effects_act:
+      self._effects.before_step(self._data, self._targets)
 
   def after_substep(self, physics: Any, random_state: np.random.RandomState) -> None:
     data = self._data
@@ -437,4 +465,5 @@ class RobotTask(composer.Task):
     self._past.qpos[:] = self._qpos_trace[-1 - age]
     mujoco.mj_kinematics(self._model, self._past)
     mujoco.mj_camlight(self._model, self._past)
-    return self.robot_camera.render(self._past, self._random_state)
+    picture = self.robot_camera.render(self._past, self._random_state)
+    return self._effects.observe("camera", picture, float(self._data.time))
