@@ -45,6 +45,8 @@ class SceneArena(composer.Arena):
       )
     center, half = (self._lower + self._upper) / 2, (self._upper - self._lower) / 2
     root.compiler.angle = "radian"
+    # Composer's arena gives 10 mg at least to every body, also to the frames of attached models.
+    root.compiler.set_attributes(boundmass=0, boundinertia=0)
     root.statistic.center = (*center, 0.5)
     root.statistic.extent = float(half.max())
     root.visual.headlight.set_attributes(

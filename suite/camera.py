@@ -188,8 +188,8 @@ class RobotCamera:
     self._unit_from_world = world_from_unit.inverse()
     self._meters_per_unit = world_from_unit.scale
     self._response = self.settings.response()
-    self._caster: GeomCaster | None = None
-    self._camera_id = -1
+    self.caster: GeomCaster | None = None
+    self.camera_id = -1
 
   @property
   def shape(self) -> tuple[int, int, int]:
@@ -203,8 +203,13 @@ class RobotCamera:
 
   def bind(self, model: mujoco.MjModel, camera_id: int) -> None:
     """Takes the geoms and the mounting from a compiled model."""
-    self._caster = GeomCaster(model, self.camera)
-    self._camera_id = camera_id
+    self.caster = GeomCaster(model, self.camera)
+    self.camera_id = camera_id
+
+  def render_field(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Renders the scene alone: colour uint8 [H, W, 3] and z-depth [H, W] [m]."""
+    color, depth = self._renderer.render(self.camera, self._unit_from_world.apply_pose(pose))
+    return color, depth * self._meters_per_unit
 
   def render(self, data: mujoco.MjData, random_state: np.random.RandomState | None = None) -> Any:
     """Returns the picture uint8 [H, W, 3] at a state with kinematics up to date.
@@ -213,18 +218,17 @@ class RobotCamera:
       data: MuJoCo's state.
       random_state: Source of the sensor's noise; without one there is none.
     """
-    if self._caster is None:
+    if self.caster is None:
       raise RuntimeError("The camera has no model yet: call bind(model, camera_id) first.")
-    pose = world_from_camera(data, self._camera_id)
-    color, depth = self._renderer.render(self.camera, self._unit_from_world.apply_pose(pose))
-    pixels, distances, ids, normals = self._caster.cast(data, pose)
+    pose = world_from_camera(data, self.camera_id)
+    color, depth = self.render_field(pose)
+    pixels, distances, ids, normals = self.caster.cast(data, pose)
     if len(pixels):
       if self.settings.compositing == DEPTH:
-        scene = depth.reshape(-1)[pixels] * self._meters_per_unit
-        front = np.flatnonzero(distances < scene)
+        front = np.flatnonzero(distances < depth.reshape(-1)[pixels])
         pixels, ids, normals = pixels[front], ids[front], normals[front]
       color = np.array(color)
-      color.reshape(-1, 3)[pixels] = self._caster.shade(ids, normals)
+      color.reshape(-1, 3)[pixels] = self.caster.shade(ids, normals)
     return self._develop(color, random_state)
 
   def _develop(self, color: np.ndarray, random_state: np.random.RandomState | None) -> np.ndarray:

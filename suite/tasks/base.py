@@ -40,6 +40,16 @@ class TaskSettings:
     default_factory=randomising.RandomisationSettings
   )
 
+  def __post_init__(self):
+    if not self.time_limit > 0:
+      raise ValueError(f"The time_limit must be positive [s], found {self.time_limit}.")
+    steps = constants.CONTROL_TIMESTEP / self.physics_timestep if self.physics_timestep > 0 else 0
+    if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
+      raise ValueError(
+        f"The physics_timestep must divide the control step of {constants.CONTROL_TIMESTEP} s, "
+        f"found {self.physics_timestep}."
+      )
+
 
 class RobotState(NamedTuple):
   """The robot's true state at the end of a control step."""
@@ -65,6 +75,15 @@ class Start(NamedTuple):
 
   xy: tuple[float, float]  # m
   yaw: float  # rad
+
+
+class Outcome(NamedTuple):
+  """How an episode went, for an evaluation."""
+
+  success: bool
+  success_time: float  # s from the start; NaN without success
+  ending: str | None  # why it ended early; None: it runs, or reached its time limit
+  duration: float  # s
 
 
 @functools.cache
@@ -153,6 +172,11 @@ class RobotTask(composer.Task):
   def state(self) -> RobotState:
     """The robot's true state."""
     return self._state
+
+  @property
+  def standing_action(self) -> np.ndarray:
+    """The action [20] that holds the reference pose (clipped to the limits)."""
+    return self._standing.astype(np.float32)
 
   # ---- what a task defines ----
 
@@ -329,6 +353,11 @@ class RobotTask(composer.Task):
     return specs.BoundedArray((len(constants.JOINT_NAMES),), np.float32, -1.0, 1.0, name=names)
 
   # ---- state and termination ----
+
+  @property
+  def outcome(self) -> Outcome:
+    """How the episode has gone so far."""
+    return Outcome(self.success, self.success_time, self.ending, float(self._data.time))
 
   @property
   def touches_scene(self) -> bool:

@@ -4,11 +4,12 @@ Byravan et al. 2022, NeRF2Real, section "Tasks" and appendix "Rewards". The goal
 as (x, y) in the scene's world frame; where the robot is does not: it has to see that.
 """
 
+import functools
 from typing import Any
 
 import numpy as np
 
-from suite import rewards
+from suite import protocols, rewards
 from suite.camera import RobotCamera
 from suite.op3 import constants
 from suite.tasks.base import RobotTask, Start, TaskSettings
@@ -16,6 +17,7 @@ from suite.tasks.base import RobotTask, Start, TaskSettings
 NAME = "nerf_nav"
 # s: ours, the paper names no limit for navigation; three times its median time to a goal (10.3 s).
 TIME_LIMIT = 30.0
+_START_GRID = 0.1  # m between the places among which an evaluation's start positions are chosen
 FALL, COLLISION = "fall", "collision"
 
 
@@ -52,6 +54,22 @@ class NerfNav(RobotTask):
         f"Unknown goal {goal_index}: the scene has {len(self._goals)} goals, counted from 0."
       )
     self.start, self.goal_index = start, goal_index
+
+  def set_trial(self, trial: protocols.NavigationTrial) -> None:
+    """Fixes start pose, goal and camera gain to those of a trial of an evaluation protocol."""
+    xy = self.evaluation_starts[trial.position]
+    self.set_start(Start((float(xy[0]), float(xy[1])), trial.yaw), goal_index=trial.goal)
+    if self.robot_camera is not None:
+      self.robot_camera.set_gain(trial.camera_gain)
+
+  @functools.cached_property
+  def evaluation_starts(self) -> np.ndarray:
+    """The start positions of the evaluation protocols [3, 2] in the world [m]."""
+    lower, upper = self._arena.extent
+    x, y = (np.arange(lower[i] + _START_GRID / 2, upper[i], _START_GRID) for i in range(2))
+    points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    free = points[np.asarray(self.scene.free_space.is_free(points), bool)]
+    return protocols.navigation_starts(free, self._goals)
 
   def _place(self, random_state: np.random.RandomState) -> None:
     drawn = random_state.randint(len(self._goals))

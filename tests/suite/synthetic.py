@@ -8,7 +8,7 @@ import trimesh
 
 from scenes.similarity import Similarity
 
-# Boxes (lower, upper) [m]: walls of a 6 x 5 m room and two pieces of furniture.
+# Boxes (lower, upper) [m]: walls of a 6 x 5 m room and furniture.
 BOXES = (
   ((-3.1, -2.6, 0.0), (-3.0, 2.6, 2.4)),
   ((3.0, -2.6, 0.0), (3.1, 2.6, 2.4)),
@@ -16,6 +16,7 @@ BOXES = (
   ((-3.1, 2.5, 0.0), (3.1, 2.6, 2.4)),
   ((2.0, 1.4, 0.0), (2.8, 2.2, 0.5)),
   ((2.2, -2.2, 0.0), (2.8, -1.6, 0.8)),
+  ((2.0, -0.5, 0.0), (2.4, 0.5, 0.03)),  # low enough to be touched by toes alone
 )
 FREE = ((-2.6, -2.1), (1.6, 2.1))  # lower and upper corner of the free floor
 
