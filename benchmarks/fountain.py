@@ -1,0 +1,138 @@
+"""Localisation against surveyed poses: fountain-P11.
+
+  python benchmarks/fountain.py --data ../shared/data/captures/fountain-P11
+
+Source of the data: Strecha et al. 2008, On benchmarking camera calibration and multi-view stereo
+for high resolution imagery. Exit code 1 if a figure is missed.
+"""
+
+import dataclasses
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from scenes.capture import read_capture
+from scenes.localise import Localisation, localise
+from scenes.similarity import Similarity
+
+MAX_POSITION_RMSE = 0.01  # [m]
+MAX_ROTATION_RMSE = 0.1  # [degree]
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseErrors:
+  """Errors of poses [N] after the best similarity and one constant rotation in the camera frame."""
+
+  position: np.ndarray  # [N], unit of the truth
+  rotation: np.ndarray  # [N] [degree]
+
+  @property
+  def position_rmse(self) -> float:
+    """Root mean square of the position errors."""
+    return float(np.sqrt(np.mean(self.position**2)))
+
+  @property
+  def rotation_rmse(self) -> float:
+    """Root mean square of the rotation errors [degree]."""
+    return float(np.sqrt(np.mean(self.rotation**2)))
+
+
+def mean_rotation(rotations: np.ndarray) -> np.ndarray:
+  """Chordal mean [3, 3] of rotations [N, 3, 3]. Source: Hartley et al. 2013, section 5.3."""
+  u, _, vt = np.linalg.svd(rotations.sum(axis=0))
+  return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def rotation_angle(rotations: np.ndarray) -> np.ndarray:
+  """Angle [degree] of rotations [..., 3, 3], accurate for small ones."""
+  sine = 0.5 * np.linalg.norm(
+    np.stack(
+      [
+        rotations[..., 2, 1] - rotations[..., 1, 2],
+        rotations[..., 0, 2] - rotations[..., 2, 0],
+        rotations[..., 1, 0] - rotations[..., 0, 1],
+      ]
+    ),
+    axis=0,
+  )
+  cosine = 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1)
+  return np.degrees(np.arctan2(sine, cosine))
+
+
+def pose_errors(estimated: np.ndarray, truth: np.ndarray) -> PoseErrors:
+  """Compares world-from-camera poses [N, 4, 4] up to a similarity.
+
+  The constant rotation between the camera frames takes up the principal point, which pictures alone
+  hardly determine: moving it turns all cameras by the same angle.
+  """
+  fit = Similarity.fit(estimated[:, :3, 3], truth[:, :3, 3])
+  aligned = fit.apply_pose(estimated)
+  difference = np.swapaxes(aligned[:, :3, :3], 1, 2) @ truth[:, :3, :3]
+  offset = mean_rotation(difference)
+  return PoseErrors(
+    position=np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1),
+    rotation=rotation_angle(difference @ offset.T),
+  )
+
+
+def read_truth(folder: Path) -> tuple[list[str], np.ndarray]:
+  """Reads the surveyed cameras: names and world-from-camera poses [N, 4, 4] [m]."""
+  names, poses = [], []
+  for path in sorted(folder.glob("*.camera")):
+    rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rows[4:7], rows[7]
+    names.append(path.name.removesuffix(".camera"))
+    poses.append(pose)
+  if not names:
+    raise FileNotFoundError(f"{folder} holds no .camera files: give the folder of fountain-P11.")
+  return names, np.stack(poses)
+
+
+def measure(data: Path, work: Path) -> tuple[PoseErrors, Localisation, float]:
+  """Localises the pictures; returns errors, the localisation and the seconds it took."""
+  start = time.perf_counter()
+  capture = read_capture(data / "images", work / "keyframes")
+  result = localise(work / "keyframes", work)
+  seconds = time.perf_counter() - start
+  _, truth = read_truth(data / "gt_dense_cameras")
+  rows = [[path.name for path in capture.images].index(name) for name in result.names]
+  return pose_errors(result.world_from_camera, truth[rows]), result, seconds
+
+
+def main(data: Path) -> int:
+  """Measures and prints a table.
+
+  Args:
+    data: Folder of fountain-P11, with images/ and gt_dense_cameras/.
+  """
+  with tempfile.TemporaryDirectory() as folder:
+    errors, result, seconds = measure(data, Path(folder))
+  complete = result.registered_fraction == 1.0
+  rows = (
+    ("registered pictures", f"{result.registered_fraction:.0%}", "100%", complete),
+    ("position RMSE [mm]", f"{1e3 * errors.position_rmse:.2f}", f"{1e3 * MAX_POSITION_RMSE:.0f}",
+     errors.position_rmse <= MAX_POSITION_RMSE),
+    ("position, largest [mm]", f"{1e3 * errors.position.max():.2f}", "", True),
+    ("rotation RMSE [degree]", f"{errors.rotation_rmse:.4f}", f"{MAX_ROTATION_RMSE}",
+     errors.rotation_rmse <= MAX_ROTATION_RMSE),
+    ("rotation, largest [degree]", f"{errors.rotation.max():.4f}", f"{MAX_ROTATION_RMSE}",
+     errors.rotation.max() <= MAX_ROTATION_RMSE),
+    ("reprojection error [px]", f"{result.reprojection_error_px:.3f}", "", True),
+    ("wall time [s]", f"{seconds:.1f}", "", True),
+  )  # fmt: skip
+  print(f"fountain-P11: {result.strategy}")
+  print(f"{'figure':<28}{'found':>10}{'at most':>10}")
+  for name, found, limit, passed in rows:
+    print(f"{name:<28}{found:>10}{limit:>10}  {'' if passed else 'MISSED'}")
+  return 0 if all(row[3] for row in rows) else 1
+
+
+if __name__ == "__main__":
+  sys.exit(tyro.cli(main))

@@ -1,0 +1,192 @@
+"""Videos: one streaming pass that keeps the sharpest frame of each part.
+
+Memory holds one candidate picture, never the film: a video of any length streams through.
+"""
+
+import collections
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import av
+import av.error
+import cv2
+import numpy as np
+
+STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; ours, so that
+# pictures of different resolution are comparable; pictures are never enlarged
+DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged; ours
+
+Progress = Callable[[float, str], None]
+
+
+class CaptureError(ValueError):
+  """An input that cannot become a capture; the message is one line a person can act on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+  """A picture chosen from a video."""
+
+  index: int  # number of the frame in the video
+  time: float  # presentation time [s]
+  sharpness: float  # variance of the Laplacian at the standard size [grey level^2]
+  image: np.ndarray  # upright BGR picture uint8 [H, W, 3]
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoInfo:
+  """What a video's header and packets say, before any decoding."""
+
+  num_frames: int  # packets of the video stream
+  declared_frames: int  # what the header promises; 0 where it does not say
+  frames_per_second: float  # mean rate [1/s]; 0 where unknown
+  codec: str  # name of the codec
+
+  @property
+  def duration(self) -> float:
+    """Length of the film [s]; 0 where the rate is unknown."""
+    return self.num_frames / self.frames_per_second if self.frames_per_second > 0 else 0.0
+
+
+def sharpness(grey: np.ndarray) -> float:
+  """Variance of the Laplacian of a grey picture [H, W] at the standard size.
+
+  Source: Pech-Pacheco et al. 2000, Diatom autofocusing in brightfield microscopy, LAP_VAR.
+  """
+  height, width = grey.shape
+  factor = STANDARD_SIZE / min(height, width)
+  if factor < 1:
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+  return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+
+
+def inspect_video(path: Path) -> VideoInfo:
+  """Counts a video's frames from its packets, without decoding.
+
+  Raises:
+    CaptureError: If the file is no video, has no video stream or no frame.
+  """
+  try:
+    with av.open(str(path)) as container:
+      if not container.streams.video:
+        raise CaptureError(f"{path} has no video stream (sound only?); give the video itself.")
+      stream = container.streams.video[0]
+      count = 0
+      try:
+        count = sum(1 for packet in container.demux(stream) if packet.size)
+      except av.error.FFmpegError:
+        count = max(count, 1)  # decoding says where it breaks
+      return VideoInfo(
+        num_frames=count,
+        declared_frames=stream.frames,
+        frames_per_second=float(stream.average_rate or stream.guessed_rate or 0),
+        codec=stream.codec_context.name,
+      )
+  except av.error.FFmpegError as error:
+    size = path.stat().st_size
+    what = "is empty (0 bytes)" if size == 0 else f"cannot be read as a video ({error.strerror})"
+    raise CaptureError(
+      f"{path} {what}: copy it from the phone again, or give a folder of images."
+    ) from error
+
+
+def _decode(path: Path, counts: collections.Counter) -> Iterator[av.VideoFrame]:
+  """Yields decoded frames; a broken packet is counted and skipped, a broken container ends."""
+  with av.open(str(path)) as container:
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    packets = container.demux(stream)
+    while True:
+      try:
+        packet = next(packets)
+      except StopIteration:
+        return
+      except av.error.FFmpegError:
+        counts["broken"] += 1
+        return
+      try:
+        for frame in packet.decode():
+          counts["decoded"] += 1
+          counts["broken"] += bool(frame.is_corrupt)
+          yield frame
+      except av.error.FFmpegError:
+        counts["broken"] += 1
+
+
+def _upright(frame: av.VideoFrame, max_size: int) -> np.ndarray:
+  """Converts to BGR, honours the rotation metadata, limits the long side to max_size."""
+  image = frame.to_ndarray(format="bgr24")
+  # frame.rotation is counter-clockwise in degrees: what has to be done to see it upright.
+  turns = round(frame.rotation / 90) % 4
+  image = np.ascontiguousarray(np.rot90(image, turns))
+  return limit_size(image, max_size)
+
+
+def limit_size(image: np.ndarray, max_size: int) -> np.ndarray:
+  """Reduces a picture so that its long side is at most max_size [pixel]."""
+  height, width = image.shape[:2]
+  factor = max_size / max(height, width)
+  if factor >= 1:
+    return image
+  size = (round(width * factor), round(height * factor))
+  return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def sharpest_frames(
+  path: Path,
+  num_parts: int,
+  *,
+  max_size: int,
+  info: VideoInfo,
+  warnings: list[str],
+  progress: Progress | None = None,
+) -> Iterator[Frame]:
+  """Cuts a video into equal parts and yields the sharpest frame of each.
+
+  Args:
+    path: The video.
+    num_parts: Number of parts, at most one per frame.
+    max_size: Longer pictures are reduced to this long side [pixel].
+    info: From `inspect_video`.
+    warnings: Receives a line when a little of the video was damaged.
+    progress: Called with (fraction, text).
+
+  Raises:
+    CaptureError: If more than DAMAGED_FRACTION of the video cannot be decoded.
+  """
+  parts = min(num_parts, info.num_frames)
+  edges = np.linspace(0, info.num_frames, parts + 1).astype(int)
+  counts: collections.Counter = collections.Counter()
+  best: tuple[float, int, av.VideoFrame] | None = None
+  part, last_time = 0, 0.0
+  for index, frame in enumerate(_decode(path, counts)):
+    last_time = float(frame.time or 0.0)
+    while part + 1 < parts and index >= edges[part + 1]:
+      if best is not None:
+        yield _chosen(best, max_size)
+      best, part = None, part + 1
+    # The luma plane is the grey picture: no colour conversion for frames that are not kept.
+    value = sharpness(frame.reformat(format="gray").to_ndarray())
+    if best is None or value > best[0]:
+      best = (value, index, frame)
+    if progress is not None and index % 10 == 0:
+      progress(min(1.0, index / info.num_frames), f"frame {index} of {info.num_frames}")
+  expected = max(info.num_frames, info.declared_frames)
+  lost = max(expected - counts["decoded"], 0) + counts["broken"]
+  if counts["decoded"] == 0 or lost > max(1, DAMAGED_FRACTION * expected):
+    raise CaptureError(
+      f"{path} is damaged: {counts['decoded']} of {expected} frames decoded, until "
+      f"{last_time:.1f} s, {counts['broken']} of them broken; copy it again, or cut the good part: "
+      f"ffmpeg -i {path.name} -t {max(last_time - 1, 1):.0f} good.mp4"
+    )
+  if lost:
+    warnings.append(f"{lost} of {expected} frames of the video are damaged and may show blocks.")
+  if best is not None:
+    yield _chosen(best, max_size)
+
+
+def _chosen(best: tuple[float, int, av.VideoFrame], max_size: int) -> Frame:
+  value, index, frame = best
+  return Frame(index, float(frame.time or 0.0), value, _upright(frame, max_size))
