@@ -44,7 +44,7 @@ def shell() -> list[Solid]:
     if sign < 0:
       group.add("box", (0.008, y, 0.045), (sign * (x - 0.008), 0, 0.045), **board)
     else:  # the east wall has a door
-      group.add("box", (0.008, 1.35, 0.045), (x - 0.008, 0.6, 0.045), **board)
+      group.add("box", (0.008, 1.41, 0.045), (x - 0.008, 0.59, 0.045), **board)
   return group.solids
 
 
