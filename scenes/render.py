@@ -33,6 +33,9 @@ class RenderSettings:
   weight_floor: float = 0.004
   """Samples of less weight get no colour of their own: less than 1 of 255. Ours."""
 
+  specular_per_sample: bool = False
+  """Ask the view network for every sample, not once a ray with the mean bottleneck. Ours."""
+
   def __post_init__(self):
     if not (self.step > 0 and self.steps_per_footprint > 0 and 0 <= self.near < self.far):
       raise ValueError(f"Found {self}; expected positive steps and 0 <= near < far.")
@@ -199,5 +202,6 @@ class Renderer:
     how.growth_steps = self.settings.growth_steps(pixel_angle)
     how.near, how.far = self.settings.near, self.settings.far
     how.stop, how.weight_floor = self.settings.stop, self.settings.weight_floor
+    how.specular_samples = int(self.settings.specular_per_sample)
     how.pixel_angle = field_pixel_angle(self.field, pixel_angle)
     return how

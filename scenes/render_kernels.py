@@ -44,6 +44,7 @@ class MarchData:
   far: wp.float32  # [unit]
   stop: wp.float32  # transmittance at which a ray ends
   weight_floor: wp.float32  # samples that count less get no colour
+  specular_samples: wp.int32  # 1: the view network is asked for every sample, 0: once a ray
   pixel_angle: wp.float32  # [rad]
 
 
@@ -83,8 +84,11 @@ def build(layout: Layout) -> Kernels:
   @wp.func_native(render_native.snippet(render_native.VIEW_HIDDEN, **view_constants))
   def view_hidden(weights: wp.array(dtype=wp.float32), d: wp.vec3) -> view: ...
 
-  @wp.func_native(render_native.snippet(render_native.COLOR, **view_constants))
-  def sample_color(weights: wp.array(dtype=wp.float32), base: outputs, hidden: view) -> wp.vec3: ...
+  @wp.func_native(render_native.snippet(render_native.DIFFUSE))
+  def diffuse(base: outputs) -> wp.vec3: ...
+
+  @wp.func_native(render_native.snippet(render_native.SPECULAR, **view_constants))
+  def specular(weights: wp.array(dtype=wp.float32), base: outputs, hidden: view) -> wp.vec3: ...
 
   @wp.func_native(render_native.snippet(render_native.OPACITY))
   def opacity_of(x: wp.float32) -> wp.float32: ...
@@ -101,12 +105,13 @@ def build(layout: Layout) -> Kernels:
       inverse[a] = 1.0 / wp.where(wp.abs(direction[a]) > 1e-9, direction[a], 1e-9)
       side = wp.where(direction[a] > 0.0, 1.0, -1.0)
       cube_exit = wp.min(cube_exit, (side - origin[a]) * inverse[a])
-    hidden = view_hidden(field.view, direction)
+    hidden_layer = view_hidden(field.view, direction)
 
     index = wp.int32(how.near / how.step)
     level = wp.int32(0)
     transmittance = wp.float32(1.0)
     total = wp.vec3()
+    mean_base = outputs()
     weights = wp.float32(0.0)
     median = wp.float32(wp.inf)
     while transmittance > how.stop:
@@ -157,7 +162,10 @@ def build(layout: Layout) -> Kernels:
       weight = transmittance * alpha
       behind = transmittance - weight
       if weight > how.weight_floor:
-        total += weight * sample_color(field.view, base, hidden)
+        total += weight * diffuse(base)
+        if how.specular_samples > 0:
+          total += weight * specular(field.view, base, hidden_layer)
+        mean_base += weight * base
         weights += weight
       if transmittance > MEDIAN and behind <= MEDIAN:
         median = distance - 0.5 * length + wp.log(transmittance / MEDIAN) / base[0]
@@ -166,7 +174,10 @@ def build(layout: Layout) -> Kernels:
 
     opacity = wp.where(transmittance > how.stop, 1.0 - transmittance, 1.0)
     if weights > 0.0:
-      total = total * (opacity / weights)
+      total = total / weights
+      if how.specular_samples == 0:
+        total += specular(field.view, mean_base / weights, hidden_layer)
+      total = total * opacity
     return _Result(total[0], total[1], total[2], opacity, median)
 
   @wp.kernel(module="unique", enable_backward=False, module_options=_OPTIONS)

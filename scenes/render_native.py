@@ -142,8 +142,15 @@ VIEW_HIDDEN = r"""
   return out;
 """
 
-# (what BASE gave, what VIEW_HIDDEN gave) -> colour.
-COLOR = r"""
+# What BASE gave -> diffuse colour.
+DIFFUSE = r"""
+  alignas(16) float raw[4] = {base[1], base[2], base[3], 0.0f};
+  LANES for (int k = 0; k < 4; ++k) raw[k] = 1.0f / (1.0f + exponential(-raw[k]));
+  return wp::vec3(raw[0], raw[1], raw[2]);
+"""
+
+# (what BASE gave, what VIEW_HIDDEN gave) -> specular colour.
+SPECULAR = r"""
   const float* w = weights.data + 10 * VIEW;
   alignas(64) float h[VIEW];
   LANES for (int j = 0; j < VIEW; ++j) h[j] = hidden[j];
@@ -160,9 +167,9 @@ COLOR = r"""
     b += y * w[2 * VIEW + j];
   }
   w += 3 * VIEW;
-  alignas(32) float raw[8] = {base[1], base[2], base[3], 0.0f, r + w[0], g + w[1], b + w[2], 0.0f};
-  LANES for (int k = 0; k < 8; ++k) raw[k] = 1.0f / (1.0f + exponential(-raw[k]));
-  return wp::vec3(raw[0] + raw[4], raw[1] + raw[5], raw[2] + raw[6]);
+  alignas(16) float raw[4] = {r + w[0], g + w[1], b + w[2], 0.0f};
+  LANES for (int k = 0; k < 4; ++k) raw[k] = 1.0f / (1.0f + exponential(-raw[k]));
+  return wp::vec3(raw[0], raw[1], raw[2]);
 """
 
 # 1 - e^-x for x >= 0, without cancellation for small x.

@@ -70,7 +70,7 @@ def test_agrees_with_the_jax_reference(shape, angle):
   # Random cells, inside and outside the unit cube, make every kind of skip happen.
   occupied = np.random.default_rng(0).random((32, 32, 32)) < 0.15
   occupancy = Occupancy.from_occupied(occupied)
-  settings = render.RenderSettings(stop=0.0, weight_floor=0.0, far=5.0)
+  settings = render.RenderSettings(stop=0.0, weight_floor=0.0, far=5.0, specular_per_sample=True)
   renderer = render.Renderer(field, settings=settings, occupancy=occupancy)
   origins, directions = _random_rays(200)
   color, distance, opacity = renderer.render_rays(origins, directions, angle)
@@ -159,6 +159,19 @@ def test_early_stop_and_weight_floor_change_little():
   color, distance, _ = fast.render_rays(origins, directions, 0.01)
   assert 0 < np.abs(color - expected_color).max() < 0.03
   np.testing.assert_allclose(distance, expected_distance, atol=1e-5)
+
+
+def test_one_specular_colour_a_ray_is_close_to_one_a_sample():
+  field = _soft_field(levels=4, log2_table_size=14)
+  each = render.Renderer(field, settings=render.RenderSettings(specular_per_sample=True, far=4.0))
+  mean = render.Renderer(field, settings=render.RenderSettings(far=4.0), occupancy=each.occupancy)
+  origins, directions = _random_rays(300)
+  expected, expected_distance, _ = each.render_rays(origins, directions, 0.01)
+  color, distance, _ = mean.render_rays(origins, directions, 0.01)
+  # The field is random, far rougher than a trained one.
+  error = np.abs(color - expected)
+  assert 0 < error.mean() < 0.02
+  np.testing.assert_array_equal(distance, expected_distance)
 
 
 def test_batches_threads_and_rays_agree_with_single_pictures(wall):
