@@ -1,0 +1,1 @@
+"""Agents: DMPO, and the link between its actors and its learner."""

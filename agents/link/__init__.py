@@ -1,0 +1,1 @@
+"""What travels between actors, evaluator and learner, over zenoh. Start with README.md."""
