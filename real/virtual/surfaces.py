@@ -13,8 +13,6 @@ _AO_HEIGHTS = (0.04, 0.10, 0.25, 0.5)  # where occlusion is probed above a surfa
 _AO_WEIGHTS = (0.16, 0.20, 0.24, 0.22)  # how dark each makes a corner; ours, by eye
 _AO_STEP = 0.04  # grid of the probes [m]
 _SHELL_PIXELS = 320  # texels per metre of floor and walls
-_WORN = ("rug", "spines")  # textures that lose some colour; the rug on the floor does as well
-_SATURATION = 0.75
 _POSTERS = (  # heights and widths [pixel]
   (560, 440), (380, 520), (480, 360), (640, 460), (520, 400), (640, 460), (560, 460), (390, 520),
 )  # fmt: skip
@@ -44,7 +42,7 @@ def _floor(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
   height, width = shape
   rug = patterns.rug(rng, (int(1.7 * _SHELL_PIXELS), int(2.4 * _SHELL_PIXELS)))
   left, top = int((2.5 - 0.75) / 5 * width), int((2 - 0.72) / 4 * height)
-  picture[top : top + rug.shape[0], left : left + rug.shape[1]] = _washed_out(rug)
+  picture[top : top + rug.shape[0], left : left + rug.shape[1]] = rug
   return picture
 
 
@@ -58,12 +56,6 @@ def _stencilled(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
   ground = textures.plaster(rng, shape, dark=(190, 158, 110), light=(236, 214, 172))
   colours = [(168, 122, 76), (240, 224, 190), (148, 132, 92), (196, 140, 96)]
   return textures.scattered(rng, ground, count=2600, sizes=(3, 16), colours=colours)
-
-
-def _washed_out(picture: np.ndarray) -> np.ndarray:
-  """Lessens saturation: video stores colour at half resolution, and vivid patterns suffer."""
-  grey = picture.mean(-1, keepdims=True)
-  return grey + _SATURATION * (picture - grey)
 
 
 def paint(things: Sequence[solids.Solid], rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -102,8 +94,6 @@ def paint(things: Sequence[solids.Solid], rng: np.random.Generator) -> dict[str,
       furniture.MARKER_ID, cell=40, margin_cells=furniture.MARKER_MARGIN_CELLS
     ),
   }
-  for name in _WORN:
-    named[name] = _washed_out(named[name])
   for k, shape in enumerate(_POSTERS):
     named[f"poster_{k}"] = art.poster(rng, shape, style=k % 4)
   thick = [s for s in things if not s.name.startswith(("picture", "marker"))]
