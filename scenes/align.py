@@ -210,9 +210,7 @@ def align(
       )
   metres, scale_source, spread = _scale(plane, positions, marker, settings, override, warnings)
   if floor_source == "plane" and surface_points is not None:
-    plane = floors.refine_floor(
-      plane, surface_points, tolerance=settings.refine_tolerance / metres
-    )
+    plane = floors.refine_floor(plane, surface_points, tolerance=settings.refine_tolerance / metres)
   if scale_source in ("camera_height", "unknown"):  # they rest on the floor just refined
     metres, _, _ = _scale(plane, positions, marker, settings, override, [])
   tilt = float(np.degrees(np.arccos(np.clip(plane.normal @ camera_up, -1, 1))))
@@ -233,7 +231,10 @@ def align(
     if surface_normals is not None:
       yaw = wall_yaw(surface_normals[band] @ upright.T)
     if yaw is None:
-      yaw, yaw_source = point_yaw((dense[band] if band.sum() > 100 else dense) @ upright.T), "points"
+      yaw, yaw_source = (
+        point_yaw((dense[band] if band.sum() > 100 else dense) @ upright.T),
+        "points",
+      )
   rotation = _turn(-yaw) @ upright
   if override.yaw_deg is None:
     rotation = _longer_side_along_x(rotation, dense[band] if band.any() else dense)

@@ -240,7 +240,7 @@ def _coacd(piece, start, matter: _Matter, settings: ConvexSettings) -> list[Part
   values = np.where(piece, np.minimum(matter.values[block], -1e-3), 1.0)
   vertices, faces, _, _ = measure.marching_cubes(np.pad(values, 1, constant_values=1.0), 0.0)
   space = matter.space
-  mesh = meshes.Mesh((vertices - 1 + start) * space.voxel + space.lower, faces[:, ::-1].astype(int))
+  mesh = meshes.Mesh((vertices - 1 + start) * space.voxel + space.lower, faces.astype(int))
   mesh = meshes.simplify(mesh, faces=settings.max_faces)
   found = coacd.run_coacd(
     coacd.Mesh(mesh.vertices, mesh.faces), threshold=settings.tolerance, real_metric=True,

@@ -183,5 +183,8 @@ def refine_floor(floor: Floor, points: np.ndarray, *, tolerance: float) -> Floor
   if turned > 5:  # the dense points near it are no floor
     return floor
   return floor._replace(
-    normal=normal, offset=offset, points=int(inside.sum()), residual=float(np.sqrt(np.mean(error**2)))
+    normal=normal,
+    offset=offset,
+    points=int(inside.sum()),
+    residual=float(np.sqrt(np.mean(error**2))),
   )

@@ -224,7 +224,9 @@ def fuse(
   rays = views.camera.rays()
   nearest, cosine = np.empty_like(depth), np.empty_like(depth)
   for n, picture in enumerate(depth):
-    nearest[n] = cv2.erode(np.where(picture > 0, picture, np.inf).astype(np.float32), np.ones((3, 3)))
+    nearest[n] = cv2.erode(
+      np.where(picture > 0, picture, np.inf).astype(np.float32), np.ones((3, 3))
+    )
     _, cosine[n] = pixel_normals(picture, rays)
   camera = views.camera
   lens = tuple(

@@ -56,7 +56,9 @@ def _detector(names: Sequence[str]) -> cv2.aruco.ArucoDetector:
   for name in names:
     code = getattr(cv2.aruco, f"DICT_{name}", None)
     if code is None:
-      raise ValueError(f'Unknown marker dictionary "{name}": take one of {", ".join(DICTIONARIES)}.')
+      raise ValueError(
+        f'Unknown marker dictionary "{name}": take one of {", ".join(DICTIONARIES)}.'
+      )
     sets.append(cv2.aruco.getPredefinedDictionary(code))
   return cv2.aruco.ArucoDetector(sets, parameters)
 

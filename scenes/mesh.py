@@ -65,11 +65,12 @@ def surface(grid: fusion.Grid) -> Mesh:
     ValueError: the grid holds no surface.
   """
   known = grid.observed
-  cell = np.ones_like(known)  # a cell counts where its eight corners are known
+  # A cell counts where its eight corners are known; skimage looks it up at its last corner.
+  cell = np.ones_like(known)
   for offset in np.ndindex(2, 2, 2):
     shifted = np.zeros_like(known)
-    target = tuple(slice(0, n - o) for n, o in zip(known.shape, offset, strict=True))
-    source = tuple(slice(o, n) for n, o in zip(known.shape, offset, strict=True))
+    target = tuple(slice(o, n) for n, o in zip(known.shape, offset, strict=True))
+    source = tuple(slice(0, n - o) for n, o in zip(known.shape, offset, strict=True))
     shifted[target] = known[source]
     cell &= shifted
   if not (cell.any() and grid.values[known].min() < 0 < grid.values[known].max()):
@@ -78,7 +79,7 @@ def surface(grid: fusion.Grid) -> Mesh:
       "density never crosses the threshold. Check the extent, the scale and the field."
     )
   vertices, faces, _, _ = measure.marching_cubes(grid.values, 0.0, mask=cell)
-  return Mesh(vertices * grid.voxel + grid.lower, faces[:, ::-1].astype(np.int64))
+  return Mesh(vertices * grid.voxel + grid.lower, faces.astype(np.int64))
 
 
 def density_to_grid(

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes import align, cameras, markers, overrides, similarity
-from tests.scenes import box_room
+from tests.scenes import furnished_room
 
 CAMERA = cameras.Camera.from_vertical_fov(0.9, 96, 72)
 
@@ -16,7 +16,7 @@ CAMERA = cameras.Camera.from_vertical_fov(0.9, 96, 72)
 def room():
   """A room in its own metric frame: sparse points, depth views and poses."""
   rng = np.random.default_rng(0)
-  views = box_room.depth_views(box_room.walk(48), CAMERA, noise=0.003, rng=rng)
+  views = furnished_room.depth_views(furnished_room.walk(48), CAMERA, noise=0.003, rng=rng)
   points, _ = views.surface_points(stride=8)
   # The floor has little texture: most of its points are missing.
   points = points[(points[:, 2] > 0.05) | (rng.random(len(points)) < 0.15)]

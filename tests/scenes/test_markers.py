@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from scenes import cameras, markers
-from tests.scenes import box_room
+from tests.scenes import furnished_room
 
 CAMERA = cameras.Camera(
   width=960, height=540, fx=800, fy=805, cx=483, cy=268, k1=-0.08, k2=0.02, p1=0.001, p2=-0.0005
@@ -40,7 +40,7 @@ def scene():
   rng = np.random.default_rng(0)
   angles = np.linspace(0.3, 2.2, 8)
   positions = np.c_[0.9 * np.cos(angles), 0.9 * np.sin(angles), rng.uniform(0.5, 0.9, 8)]
-  poses = np.array([box_room.look_at(p, [0.05, 0.02, 0]) for p in positions])
+  poses = np.array([furnished_room.look_at(p, [0.05, 0.02, 0]) for p in positions])
   return poses, [picture(p, "APRILTAG_36h11", 7, rng) for p in poses]
 
 
