@@ -4,7 +4,9 @@ Shapes: N views, H height, W width.
 """
 
 import dataclasses
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -76,3 +78,26 @@ def evaluate(
     figures[f"held_out_psnr_{size}_db"] = float(np.mean([score.psnr_db for score in scores]))
     figures[f"held_out_ssim_{size}"] = float(np.mean([score.ssim for score in scores]))
   return full, figures
+
+
+def save_scores(scores: Sequence[ViewScore], folder: Path) -> None:
+  """Writes scores so that `load_scores` finds them."""
+  np.savez(
+    folder / "views.npz",
+    truth=np.stack([score.truth for score in scores]),
+    image=np.stack([score.image for score in scores]),
+    depth=np.stack([score.depth for score in scores]).astype(np.float16),
+  )
+  rows = [{"name": s.name, "psnr_db": s.psnr_db, "ssim": s.ssim} for s in scores]
+  (folder / "views.json").write_text(json.dumps(rows, indent=1))
+
+
+def load_scores(folder: Path) -> list[ViewScore]:
+  """Reads what `save_scores` wrote."""
+  rows = json.loads((folder / "views.json").read_text())
+  arrays = np.load(folder / "views.npz")
+  truth, image, depth = arrays["truth"], arrays["image"], arrays["depth"].astype(np.float32)
+  return [
+    ViewScore(row["name"], truth[k], image[k], depth[k], row["psnr_db"], row["ssim"])
+    for k, row in enumerate(rows)
+  ]

@@ -34,7 +34,7 @@ FIGURES: Mapping[str, tuple[str, str]] = {
   "held_out_ssim_60x80": ("", "the same views at 60x80"),
   "robot_psnr_db": ("dB", "PSNR at 30x40; from the robot's own camera where the truth is known"),
   "robot_psnr_60x80_db": ("dB", "PSNR at 60x80 from the robot's own camera"),
-  "collision_error_m": ("m", "95th percentile of the distance between convex parts and seen surface, the worse direction"),
+  "collision_error_m": ("m", "95th percentile of parts to seen surface and back, the worse"),
   "collision_parts": ("", "convex parts that MuJoCo collides"),
   "floor_tilt_deg": ("deg", "angle between the floor found and the true vertical's floor"),
   "scale_source": ("", "where the metric scale comes from"),
@@ -42,7 +42,7 @@ FIGURES: Mapping[str, tuple[str, str]] = {
   "camera_rmse_m": ("m", "RMSE of the camera positions against the truth after alignment"),
   "free_area_m2": ("m^2", "floor area that the robot can stand on"),
   "baseline_psnr_db": ("dB", "PSNR of the COLMAP Poisson mesh on the same held-out views"),
-}  # fmt: skip  # ruff: noqa: E501
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,6 @@ class ReportData:
   visual: trimesh.Trimesh
   collision: Sequence[trimesh.Trimesh]
   free_space_picture: np.ndarray  # uint8 [H, W, 3], top-down with goals and camera path
-  scale_text: str
 
 
 def write(path: Path, data: ReportData) -> None:
@@ -99,7 +98,7 @@ def _summary(data: ReportData) -> str:
   return parts.section(
     "Figures",
     "",
-    parts.warnings([*data.warnings, data.scale_text] if data.scale_text else data.warnings),
+    parts.warnings(data.warnings),
     parts.table(("figure", "value", "unit", "meaning"), rows),
   )
 
@@ -167,7 +166,9 @@ def _geometry(data: ReportData) -> str:
   visual = data.visual
   if len(visual.faces) > _MESH_FACES:
     visual = visual.simplify_quadric_decimation(face_count=_MESH_FACES)
-  surface = parts.figure_3d([parts.mesh_trace(visual, name="surface"), parts.path_trace(data.camera_path)])  # fmt: skip
+  surface = parts.figure_3d(
+    [parts.mesh_trace(visual, name="surface"), parts.path_trace(data.camera_path)]
+  )
   convex = parts.figure_3d(
     [
       parts.mesh_trace(part, color=parts.part_color(index), name=f"part {index}")

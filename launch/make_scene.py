@@ -1,0 +1,109 @@
+"""Makes a scene bundle from a video or pictures of a room.
+
+  python launch/make_scene.py --capture room.mp4 --out out/room --marker-side 0.2
+  python launch/make_scene.py --capture builtin --out out/demo --preset demo
+
+A second run with the same --out continues where the first one stopped.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Literal
+
+import rich
+import tyro
+from rich.table import Table
+
+from real.virtual import yardstick
+from scenes import pipeline
+from scenes.bundle import Bundle
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Arguments:
+  """Makes a scene bundle from a video or pictures of a room."""
+
+  capture: str
+  """A video, a folder of pictures, a COLMAP model, a transforms.json, or "builtin" for the
+  project's own room."""
+  out: Path
+  """Folder of the bundle."""
+  preset: Literal["fast", "demo", "paper"] = "fast"
+  """"fast": two CPU cores; "demo": quicker; "paper": the paper's tables, for a GPU."""
+  keyframes: int | None = None
+  """Pictures to take from the capture; the preset's number if not given."""
+  train_seconds: float | None = None
+  """Seconds of training; the preset's if not given."""
+  marker_side: float | None = None
+  """Side of the black square of an ArUco or AprilTag marker in the room [m]: gives the scale."""
+  camera_height: float | None = None
+  """Median height of the camera above the floor [m]: gives the scale where there is no marker."""
+  override: Path | None = None
+  """YAML or JSON that fixes floor, scale, yaw, extent by hand; see scenes/overrides.py."""
+  baseline: Literal["none", "colmap"] | None = None
+  """"colmap" adds the Poisson mesh of the COLMAP points to the report."""
+  name: str | None = None
+  """The scene's name; the output folder's if not given."""
+
+
+def settings_of(arguments: Arguments) -> pipeline.SceneSettings:
+  """Applies the arguments to their preset."""
+  settings = pipeline.preset(arguments.preset)
+  if arguments.keyframes is not None:
+    taken = dataclasses.replace(settings.capture, num_keyframes=arguments.keyframes)
+    settings = dataclasses.replace(settings, capture=taken)
+  if arguments.train_seconds is not None:
+    training = dataclasses.replace(settings.train, max_seconds=arguments.train_seconds)
+    settings = dataclasses.replace(settings, train=training)
+  if arguments.camera_height is not None:
+    placing = dataclasses.replace(settings.align, camera_height=arguments.camera_height)
+    settings = dataclasses.replace(settings, align=placing)
+  if arguments.marker_side is not None:
+    settings = dataclasses.replace(settings, marker_side=arguments.marker_side)
+  if arguments.baseline is not None:
+    settings = dataclasses.replace(settings, baseline=arguments.baseline)
+  return settings
+
+
+def _print_figures(scene: Bundle) -> None:
+  table = Table("figure", "value", title=f"scene {scene.name}")
+  for key, value in scene.figures.items():
+    if isinstance(value, (int, float)):
+      table.add_row(key, f"{value:.4g}")
+    elif isinstance(value, str):
+      table.add_row(key, value)
+  table.add_row("seconds", f"{sum(scene.scene['seconds'].values()):.0f}")
+  rich.print(table)
+  for warning in scene.scene["warnings"]:
+    rich.print(f"[yellow]warning:[/] {warning}")
+
+
+def main() -> None:
+  """Parses the command line and makes the scene."""
+  arguments = tyro.cli(Arguments, description=__doc__)
+  try:
+    settings = settings_of(arguments)
+    source, measure = Path(arguments.capture), None
+    if arguments.capture == "builtin":
+      source, measure = yardstick.VIDEO, yardstick.measure
+      if settings.marker_side is None:
+        settings = dataclasses.replace(settings, marker_side=yardstick.MARKER_SIDE)
+    scene = pipeline.make_scene(
+      source,
+      arguments.out,
+      settings=settings,
+      override=arguments.override,
+      name=arguments.name,
+      measure=measure,
+    )
+  except (ValueError, OSError, FloatingPointError) as error:
+    sys.exit(f"error: {error}")
+  except KeyboardInterrupt:
+    sys.exit("interrupted: run the same command again, it continues where it stopped")
+  _print_figures(scene)
+  print(f"report: {arguments.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+  main()
