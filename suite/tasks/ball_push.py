@@ -91,7 +91,9 @@ class BallPush(RobotTask):
     in_front = random_state.uniform() < BALL_IN_FRONT
     for _ in range(_MAX_ATTEMPTS):
       self._put_ball((0.0, 0.0), height=10.0)  # out of the way while the robot is placed
-      self._stand_somewhere(lambda: self._free_place(random_state), random_state)
+      self._stand_somewhere(
+        lambda: Start(tuple(self._free_place(random_state)), random_state.uniform(-np.pi, np.pi))
+      )
       if self.ball_start is not None:
         self._put_ball(self.ball_start)
         return
@@ -107,7 +109,7 @@ class BallPush(RobotTask):
     """Draws a free place of the workspace [2]."""
     for _ in range(_MAX_ATTEMPTS):
       xy = random_state.uniform(self.workspace.lower, self.workspace.upper)
-      if self.scene.free_space.is_free(xy[None])[0]:
+      if self.scene.free_space.is_reachable(xy[None])[0]:
         return xy
     raise ValueError(
       f"Found no free place in the workspace of {getattr(self.scene, 'name', '')!r} in "

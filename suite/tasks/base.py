@@ -4,7 +4,7 @@ import abc
 import collections
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -140,6 +140,8 @@ class RobotTask(composer.Task):
     self._robot = op3.OP3(head_pan_limit=head_pan_limit)
     self._arena.add_free_entity(self._robot)
     self.set_timesteps(constants.CONTROL_TIMESTEP, settings.physics_timestep)
+    self._timestep = settings.physics_timestep
+    self._substeps = self.physics_steps_per_control_step  # composer computes it at every call
     lower, upper = self._robot.control_limits
     self._middle, self._half_range = (lower + upper) / 2, (upper - lower) / 2
     paper_lower, paper_upper = constants.joint_limits()
@@ -148,7 +150,7 @@ class RobotTask(composer.Task):
     self._action_filter = filters.ExponentialFilter(constants.ACTION_FILTER)
     self._proprioception = Proprioception(
       physics_timestep=settings.physics_timestep,
-      substeps=self.physics_steps_per_control_step,
+      substeps=self._substeps,
       joints=len(constants.JOINT_NAMES),
     )
     self.start: Start | None = None  # if set, every episode starts here (evaluation, rehearsal)
@@ -242,7 +244,7 @@ class RobotTask(composer.Task):
       latency = 0.0
     draws = self.settings.randomisation
     oldest = latency + draws.delay_range[1] + draws.jitter_half_width
-    rows = int(np.ceil(oldest / self.physics_timestep)) + self.physics_steps_per_control_step + 1
+    rows = int(np.ceil(oldest / self._timestep)) + self._substeps + 1
     self._qpos_trace = np.zeros((rows, model.nq))  # newest last
     self._camera_latency = latency
     self._substep = 0
@@ -309,7 +311,7 @@ class RobotTask(composer.Task):
     assert self.draws is not None
     self._data.xfrc_applied[self._torso, :3] = self.draws.pushes.at(self._data.time)
     self._substep = 0
-    count = self.physics_steps_per_control_step
+    count = self._substeps
     self._qpos_trace[:-count] = self._qpos_trace[count:]
 
   def before_substep(
@@ -325,7 +327,7 @@ class RobotTask(composer.Task):
       self._substep, data.sensordata[self._imu_slice], qpos[self._joint_qpos]
     )
     self._substep += 1
-    self._qpos_trace[self._substep - 1 - self.physics_steps_per_control_step] = qpos
+    self._qpos_trace[self._substep - 1 - self._substeps] = qpos
     if data.ncon:
       pairs = data.contact.geom
       self._touched |= int(np.bitwise_or.reduce(self._touch_table[pairs[:, 0], pairs[:, 1]]))
@@ -405,13 +407,13 @@ class RobotTask(composer.Task):
     mujoco.mju_mulQuat(qpos[root + 3 : root + 7], turn, posture[3:7])
     qpos[self._joint_qpos] = posture[7:]
 
-  def _stand_somewhere(self, draw_xy: Any, random_state: np.random.RandomState) -> None:
+  def _stand_somewhere(self, draw: Callable[[], Start]) -> None:
     """Stands the robot at `start`, or at a drawn place where it touches nothing but the floor."""
     if self.start is not None:
       self._stand_at(self.start)
       return
     for _ in range(_MAX_START_ATTEMPTS):
-      self._stand_at(Start(draw_xy(), random_state.uniform(-np.pi, np.pi)))
+      self._stand_at(draw())
       if not self._touches_anything():
         return
     raise composer.EpisodeInitializationError(
@@ -490,7 +492,7 @@ class RobotTask(composer.Task):
     delay = self._camera_latency + self.draws.camera_delay
     if self.draws.jitter:
       delay = max(0.0, delay + self._random_state.uniform(-1, 1) * self.draws.jitter)
-    age = min(round(delay / self.physics_timestep), len(self._qpos_trace) - 1)
+    age = min(round(delay / self._timestep), len(self._qpos_trace) - 1)
     self._past.qpos[:] = self._qpos_trace[-1 - age]
     mujoco.mj_kinematics(self._model, self._past)
     mujoco.mj_camlight(self._model, self._past)

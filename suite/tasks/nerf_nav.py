@@ -68,13 +68,19 @@ class NerfNav(RobotTask):
     lower, upper = self._arena.extent
     x, y = (np.arange(lower[i] + _START_GRID / 2, upper[i], _START_GRID) for i in range(2))
     points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    free = points[np.asarray(self.scene.free_space.is_free(points), bool)]
+    free = points[np.asarray(self.scene.free_space.is_reachable(points), bool)]
     return protocols.navigation_starts(free, self._goals)
 
   def _place(self, random_state: np.random.RandomState) -> None:
     drawn = random_state.randint(len(self._goals))
     self._goal = self._goals[drawn if self.goal_index is None else self.goal_index]
-    self._stand_somewhere(lambda: self.scene.free_space.sample(random_state), random_state)
+    rng = np.random.default_rng(random_state.randint(2**31))
+
+    def draw() -> Start:
+      x, y, yaw = self.scene.free_space.sample(rng, 1)[0]
+      return Start((x, y), yaw)
+
+    self._stand_somewhere(draw)
 
   def _goal_observation(self) -> np.ndarray:
     return self._goal

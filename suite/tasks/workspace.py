@@ -65,7 +65,7 @@ def find_workspace(scene: Any) -> Workspace:
     )
   x, y = (np.arange(lower[i] + _STEP / 2, upper[i], _STEP) for i in range(2))
   points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-  free = np.asarray(scene.free_space.is_free(points.reshape(-1, 2)), float).reshape(
+  free = np.asarray(scene.free_space.is_reachable(points.reshape(-1, 2)), float).reshape(
     points.shape[:2]
   )
   cells = round(size / _STEP)

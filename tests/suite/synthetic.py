@@ -22,12 +22,12 @@ FREE = ((-2.6, -2.1), (1.6, 2.1))  # lower and upper corner of the free floor
 
 
 class FreeFloor:
-  """A rectangle of free floor."""
+  """A rectangle of free floor, with the interface of `scenes.free_space.FreeSpace`."""
 
-  def sample(self, random_state, count=None):
-    return random_state.uniform(*FREE, size=None if count is None else (count, 2))
+  def sample(self, rng, count):
+    return np.column_stack([rng.uniform(*FREE, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
 
-  def is_free(self, xy):
+  def is_reachable(self, xy):
     xy = np.asarray(xy)
     return ((xy >= FREE[0]) & (xy <= FREE[1])).all(axis=-1)
 
