@@ -1,8 +1,10 @@
 """Renders a trained field: one ray a pixel through the camera's own lens, colour and depth."""
 
+import concurrent.futures
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -78,6 +80,7 @@ class Renderer:
     settings: RenderSettings | None = None,
     occupancy: occupancy_lib.Occupancy | None = None,
     device: str = "cpu",
+    threads: int = 1,
   ):
     """Uploads the field.
 
@@ -86,6 +89,7 @@ class Renderer:
       settings: How to march.
       occupancy: Where the field holds matter; found here if None.
       device: "cpu", "cuda" or another of Warp's names.
+      threads: Threads that share the rays of a call on a CPU.
 
     Raises:
       ValueError: If there is no such device.
@@ -96,6 +100,7 @@ class Renderer:
     self.field = field
     self.settings = settings or RenderSettings()
     self.device = device
+    self._threads = threads if device == "cpu" else 1
     if occupancy is None:
       occupancy = occupancy_lib.build(field, device=device)
     self.occupancy = occupancy
@@ -130,19 +135,14 @@ class Renderer:
     shape = (len(poses), camera.height * camera.width)
     color = wp.empty((*shape, 3), dtype=wp.uint8, device=self.device)
     depth = wp.empty(shape, dtype=wp.float32, device=self.device)
-    wp.launch(
-      self._kernels.frame,
-      dim=shape,
-      inputs=[
-        self._data,
-        self._march(camera.pixel_angle),
-        wp.array(poses, dtype=wp.mat44, device=self.device),
-        rays,
-        color,
-        depth,
-      ],
-      device=self.device,
-    )
+    places: Any = wp.array(poses, dtype=wp.mat44, device=self.device)
+    fixed = (self._data, self._march(camera.pixel_angle), places)
+
+    def draw(first: int, last: int) -> None:
+      inputs = [*fixed, rays[first:last], color[:, first:last], depth[:, first:last]]
+      self._launch(self._kernels.frame, (len(poses), last - first), inputs)
+
+    self._share(draw, shape[1])
     size = (len(poses), camera.height, camera.width)
     return color.numpy().reshape(*size, 3), depth.numpy().reshape(size)
 
@@ -174,21 +174,29 @@ class Renderer:
     color = wp.empty((count, 3), dtype=wp.float32, device=self.device)
     distance = wp.empty(count, dtype=wp.float32, device=self.device)
     opacity = wp.empty(count, dtype=wp.float32, device=self.device)
-    wp.launch(
-      self._kernels.rays,
-      dim=count,
-      inputs=[
-        self._data,
-        self._march(pixel_angle),
-        wp.array(origins, dtype=wp.vec3, device=self.device),
-        wp.array(directions, dtype=wp.vec3, device=self.device),
-        color,
-        distance,
-        opacity,
-      ],
-      device=self.device,
-    )
+    starts: Any = wp.array(origins, dtype=wp.vec3, device=self.device)
+    ways: Any = wp.array(directions, dtype=wp.vec3, device=self.device)
+    fixed = (self._data, self._march(pixel_angle))
+    arrays = (starts, ways, color, distance, opacity)
+
+    def draw(first: int, last: int) -> None:
+      inputs = [*fixed, *(array[first:last] for array in arrays)]
+      self._launch(self._kernels.rays, last - first, inputs)
+
+    self._share(draw, count)
     return color.numpy(), distance.numpy(), opacity.numpy()
+
+  def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list[Any]) -> None:
+    wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_tape=False)
+
+  def _share(self, draw: Callable[[int, int], None], count: int) -> None:
+    """Lets the threads draw equal parts of `count` rays."""
+    if self._threads < 2 or count < self._threads:
+      draw(0, count)
+      return
+    borders = [count * part // self._threads for part in range(self._threads + 1)]
+    with concurrent.futures.ThreadPoolExecutor(self._threads) as pool:
+      list(pool.map(draw, borders[:-1], borders[1:]))
 
   def _upload_rays(self, camera: Camera) -> Any:
     rays = camera.rays().reshape(-1, 3).astype(np.float32)

@@ -185,6 +185,8 @@ def test_batches_threads_and_rays_agree_with_single_pictures(wall):
     np.testing.assert_array_equal(color[i], singles[i][0])
     np.testing.assert_array_equal(depth[i], singles[i][1])
     np.testing.assert_array_equal(threaded[i][0], singles[i][0])
+  shared = render.Renderer(wall.field, settings=FINE, occupancy=wall.occupancy, threads=3)
+  np.testing.assert_array_equal(shared.render_batch(LENS, poses)[0], color)
   rays = LENS.rays().reshape(-1, 3)
   slant = np.linalg.norm(rays, axis=-1)
   origins = np.broadcast_to(poses[1, :3, 3], rays.shape)
