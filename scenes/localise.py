@@ -210,8 +210,8 @@ def _map(
     )
   steps.begin("mapping")
   if known is not None:
-    model = mapping.triangulate(database, images_folder, known, names)
-    return _Mapped(model, f"{words} matching, triangulated with known poses", tuple(warnings))
+    fixed = mapping.triangulate(database, images_folder, known, names)
+    return _Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
   model, mapper = _best_model(database, images_folder, len(names), settings, steps)
   if model is None or model.num_reg_images() < settings.repair_below * len(names):
     placed = {i.name for i in mapping.registered(model)} if model else set()

@@ -27,7 +27,7 @@ _FATAL_ONLY = 3  # glog level
 class FeatureSettings:
   """Features and their matching."""
 
-  max_num_features: int = 2048  # of a picture, the largest first; time grows with the square; ours
+  max_num_features: int = 1536  # of a picture, the largest first; time grows with the square; ours
   few_num_features: int = (
     8192  # the same for captures of few pictures, where each one counts; COLMAP
   )

@@ -26,15 +26,13 @@ class PairSettings:
 
   exhaustive_cost: float = 1.6e10  # products of feature counts that may be compared exhaustively:
   # measured 5.2e-9 CPU s each on a 2-core machine, so 80 CPU s; 11,325 pairs of 1,090 features fit
-  overlap: int = (
-    10  # following keyframes that each one is matched with; the paper's matcher, COLMAP
-  )
+  overlap: int = 8  # following keyframes that each one is matched with; ours (COLMAP: 10)
   loop_keyframes: int = 300  # at most this many keyframes are scored for loop closures; ours
-  loop_closures: int = 20  # partners that each scored keyframe is matched with; ours
+  loop_closures: int = 12  # partners that each scored keyframe is matched with; ours
   score_features: int = 256  # largest features of a keyframe that take part in scoring
   score_ratio: float = 0.85  # nearest to second-nearest descriptor distance in scoring
   min_score: int = 5  # mutual matches of a pair worth matching: of the living room's verified pairs
-  # further than 10 keyframes apart 97 % have them, of all others a fifth has not
+  # further than 10 keyframes apart 97 % have them, of all others a quarter has not
 
 
 def exhaustive_pairs(count: int) -> list[Pair]:

@@ -104,7 +104,7 @@ def one_camera(cameras: list[Camera], source: Path) -> Camera:
         f"{source} has several cameras ({first.width}x{first.height} focal {first.fx:.0f} and "
         f"{other.width}x{other.height} focal {other.fx:.0f}); expected one camera and one zoom."
       )
-  values = {
+  values: dict[str, Any] = {
     name: float(np.median([getattr(c, name) for c in cameras]))
     for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
   }
@@ -209,11 +209,11 @@ def read_transforms(source: Path) -> KnownPoses:
   for frame, matrix in zip(frames, matrices, strict=True):
     if matrix.shape == (3, 4):
       matrix = np.vstack([matrix, [0, 0, 0, 1]])
-    error = np.inf
+    deviation = np.inf
     if matrix.shape == (4, 4):
       rotation = matrix[:3, :3]
-      error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not error < ROTATION_TOLERANCE or np.linalg.det(matrix[:3, :3]) < 0:
+      deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not deviation < ROTATION_TOLERANCE or np.linalg.det(matrix[:3, :3]) < 0:
       raise CaptureError(f"{path}: transform_matrix of {frame['file_path']} is no rigid pose.")
     poses.append(matrix @ OPENCV_FROM_OPENGL)
   empty = np.zeros((0, 3))

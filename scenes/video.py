@@ -117,11 +117,10 @@ def _decode(path: Path, counts: collections.Counter) -> Iterator[av.VideoFrame]:
 
 def _upright(frame: av.VideoFrame, max_size: int) -> np.ndarray:
   """Converts to BGR, honours the rotation metadata, limits the long side to max_size."""
-  image = frame.to_ndarray(format="bgr24")
+  stored = frame.to_ndarray(format="bgr24")
   # frame.rotation is counter-clockwise in degrees: what has to be done to see it upright.
   turns = round(frame.rotation / 90) % 4
-  image = np.ascontiguousarray(np.rot90(image, turns))
-  return limit_size(image, max_size)
+  return limit_size(np.ascontiguousarray(np.rot90(stored, turns), np.uint8), max_size)
 
 
 def limit_size(image: np.ndarray, max_size: int) -> np.ndarray:
