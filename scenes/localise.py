@@ -8,7 +8,6 @@ keyframes, P points.
 import dataclasses
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable
@@ -19,23 +18,27 @@ import numpy as np
 import pycolmap
 
 from scenes import mapping, matching
-from scenes.cameras import Camera
+from scenes.localisation import (
+  Localisation,
+  LocalisationError,
+  from_model,
+  load,
+  poses_of,
+  reprojection_error,
+  save,
+)
 from scenes.matching import FeatureSettings, quiet
 from scenes.pairs import PairSettings, repair_pairs
 from scenes.parallax import parallax_share
-from scenes.similarity import Similarity
-from scenes.sources import KnownPoses, list_images, to_colmap, to_opencv
+from scenes.sources import KnownPoses, list_images, to_colmap
 from scenes.unit_frame import unit_from_source as choose_unit_frame
+
+__all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "localise"]
 
 Progress = Callable[[float, str], None]
 
 _MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
-_FIGURES = "localisation.json"
 _STAGE_SHARES = {"features": 0.25, "matching": 0.4, "mapping": 0.25, "refining": 0.1}
-
-
-class LocalisationError(RuntimeError):
-  """The keyframes do not connect; the message says how many did, why, and what to film."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,24 +57,6 @@ class LocaliseSettings:
   min_registered: int = 10  # fewer are an error, unless there are fewer keyframes
   min_parallax: float = 0.08  # share of matches off a homography below which a warning is given
   seed: int = 0  # of RANSAC and of the mappers
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Localisation:
-  """Where the keyframes were taken, in the unit frame."""
-
-  camera: Camera  # the one camera of all keyframes
-  names: tuple[str, ...]  # registered keyframes, sorted
-  world_from_camera: np.ndarray  # float64 [N, 4, 4], unit frame, OpenCV camera axes
-  points: np.ndarray  # float64 [P, 3], unit frame
-  point_colors: np.ndarray  # uint8 [P, 3]
-  point_errors: np.ndarray  # mean reprojection error of each point [P] [pixel]
-  reprojection_error_px: float  # mean over the observations [pixel]; NaN where none are known
-  registered_fraction: float  # registered keyframes of all given
-  strategy: str  # which pairs were matched and which mapper was used
-  unit_from_source: Similarity  # from the source's frame (COLMAP's, or that of the known poses)
-  warnings: tuple[str, ...] = ()  # what may ruin the reconstruction
-  seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # wall time of each step
 
 
 def localise(
@@ -113,7 +98,7 @@ def localise(
     database = _prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
     result = _map(database, images_folder, names, settings, known, steps)
   localisation = _describe(result, len(names), known, images_folder, steps)
-  _save(result.model, localisation, out_folder / _MODEL_FOLDER)
+  save(result.model, localisation, out_folder / _MODEL_FOLDER)
   return localisation
 
 
@@ -311,7 +296,7 @@ def _describe(
   if known is None or not len(known.points):
     model.update_point_3d_errors()
     model.extract_colors_for_all_images(str(images_folder))
-  poses = _poses(mapping.registered(model))
+  poses = poses_of(mapping.registered(model))
   solid = [p.xyz for p in model.points3D.values() if p.track.length() >= 3]
   if not solid:
     solid = [p.xyz for p in model.points3D.values()]
@@ -320,77 +305,10 @@ def _describe(
   model.transform(pycolmap.Sim3d(matrix))
   values = {
     "registered_fraction": model.num_reg_images() / total,
-    "reprojection_error_px": _reprojection_error(model),
+    "reprojection_error_px": reprojection_error(model),
     "strategy": result.strategy,
     "unit_from_source": unit,
     "warnings": result.warnings,
     "seconds": dict(steps.seconds),
   }
-  return _from_model(model, values)
-
-
-def _reprojection_error(model: pycolmap.Reconstruction) -> float:
-  """Mean over the observations [pixel]; over the points where there are no observations."""
-  points = list(model.points3D.values())
-  if not points:
-    return float("nan")
-  weights = np.array([max(p.track.length(), 1) for p in points])
-  return float(np.average([p.error for p in points], weights=weights))
-
-
-def _poses(images: list[pycolmap.Image]) -> np.ndarray:
-  """World-from-camera poses [N, 4, 4]."""
-  poses = np.tile(np.eye(4), (len(images), 1, 1))
-  for row, image in enumerate(images):
-    poses[row, :3] = image.cam_from_world().inverse().matrix()
-  return poses
-
-
-def _from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Localisation:
-  images = mapping.registered(model)
-  points = list(model.points3D.values())
-  return Localisation(
-    camera=to_opencv(next(iter(model.cameras.values()))),
-    names=tuple(image.name for image in images),
-    world_from_camera=_poses(images),
-    points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
-    point_colors=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-    point_errors=np.array([p.error for p in points], np.float64),
-    **values,
-  )
-
-
-def _save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Path) -> None:
-  """Writes the model and its figures; the folder appears whole or not at all."""
-  partial = folder.with_name(folder.name + ".partial")
-  shutil.rmtree(partial, ignore_errors=True)
-  partial.mkdir(parents=True)
-  model.write(str(partial))
-  figures = {
-    "registered_fraction": localisation.registered_fraction,
-    "reprojection_error_px": localisation.reprojection_error_px,
-    "strategy": localisation.strategy,
-    "unit_from_source": localisation.unit_from_source.to_dict(),
-    "warnings": list(localisation.warnings),
-    "seconds": localisation.seconds,
-  }
-  (partial / _FIGURES).write_text(json.dumps(figures, indent=2))
-  shutil.rmtree(folder, ignore_errors=True)
-  os.replace(partial, folder)
-
-
-def load(folder: Path) -> Localisation:
-  """Reads what `localise` wrote into `sfm/`.
-
-  Raises:
-    LocalisationError: If the folder holds no localisation.
-  """
-  folder = Path(folder)
-  try:
-    values = json.loads((folder / _FIGURES).read_text())
-    model = pycolmap.Reconstruction(str(folder))
-  except (OSError, ValueError, RuntimeError) as error:
-    raise LocalisationError(f"{folder} holds no localisation: {error}") from error
-  values["unit_from_source"] = Similarity.from_dict(values["unit_from_source"])
-  values["warnings"] = tuple(values["warnings"])
-  return _from_model(model, values)
+  return from_model(model, values)
