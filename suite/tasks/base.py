@@ -154,6 +154,7 @@ class RobotTask(composer.Task):
       joints=len(constants.JOINT_NAMES),
     )
     self.start: Start | None = None  # if set, every episode starts here (evaluation, rehearsal)
+    self.hand_force = np.zeros(3)  # N on the torso in the world, in addition to the pushes
     self.draws: randomising.EpisodeDraws | None = None
     self.reward_terms: dict[str, float] = {}
     self.success = False
@@ -309,7 +310,9 @@ class RobotTask(composer.Task):
     self._targets = self._middle + self._half_range * self._control
     self._data.ctrl[:] = self._targets
     assert self.draws is not None
-    self._data.xfrc_applied[self._torso, :3] = self.draws.pushes.at(self._data.time)
+    self._data.xfrc_applied[self._torso, :3] = (
+      self.draws.pushes.at(self._data.time) + self.hand_force
+    )
     self._substep = 0
     count = self._substeps
     self._qpos_trace[:-count] = self._qpos_trace[count:]

@@ -1,0 +1,226 @@
+"""A task in the browser: the robot in its room, its picture, its reward; it can be pushed by hand.
+
+Started by `python launch/view.py --task nerf_nav`.
+"""
+
+import html
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import trimesh
+import viser
+from viser import transforms
+
+import suite
+from suite.op3 import constants, op3
+
+_SPRING = 40.0  # N/m between the handle that is dragged and the torso
+_MAX_FORCE = 20.0  # N
+_PUSH_SECONDS = 0.15  # length of a push by a button
+_BACKLOG = 0.25  # s that the clock may fall behind before it is set anew
+_PICTURE_SCALE = 6  # of the robot's picture on the page
+_BAR_RANGE = 1.5  # a bar's full length is a reward term of this size
+_DIRECTIONS = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}
+
+
+def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+  """Returns the surface of a box, cylinder, capsule or sphere in its own frame."""
+  size = model.geom_size[geom]
+  kind = mujoco.mjtGeom(model.geom_type[geom])
+  if kind == mujoco.mjtGeom.mjGEOM_BOX:
+    return trimesh.creation.box(2 * size)
+  if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+    return trimesh.creation.cylinder(size[0], 2 * size[1], sections=24)
+  if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+    return trimesh.creation.capsule(2 * size[1], size[0], count=(16, 16))
+  if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+    return trimesh.creation.icosphere(3, size[0])
+  return None
+
+
+def bars(terms: dict[str, float]) -> str:
+  """Returns the reward terms as bars from the middle, as HTML."""
+  rows = []
+  for name, value in terms.items():
+    share = 50 * min(abs(value) / _BAR_RANGE, 1.0)
+    left = 50.0 if value >= 0 else 50.0 - share
+    color = "#009E73" if value >= 0 else "#D55E00"
+    rows.append(
+      f'<div style="display:flex;align-items:center;font-size:12px;margin:3px 12px">'
+      f'<span style="width:8.5em">{html.escape(name)}</span>'
+      f'<span style="flex:1;position:relative;height:11px;background:#8883">'
+      f'<i style="position:absolute;left:{left:.1f}%;width:{share:.1f}%;height:100%;'
+      f'background:{color}"></i></span>'
+      f'<span style="width:4em;text-align:right">{value:+.2f}</span></div>'
+    )
+  return "".join(rows)
+
+
+class TaskViewer:
+  """One environment, shown and controlled through a viser server."""
+
+  def __init__(self, environment: Any, server: viser.ViserServer):
+    self._environment, self._server = environment, server
+    self._rng = np.random.default_rng(0)
+    self._push_until, self._push = 0.0, np.zeros(3)
+    self._dragging = False
+    self._reset_asked = False
+    environment.reset()
+    self._geoms = self._add_geoms()
+    self._add_room()
+    self._add_controls()
+    self._show()
+
+  def _add_room(self) -> None:
+    server, scene = self._server, self._environment.task.scene
+    server.scene.set_up_direction("+z")
+    lower, upper = (np.asarray(corner)[:2] for corner in scene.extent)
+    center = (lower + upper) / 2
+    server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
+    visual = getattr(scene, "visual_path", None)
+    if visual is not None and Path(visual).is_file():
+      server.scene.add_mesh_trimesh("/room", trimesh.load(visual, force="mesh"))
+    else:
+      for index, path in enumerate(scene.collision_parts):
+        part = trimesh.load(path, force="mesh")
+        server.scene.add_mesh_simple(
+          f"/room/{index:03d}", part.vertices, part.faces, color=(150, 165, 180), opacity=0.6,
+          flat_shading=True,
+        )  # fmt: skip
+    for index, goal in enumerate(getattr(self._environment.task, "goals", ())):
+      server.scene.add_icosphere(
+        f"/goals/{index}", radius=0.05, color=(0, 158, 115), position=(*goal, 0.05)
+      )
+    position = self._environment.task.state.position
+    server.initial_camera.position = (*(position[:2] + 0.25 * (center - position[:2])), 1.5)
+    server.initial_camera.look_at = tuple(position)
+
+  def _add_geoms(self) -> dict[int, Any]:
+    model = self._environment.physics.model.ptr
+    handles = {}
+    self._radii: dict[int, float] = {}
+    for geom in np.flatnonzero(np.isin(model.geom_group, (op3.VISIBLE_GROUP, op3.HEAD_GROUP))):
+      mesh = geom_mesh(model, int(geom))
+      if mesh is not None:
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
+          self._radii[int(geom)] = float(model.geom_size[geom, 0])
+        color = tuple(round(255 * c) for c in model.geom_rgba[geom, :3])
+        handles[int(geom)] = self._server.scene.add_mesh_simple(
+          f"/moving/{geom}", mesh.vertices, mesh.faces, color=color, flat_shading=True
+        )
+    return handles
+
+  def _add_controls(self) -> None:
+    gui = self._server.gui
+    self._running = gui.add_checkbox("run", True)
+    self._policy = gui.add_dropdown("policy", ("stand", "random"))
+    gui.add_button("reset").on_click(lambda _: setattr(self, "_reset_asked", True))
+    camera = self._environment.task.robot_camera
+    self._picture = None
+    if camera is not None:
+      blank = np.zeros(camera.shape, np.uint8).repeat(_PICTURE_SCALE, 0).repeat(_PICTURE_SCALE, 1)
+      self._picture = gui.add_image(blank, label="robot's camera")
+    self._status = gui.add_markdown("")
+    self._bars = gui.add_html("")
+    with gui.add_folder("push"):
+      self._force = gui.add_slider("force [N]", 1.0, _MAX_FORCE, 0.5, 8.0)
+      gui.add_button_group("direction", tuple(_DIRECTIONS)).on_click(
+        lambda event: self._start_push(event.target.value)
+      )
+    self._handle = self._server.scene.add_transform_controls(
+      "/hand", scale=0.25, disable_rotations=True, position=self._environment.task.state.position
+    )
+
+    @self._handle.on_update
+    def _(event: Any) -> None:
+      self._dragging = event.phase != "end"
+
+  def _start_push(self, direction: str) -> None:
+    aligned = self._environment.task.state.aligned
+    self._push = aligned @ np.array([*_DIRECTIONS[direction], 0.0]) * self._force.value
+    self._push_until = self._environment.physics.time() + _PUSH_SECONDS
+
+  def _hand_force(self) -> np.ndarray:
+    """Returns the force of the hand on the torso [3] [N]."""
+    task = self._environment.task
+    force = np.zeros(3)
+    if self._dragging:
+      force = _SPRING * (np.array(self._handle.position) - task.state.position)
+      force *= min(1.0, _MAX_FORCE / max(np.linalg.norm(force), 1e-9))
+    if self._environment.physics.time() < self._push_until:
+      force = force + self._push
+    return force
+
+  def step(self) -> None:
+    """Takes one control step and shows it."""
+    environment = self._environment
+    if self._reset_asked:
+      self._reset_asked, self._push_until = False, 0.0
+      environment.reset()
+    task = environment.task
+    task.hand_force = self._hand_force()
+    action = task.standing_action
+    if self._policy.value == "random":
+      action = np.clip(action + self._rng.normal(0, 0.5, action.shape), -1, 1)
+    timestep = environment.step(action)
+    if timestep.first():
+      self._push_until = 0.0
+    self._show(timestep.observation.get("camera"))
+
+  def _show(self, picture: np.ndarray | None = None) -> None:
+    environment = self._environment
+    model, data, task = (
+      environment.physics.model.ptr,
+      environment.physics.data.ptr,
+      environment.task,
+    )
+    with self._server.atomic():
+      for geom, handle in self._geoms.items():
+        handle.position = data.geom_xpos[geom]
+        handle.wxyz = transforms.SO3.from_matrix(data.geom_xmat[geom].reshape(3, 3)).wxyz
+        if geom in self._radii:  # an episode draws the ball's radius anew
+          handle.scale = float(model.geom_size[geom, 0]) / self._radii[geom]
+      if not self._dragging:
+        self._handle.position = task.state.position
+      if picture is not None and self._picture is not None:
+        self._picture.image = picture.repeat(_PICTURE_SCALE, 0).repeat(_PICTURE_SCALE, 1)
+      self._bars.content = bars(task.reward_terms)
+      outcome = task.outcome
+      self._status.content = (
+        f"{outcome.duration:.2f} s · {'**success**' if outcome.success else 'no success yet'}"
+        + (f" · ended by {outcome.ending}" if outcome.ending else "")
+      )
+
+  def run(self, stop: threading.Event) -> None:
+    """Steps in real time until told to stop."""
+    due = time.monotonic()
+    while not stop.is_set():
+      if self._running.value:
+        self.step()
+      due = max(due + constants.CONTROL_TIMESTEP, time.monotonic() - _BACKLOG)
+      stop.wait(max(0.0, due - time.monotonic()))
+
+
+def view_task(
+  task: str, *, scene: Path | None = None, host: str = "127.0.0.1", port: int = 8080
+) -> None:
+  """Serves a task until interrupted.
+
+  Args:
+    task: Name of the task.
+    scene: Folder of a scene bundle; None is the built-in room.
+    host: Address to serve on.
+    port: Port to serve on.
+  """
+  environment = suite.load(task, scene=scene)
+  server = viser.ViserServer(host=host, port=port, label=f"task {task}", verbose=False)
+  viewer = TaskViewer(environment, server)
+  print(f"open http://{host}:{server.get_port()} (Ctrl-C ends)")
+  try:
+    viewer.run(threading.Event())
+  except KeyboardInterrupt:
+    server.stop()
