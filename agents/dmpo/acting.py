@@ -25,6 +25,11 @@ class TrajectoryBuilder:
     self._steps: list[tuple[np.ndarray, float, float]] = []
     self._initial: PolicyState | None = None
 
+  @property
+  def steps(self) -> int:
+    """Transitions collected and not given out."""
+    return len(self._steps)
+
   def start(self, observation: FlatObservation, state: PolicyState) -> None:
     """Begins an episode; what was not given out is dropped.
 

@@ -172,6 +172,11 @@ class Replay:
       names = [name for name in self._arrays if name != _ORIGIN]
       return {name: np.array(self._arrays[name][slots]) for name in names}
 
+  def steps_after(self, inserted: int) -> int:
+    """Environment steps of the entries that came after the first `inserted` ones."""
+    with self._lock:
+      return int(self._arrays["last"][self._arrays[_ORIGIN][:, 2] > inserted].sum())
+
   def origins(self) -> list[tuple[int, int]]:
     """Returns (actor, number) of every entry."""
     with self._lock:

@@ -1,11 +1,11 @@
-"""The update: what moves, what does not, padding, and that it learns a problem with known answer."""
+"""The update: what moves, what does not, padding, and a problem with a known answer."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.dmpo import config, learning
+from agents.dmpo import config, learning, networks
 from agents.dmpo.replay import Replay, trajectory_fields
 from agents.dmpo.specs import Layout
 
@@ -113,7 +113,8 @@ def test_it_learns_a_one_step_problem():
       "network.policy_layers": (16,), "network.critic_layers": (32, 32), "network.vmin": -3.0,
       "network.vmax": 2.0, "trajectory_length": 2, "policy_learning_rate": 5e-3,
       "critic_learning_rate": 5e-3, "target_critic_period": 20, "epsilon_mean": 0.05,
-      "epsilon_stddev": 1e-3, "init_log_alpha_stddev": 10.0,
+      "epsilon_stddev": 1e-3, "init_log_alpha_stddev": 1.0, "init_log_alpha_mean": 1.0,
+      "init_log_temperature": -1.0,
     },
   )  # fmt: skip
   functions = learning.make_learning(settings, layout)
@@ -127,8 +128,6 @@ def test_it_learns_a_one_step_problem():
       "discount": np.zeros((128, 2), np.float32), "last": np.ones(128, np.int32),
     }  # fmt: skip
     state, metrics = functions.update(state, batch)
-  from agents.dmpo import networks
-
   head = networks.policy_head(state.policy, jnp.zeros((1, 0)), jnp.ones((1, 1)), settings.network)
   assert abs(float(head.mean[0, 0]) - 0.5) < 0.15
   assert float(head.stddev[0, 0]) < 0.6

@@ -84,7 +84,7 @@ def test_stored_state_continues_an_episode():
     params, SMALL, state=state[:, 3:], images=images[:, 3:] / 255.0,
     initial=jax.tree.map(jnp.zeros_like, stored),
   )  # fmt: skip
-  assert np.abs(forgotten.embedding - whole.embedding[:, 3:]).max() > 1e-2
+  assert np.abs(forgotten.embedding - whole.embedding[:, 3:]).max() > 1e-3
 
 
 def test_first_standard_deviation_and_mean():

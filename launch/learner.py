@@ -1,0 +1,111 @@
+"""Starts a learner: `python launch/learner.py --env suite:nerf_nav --run runs/x`.
+
+Listens on this machine only, unless --listen names another address; then --users is needed. Actors
+join with `launch/actor.py --connect`.
+"""
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "disabled")  # the environment is only asked for its specs
+
+from agents.dmpo import config as configs  # noqa: E402
+from agents.dmpo.checkpoints import CheckpointError, read_info  # noqa: E402
+from agents.dmpo.learner import Learner, RunSettings  # noqa: E402
+from agents.link.arguments import add_link_arguments, link_settings  # noqa: E402
+from agents.link.sessions import LinkError  # noqa: E402
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+def parse() -> argparse.Namespace:
+  parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+  )
+  parser.add_argument("--env", help="such as suite:nerf_nav or dm_control:cartpole:swingup")
+  parser.add_argument("--run", type=Path, required=True, help="the run's folder")
+  parser.add_argument("--listen", default=DEFAULT_ENDPOINT, help="such as tcp/0.0.0.0:7447")
+  parser.add_argument("--preset", default=None, choices=sorted(configs.PRESETS))
+  parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
+                      help="changes a setting of the agent, such as network.vmax=10")  # fmt: skip
+  parser.add_argument("--seed", type=int, default=0)
+  parser.add_argument("--max-env-steps", type=int, help="environment steps of the run")
+  parser.add_argument("--resume", action="store_true", help="continue from the newest checkpoint")
+  parser.add_argument("--checkpoint-period", type=float, default=RunSettings.checkpoint_period,
+                      help="time between checkpoints [s]")  # fmt: skip
+  parser.add_argument("--log-period", type=float, default=RunSettings.log_period,
+                      help="time between rows of the log [s]")  # fmt: skip
+  parser.add_argument("--replay-on-disk", action="store_true",
+                      help="keep the replay in files, so that it survives the learner")  # fmt: skip
+  parser.add_argument("--evaluation-period", type=int, default=RunSettings.evaluation_period,
+                      help="environment steps between evaluations")  # fmt: skip
+  parser.add_argument("--evaluation-episodes", type=int, default=RunSettings.evaluation_episodes)
+  add_link_arguments(parser, side="learner")
+  return parser.parse_args()
+
+
+def agent_settings(arguments: argparse.Namespace) -> tuple[str, configs.DmpoConfig]:
+  """The environment and the agent's settings: those of the checkpoint when a run is resumed."""
+  info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
+  if info is not None:
+    environment, config = info["environment"], configs.from_dict(info["config"])
+    if arguments.env not in (None, environment):
+      raise ValueError(
+        f"{arguments.run} was trained on {environment}, found --env {arguments.env}."
+      )
+  elif arguments.env is None:
+    raise ValueError("Say what to learn, such as --env suite:nerf_nav.")
+  else:
+    environment, config = arguments.env, configs.preset(arguments.preset or "paper")
+  return environment, configs.override(config, dict(map(_assignment, arguments.set)))
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+  name, equals, value = text.partition("=")
+  if not equals:
+    raise ValueError(f"--set expects NAME=VALUE, found {text!r}.")
+  try:
+    return name, json.loads(value)
+  except json.JSONDecodeError:
+    raise ValueError(
+      f"--set {name}: expected a number, true, false or a list, found {value!r}."
+    ) from None
+
+
+def main() -> int:
+  arguments = parse()
+  logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
+  try:
+    environment, config = agent_settings(arguments)
+    settings = RunSettings(
+      environment=environment,
+      run=arguments.run,
+      seed=arguments.seed,
+      max_env_steps=arguments.max_env_steps,
+      checkpoint_period=arguments.checkpoint_period,
+      log_period=arguments.log_period,
+      replay_on_disk=arguments.replay_on_disk,
+      evaluation_period=arguments.evaluation_period,
+      evaluation_episodes=arguments.evaluation_episodes,
+    )
+    learner = Learner(
+      settings, config, endpoint=arguments.listen, link=link_settings(arguments),
+      resume=arguments.resume,
+    )  # fmt: skip
+  except (ValueError, LinkError, CheckpointError) as error:
+    print(f"error: {error}", file=sys.stderr)
+    return 2
+  for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda *_: learner.stop())
+  learner.run()
+  return 0
+
+
+if __name__ == "__main__":
+  sys.exit(main())
