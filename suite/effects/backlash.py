@@ -34,74 +34,96 @@ class Backlash(Operator):
     parameters = self.per_joint(binding)
     self._half = parameters["gap"] / 2
     self._on_motor = parameters["encoder_on_motor"]
+    self._encoder_on_motor = bool(self._on_motor.any())
     self._free = self._half > 0  # joints that have a gap at all
+    self._any_free = bool(self._free.any())
     self._armature = model.dof_armature[dofs].copy()
     self._damping = model.dof_damping[dofs].copy()
     rotor = self._armature * (1 - _LINK_SHARE)
     self._rotor = np.where(rotor > 0, rotor, _ROTOR_WITHOUT_ARMATURE * model.dof_M0[dofs])
     self._link_armature = self._armature - np.minimum(rotor, self._armature)
-    joint = binding.actuator_joint
-    self._driven = joint >= 0
-    self._joint_of_actuator = np.maximum(joint, 0)
+    self._per_torque = binding.timestep / self._rotor
+    # Damping of the motor is implicit, as in the simulator.
+    self._keep = 1 / (1 + self._per_torque * self._damping)
+    self._driven = np.flatnonzero(binding.actuator_joint >= 0)
+    self._joint_of = binding.actuator_joint[self._driven]
+    self._gear = binding.gear[self._driven]
+    self._simple = np.array_equal(binding.actuator_joint, np.arange(len(binding.joints)))
     self.offset = np.zeros(len(binding.joints))
     """Motor position minus link position, [J] rad, within half the gap."""
-    self.apart = np.zeros(len(binding.joints), bool)
-    """Whether motor and link are apart, [J]."""
     self._speed = np.zeros(len(binding.joints))
     self._binding = binding
     self._started = False
+    self._set_apart(np.zeros(len(binding.joints), bool))
+
+  def _set_apart(self, apart: Array) -> None:
+    self.apart = apart
+    """Whether motor and link are apart, [J]."""
+    self._any_apart = bool(apart.any())
+    self._closed = self._free & ~apart
+    self._alive = np.ones(self._binding.model.nu)
+    self._alive[self._driven] = ~apart[self._joint_of]
+    self._moving = apart * self._binding.timestep
 
   def reset(self) -> None:
     self.offset[:] = 0.0
     self._started = False
-    if self.apart.any():
-      self.apart[:] = False
+    if self._any_apart:
+      self._set_apart(np.zeros_like(self.apart))
       self._write(self._binding)
 
   def _torque(self, binding: Binding, speed: Array) -> Array:
     """Returns the actuators' torque on each joint's motor [J] at motor speed."""
     position = binding.position + binding.encoder_shift
-    force = binding.actuator_force(position, speed) * binding.gear
+    force = binding.actuator_force(position, speed)
+    if self._simple:
+      force *= self._gear
+      return force
     torque = np.zeros(len(binding.joints))
-    np.add.at(torque, self._joint_of_actuator[self._driven], force[self._driven])
+    np.add.at(torque, self._joint_of, force[self._driven] * self._gear)
     return torque
 
   def step(self, binding: Binding) -> None:
-    if not self._free.any():
+    if not self._any_free:
       return
-    step, velocity = binding.timestep, binding.velocity
-    changed = False
-    if self.apart.any():
-      # The motor moved on its own since the last call: has it crossed the gap?
-      moved = self.offset + step * (self._speed - velocity)
-      hit = self.apart & (np.abs(moved) >= self._half)
-      self.offset = np.where(self.apart, np.clip(moved, -self._half, self._half), self.offset)
-      if hit.any():
-        impulse = self._rotor * (self._speed - velocity)
-        binding.force += np.where(hit, impulse / step, 0.0)
-        self.apart &= ~hit
-        changed = True
-    else:
-      hit = self.apart
-    binding.encoder_shift += self._on_motor * self.offset
-    torque = self._torque(binding, np.where(self.apart, self._speed, velocity))
+    velocity, closed, apart = binding.velocity, self._closed, self.apart
+    if self._any_apart:
+      # The motors moved on their own since the last call: which have crossed their gap?
+      relative = self._speed - velocity
+      moved = self.offset + relative * self._moving
+      hit = np.abs(moved) >= self._half
+      hit &= apart
+      self.offset = np.minimum(np.maximum(moved, -self._half), self._half)
+      if np.count_nonzero(hit):
+        relative *= self._rotor / binding.timestep
+        binding.force += np.where(hit, relative, 0.0)
+        apart = apart & ~hit
+    if self._encoder_on_motor:
+      binding.encoder_shift += self._on_motor * self.offset
+    speed = np.where(apart, self._speed, velocity) if self._any_apart else velocity
+    torque = self._torque(binding, speed)
     if not self._started:
       self._started = True
       self.offset = np.where(torque >= 0, self._half, -self._half)
-    passed = torque - self._rotor * binding.data.qacc[binding.dofs] - self._damping * velocity
-    pulls = self._free & ~self.apart & ~hit & (passed * self.offset < 0)
-    if pulls.any():
-      self._speed = np.where(pulls, velocity, self._speed)
-      self.apart |= pulls
-      changed = True
-    if self.apart.any():
-      # Damping implicit, as in the simulator; the torque's own dependence on speed explicit.
-      speed = (self._speed + step / self._rotor * torque) / (1 + step * self._damping / self._rotor)
-      self._speed = np.where(self.apart, speed, self._speed)
-      apart = self.apart[self._joint_of_actuator] & self._driven
-      binding.strength *= np.where(apart, 0.0, 1.0)
-    if changed:
+    # What the motor passes on to a link that it touches; where it would have to pull, they part.
+    passed = self._rotor * binding.data.qacc[binding.dofs]
+    passed += self._damping * velocity
+    np.subtract(torque, passed, out=passed)
+    passed *= self.offset
+    pulls = passed < 0
+    pulls &= closed
+    if np.count_nonzero(pulls):
+      np.copyto(self._speed, velocity, where=pulls)
+      apart = apart | pulls
+    if apart is not self.apart:
+      self._set_apart(apart)
       self._write(binding)
+    if self._any_apart:
+      torque *= self._per_torque
+      torque += self._speed
+      torque *= self._keep
+      np.copyto(self._speed, torque, where=apart)
+      binding.strength *= self._alive
 
   def _write(self, binding: Binding) -> None:
     model, dofs = binding.model, binding.dofs

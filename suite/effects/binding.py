@@ -23,6 +23,7 @@ _FIELDS = (
   "dof_damping",
   "dof_dampingpoly",
   "dof_frictionloss",
+  "dof_solimp",
   "dof_armature",
   "jnt_stiffness",
   "qpos_spring",
@@ -71,8 +72,8 @@ class Binding:
         raise unknown_name("hinge or slide joint", name, list(names))
     self.joints = list(joints)
     self.joint_ids = np.array([names[name] for name in joints], int)
-    self.qpos = model.jnt_qposadr[self.joint_ids]
-    self.dofs = model.jnt_dofadr[self.joint_ids]
+    self.qpos = _as_slice(model.jnt_qposadr[self.joint_ids])
+    self.dofs = _as_slice(model.jnt_dofadr[self.joint_ids])
     self.timestep = float(model.opt.timestep)
     self.snapshot = inertia.Snapshot(model, _FIELDS)
     self.gravity = model.opt.gravity.copy()
@@ -146,45 +147,52 @@ class Binding:
       raise unknown_name(noun, target, [_name(self.model, kind, i) for i in range(count)])
     return index
 
-  def note_actuators(self) -> None:
-    """Notes the constants of the actuators after all constant effects are written."""
-    self._gain = self.model.actuator_gainprm[:, 0].copy()
-    self._bias = self.model.actuator_biasprm[:, :3].copy()
-    self._dry_friction = self.model.dof_frictionloss[self.dofs].copy()
-    joint = np.maximum(self.actuator_joint, 0)
-    self._shift_joint = joint
-    self._shift_gain = np.where(self.actuator_joint >= 0, self._bias[:, 1] * self.gear, 0.0)
-
-  def write_actuators(self) -> None:
-    """Writes strength and encoder shift into the model's actuator constants."""
-    strength = self.strength
+  def note_constants(self) -> None:
+    """Notes actuators and friction after all constant effects are written."""
     model = self.model
-    model.actuator_gainprm[:, 0] = self._gain * strength
-    bias = self._bias.copy()
-    if len(self.joints):
-      bias[:, 0] += self._shift_gain * self.encoder_shift[self._shift_joint]
-    bias *= strength[:, None]
-    model.actuator_biasprm[:, :3] = bias
+    self._gain_view = model.actuator_gainprm[:, 0]
+    self._bias_view = model.actuator_biasprm[:, :3]
+    self._gain, self._bias = self._gain_view.copy(), self._bias_view.copy()
+    self._dry_friction = model.dof_frictionloss[self.dofs].copy()
+    self._of_joint = np.maximum(self.actuator_joint, 0)
+    # One actuator a joint, in the same order: no gathering needed.
+    if np.array_equal(self.actuator_joint, np.arange(len(self.joints))):
+      self._of_joint = slice(None)
+    on_joint = self.actuator_joint >= 0
+    self._per_position = np.where(on_joint, self._bias[:, 1] * self.gear, 0.0)
+    self._per_velocity = np.where(on_joint, self._bias[:, 2] * self.gear, 0.0)
+    self._ctrl_low, self._ctrl_high = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
+    self._low, self._high = _limits(model.actuator_forcelimited, model.actuator_forcerange)
+    self._work = np.zeros(model.nu)
+
+  def write_actuators(self, *, shifted: bool) -> None:
+    """Writes strength, and encoder shift if `shifted`, into the model's actuator constants."""
+    strength = self.strength
+    np.multiply(self._gain, strength, out=self._gain_view)
+    np.multiply(self._bias, strength[:, None], out=self._bias_view)
+    if shifted and len(self.joints):
+      shift = self._per_position * self.encoder_shift[self._of_joint]
+      shift *= strength
+      self._bias_view[:, 0] += shift
 
   def write_friction(self) -> None:
     """Writes this step's dry friction into the model."""
     self.model.dof_frictionloss[self.dofs] = self._dry_friction + self.friction
 
   def actuator_force(self, position: Array, velocity: Array) -> Array:
-    """Returns the force [U] the actuators give at joint positions and velocities [J], unscaled."""
-    model = self.model
+    """Returns the force [U] that the actuators give at joint positions and velocities [J]."""
     ctrl = self.ctrl
-    if model.actuator_ctrllimited.any():
-      limits = model.actuator_ctrlrange
-      ctrl = np.where(model.actuator_ctrllimited, np.clip(ctrl, limits[:, 0], limits[:, 1]), ctrl)
-    length = self.gear * position[self._shift_joint]
-    speed = self.gear * velocity[self._shift_joint]
-    bias = self._bias
-    force = self._gain * ctrl + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * speed
-    force = force * self.strength
-    limits = model.actuator_forcerange
-    limited = np.clip(force, limits[:, 0], limits[:, 1])
-    return np.where(model.actuator_forcelimited, limited, force)
+    if self._ctrl_low is not None:
+      ctrl = np.minimum(np.maximum(ctrl, self._ctrl_low), self._ctrl_high)
+    force = self._gain * ctrl
+    force += self._bias[:, 0]
+    force += np.multiply(self._per_position, position[self._of_joint], out=self._work)
+    force += np.multiply(self._per_velocity, velocity[self._of_joint], out=self._work)
+    force *= self.strength
+    if self._low is not None:
+      np.maximum(force, self._low, out=force)
+      np.minimum(force, self._high, out=force)
+    return force
 
   def restore(self) -> None:
     """Writes back every value noted when the binding was made."""
@@ -194,3 +202,18 @@ class Binding:
 
 def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
   return mujoco.mj_id2name(model, kind, index) or ""
+
+
+def _as_slice(indices: Array) -> Array | slice:
+  """Returns consecutive indices as a slice, which numpy reads faster."""
+  if len(indices) and np.array_equal(indices, np.arange(indices[0], indices[0] + len(indices))):
+    return slice(int(indices[0]), int(indices[0]) + len(indices))
+  return np.array(indices, int)
+
+
+def _limits(limited: Array, ranges: Array) -> tuple[Array | None, Array | None]:
+  """Returns lower and upper limits, infinite where an actuator has none; None if none has."""
+  if not limited.any():
+    return None, None
+  chosen = limited.astype(bool)
+  return np.where(chosen, ranges[:, 0], -np.inf), np.where(chosen, ranges[:, 1], np.inf)

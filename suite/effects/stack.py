@@ -64,7 +64,7 @@ class EffectStack:
     except ValueError:
       binding.restore()
       raise
-    binding.note_actuators()
+    binding.note_constants()
     self.binding, self.operators = binding, operators
     self._commands = [op for op in operators if op.overrides("command")]
     self._steps = [op for op in operators if op.overrides("step")]
@@ -76,6 +76,7 @@ class EffectStack:
       acts.keys() & {"asymmetric_friction", "cogging", "residual_force", "backlash"}
     )
     self._scales = "actuator" in acts.values()
+    self._shifts = "backlash" in acts
     self.reset()
     return self
 
@@ -116,8 +117,8 @@ class EffectStack:
     if not self._steps:
       return
     binding.data = data
-    np.take(data.qpos, binding.qpos, out=binding.position)
-    np.take(data.qvel, binding.dofs, out=binding.velocity)
+    binding.position[:] = data.qpos[binding.qpos]
+    binding.velocity[:] = data.qvel[binding.dofs]
     binding.force.fill(0.0)
     binding.friction.fill(0.0)
     binding.encoder_shift.fill(0.0)
@@ -129,7 +130,7 @@ class EffectStack:
     if self._adds_force:
       data.qfrc_applied[binding.dofs] = binding.force
     if self._scales:
-      binding.write_actuators()
+      binding.write_actuators(shifted=self._shifts)
 
   def observe(self, channel: str, value: Array, time: float) -> Array:
     """Returns what is measured at `time` [s] when the truth is `value`.
