@@ -83,10 +83,10 @@ class TaskViewer:
     server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
     visual = getattr(scene, "visual_path", None)
     if visual is not None and Path(visual).is_file():
-      server.scene.add_mesh_trimesh("/room", trimesh.load(visual, force="mesh"))
+      server.scene.add_mesh_trimesh("/room", trimesh.load_mesh(visual))
     else:
       for index, path in enumerate(scene.collision_parts):
-        part = trimesh.load(path, force="mesh")
+        part = trimesh.load_mesh(path)
         server.scene.add_mesh_simple(
           f"/room/{index:03d}", part.vertices, part.faces, color=(150, 165, 180), opacity=0.6,
           flat_shading=True,
@@ -150,7 +150,7 @@ class TaskViewer:
     force = np.zeros(3)
     if self._dragging:
       force = _SPRING * (np.array(self._handle.position) - task.state.position)
-      force *= min(1.0, _MAX_FORCE / max(np.linalg.norm(force), 1e-9))
+      force *= min(1.0, _MAX_FORCE / max(float(np.linalg.norm(force)), 1e-9))
     if self._environment.physics.time() < self._push_until:
       force = force + self._push
     return force

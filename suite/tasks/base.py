@@ -111,6 +111,10 @@ def standing_posture() -> np.ndarray:
   return qpos
 
 
+def _single(read: Callable[[], np.ndarray]) -> np.ndarray:
+  return np.asarray(read(), np.float32)
+
+
 class RobotTask(composer.Task):
   """The OP3 in a room. A task says where it starts, what is rewarded and when it has succeeded."""
 
@@ -469,7 +473,7 @@ class RobotTask(composer.Task):
     if self.settings.privileged:
       for name, (size, read) in self._all_privileged().items():
         readings[f"privileged/{name}"] = Reading(
-          lambda read=read: np.asarray(read(), np.float32), specs.Array((size,), np.float32)
+          functools.partial(_single, read), specs.Array((size,), np.float32)
         )
     return readings
 

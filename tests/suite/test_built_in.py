@@ -1,0 +1,60 @@
+"""Both tasks in the built-in room, with its own radiance field."""
+
+import time
+
+import numpy as np
+import pytest
+
+import suite
+from suite import loading
+
+
+@pytest.fixture(scope="module")
+def room():
+  from scenes import bundle
+
+  if not (bundle.BUILT_IN / "scene.json").is_file():
+    pytest.skip("the built-in room is not in this checkout")
+  return bundle.Bundle.load()
+
+
+@pytest.fixture(scope="module")
+def renderer(room):
+  return loading.load_renderer(room)
+
+
+@pytest.mark.parametrize("task", suite.ALL_TASKS)
+def test_a_task_runs_in_the_built_in_room(task, room, renderer):
+  environment = suite.load(task, scene=room, renderer=renderer, random=0)
+  pictures = []
+  for _ in range(4):
+    observation = environment.reset().observation
+    assert not environment.task.touches_scene
+    pictures.append(observation["camera"])
+    for _ in range(3):
+      timestep = environment.step(environment.task.standing_action)
+    assert not timestep.last()
+  spread = [picture.std() for picture in pictures]
+  assert min(spread) > 5  # a room, not a wall of fog
+  assert not np.array_equal(pictures[0], pictures[1])
+
+
+def test_a_reset_takes_less_than_20_ms(room):
+  environment = suite.load("ball_push", scene=room, image_size=None, random=0)
+  environment.reset()
+  times = []
+  for _ in range(15):
+    begin = time.process_time()
+    environment.reset()
+    times.append(time.process_time() - begin)
+  assert np.median(times) < 0.020
+
+
+def test_start_places_are_clear_of_furniture(room):
+  environment = suite.load("nerf_nav", scene=room, image_size=None, random=0)
+  for _ in range(30):
+    environment.reset()
+    timestep = environment.step(environment.task.standing_action)
+    assert environment.task.outcome.ending is None and not timestep.last()
+    assert room.free_space.is_reachable(environment.task.state.position[None])[0]
+  assert room.free_space.is_reachable(environment.task.goals).all()
