@@ -12,6 +12,14 @@ def unknown_name(kind: str, found: Any, known: Iterable[str]) -> str:
   return f"Unknown {kind} {found!r}: expected one of {', '.join(repr(name) for name in known)}."
 
 
+def not_compiled(error: ValueError, scene: Any) -> str:
+  """Returns the message for a model that cannot be built; MuJoCo's own words name the element."""
+  if "Compile error" not in str(error):
+    return str(error)
+  reason = [line for line in str(error).splitlines() if line.startswith(("Error", "Element"))]
+  return f"MuJoCo cannot build {scene} ({'; '.join(reason)}): make the scene's bundle again."
+
+
 def bad_action(action: np.ndarray, spec: specs.BoundedArray) -> str:
   """Returns the message for an action that cannot be applied."""
   if action.shape != spec.shape:

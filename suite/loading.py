@@ -74,7 +74,10 @@ def load(
     effects=read_effects(effects) if isinstance(effects, str | Path) else tuple(effects or ()),
   )
   built = task_class(bundle, camera=robot_camera, settings=settings)
-  return Environment(built, time_limit=settings.time_limit, random_state=random)
+  try:
+    return Environment(built, time_limit=settings.time_limit, random_state=random)
+  except ValueError as error:
+    raise ValueError(errors.not_compiled(error, getattr(bundle, "folder", "the scene"))) from error
 
 
 def open_scene(scene: Any) -> Any:
@@ -88,7 +91,15 @@ def open_scene(scene: Any) -> Any:
 
 def load_renderer(bundle: Any) -> FieldRenderer:
   """Returns a renderer of a bundle's field on this machine's CPU."""
+  import safetensors
+
   from scenes.field import Field
   from scenes.render import Renderer
 
-  return Renderer(Field.load(bundle.field_path))
+  try:
+    field = Field.load(bundle.field_path)
+  except (safetensors.SafetensorError, KeyError, ValueError) as error:
+    raise ValueError(
+      f"{bundle.field_path} is damaged or of another version ({error}): make the bundle again."
+    ) from error
+  return Renderer(field)

@@ -122,7 +122,7 @@ class BallPush(RobotTask):
     )
 
   def _nearest_free(self, xy: np.ndarray) -> np.ndarray:
-    """Returns the point [2] itself if a robot can stand there, or the nearest place where one can."""
+    """Returns the point [2] itself if a robot can stand there, or else the nearest such place."""
     if self.scene.free_space.is_reachable(xy[None])[0]:
       return xy
     side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2

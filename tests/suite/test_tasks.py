@@ -434,6 +434,17 @@ def test_bad_input_is_one_clear_error(room, tmp_path, nav):
     nav.task.set_start(None, goal_index=3)
 
 
+def test_a_damaged_bundle_is_one_clear_error(tmp_path):
+  broken = make_room(tmp_path)
+  broken.collision_parts[3].write_text("v 0 0 0\n")
+  with pytest.raises(ValueError, match="cannot build .*part_003.*make the scene's bundle again"):
+    load("nerf_nav", broken)
+  broken.field_path = tmp_path / "field.safetensors"
+  broken.field_path.write_bytes(b"garbage" * 10)
+  with pytest.raises(ValueError, match=r"field.safetensors is damaged.*make the bundle again"):
+    suite.load("nerf_nav", scene=broken)
+
+
 def test_ball_pushing_needs_room_for_its_workspace(tmp_path):
   small = make_room(tmp_path)
   small.extent = (np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.5, 2.0]))
