@@ -44,8 +44,8 @@ class FieldSettings:
   """Width of the view network, V. Paper, NeRF table."""
   density_bias: float = -5.0
   """Added before squareplus. Paper, NeRF table."""
-  density_scale: float = 10.0
-  """Density [1/unit] per unit of squareplus. Ours: a surface must become opaque within a cell."""
+  density_scale: float = 1.0
+  """Density [1/unit] per unit of squareplus. Ours: with 10 the tail of squareplus leaves fog."""
   specular_bias: float = -3.0
   """Added before the specular colour's sigmoid, so that colour starts diffuse. Ours."""
   footprint_rule: str = "additive"

@@ -20,6 +20,9 @@ from scenes.train_settings import TrainSettings
 from scenes.views import BlurPyramid, Views
 
 _CHUNK_SAMPLES = 768  # ours: a thread's activations stay in a second-level cache of 1 MB
+_UNSEEN_DENSITY = 8.0  # ours: density of cells before the first look [1/unit]
+_SWEEP_DECAY = 0.5  # ours: such a cell counts as occupied for the first three looks
+_CELL_STRIDE = 7_368_787  # a prime
 _DISTANCE_CELLS = 12  # ours: empty space is skipped in strides of at most this many cells
 
 
@@ -120,7 +123,9 @@ def make_chunk(settings: FieldSettings, *, samples: int, stored: int) -> fused_k
     "coordinates": 3 * stored, "d_features": features * stored,
   }  # fmt: skip
   arrays = {name: np.zeros(size, np.float32) for name, size in sizes.items()}
-  return fused_kernels.Chunk(ray_of=np.zeros(n, np.int64), first=np.zeros(r + 1, np.int64), **arrays)
+  return fused_kernels.Chunk(
+    ray_of=np.zeros(n, np.int64), first=np.zeros(r + 1, np.int64), **arrays
+  )
 
 
 def kernel_settings(
@@ -238,13 +243,15 @@ class _Engine:
     """Recomputes which cells are occupied and how far the others are from those."""
     occupancy = self.occupancy
     density = -np.log1p(-threshold) / self.settings.march_step
-    occupied = (occupancy.inner_density > density).astype(np.uint8)
-    scratch = np.empty((2, occupied.size), np.uint8)
-    fused_march.chebyshev_distance(
-      occupied, occupancy.inner_size, _DISTANCE_CELLS, occupancy.inner_distance, scratch
-    )
-    # Outside, a cell spans a step whose length grows with the distance: the same threshold holds.
-    occupancy.outer_distance[:] = occupancy.outer_density <= density
+    occupied = occupancy.inner_density > density
+    occupancy.inner_distance[:] = fused_march.chebyshev_distance(
+      occupied.reshape((occupancy.inner_size,) * 3), limit=_DISTANCE_CELLS
+    ).ravel()
+    # Outside, a step's length grows with the distance as a cell's does: the same threshold holds.
+    occupied = occupancy.outer_density > density
+    occupancy.outer_distance[:] = fused_march.chebyshev_distance(
+      occupied.reshape((occupancy.outer_size,) * 3), limit=_DISTANCE_CELLS
+    ).ravel()
 
 
 class FusedTrainer:
@@ -276,7 +283,7 @@ class FusedTrainer:
     refresh(field, network)
     self.engine = _Engine(
       field, kernel_settings(field, self.pixel_angle, settings), self.table, network,
-      full_occupancy(settings.inner_cells, settings.outer_cells, 0.5),
+      full_occupancy(settings.inner_cells, settings.outer_cells, _UNSEEN_DENSITY),
       [make_chunk(field, samples=_CHUNK_SAMPLES, stored=stored) for _ in range(threads)],
       ThreadPoolExecutor(threads),
     )  # fmt: skip
@@ -284,15 +291,30 @@ class FusedTrainer:
       [level for level in range(field.levels) if level % threads == t] for t in range(threads)
     ]
     self._sweep = 0
-    self.step_scale = 4.0 if initial is None else 1.0
+    self._coarse_steps = 0 if initial else settings.coarse_steps
+
+  def prepare(self) -> None:
+    """Compiles the kernels without changing anything."""
+    engine, settings = self.engine, self.settings
+    nothing, figures = np.zeros(0, np.float32), np.zeros(6)
+    resolutions, entries = engine.resolutions, engine.entries
+    fused_kernels.train_rays(
+      self.pictures, engine.kernel, engine.occupancy, engine.network, self._gradient_networks[0],
+      self.table, resolutions, entries, engine.chunks[0], np.uint64(0), 0, 0, np.float32(0), figures,
+    )  # fmt: skip
+    fused_grid.scatter_level(self.gradient, 0, resolutions[0], entries, nothing, 0, nothing, 1)
+    fused_grid.adam(
+      nothing, nothing, nothing, nothing, 0, 0, 0.0, 0.0, settings.adam_beta1,
+      settings.adam_beta2, settings.adam_epsilon, 1,
+    )  # fmt: skip
+    engine.densities(np.zeros((0, 3), np.float32), sigma=0.0)
 
   def step(self, learning_rate: float) -> dict[str, float]:
     """Makes one step; returns rays, samples, psnr_db, charbonnier and distortion of its batch."""
     engine, settings = self.engine, self.settings
     threads = len(engine.chunks)
-    kernel = engine.kernel._replace(
-      step=np.float32(engine.settings.march_step * self.step_scale)
-    )
+    coarse = max(4 >> (3 * self.steps_done // self._coarse_steps), 1) if self._coarse_steps else 1
+    kernel = engine.kernel._replace(step=np.float32(engine.settings.march_step * coarse))
     seed = np.uint64((self.seed * 1_000_003 + self.steps_done) & (2**63 - 1))
     figures = np.zeros((threads, 6))
     resolutions, entries = engine.resolutions, engine.entries
@@ -333,7 +355,8 @@ class FusedTrainer:
     sums = figures.sum(0)
     self.rays_done += int(sums[0])
     self.samples_done += int(sums[2])
-    if self.steps_done % settings.occupancy_interval == 0:
+    sweeping = self.steps_done <= settings.occupancy_sweep_steps
+    if self.steps_done % (settings.occupancy_interval << sweeping) == 0:
       self._update_occupancy()
     return {
       "rays": sums[0],
@@ -345,26 +368,19 @@ class FusedTrainer:
     }
 
   def _update_occupancy(self) -> None:
-    """Looks at a stretch of the cells in a scrambled order, and at some occupied ones."""
+    """Looks at all cells early on, then at a stretch of them in a scrambled order."""
     engine, settings = self.engine, self.settings
     rng = np.random.default_rng((self.seed, self.steps_done))
-    occupancy = engine.occupancy
-    inner, outer = occupancy.inner_size**3, occupancy.outer_size**3
-    count = settings.occupancy_samples
+    inner, outer = engine.occupancy.inner_size**3, engine.occupancy.outer_size**3
+    total = inner + outer
+    sweeping = self.steps_done <= settings.occupancy_sweep_steps
+    count = total if sweeping else min(settings.occupancy_samples, total)
     # A stride coprime to the number of cells visits every cell once before any twice.
-    order = (self._sweep + np.arange(count)) % (inner + outer)
-    self._sweep = (self._sweep + count) % (inner + outer)
-    cells = order * 7_368_787 % (inner + outer)
-    occupied = np.flatnonzero(occupancy.inner_distance == 0)
-    if len(occupied):
-      again = rng.choice(occupied, min(count // 4, len(occupied)))
-    else:
-      again = occupied
-    in_inner = np.concatenate([cells[cells < inner], again])
-    in_outer = cells[cells >= inner] - inner
-    decay = settings.occupancy_decay
-    engine.update_occupancy(in_inner, rng, inner=True, decay=decay)
-    engine.update_occupancy(in_outer, rng, inner=False, decay=decay)
+    cells = (self._sweep + np.arange(count)) % total * _CELL_STRIDE % total
+    self._sweep = (self._sweep + count) % total
+    decay = _SWEEP_DECAY if sweeping else settings.occupancy_decay
+    engine.update_occupancy(cells[cells < inner], rng, inner=True, decay=decay)
+    engine.update_occupancy(cells[cells >= inner] - inner, rng, inner=False, decay=decay)
     engine.refresh_distances(threshold=settings.occupancy_threshold)
 
   def field(self) -> Field:
@@ -372,6 +388,32 @@ class FusedTrainer:
     params: dict[str, Any] = unflatten(self.settings.field, self.flat)
     params["table"] = self.table.reshape(self.settings.field.shapes["table"]).copy()
     return Field(self.settings.field, params, self.pixel_angle)
+
+  def state(self) -> dict[str, np.ndarray]:
+    """Returns everything that a later run needs to continue, by name."""
+    occupancy = self.engine.occupancy
+    counters = [self.steps_done, self.rays_done, self.samples_done, self._sweep]
+    return {
+      "table": self.table,
+      "network": self.flat,
+      **{f"moment_{i}": moment for i, moment in enumerate(self.moments)},
+      "inner_density": occupancy.inner_density,
+      "outer_density": occupancy.outer_density,
+      "counters": np.array(counters, np.int64),
+    }
+
+  def restore(self, arrays: dict[str, np.ndarray]) -> None:
+    """Continues from what `state` returned."""
+    self.table[:] = arrays["table"]
+    self.flat[:] = arrays["network"]
+    for i, moment in enumerate(self.moments):
+      moment[:] = arrays[f"moment_{i}"]
+    self.engine.occupancy.inner_density[:] = arrays["inner_density"]
+    self.engine.occupancy.outer_density[:] = arrays["outer_density"]
+    self.steps_done, self.rays_done, self.samples_done, self._sweep = map(int, arrays["counters"])
+    refresh(self.engine.settings, self.engine.network)
+    if self.steps_done >= self.settings.occupancy_interval:
+      self.engine.refresh_distances(threshold=self.settings.occupancy_threshold)
 
 
 class FusedField:

@@ -6,12 +6,14 @@ The table is flat float32 [L * T * 2]: row (level * T + index) holds two feature
 import numba
 import numpy as np
 
+from scenes.kernel_cache import KERNEL_CACHE
+
 _PRIME_Y = np.uint32(2654435761)
 _PRIME_Z = np.uint32(805459861)
 _ONE = np.float32(1)
 
 
-@numba.njit(fastmath=True, nogil=True, inline="always")
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", inline="always")
 def _corner_rows(ix, iy, iz, resolution, entries):
   """Rows of the 8 corners of a cell: x varies fastest."""
   side = resolution + 1
@@ -38,7 +40,7 @@ def _corner_rows(ix, iy, iz, resolution, entries):
   )  # fmt: skip
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def encode(table, resolutions, entries, coordinates, count, features, stride):
   """Writes the features of `count` points.
 
@@ -83,7 +85,7 @@ def encode(table, resolutions, entries, coordinates, count, features, stride):
       )  # fmt: skip
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=KERNEL_CACHE)
 def scatter_level(gradient, level, resolution, entries, coordinates, count, d_features, levels):
   """Adds the table's gradient of one level.
 
@@ -123,7 +125,7 @@ def scatter_level(gradient, level, resolution, entries, coordinates, count, d_fe
       gradient[row + 1] += weights[corner] * d1
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=KERNEL_CACHE)
 def adam(values, first, second, gradient, start, stop, rate, decay, beta1, beta2, epsilon, step):
   """Updates values[start:stop] by AdamW where the gradient is not zero, then clears the gradient.
 

@@ -9,20 +9,18 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
+from scenes.fast_math import fast_exp, fast_log2
 from scenes.fused_grid import encode
 from scenes.fused_march import march, squash, uniform
 from scenes.fused_network import (
   base_backward,
   base_forward,
-  fast_exp,
   view_backward,
   view_forward,
   view_offsets,
 )
+from scenes.kernel_cache import KERNEL_CACHE
 
 _ZERO, _ONE, _HALF, _TWO, _FOUR = (np.float32(x) for x in (0, 1, 0.5, 2, 4))
 _TWELFTH = np.float32(1 / 12)
@@ -97,36 +95,7 @@ class Chunk(NamedTuple):
   d_features: np.ndarray  # [S, 2 L]
 
 
-@intrinsic
-def _bits_from_float(typing_context, value):
-  def codegen(context, builder, signature, arguments):
-    return builder.bitcast(arguments[0], ir.IntType(32))
-
-  return types.int32(types.float32), codegen
-
-
-@intrinsic
-def _float_from_bits(typing_context, bits):
-  def codegen(context, builder, signature, arguments):
-    return builder.bitcast(arguments[0], ir.FloatType())
-
-  return types.float32(types.int32), codegen
-
-
-@numba.njit(fastmath=True, nogil=True, inline="always")
-def _log2(x):
-  """Binary logarithm of a positive normal float32 to 3e-5."""
-  bits = _bits_from_float(x)
-  exponent = np.float32((bits >> np.int32(23)) - np.int32(127))
-  mantissa = _float_from_bits(np.int32((bits & np.int32(0x7FFFFF)) | np.int32(0x3F800000)))
-  s = (mantissa - _ONE) / (mantissa + _ONE)
-  q = s * s
-  series = _ONE + q * (np.float32(1 / 3) + q * (np.float32(0.2) + q * (
-    np.float32(1 / 7) + q * np.float32(1 / 9))))  # fmt: skip
-  return exponent + np.float32(2.8853900817779268) * s * series
-
-
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def _look_up(pictures, level, image, px, py, c):
   """Bilinear value in [0, 1] of a channel at the centre of full-size pixel (px, py)."""
   height, width = pictures.heights[level], pictures.widths[level]
@@ -150,7 +119,7 @@ def _look_up(pictures, level, image, px, py, c):
   return (upper * (_ONE - fy) + lower * fy) * scale
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def draw_ray(pictures, settings, seed, index, ray):
   """Draws a pixel and a blur; writes origin, direction, target, footprint, background to `ray`."""
   images = len(pictures.origins) // 3
@@ -191,7 +160,7 @@ def draw_ray(pictures, settings, seed, index, ray):
   ray[9] = _ONE + blur if settings.paper_footprint else _ONE + np.float32(12) * blur * blur
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def spherical_harmonics(x, y, z, row):
   """As encoding.spherical_harmonics."""
   row[0] = np.float32(0.28209479)
@@ -205,9 +174,10 @@ def spherical_harmonics(x, y, z, row):
   row[8] = np.float32(0.54627421) * (x * x - y * y)
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def place(chunk, settings, count, inputs, coordinates):
   """Writes the samples' grid coordinates and variance features."""
+  scratch = chunk.d_color
   for n in range(count):
     ray = chunk.rays[13 * chunk.ray_of[n] : 13 * chunk.ray_of[n] + 13]
     t, length = chunk.distance[n], chunk.length[n]
@@ -222,11 +192,15 @@ def place(chunk, settings, count, inputs, coordinates):
     along = length * length * _TWELFTH
     for i in range(3):
       d = ray[3 + i] * ray[3 + i]
-      variance = across * (_ONE - d) + along * d
-      chunk.x[n * inputs + inputs - 3 + i] = _LOG_SCALE * _log2(variance + _VARIANCE_FLOOR) + _ONE
+      scratch[3 * n + i] = across * (_ONE - d) + along * d + _VARIANCE_FLOOR
+  for i in range(3 * count):
+    scratch[i] = _LOG_SCALE * fast_log2(scratch[i]) + _ONE
+  for n in range(count):
+    for i in range(3):
+      chunk.x[n * inputs + inputs - 3 + i] = scratch[3 * n + i]
 
 
-@numba.njit(fastmath=True, nogil=True, inline="always")
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", inline="always")
 def density_of(raw, settings):
   """Density by squareplus, without cancellation for very negative inputs."""
   z = raw + settings.density_bias
@@ -235,7 +209,7 @@ def density_of(raw, settings):
   return settings.density_scale * ramp
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def _keep_visible(chunk, rays, count, inputs, width, outputs, coordinates, threshold):
   """Drops the samples of every ray behind opaque matter; returns how many are left."""
   kept = 0
@@ -270,7 +244,7 @@ def _keep_visible(chunk, rays, count, inputs, width, outputs, coordinates, thres
   return kept
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def forward(
   chunk, settings, network, table, resolutions, entries, rays, count, coordinates, threshold
 ):  # fmt: skip
@@ -298,13 +272,13 @@ def forward(
   return count
 
 
-@numba.njit(fastmath=True, nogil=True, inline="always")
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", inline="always")
 def _spacing(t):
   """Normalised distance of the distortion loss, see sampling.spacing."""
   return _HALF * t if t < _ONE else _ONE - _HALF / t
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def _ray_losses(chunk, settings, r, outputs):
   """Composites a ray, adds its losses' gradients; returns the squared error and both losses.
 
@@ -364,7 +338,7 @@ def _ray_losses(chunk, settings, r, outputs):
   return (e0 * e0 + e1 * e1 + e2 * e2) * _THIRD, photometric, distortion
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=KERNEL_CACHE)
 def train_rays(
   pictures, settings, occupancy, network, gradient, table, resolutions, entries, chunk, seed,
   first_ray, budget, threshold, figures,
@@ -429,7 +403,7 @@ def train_rays(
   figures[3], figures[4], figures[5] = square_sum, loss_sum, distortion_sum
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=KERNEL_CACHE)
 def render_rays(
   settings, occupancy, network, table, resolutions, entries, chunk, rays_in, first, stop,
   footprint, colors, depths, opacities,
@@ -443,9 +417,7 @@ def render_rays(
   at = first
   while at < stop:
     rays, count = 0, 0
-    while (
-      at + rays < stop and rays < CHUNK_RAYS and count + settings.ray_samples <= capacity
-    ):
+    while at + rays < stop and rays < CHUNK_RAYS and count + settings.ray_samples <= capacity:
       ray = chunk.rays[13 * rays : 13 * rays + 13]
       for i in range(6):
         ray[i] = rays_in[6 * (at + rays) + i]
@@ -482,7 +454,7 @@ def render_rays(
     at += rays
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=KERNEL_CACHE)
 def densities(
   settings, network, table, resolutions, entries, chunk, positions, variance, first, stop, result
 ):  # fmt: skip
@@ -493,7 +465,7 @@ def densities(
   features = 2 * len(resolutions)
   inputs = features + 3
   outputs = len(network.base_b2)
-  extent = _LOG_SCALE * _log2(variance + _VARIANCE_FLOOR) + _ONE
+  extent = _LOG_SCALE * fast_log2(variance + _VARIANCE_FLOOR) + _ONE
   capacity = len(chunk.distance)
   at = first
   while at < stop:

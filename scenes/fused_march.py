@@ -20,11 +20,11 @@ class Occupancy(NamedTuple):
   inner_distance: np.ndarray  # uint8: cells to the nearest occupied one (Chebyshev), 0 = occupied
   inner_density: np.ndarray  # float32: recent maximum of the density [1/unit]
   outer_size: int  # cells along an axis of the squashed space [-2, 2]^3
-  outer_distance: np.ndarray  # uint8: 0 = occupied
+  outer_distance: np.ndarray  # uint8: likewise, in squashed cells
   outer_density: np.ndarray  # float32
 
 
-@numba.njit(nogil=True, inline="always")
+@numba.njit(nogil=True, error_model="numpy", inline="always")
 def uniform(seed, index, dimension):
   """A number in [0, 1) that depends on nothing but its arguments (splitmix64)."""
   z = (
@@ -38,7 +38,7 @@ def uniform(seed, index, dimension):
   return np.float32(z >> np.uint64(40)) * np.float32(1 / 16777216)
 
 
-@numba.njit(fastmath=True, nogil=True, inline="always")
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", inline="always")
 def squash(x, y, z, norm):
   """Grid coordinates in [0, 1]^3 of a point whose max(1, |x|_max) is `norm`."""
   factor = (_TWO - _ONE / norm) / norm * _QUARTER
@@ -50,7 +50,7 @@ def squash(x, y, z, norm):
   )
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def march(
   occupancy, ox, oy, oz, dx, dy, dz, near, jitter, step, depth_limit, limit, distances, lengths, at
 ):  # fmt: skip
@@ -76,6 +76,7 @@ def march(
   cell = _ONE / half_size
   outer_size = occupancy.outer_size
   outer_scale = np.float32(outer_size)
+  outer_cell = _TWO / outer_scale
   steepest = max(abs(dx), max(abs(dy), abs(dz)))
   depth = _ZERO
   stride_per_cell = cell / (steepest * step)
@@ -108,57 +109,41 @@ def march(
       index = (
         np.int64(u * outer_scale) * outer_size + np.int64(v * outer_scale)
       ) * outer_size + np.int64(w * outer_scale)
-      if occupancy.outer_distance[index] == 0:
+      away = occupancy.outer_distance[index]
+      if away == 0:
         distances[at + count] = middle
         lengths[at + count] = length
         count += 1
         depth += occupancy.outer_density[index] * length
         if depth > depth_limit:
           break
-      t += length
+        t += length
+      else:
+        # Squashing shrinks lengths by norm / 2 at least.
+        t += max(np.float32(away - 1) * outer_cell * norm, length)
   return count
 
 
-@numba.njit(nogil=True)
-def chebyshev_distance(occupied, size, limit, distance, scratch):
-  """Writes for every cell the distance to the nearest occupied one, in cells, at most `limit`.
+def chebyshev_distance(occupied: np.ndarray, *, limit: int) -> np.ndarray:
+  """Distance of every cell to the nearest occupied one, in cells.
 
-  Repeated separable dilation by one cell: exact for the maximum norm.
+  Dilates by one cell along each axis in turn, which is exact for the maximum norm.
 
   Args:
-    occupied: uint8 [size^3], 1 = occupied.
-    size: Cells along an axis.
+    occupied: bool [R, R, R].
     limit: Largest distance to tell apart.
-    distance: Result uint8 [size^3].
-    scratch: Two arrays uint8 [2, size^3].
+
+  Returns:
+    Distances uint8 [R, R, R], 0 where occupied, at most `limit`.
   """
-  total = size * size * size
-  current, other = scratch[0], scratch[1]
-  for i in range(total):
-    current[i] = occupied[i]
-    distance[i] = 0 if occupied[i] else limit
-  for ring in range(1, limit):
-    for row in range(size * size):
-      line = row * size
-      for k in range(1, size - 1):
-        other[line + k] = current[line + k - 1] | current[line + k] | current[line + k + 1]
-      other[line] = current[line] | current[line + 1]
-      other[line + size - 1] = current[line + size - 1] | current[line + size - 2]
-    for plane in range(size):
-      for j in range(size):
-        line = (plane * size + j) * size
-        before = line - size if j > 0 else line
-        after = line + size if j < size - 1 else line
-        for k in range(size):
-          current[line + k] = other[before + k] | other[line + k] | other[after + k]
-    area = size * size
-    for plane in range(size):
-      line = plane * area
-      before = line - area if plane > 0 else line
-      after = line + area if plane < size - 1 else line
-      for k in range(area):
-        other[line + k] = current[before + k] | current[line + k] | current[after + k]
-    current, other = other, current
-    for i in range(total):
-      if current[i] != 0 and distance[i] > ring:
-        distance[i] = ring
+  near = occupied.copy()
+  distance = np.full(occupied.shape, limit, np.uint8)
+  for ring in range(limit):
+    if ring > 0:
+      for axis in range(3):
+        line = np.moveaxis(near, axis, 0)
+        before = line.copy()
+        line[1:] |= before[:-1]
+        line[:-1] |= before[1:]
+    distance -= near.view(np.uint8)
+  return distance

@@ -43,9 +43,7 @@ def _make_tile(rows: int, vectors: int) -> Callable:
       x_base = pointer(signature.args[0], x, x_at)
       w_base = pointer(signature.args[4], w, w_at)
       y_base = pointer(signature.args[7], y, y_at)
-      x_starts = [
-        builder.gep(x_base, [builder.mul(constant(row), x_row)]) for row in range(rows)
-      ]
+      x_starts = [builder.gep(x_base, [builder.mul(constant(row), x_row)]) for row in range(rows)]
       y_starts = []
       for row in range(rows):
         start = builder.gep(y_base, [builder.mul(constant(row), y_row)])
@@ -112,7 +110,7 @@ _tile_7x2, _tile_1x2 = _make_tile(7, 2), _make_tile(1, 2)
 _tile_8x1, _tile_1x1 = _make_tile(8, 1), _make_tile(1, 1)
 
 
-@numba.njit(fastmath=True, nogil=True)
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def add_product(
   x, x_at, x_row, x_column, w, w_at, w_row, y, y_at, y_row, rows, count, columns
 ):  # fmt: skip

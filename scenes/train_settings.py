@@ -55,15 +55,19 @@ class TrainSettings:
   """Samples behind this much light take no part. Ours; Mueller et al. 2022: 1e-4."""
   depth_limit: float = 40.0
   """A march ends where the occupancy grid's optical depth passes this. Ours."""
+  coarse_steps: int = 192
+  """Steps of the start that march four times, then twice as coarsely: nothing is empty yet. Ours."""
   inner_cells: int = 128
   """Occupancy cells along the unit cube: 4 cm in a room of 5 m. Mueller et al. 2022."""
   outer_cells: int = 64
   """Occupancy cells along the squashed space. Ours."""
   occupancy_interval: int = 16
   """Steps between updates of the occupancy. Mueller et al. 2022, appendix C."""
-  occupancy_samples: int = 1 << 16
-  """Cells looked at in an update. Ours."""
-  occupancy_decay: float = 0.9
+  occupancy_sweep_steps: int = 256
+  """Steps of the start in which every second update looks at all cells. Mueller et al. 2022."""
+  occupancy_samples: int = 1 << 17
+  """Cells looked at in an update after that. Ours."""
+  occupancy_decay: float = 0.8
   """Factor on a cell's density when it is looked at again. Ours."""
   occupancy_threshold: float = 0.01
   """A cell is occupied when a step through it absorbs this fraction. Mueller et al. 2022."""

@@ -1,0 +1,43 @@
+"""A room that needs no renderer: rays from inside a box, colours a formula of the point they hit."""
+
+import numpy as np
+
+from scenes.cameras import Camera
+from scenes.views import Views
+
+HALF_SIZE = 0.8  # the walls are at +-0.8 units
+
+
+def wall_distance(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+  """Distance [...] to the wall along unit directions [..., 3] from origins [..., 3] inside."""
+  with np.errstate(divide="ignore"):
+    to_walls = (np.sign(directions) * HALF_SIZE - origins) / directions
+  return to_walls.min(-1)
+
+
+def wall_color(points: np.ndarray) -> np.ndarray:
+  """Colours [..., 3] in [0, 1] of points on the walls [..., 3]."""
+  return 0.5 + 0.4 * np.sin(points * [9.0, 11.0, 13.0] + [0.0, 1.0, 2.0])
+
+
+def make_views(count: int, *, width: int = 32, height: int = 24, seed: int = 0) -> Views:
+  """Films the box from inside with random turns."""
+  camera = Camera(width=width, height=height, fx=0.8 * width, fy=0.8 * width, cx=width / 2,
+                  cy=height / 2, k1=0.03)  # fmt: skip
+  rng = np.random.default_rng(seed)
+  images, poses = [], []
+  for _ in range(count):
+    forward = rng.normal(size=3) * [1, 1, 0.4]
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    pose[:3, 3] = rng.uniform(-0.4, 0.4, 3)
+    rays = camera.rays() @ pose[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    hits = pose[:3, 3] + wall_distance(pose[:3, 3], rays)[..., None] * rays
+    images.append(np.rint(255 * wall_color(hits)).astype(np.uint8))
+    poses.append(pose)
+  names = tuple(f"{i:04d}" for i in range(count))
+  return Views(camera, np.stack(images), np.stack(poses), names)

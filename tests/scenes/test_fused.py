@@ -1,0 +1,197 @@
+"""The fused kernels against JAX: gradients, forward values, and against scipy for distances."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_cdt
+
+from scenes import field_losses, fused, fused_grid, fused_kernels, fused_march, sampling
+from scenes.encoding import sample_variance
+from scenes.field import Field, FieldSettings, init_params, query, query_density
+from scenes.train_settings import TrainSettings
+from tests.scenes import box_views
+
+SETTINGS = TrainSettings(
+  field=FieldSettings(
+    log2_table_size=10, growth=1.3, base_resolution=4, march_step=0.1, density_scale=3.0
+  ),
+  batch_samples=1 << 10, ray_samples=64, distortion_weight=0.3, depth_limit=1e9, blur_max=2.0,
+  inner_cells=16, outer_cells=16,
+)  # fmt: skip
+
+
+def _rough_field(pixel_angle=0.05):
+  """A field with parameters far from their initial values, so that every term matters."""
+  rng = np.random.default_rng(0)
+  params = {
+    name: np.array(value + rng.normal(size=value.shape) * (0.3 if name == "table" else 0.1), "f4")
+    for name, value in init_params(jax.random.PRNGKey(0), SETTINGS.field).items()
+  }
+  return Field(SETTINGS.field, params, pixel_angle)
+
+
+@pytest.fixture(scope="module")
+def backward():
+  """A trainer, one chunk's rays and samples, its figures and its gradient."""
+  views = box_views.make_views(3, width=16, height=16)
+  trainer = fused.FusedTrainer(
+    views, SETTINGS, seed=1, initial=_rough_field(views.camera.pixel_angle)
+  )
+  engine, figures = trainer.engine, np.zeros(6)
+  fused_kernels.train_rays(
+    trainer.pictures, engine.kernel, engine.occupancy, engine.network,
+    trainer._gradient_networks[0], trainer.table, engine.resolutions, engine.entries,
+    engine.chunks[0], np.uint64(5), 0, 300, np.float32(0), figures,
+  )  # fmt: skip
+  chunk = engine.chunks[0]
+  for level, resolution in enumerate(engine.resolutions):
+    fused_grid.scatter_level(
+      trainer.gradient, level, resolution, engine.entries, chunk.coordinates, int(figures[1]),
+      chunk.d_features, len(engine.resolutions),
+    )  # fmt: skip
+  gradient = fused.unflatten(SETTINGS.field, trainer._gradients[0])
+  gradient["table"] = trainer.gradient.reshape(SETTINGS.field.shapes["table"])
+  return trainer, chunk, figures, gradient
+
+
+def _reference_losses(params, trainer, chunk, count):
+  """The same rays and samples in JAX: sums of the Charbonnier and the distortion loss."""
+  rays, first = chunk.rays.reshape(-1, 13)[:count], chunk.first[: count + 1]
+  most = np.diff(first).max()
+  distance, length = np.ones((count, most), np.float32), np.zeros((count, most), np.float32)
+  for ray in range(count):
+    samples = slice(first[ray], first[ray + 1])
+    distance[ray, : samples.stop - samples.start] = chunk.distance[samples]
+    length[ray, : samples.stop - samples.start] = chunk.length[samples]
+  origins, directions, targets = rays[:, :3], rays[:, 3:6], rays[:, 6:9]
+  positions = origins[:, None] + directions[:, None] * distance[..., None]
+  along = jnp.broadcast_to(directions[:, None], positions.shape)
+  variance = sample_variance(
+    along, distance, length, pixel_angle=trainer.pixel_angle, footprint=rays[:, 9, None]
+  )
+  density, color = query(SETTINGS.field, params, positions, variance, along)
+  weights = sampling.interval_weights(density, length)
+  rest = 1 - weights.sum(1)
+  total = (weights[..., None] * color).sum(1) + rest[:, None] * rays[:, 10:13]
+  photometric = field_losses.charbonnier(total, targets, padding=1e-3) * count
+  extent = sampling.spacing(distance + length / 2) - sampling.spacing(distance - length / 2)
+  order = jnp.argsort(distance + (length == 0) * 1e3, axis=-1)
+
+  def sort(values):
+    return jnp.take_along_axis(values, order, axis=-1)
+
+  distortion = field_losses.distortion_of_intervals(
+    sort(weights), sort(sampling.spacing(distance)), sort(extent)
+  ).sum()
+  return photometric + SETTINGS.distortion_weight * distortion, (photometric, distortion)
+
+
+def test_gradients_agree_with_autodiff(backward):
+  trainer, chunk, figures, gradient = backward
+  params = _rough_field().params
+  (_, (photometric, distortion)), expected = jax.value_and_grad(_reference_losses, has_aux=True)(
+    params, trainer, chunk, int(figures[0])
+  )
+  np.testing.assert_allclose(figures[4], photometric, rtol=1e-5)
+  np.testing.assert_allclose(figures[5], distortion, rtol=1e-5)
+  for name, value in expected.items():
+    error = np.linalg.norm(gradient[name] - value) / np.linalg.norm(value)
+    assert error < 1e-4, (name, error)
+
+
+def test_rays_are_pixels_of_the_pictures(backward):
+  trainer, chunk, figures, _ = backward
+  rays = chunk.rays.reshape(-1, 13)[: int(figures[0])]
+  sharp = rays[rays[:, 9] == 1.0]
+  assert 3 < len(sharp) < len(rays)
+  distance = box_views.wall_distance(sharp[:, :3], sharp[:, 3:6])
+  expected = box_views.wall_color(sharp[:, :3] + distance[:, None] * sharp[:, 3:6])
+  np.testing.assert_allclose(sharp[:, 6:9], expected, atol=3e-3)
+  origins = trainer.pictures.origins.reshape(-1, 3)
+  assert all(np.isclose(origins, o).all(-1).any() for o in rays[:, :3])
+
+
+def test_densities_agree_with_the_field():
+  field = _rough_field()
+  rng = np.random.default_rng(3)
+  positions = (rng.normal(size=(300, 3)) * 1.5).astype(np.float32)
+  found = fused.FusedField(field).densities(positions, sigma=0.01)
+  variances = np.full((300, 3), 1e-4, np.float32)
+  expected = query_density(field.settings, field.params, positions, variances)
+  np.testing.assert_allclose(found, expected, rtol=2e-4)
+
+
+def test_density_grid_has_order_xyz():
+  field = _rough_field()
+  grid = fused.density_grid(field, 5, [-0.5, -0.4, -0.3], [0.5, 0.8, 0.9], sigma=0.02)
+  point = np.array([[-0.5 + 0.25 * 3, -0.4 + 0.3 * 1, -0.3 + 0.3 * 2]], np.float32)
+  expected = query_density(field.settings, field.params, point, np.full((1, 3), 4e-4, np.float32))
+  np.testing.assert_allclose(grid[3, 1, 2], expected[0], rtol=2e-4)
+
+
+def test_render_agrees_with_a_sum_in_jax():
+  field = _rough_field()
+  evaluator = fused.FusedField(field, settings=SETTINGS)
+  evaluator._engine.occupancy.inner_density[:] = 100.0
+  evaluator._has_occupancy = True  # everything occupied: the march is regular
+  origin, direction = np.array([[0.1, 0.2, -0.9]]), np.array([[0.0, 0.6, 0.8]])
+  color, distance, opacity = evaluator.render_rays(origin, direction, pixel_angle=0.1)
+  t, edges, lengths = SETTINGS.near + 0.05, [], []
+  while t < fused_march.FAR:
+    norm = np.abs(origin + (t + 0.05) * direction).max()
+    length = 0.1 * max(norm, 1.0)
+    edges.append(t + length / 2)
+    lengths.append(length)
+    t += length
+  edges = np.array(edges[: SETTINGS.ray_samples], np.float32)[None]
+  lengths = np.array(lengths[: SETTINGS.ray_samples], np.float32)[None]
+  positions = (origin + edges[..., None] * direction).astype(np.float32)
+  along = np.broadcast_to(direction.astype(np.float32), positions.shape)
+  variance = sample_variance(along, edges, lengths, pixel_angle=0.05, footprint=4.0)
+  density, colors = query(field.settings, field.params, positions, variance, along)
+  weights = sampling.interval_weights(density, lengths)
+  np.testing.assert_allclose(color[0], (weights[..., None] * colors).sum(1)[0], atol=2e-3)
+  np.testing.assert_allclose(opacity[0], weights.sum(), atol=2e-3)
+  np.testing.assert_allclose(distance[0], sampling.expected_distance(weights, edges)[0], rtol=5e-3)
+
+
+def test_chebyshev_distance_agrees_with_scipy():
+  rng = np.random.default_rng(0)
+  occupied = rng.random((20, 20, 20)) < 0.002
+  found = fused_march.chebyshev_distance(occupied, limit=6)
+  expected = np.minimum(distance_transform_cdt(~occupied, metric="chessboard"), 6)
+  np.testing.assert_array_equal(found, expected)
+
+
+def test_march_visits_every_occupied_cell_on_its_way():
+  rng = np.random.default_rng(1)
+  size = 16
+  occupied = rng.random((size,) * 3) < 0.05
+  distance = fused_march.chebyshev_distance(occupied, limit=6)
+  grid = fused_march.Occupancy(
+    size, distance.ravel(), np.zeros(size**3, np.float32),
+    4, np.full(64, 6, np.uint8), np.zeros(64, np.float32),
+  )  # fmt: skip
+  step = 0.01
+  for _ in range(20):
+    origin = rng.uniform(-0.5, 0.5, 3).astype(np.float32)
+    direction = rng.normal(size=3)
+    direction = (direction / np.linalg.norm(direction)).astype(np.float32)
+    distances, lengths = np.zeros(512, np.float32), np.zeros(512, np.float32)
+    count = fused_march.march(
+      grid, *origin, *direction, np.float32(0), np.float32(0), np.float32(step), np.float32(1e9),
+      512, distances, lengths, 0,
+    )  # fmt: skip
+    t = np.arange(step / 2, 3.5, step)
+    points = origin + t[:, None] * direction
+    points = points[np.abs(points).max(-1) < 1]
+    cells = ((points + 1) * size / 2).astype(int)
+    expected = np.flatnonzero(occupied[cells[:, 0], cells[:, 1], cells[:, 2]]).size
+    assert abs(count - expected) <= 2  # rounding at the faces of cells
+    np.testing.assert_allclose(lengths[:count], step)
+
+
+def test_shapes_that_the_kernels_cannot_run_are_refused():
+  with pytest.raises(ValueError, match=r"levels \* features = 10"):
+    fused.check_supported(FieldSettings(levels=5))
