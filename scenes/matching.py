@@ -28,9 +28,7 @@ class FeatureSettings:
   """Features and their matching."""
 
   max_num_features: int = 1536  # of a picture, the largest first; time grows with the square; ours
-  few_num_features: int = (
-    8192  # the same for captures of few pictures, where each one counts; COLMAP
-  )
+  few_num_features: int = 4096  # the same for captures of few pictures; ours
   few_pictures: int = 40  # so many are few; ours
   max_image_size: int = 1600  # long side at which features are sought [pixel]; ours
   affine_shape: bool = True  # paper, appendix A
