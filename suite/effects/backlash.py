@@ -52,8 +52,11 @@ class Backlash(Operator):
     self.offset = np.zeros(len(binding.joints))
     """Motor position minus link position, [J] rad, within half the gap."""
     self._speed = np.zeros(len(binding.joints))
+    self._last_torque, self._last_velocity = np.zeros((2, len(binding.joints)))
+    self._per_step = self._rotor / binding.timestep
     self._binding = binding
     self._started = False
+    self._kick: Array | None = None
     self._set_apart(np.zeros(len(binding.joints), bool))
 
   def _set_apart(self, apart: Array) -> None:
@@ -67,14 +70,16 @@ class Backlash(Operator):
 
   def reset(self) -> None:
     self.offset[:] = 0.0
-    self._started = False
+    self._started, self._kick = False, None
     if self._any_apart:
       self._set_apart(np.zeros_like(self.apart))
       self._write(self._binding)
 
   def _torque(self, binding: Binding, speed: Array) -> Array:
     """Returns the actuators' torque on each joint's motor [J] at motor speed."""
-    position = binding.position + binding.encoder_shift
+    position = binding.position
+    if self._encoder_on_motor:
+      position = position + binding.encoder_shift
     force = binding.actuator_force(position, speed)
     if self._simple:
       force *= self._gear
@@ -87,6 +92,7 @@ class Backlash(Operator):
     if not self._any_free:
       return
     velocity, closed, apart = binding.velocity, self._closed, self.apart
+    kick, self._kick = self._kick, None
     if self._any_apart:
       # The motors moved on their own since the last call: which have crossed their gap?
       relative = self._speed - velocity
@@ -95,8 +101,9 @@ class Backlash(Operator):
       hit &= apart
       self.offset = np.minimum(np.maximum(moved, -self._half), self._half)
       if np.count_nonzero(hit):
-        relative *= self._rotor / binding.timestep
-        binding.force += np.where(hit, relative, 0.0)
+        relative *= self._per_step
+        self._kick = np.where(hit, relative, 0.0)
+        binding.force += self._kick
         apart = apart & ~hit
     if self._encoder_on_motor:
       binding.encoder_shift += self._on_motor * self.offset
@@ -105,10 +112,20 @@ class Backlash(Operator):
     if not self._started:
       self._started = True
       self.offset = np.where(torque >= 0, self._half, -self._half)
-    # What the motor passes on to a link that it touches; where it would have to pull, they part.
-    passed = self._rotor * binding.data.qacc[binding.dofs]
+      np.copyto(self._last_torque, torque)
+      np.copyto(self._last_velocity, velocity)
+      return
+    # What the motor passed on in the last step to a link that it touches: torque - J a - damping w,
+    # all of that step, as light links need a small difference of large torques. Where it would
+    # have had to pull, they part.
+    passed = velocity - self._last_velocity
+    passed *= self._per_step
     passed += self._damping * velocity
-    np.subtract(torque, passed, out=passed)
+    np.subtract(self._last_torque, passed, out=passed)
+    if kick is not None:
+      passed += kick
+    np.copyto(self._last_torque, torque)
+    np.copyto(self._last_velocity, velocity)
     passed *= self.offset
     pulls = passed < 0
     pulls &= closed

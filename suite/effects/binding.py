@@ -153,6 +153,7 @@ class Binding:
     self._gain_view = model.actuator_gainprm[:, 0]
     self._bias_view = model.actuator_biasprm[:, :3]
     self._gain, self._bias = self._gain_view.copy(), self._bias_view.copy()
+    self._bias_constant = self._bias[:, 0].copy()
     self._dry_friction = model.dof_frictionloss[self.dofs].copy()
     self._of_joint = np.maximum(self.actuator_joint, 0)
     # One actuator a joint, in the same order: no gathering needed.
@@ -161,6 +162,7 @@ class Binding:
     on_joint = self.actuator_joint >= 0
     self._per_position = np.where(on_joint, self._bias[:, 1] * self.gear, 0.0)
     self._per_velocity = np.where(on_joint, self._bias[:, 2] * self.gear, 0.0)
+    self._uses_velocity = bool(self._per_velocity.any())
     self._ctrl_low, self._ctrl_high = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
     self._low, self._high = _limits(model.actuator_forcelimited, model.actuator_forcerange)
     self._work = np.zeros(model.nu)
@@ -185,9 +187,10 @@ class Binding:
     if self._ctrl_low is not None:
       ctrl = np.minimum(np.maximum(ctrl, self._ctrl_low), self._ctrl_high)
     force = self._gain * ctrl
-    force += self._bias[:, 0]
+    force += self._bias_constant
     force += np.multiply(self._per_position, position[self._of_joint], out=self._work)
-    force += np.multiply(self._per_velocity, velocity[self._of_joint], out=self._work)
+    if self._uses_velocity:
+      force += np.multiply(self._per_velocity, velocity[self._of_joint], out=self._work)
     force *= self.strength
     if self._low is not None:
       np.maximum(force, self._low, out=force)

@@ -303,8 +303,9 @@ def test_backlash_against_two_masses(encoder_on_motor):
   q, _, stack, _ = _run(_geared(), [effect], controls)
   expected = _two_masses(controls, encoder_on_motor=encoder_on_motor)
   nominal, _, _, _ = _run(_geared(), [], controls)
-  error, size = np.std(q - expected), np.std(nominal - expected)
-  assert error < 0.35 * size, (error, size)
+  # The first cycle differs: these gears start in contact, the two masses in the middle of the gap.
+  error, size = np.std((q - expected)[300:]), np.std((nominal - expected)[300:])
+  assert error < min(0.05 * _GAP, 0.25 * size), (error, size)
   assert np.abs(stack.operator("backlash").offset).max() <= _GAP / 2
 
 
