@@ -1,7 +1,7 @@
-"""From the model's arbitrary frame to the world: metres, z up, floor at z = 0, walls along the axes.
+"""From the model's frame to the world: metres, z up, floor at z = 0, walls along the axes.
 
-Does automatically what the paper does by hand in Blender (section "Collision mesh extraction"); every
-choice can be overridden (`scenes.overrides`). Shapes: N cameras, P points.
+Does automatically what the paper does by hand in Blender (section "Collision mesh extraction");
+every choice can be overridden (`scenes.overrides`). Shapes: N cameras, P points.
 """
 
 import dataclasses
@@ -83,7 +83,7 @@ def rotation_to_up(normal: np.ndarray) -> np.ndarray:
 
 
 def wall_yaw(normals: np.ndarray, *, weights: np.ndarray | None = None) -> float | None:
-  """Direction of the walls from normals [P, 3] in a frame with z up: an angle in [0, pi/2), or None.
+  """Direction of the walls from normals [P, 3], z up: an angle in [0, pi/2), or None.
 
   The mode of the angles modulo a quarter turn, refined by their circular mean near it.
   """
@@ -265,8 +265,8 @@ def align(
     upper = override.extent_upper
   if not (lower < upper).all():
     raise ValueError(
-      f"The extent is empty: lower {np.round(lower, 2).tolist()}, upper {np.round(upper, 2).tolist()} "
-      "m. Correct extent_lower and extent_upper in the override file."
+      f"The extent is empty: lower {np.round(lower, 2).tolist()}, upper "
+      f"{np.round(upper, 2).tolist()} m. Correct extent_lower and extent_upper in the override file."
     )
   report(1.0, "aligned")
   return Alignment(

@@ -31,7 +31,8 @@ class CollisionSettings:
 def remove_floor(grid: fusion.Grid, *, threshold: float) -> fusion.Grid:
   """Takes out the floor: below the threshold there is matter only under matter.
 
-  What stands just above the threshold is extended down to z = 0, so that no ball rolls under a chest.
+  What stands just above the threshold is extended down to z = 0, so that no ball rolls under a
+  chest.
   """
   heights = grid.centres(2)
   layer = int(np.searchsorted(heights, threshold))

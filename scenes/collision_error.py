@@ -14,6 +14,7 @@ from scipy import spatial
 from scenes import collision, convex
 
 _SAMPLES_PER_AREA = 5_000  # on the parts [1/m^2]: neighbours 1.4 cm apart
+_CROP_EDGE = 0.06  # the parts' upper face, where the crop cut them, is no surface of the scene [m]
 
 
 class CollisionError(NamedTuple):
@@ -103,8 +104,11 @@ def collision_error(
   _, first = np.unique(cells, axis=0, return_index=True)
   thinned = surface[keep][first]
   touched = exposed_points(parts, eyes)
-  touched = touched[((touched > lower) & (touched < upper)).all(-1)]
+  crop = np.asarray(upper) - [0, 0, _CROP_EDGE]
+  touched = touched[((touched > lower) & (touched < crop)).all(-1)]
   touched = touched[touched[:, 2] > floor_threshold]
+  if not len(touched):
+    raise ValueError("No ray from the eyes meets a convex part inside the collision crop.")
   if distance_to_surface is None:
     everything = np.concatenate([surface[~keep][::4], thinned])
     to_surface = spatial.cKDTree(everything).query(touched, workers=-1)[0]

@@ -1,10 +1,10 @@
 """Cuts the solid voxels of a grid into convex parts that leave the seen free space free.
 
-MuJoCo collides convex hulls only, and the hull of a room is a filled block. So the solid is cut into
-cells first; a cell whose hull covers no seen free space is a part as it is, the others are decomposed
-by CoACD; then neighbours are merged for as long as their common hull still keeps out of free space.
-Space that no ray reached counts as solid, unless it borders on seen free space, as under a table: so
-furniture and walls have an inside.
+MuJoCo collides convex hulls only, and the hull of a room is a filled block. So the solid is cut
+into cells first; a cell whose hull covers no seen free space is a part as it is, the others are
+decomposed by CoACD; then neighbours are merged for as long as their common hull still keeps out of
+free space. Space that no ray reached counts as solid, unless it borders on seen free space, as
+under a table: so furniture and walls have an inside.
 Shapes: X, Y, Z voxels, P points, F faces.
 """
 
@@ -117,9 +117,7 @@ def _intrusion_of(part: Part, space: _Space, tolerance: float) -> tuple[int, int
   first = np.floor((part.vertices.min(0) - space.lower) / space.voxel).astype(int)
   last = np.ceil((part.vertices.max(0) - space.lower) / space.voxel).astype(int) + 1
   first, last = np.clip(first, 0, shape), np.clip(last, 0, shape)
-  return _intrusion(
-    space.clearance, space.lower, space.voxel, first, last, part.planes, tolerance
-  )
+  return _intrusion(space.clearance, space.lower, space.voxel, first, last, part.planes, tolerance)
 
 
 def _intrudes(part: Part, space: _Space, tolerance: float) -> bool:
@@ -223,7 +221,8 @@ def _split(piece, start, part, matter: _Matter, settings: ConvexSettings) -> lis
   best, score = [], np.inf
   for axis, cut in _cuts(piece, 2):
     halves = _halves(piece, start, axis, cut, matter, settings)
-    # Bad voxels first, then volume: an equal cut that leaves smaller hulls follows the shape better.
+    # Bad voxels first, then volume: an equal cut that leaves smaller hulls follows the shape
+    # better.
     total = sum(h[3][1] + 0.02 * h[3][0] for h in halves)
     if halves and total < score:
       best, score = halves, total
@@ -268,9 +267,7 @@ def decompose(
       "scale and floor_threshold in the override file."
     )
   reach = max(1, round(settings.doubt / grid.voxel))
-  free = ndimage.binary_dilation(
-    grid.observed & ~grid.solid, iterations=reach, mask=~grid.solid
-  )
+  free = ndimage.binary_dilation(grid.observed & ~grid.solid, iterations=reach, mask=~grid.solid)
   clearance = ndimage.distance_transform_edt(free).astype(np.float32) * grid.voxel
   clearance = np.maximum(clearance - 0.5 * grid.voxel, 0)
   space = _Space(clearance, np.asarray(grid.lower, np.float64), grid.voxel)
@@ -310,7 +307,7 @@ def decompose(
 
 
 def _merge(parts, space, tolerance, settings, *, target) -> list[Part]:
-  """Merges neighbours, those whose hull adds least volume first, until the target or no more fit."""
+  """Merges neighbours, those whose hull adds least volume first, down to the target."""
   alive: dict[int, Part] = dict(enumerate(parts))
   boxes = {i: (p.vertices.min(0), p.vertices.max(0)) for i, p in alive.items()}
   fresh = len(parts)

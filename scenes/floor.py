@@ -1,8 +1,8 @@
 """Finds the floor: the lowest large plane near the cameras' mean up direction.
 
 The plane with the most points can be a table top, and the lowest plane a reflection or a few stray
-points. So planes are measured by the ground they cover, not by their points, and of those that cover
-enough the lowest is taken. Shapes: P points.
+points. So planes are measured by the ground they cover, not by their points, and of those that
+cover enough the lowest is taken. Shapes: P points.
 """
 
 import dataclasses
@@ -76,7 +76,7 @@ def fit_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _best_plane(points, up, tolerance, settings, rng):
-  """The plane near up with the most points among random triples, refined: normal, offset, inliers."""
+  """The plane near up with the most points among random triples: normal, offset, inliers."""
   best, found = -1, None
   triples = rng.integers(0, len(points), (settings.hypotheses, 3))
   a, b, c = (points[triples[:, i]] for i in range(3))
@@ -133,8 +133,8 @@ def find_floor(
   points = points[np.isfinite(points).all(-1)]
   if len(points) < _MIN_POINTS:
     raise ValueError(
-      f"Found {len(points)} points to look for the floor in, need at least {_MIN_POINTS}: film more "
-      'of the floor, or give "floor_points" in the override file.'
+      f"Found {len(points)} points to look for the floor in, need at least {_MIN_POINTS}: film "
+      'more of the floor, or give "floor_points" in the override file.'
     )
   rng = np.random.default_rng(seed)
   if len(points) > settings.max_points:

@@ -1,7 +1,7 @@
 """The free-space map: where a robot of given radius and height can stand, and where to send it.
 
-The map is a top-down projection of the convex parts. Files follow ROS map_server: a PGM whose first row
-is the largest y, and a YAML with resolution and the lower left corner.
+The map is a top-down projection of the convex parts. Files follow ROS map_server: a PGM whose
+first row is the largest y, and a YAML with resolution and the lower left corner.
 Shapes: H rows along y, W columns along x (row 0 is the smallest y in memory).
 """
 
@@ -106,8 +106,8 @@ class FreeSpace:
   def _full(self) -> str:
     share = (self.cells == FREE).mean()
     return (
-      f"Found no place where a robot of radius {self.radius:g} m fits: {100 * share:.0f} % of the map "
-      "is free, nowhere wide enough. Check the scale, the floor and the collision parts."
+      f"Found no place where a robot of radius {self.radius:g} m fits: {100 * share:.0f} % of the "
+      "map is free, nowhere wide enough. Check the scale, the floor and the collision parts."
     )
 
   def write(self, path: pathlib.Path) -> None:
@@ -118,7 +118,8 @@ class FreeSpace:
     path.with_suffix(".yaml").write_text(
       f"image: {path.name}\nmode: trinary\nresolution: {float(self.resolution)!r}\n"
       f"origin: [{float(self.origin[0])!r}, {float(self.origin[1])!r}, 0.0]\n"
-      f"negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\nrobot_radius: {float(self.radius)!r}\n",
+      "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+      f"robot_radius: {float(self.radius)!r}\n",
       encoding="ascii",
     )
 
@@ -156,8 +157,8 @@ def read(path: pathlib.Path) -> FreeSpace:
 def _shadow(part: convex.Part, low: float, high: float) -> np.ndarray | None:
   """Corners [K, 2] of what a convex part covers between two heights; None if it is elsewhere.
 
-  A convex body's slab is convex, so its shadow is the hull of its corners: the part's own within the
-  slab and those of its edges with both planes.
+  A convex body's slab is convex, so its shadow is the hull of its corners: the part's own within
+  the slab and those of its edges with both planes.
   """
   v = part.vertices
   if v[:, 2].max() < low or v[:, 2].min() > high:
@@ -188,7 +189,8 @@ def free_space(
     parts: Convex parts, world frame.
     lower: Lower corner of the extent, [>= 2].
     upper: Upper corner of the extent, [>= 2].
-    seen: Fused depth, world frame: columns that no ray ever crossed at the robot's height are unknown
+    seen: Fused depth, world frame: columns that no ray ever crossed at the robot's height are
+    unknown
       and no place to stand. Without it everything inside the extent counts as seen.
     settings: Settings.
     progress: Called with the share done and a word.

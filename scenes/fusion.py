@@ -1,8 +1,8 @@
 """Fuses depth pictures into a signed distance grid: the source of every surface.
 
-Thresholding the field's density keeps floaters and invents matter where no camera ever looked. Here a
-voxel is free because rays passed through it, solid because it lies just behind a seen surface, and
-unknown otherwise. Shapes: N views, H height, W width, X, Y, Z voxels.
+Thresholding the field's density keeps floaters and invents matter where no camera ever looked.
+Here a voxel is free because rays passed through it, solid because it lies just behind a seen
+surface, and unknown otherwise. Shapes: N views, H height, W width, X, Y, Z voxels.
 """
 
 import dataclasses
@@ -198,8 +198,8 @@ def fuse(
 ) -> Grid:
   """Averages truncated signed distances of all views over a box.
 
-  A pixel's surface is taken as a plane with the depth picture's own normal; the weight is the cosine of
-  incidence over the squared depth.
+  A pixel's surface is taken as a plane with the depth picture's own normal; the weight is the
+  cosine of incidence over the squared depth.
 
   Args:
     views: Depth pictures in the frame of the box.
@@ -216,8 +216,8 @@ def fuse(
   shape = np.maximum(np.ceil((upper - lower) / voxel).astype(int), 1) + 1
   if np.prod(shape, dtype=np.float64) > _MAX_VOXELS:
     raise ValueError(
-      f"A box of {np.round(upper - lower, 3)} at voxels of {voxel:.4g} has {shape} voxels, more than "
-      f"{_MAX_VOXELS}: crop the extent or take larger voxels."
+      f"A box of {np.round(upper - lower, 3)} at voxels of {voxel:.4g} has {shape} voxels, more "
+      f"than {_MAX_VOXELS}: crop the extent or take larger voxels."
     )
   truncation = 3 * voxel if truncation is None else truncation
   depth = np.where(np.isfinite(views.depth), views.depth, 0).astype(np.float32)
@@ -239,8 +239,8 @@ def fuse(
   for start in range(0, len(depth), batch):
     part = slice(start, start + batch)
     _fuse(
-      lower.astype(np.float32), np.float32(voxel), np.float32(truncation), inverse[part], lens, limit,
-      depth[part], nearest[part], cosine[part], values, weights,
+      lower.astype(np.float32), np.float32(voxel), np.float32(truncation), inverse[part], lens,
+      limit, depth[part], nearest[part], cosine[part], values, weights,
     )  # fmt: skip
     if progress:
       progress(min(1.0, (start + batch) / len(depth)), "fusing depth")

@@ -1,9 +1,9 @@
 """The scene's surface as a triangle mesh: marching cubes, without floaters, coloured, as glTF.
 
 Two sources give the same `Grid`: depth pictures fused (`scenes.fusion`, the default) or the field's
-density at a threshold, as the paper does (section "Collision mesh extraction"). On the built-in room
-fusion is the more accurate one; the density needs the carving of `density_to_grid` to lose floaters.
-Shapes: V vertices, F faces, X, Y, Z voxels.
+density at a threshold, as the paper does (section "Collision mesh extraction"). On the built-in
+room fusion is the more accurate one; the density needs the carving of `density_to_grid` to lose
+floaters. Shapes: V vertices, F faces, X, Y, Z voxels.
 """
 
 import dataclasses
@@ -113,7 +113,7 @@ def density_to_grid(
 
 
 def drop_floaters(grid: fusion.Grid, *, min_component: float) -> fusion.Grid:
-  """Sets free every connected piece of matter whose box has a shorter diagonal [unit of the grid]."""
+  """Sets free every connected piece of matter whose box has a shorter diagonal."""
   labels, count = ndimage.label(grid.solid, structure=np.ones((3, 3, 3)))
   if count == 0:
     return grid
@@ -157,8 +157,8 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
 def paint(mesh: Mesh, views: fusion.DepthViews) -> Mesh:
   """Colours every vertex with the mean of the views that see it.
 
-  A view sees a vertex if its depth picture agrees within 4 % of the depth. Vertices that no view sees
-  take mid grey.
+  A view sees a vertex if its depth picture agrees within 4 % of the depth. Vertices that no view
+  sees take mid grey.
   """
   if views.color is None:
     raise ValueError("Painting a mesh needs views with colour pictures, found depth only.")

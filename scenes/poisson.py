@@ -1,10 +1,11 @@
 """The paper's baseline: a Poisson mesh of the structure-from-motion points, shown with its colours.
 
-Paper, appendix "COLMAP details": "we reconstruct a dense mesh from the sparse results using the Poisson
-mesher with the default settings". Sparse points carry no normals, so they are estimated from
-neighbours and turned towards the cameras. Of the default settings two cannot stay: trim = 10 removes the
-whole mesh, because sparse points reach a density of 4 to 6 only, so faces far from any point are
-removed instead; and depth = 13 makes the mesh of 9 in ten times the time. Shapes: P points, F faces, H height, W width.
+Paper, appendix "COLMAP details": "we reconstruct a dense mesh from the sparse results using the
+Poisson mesher with the default settings". Sparse points carry no normals, so they are estimated from
+neighbours and turned towards the cameras. Of the default settings two cannot stay: trim = 10
+removes the whole mesh, because sparse points reach a density of 4 to 6 only, so faces far from any
+point are removed instead; and depth = 13 makes the mesh of 9 in ten times the time. Shapes: P
+points, F faces, H height, W width.
 """
 
 import pathlib
@@ -51,9 +52,7 @@ def _write_ply(path: pathlib.Path, points, normals, colors) -> None:
   path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode("ascii") + rows.tobytes())
 
 
-def poisson_mesh(
-  points: np.ndarray, colors: np.ndarray, *, camera_positions: np.ndarray
-) -> Mesh:
+def poisson_mesh(points: np.ndarray, colors: np.ndarray, *, camera_positions: np.ndarray) -> Mesh:
   """Meshes sparse points with COLMAP's Poisson mesher at its default settings.
 
   Args:
@@ -132,8 +131,8 @@ def render_mesh(
 ) -> tuple[np.ndarray, np.ndarray]:
   """Draws a mesh with vertex colours through a camera's lens.
 
-  Corners are projected with the distortion, edges between them are straight: small triangles show it
-  right. Triangles that reach behind the camera are left out.
+  Corners are projected with the distortion, edges between them are straight: small triangles show
+  it right. Triangles that reach behind the camera are left out.
 
   Args:
     mesh: With colours.

@@ -41,13 +41,17 @@ def solve(room, transform, **kwargs):
 
 
 def marker(transform, spread=0.004):
-  return markers.MarkerScale(1 / transform.scale, spread, "4X4_50", (1,), 9, 0.3, np.zeros((1, 4, 3)))
+  return markers.MarkerScale(
+    1 / transform.scale, spread, "4X4_50", (1,), 9, 0.3, np.zeros((1, 4, 3))
+  )
 
 
 def test_marker_floor_walls_and_extent(room):
   transform = unit_frame()
   found = solve(room, transform, marker=marker(transform))
-  total = found.world_from_unit @ transform  # world <- true metric frame: yaw multiple of 90 degrees
+  total = (
+    found.world_from_unit @ transform
+  )  # world <- true metric frame: yaw multiple of 90 degrees
   assert found.scale_source == "marker" and not found.warnings
   assert total.scale == pytest.approx(1, rel=1e-9)
   assert found.tilt_deg(transform.rotation @ [0, 0, 1]) < 0.15
@@ -121,7 +125,9 @@ def test_alignment_survives_json(room):
   found = solve(room, unit_frame())
   again = align.Alignment.from_dict(json.loads(json.dumps(found.to_dict())))
   points = np.random.default_rng(0).random((5, 3))
-  np.testing.assert_allclose(again.world_from_unit.apply(points), found.world_from_unit.apply(points))
+  np.testing.assert_allclose(
+    again.world_from_unit.apply(points), found.world_from_unit.apply(points)
+  )
   assert again.warnings == found.warnings
 
 

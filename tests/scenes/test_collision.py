@@ -80,7 +80,9 @@ def test_walls_enclose_without_filling(parts):
     d = np.array(direction, float)
     found = mujoco.mj_ray(model, data, [0.0, -0.5, 0.45], d, None, 1, -1, geom)
     start = -0.5 if d[1] else 0.0
-    assert found == pytest.approx(expected - np.sign(d[1]) * start if d[1] in (1, -1) else 2.5, abs=0.05)
+    assert found == pytest.approx(
+      expected - np.sign(d[1]) * start if d[1] in (1, -1) else 2.5, abs=0.05
+    )
 
 
 def test_errors_both_ways(parts, views):
@@ -94,7 +96,9 @@ def test_errors_both_ways(parts, views):
   assert found.surface_to_parts_p95 < 0.05
   assert found.parts_within_5cm > 0.93  # the table's underside was never seen
   by_points = collision_error.collision_error(parts, surface, eyes=eyes, lower=LOWER, upper=top)
-  assert by_points.parts_to_surface_median == pytest.approx(found.parts_to_surface_median, abs=0.008)
+  assert by_points.parts_to_surface_median == pytest.approx(
+    found.parts_to_surface_median, abs=0.008
+  )
 
 
 def test_error_of_parts_moved_by_ten_centimetres(parts, views):
@@ -112,7 +116,9 @@ def test_error_of_parts_moved_by_ten_centimetres(parts, views):
 def test_free_space_of_the_room(parts, grid):
   ground = free_space.free_space(parts, lower=LOWER, upper=UPPER, seen=grid)
   assert ground.is_reachable(STANDING).all()
-  blocked = np.array([[-0.9, -1.2], [-2.3, 0.6], [2.45, 0.0], [0.56, 0.56]])  # box, shelf, wall, leg
+  blocked = np.array(
+    [[-0.9, -1.2], [-2.3, 0.6], [2.45, 0.0], [0.56, 0.56]]
+  )  # box, shelf, wall, leg
   assert not ground.is_reachable(blocked).any()
   area = ground.reachable.sum() * ground.resolution**2
   assert 8 < area < 15
@@ -124,7 +130,10 @@ def test_floor_is_taken_out_and_matter_stands_on_the_ground(views):
   grid = collision.solid_grid(views, lower=LOWER, upper=UPPER, settings=SETTINGS)
   column = grid.solid[int((0.0 - LOWER[0]) / 0.04), int((0.0 - LOWER[1]) / 0.04)]
   assert not column[:20].any()  # bare floor
-  i, j = int((-0.9 - LOWER[0]) / 0.04), int((-1.08 - LOWER[1]) / 0.04)  # within the box's north side
+  i, j = (
+    int((-0.9 - LOWER[0]) / 0.04),
+    int((-1.08 - LOWER[1]) / 0.04),
+  )  # within the box's north side
   assert grid.solid[i, j : j + 3, 0].any()
   with pytest.raises(ValueError, match="above the extent"):
     collision.remove_floor(grid, threshold=5.0)

@@ -10,8 +10,14 @@ from scenes import floor
 def room(rng, *, floor_points=900, table_points=4000, below=120):
   """Sparse points of a room: a textureless floor, a busy table and a wall, z up."""
   parts = [
-    np.c_[rng.uniform(-2.5, 2.5, floor_points), rng.uniform(-2, 2, floor_points), np.zeros(floor_points)],
-    np.c_[rng.uniform(0, 1.6, table_points), rng.uniform(0, 1, table_points), np.full(table_points, 0.75)],
+    np.c_[
+      rng.uniform(-2.5, 2.5, floor_points), rng.uniform(-2, 2, floor_points), np.zeros(floor_points)
+    ],
+    np.c_[
+      rng.uniform(0, 1.6, table_points),
+      rng.uniform(0, 1, table_points),
+      np.full(table_points, 0.75),
+    ],
     np.c_[np.full(2000, 2.5), rng.uniform(-2, 2, 2000), rng.uniform(0, 2.5, 2000)],
     np.c_[rng.uniform(-2.5, 2.5, 500), rng.uniform(-2, 2, 500), np.full(500, 2.5)],
     rng.uniform([-2.5, -2, -1.2], [2.5, 2, -0.1], (below, 3)),  # reflections
@@ -50,7 +56,7 @@ def test_refinement_uses_dense_points():
 def test_says_what_is_missing():
   with pytest.raises(ValueError, match="need at least"):
     floor.find_floor(np.zeros((5, 3)), up=np.array([0, 0, 1.0]), camera_positions=CAMERAS)
-  wall = np.c_[np.full(500, 2.5), np.random.default_rng(0).uniform(0, 2, (500, 2)) + [0, 2]]
+  wall = np.c_[np.full(500, 2.5), [*np.random.default_rng(0).uniform(0, 2, (500, 2)), 0, 2]]
   with pytest.raises(ValueError, match="film the floor"):
     floor.find_floor(wall, up=np.array([0, 0, 1.0]), camera_positions=CAMERAS)
   rolled = np.tile(np.eye(4), (2, 1, 1))

@@ -56,7 +56,9 @@ def test_clearance_and_reach(ground):
 def test_rooms_without_door_are_not_mixed():
   wall = box([0.5, 0.2, 0.5], [0.05, 2.0, 0.5])
   ground = free_space.free_space([wall], lower=LOWER, upper=UPPER)
-  assert ground.is_reachable(np.array([-1.0, 0.0])) and not ground.is_reachable(np.array([1.5, 0.0]))
+  assert ground.is_reachable(np.array([-1.0, 0.0])) and not ground.is_reachable(
+    np.array([1.5, 0.0])
+  )
 
 
 def test_map_server_files_round_trip(ground, tmp_path):

@@ -66,13 +66,13 @@ def test_scale_within_half_a_percent(scene):
 
 def test_wrong_poses_and_misread_codes_are_dropped(scene):
   poses, pictures = scene
-  found = markers.detect(pictures, dictionaries=["APRILTAG_36h11"])
+  found = markers.detect(pictures, dictionaries=[["APRILTAG_36h11"]])
   bad = in_units(poses)
   bad[2, :3, 3] += 0.05  # one localised pose is off by 12 cm
-  misread = markers.Detection("4X4_1000", 3, 1, np.array([[10.0, 10], [90, 10], [90, 90], [10, 90]]))
-  scale = markers.marker_scale(
-    [*found, misread], camera=CAMERA, frame_from_camera=bad, side=SIDE
+  misread = markers.Detection(
+    "4X4_1000", 3, 1, np.array([[10.0, 10], [90, 10], [90, 90], [10, 90]])
   )
+  scale = markers.marker_scale([*found, misread], camera=CAMERA, frame_from_camera=bad, side=SIDE)
   assert scale.detections == len(pictures) - 1
   assert scale.metres_per_unit == pytest.approx(1 / UNIT, rel=0.005)
 
@@ -84,4 +84,4 @@ def test_nothing_found_is_none_and_mistakes_are_named(scene):
   with pytest.raises(ValueError, match="positive"):
     markers.marker_scale(found, camera=CAMERA, frame_from_camera=poses, side=0)
   with pytest.raises(ValueError, match="Unknown marker dictionary"):
-    markers.detect(pictures[:1], dictionaries=["9X9"])
+    markers.detect(pictures[:1], dictionaries=[["9X9"]])

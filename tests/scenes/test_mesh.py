@@ -85,9 +85,7 @@ def test_density_with_floaters_is_carved(grid):
   density = density.reshape(grid.values.shape)
   plain = mesh.density_to_grid(density, lower=grid.lower, voxel=VOXEL, threshold=25)
   carved = mesh.density_to_grid(density, lower=grid.lower, voxel=VOXEL, threshold=25, carved=grid)
-  far = [
-    (furnished_room.distance(mesh.surface(g).vertices) > 0.15).sum() for g in (plain, carved)
-  ]
+  far = [(furnished_room.distance(mesh.surface(g).vertices) > 0.15).sum() for g in (plain, carved)]
   assert far[0] > 500 and far[1] < 0.05 * far[0]
   cleaned = mesh.drop_floaters(plain, min_component=0.6)
   assert ndimage.label(cleaned.solid)[1] < ndimage.label(plain.solid)[1]
