@@ -2,11 +2,14 @@
 
 import functools
 import json
+import re
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+import suite.effects as effects_package
 from suite.effects import (
   KINDS,
   Effect,
@@ -343,3 +346,14 @@ def test_wrong_targets_name_what_would_be_right_and_leave_the_model_alone(effect
 def test_an_unbound_stack_says_so():
   with pytest.raises(ValueError, match="bind"):
     EffectStack().before_step(None, np.zeros(1))
+
+
+def test_the_readme_example_runs(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  readme = Path(effects_package.__file__).with_name("README.md").read_text()
+  example = re.search(r"```python\n(.*?)```", readme, re.DOTALL).group(1)
+  names: dict = {}
+  exec(example, names)
+  assert (tmp_path / "effects.json").exists()
+  # 30 ms late, friction against it, but on its way to 0.5.
+  assert 0.05 < names["seen"][0] < 0.6
