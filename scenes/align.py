@@ -266,7 +266,8 @@ def align(
   if not (lower < upper).all():
     raise ValueError(
       f"The extent is empty: lower {np.round(lower, 2).tolist()}, upper "
-      f"{np.round(upper, 2).tolist()} m. Correct extent_lower and extent_upper in the override file."
+      f"{np.round(upper, 2).tolist()} m. Correct extent_lower and extent_upper in the override "
+      "file."
     )
   report(1.0, "aligned")
   return Alignment(

@@ -1,8 +1,8 @@
 """The paper's baseline: a Poisson mesh of the structure-from-motion points, shown with its colours.
 
 Paper, appendix "COLMAP details": "we reconstruct a dense mesh from the sparse results using the
-Poisson mesher with the default settings". Sparse points carry no normals, so they are estimated from
-neighbours and turned towards the cameras. Of the default settings two cannot stay: trim = 10
+Poisson mesher with the default settings". Sparse points carry no normals, so they are estimated
+from neighbours and turned towards the cameras. Of the default settings two cannot stay: trim = 10
 removes the whole mesh, because sparse points reach a density of 4 to 6 only, so faces far from any
 point are removed instead; and depth = 13 makes the mesh of 9 in ten times the time. Shapes: P
 points, F faces, H height, W width.

@@ -56,7 +56,7 @@ def test_refinement_uses_dense_points():
 def test_says_what_is_missing():
   with pytest.raises(ValueError, match="need at least"):
     floor.find_floor(np.zeros((5, 3)), up=np.array([0, 0, 1.0]), camera_positions=CAMERAS)
-  wall = np.c_[np.full(500, 2.5), [*np.random.default_rng(0).uniform(0, 2, (500, 2)), 0, 2]]
+  wall = np.c_[np.full(500, 2.5), np.random.default_rng(0).uniform([0, 2], [2, 4], (500, 2))]
   with pytest.raises(ValueError, match="film the floor"):
     floor.find_floor(wall, up=np.array([0, 0, 1.0]), camera_positions=CAMERAS)
   rolled = np.tile(np.eye(4), (2, 1, 1))
