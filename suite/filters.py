@@ -74,14 +74,15 @@ class LowPass:
 
   def reset(self) -> None:
     """Forgets the past: the next sample is the new steady state."""
-    self._state1: Array | None = None
-    self._state2: Array | None = None
+    self._started = False
+    self._state1 = self._state2 = np.zeros(())
 
   def __call__(self, sample: Array) -> Array:
     """Returns the filtered sample, a new array of the same shape."""
     b0, b1, b2, a1, a2 = self.coefficients
     x = np.asarray(sample, np.float64)
-    if self._state1 is None:
+    if not self._started:
+      self._started = True
       # Steady state of the transposed direct form II for a constant input and unit gain.
       self._state2 = (b2 - a2) * x
       self._state1 = (b1 - a1) * x + self._state2

@@ -188,11 +188,11 @@ class Randomiser:
     self._model = getattr(model, "ptr", model)
     self._scratch = mujoco.MjData(self._model)
     self._torso = self._find(mujoco.mjtObj.mjOBJ_BODY, torso)
-    self._sites = [self._find(mujoco.mjtObj.mjOBJ_SITE, name) for name in imu_sites]
+    sites = [self._find(mujoco.mjtObj.mjOBJ_SITE, name) for name in imu_sites]
+    self._sites = [site for site in sites if site is not None]
     self._ball = self._find(mujoco.mjtObj.mjOBJ_GEOM, ball)
-    fields = (*inertia.MASS_FIELDS, "site_pos", "site_quat", "site_sameframe")
-    fields = (*fields, "geom_size", "geom_rbound", "geom_aabb")
-    self._nominal = inertia.Snapshot(self._model, fields)
+    places = ("site_pos", "site_quat", "site_sameframe", "geom_size", "geom_rbound", "geom_aabb")
+    self._nominal = inertia.Snapshot(self._model, (*inertia.MASS_FIELDS, *places))
 
   def _find(self, kind: mujoco.mjtObj, name: str | None) -> int | None:
     if name is None:

@@ -8,6 +8,7 @@ Shapes: J joints of the binding, U actuators of the model.
 
 import difflib
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -92,7 +93,8 @@ class Binding:
     self.strength = np.ones(num_actuators)
     """Factor on the actuators' force at this step."""
     self.ctrl = np.zeros(num_actuators)
-    self.data: mujoco.MjData | None = None
+    self.data: Any = None
+    """mujoco.MjData of the step."""
 
   def _find_actuators(self) -> None:
     model = self.model
@@ -184,7 +186,7 @@ class Binding:
   def actuator_force(self, position: Array, velocity: Array) -> Array:
     """Returns the force [U] that the actuators give at joint positions and velocities [J]."""
     ctrl = self.ctrl
-    if self._ctrl_low is not None:
+    if self._ctrl_low is not None and self._ctrl_high is not None:
       ctrl = np.minimum(np.maximum(ctrl, self._ctrl_low), self._ctrl_high)
     force = self._gain * ctrl
     force += self._bias_constant
@@ -192,7 +194,7 @@ class Binding:
     if self._uses_velocity:
       force += np.multiply(self._per_velocity, velocity[self._of_joint], out=self._work)
     force *= self.strength
-    if self._low is not None:
+    if self._low is not None and self._high is not None:
       np.maximum(force, self._low, out=force)
       np.minimum(force, self._high, out=force)
     return force

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ def to_list(effects: Iterable[Effect]) -> list[dict[str, Any]]:
       if isinstance(value, float) and math.isinf(value):
         continue
       low, high = effect.intervals.get(name, (None, None))
-      plain: Any = list(value) if kind.parameter(name).is_list else value
+      plain = list(value) if isinstance(value, Sequence) else value
       parameters[name] = {
         "value": plain,
         "low": low,

@@ -48,7 +48,7 @@ class Payload(Operator):
         body = int(binding.model.jnt_bodyid[joint])
       else:
         body = binding.index("body", effect.target)
-      position = [self.value(effect, axis) for axis in "xyz"]
+      position = np.array([self.value(effect, axis) for axis in "xyz"])
       mass = self.value(effect, "mass")
       inertia.attach_mass(binding.model, body, added=mass, position=position)
       binding.masses_changed |= mass != 0
