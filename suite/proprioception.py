@@ -6,31 +6,26 @@ reading has a history of five control steps, oldest first. Shapes: J joints, S p
 control step, H history.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 
-from suite import filters
+from suite import filters, specs
 from suite.madgwick import Madgwick
 from suite.op3 import constants
 
-HISTORY = 5  # control steps (paper: "a history of past 5 proprioceptive observations")
 _EPSILON = 1e-9  # s, against rounding in sums of time steps
 
 
 class Proprioception:
   """Encoders, gyroscope, accelerometer and the estimate of gravity, with a history."""
 
-  def __init__(
-    self, *, physics_timestep: float, substeps: int, joints: int, history: int = HISTORY
-  ):
+  def __init__(self, *, physics_timestep: float, substeps: int):
     """Allocates the buffers.
 
     Args:
       physics_timestep: s.
       substeps: Physics steps in a control step.
-      joints: Number of encoders.
-      history: Control steps in an observation.
     """
     self._timestep, self._substeps = physics_timestep, substeps
     self._low_pass = filters.LowPass(filters.CHIP_BANDWIDTH_HZ, 1 / physics_timestep)
@@ -38,23 +33,15 @@ class Proprioception:
     self._imu_line, self._joint_line = filters.DelayLine(), filters.DelayLine()
     # Row 0 holds the last values of the previous control step: ticks fall between physics steps.
     self._imu = np.zeros((substeps + 1, 6))
-    self._joints = np.zeros((substeps + 1, joints))
-    self._sizes = {
-      "gyroscope": 3, "accelerometer": 3, "gravity": 3,
-      "joint_positions": joints, "previous_control": joints,
-    }  # fmt: skip
+    self._joints = np.zeros((substeps + 1, len(constants.JOINT_NAMES)))
     self._histories = {
-      name: np.zeros((history, size), np.float32) for name, size in self._sizes.items()
+      name: np.zeros((specs.HISTORY, size), np.float32)
+      for name, (size, _) in specs.PROPRIOCEPTION.items()
     }
     self._step = 0
     self._tick = 0
     self.observe: Callable[[str, np.ndarray, float], np.ndarray] | None = None
     """What a reading becomes on the way: (channel, true value, time [s]); see suite.effects."""
-
-  @property
-  def sizes(self) -> Mapping[str, int]:
-    """Number of values of each reading."""
-    return self._sizes
 
   def reset(
     self,

@@ -14,12 +14,13 @@ from dm_env import specs
 
 from suite import filters, rewards
 from suite import randomisation as randomising
+from suite import specs as policy_specs
 from suite.arena import SceneArena
 from suite.camera import RobotCamera
 from suite.effects import Effect, EffectStack
 from suite.environment import Reading
 from suite.op3 import constants, op3
-from suite.proprioception import HISTORY, Proprioception
+from suite.proprioception import Proprioception
 
 PHYSICS_TIMESTEP = 0.0025  # s: benchmarks/physics_step.py, results in suite/README.md
 MIN_UPRIGHT = 0.5  # cosine of the torso's tilt below which it has fallen (60 degrees): ours
@@ -155,7 +156,6 @@ class RobotTask(composer.Task):
     self._proprioception = Proprioception(
       physics_timestep=settings.physics_timestep,
       substeps=self._substeps,
-      joints=len(constants.JOINT_NAMES),
     )
     self.start: Start | None = None  # if set, every episode starts here (evaluation, rehearsal)
     self.hand_force = np.zeros(3)  # N on the torso in the world, in addition to the pushes
@@ -357,9 +357,7 @@ class RobotTask(composer.Task):
     return 0.0 if self.ending is not None else 1.0
 
   def action_spec(self, physics: Any) -> specs.BoundedArray:
-    """Position targets of the joints, normalised: -1 is the lower limit, 1 the upper."""
-    names = "\t".join(constants.JOINT_NAMES)
-    return specs.BoundedArray((len(constants.JOINT_NAMES),), np.float32, -1.0, 1.0, name=names)
+    return policy_specs.action_spec()
 
   # ---- state and termination ----
 
@@ -452,24 +450,18 @@ class RobotTask(composer.Task):
 
   def _make_observables(self) -> collections.OrderedDict[str, Reading]:
     readings: collections.OrderedDict[str, Reading] = collections.OrderedDict()
-    for name, size in self._proprioception.sizes.items():
-      shape = (HISTORY, size)
-      bound = {"gravity": 1.0, "previous_control": 1.0}.get(name)
-      spec = (
-        specs.Array(shape, np.float32)
-        if bound is None
-        else specs.BoundedArray(shape, np.float32, -bound, bound)
-      )
-      readings[name] = Reading(functools.partial(self._proprioception.read, name), spec)
-    lower, upper = (corner.astype(np.float32) for corner in self._arena.extent)
-    readings["goal"] = Reading(
-      lambda: self._goal_observation().astype(np.float32),
-      specs.BoundedArray((2,), np.float32, lower, upper),
+    lower, upper = self._arena.extent
+    camera = self.robot_camera
+    policy = policy_specs.policy_observation_spec(
+      goal_lower=lower, goal_upper=upper, image_shape=None if camera is None else camera.shape
     )
-    if self.robot_camera is not None:
-      readings["camera"] = Reading(
-        self._take_picture, specs.BoundedArray(self.robot_camera.shape, np.uint8, 0, 255)
-      )
+    for name, spec in policy.items():
+      if name == "goal":
+        readings[name] = Reading(lambda: self._goal_observation().astype(np.float32), spec)
+      elif name == "camera":
+        readings[name] = Reading(self._take_picture, spec)
+      else:
+        readings[name] = Reading(functools.partial(self._proprioception.read, name), spec)
     if self.settings.privileged:
       for name, (size, read) in self._all_privileged().items():
         readings[f"privileged/{name}"] = Reading(

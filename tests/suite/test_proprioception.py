@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from suite import filters
+from suite import filters, specs
 from suite.op3 import constants
 from suite.proprioception import Proprioception
 
@@ -13,17 +13,17 @@ TIMESTEP, SUBSTEPS = 0.0025, 10
 
 def _run(truth_imu, truth_joints, steps, *, imu_delay=0.0, joint_delay=0.0, jitter=0.0, seed=0):
   """Feeds functions of time; returns the newest readings after each control step by name."""
-  path = Proprioception(physics_timestep=TIMESTEP, substeps=SUBSTEPS, joints=2)
+  path = Proprioception(physics_timestep=TIMESTEP, substeps=SUBSTEPS)
   path.reset(
-    truth_imu(0.0), truth_joints(0.0), np.zeros(2), imu_delay=imu_delay, joint_delay=joint_delay,
+    truth_imu(0.0), truth_joints(0.0), np.zeros(20), imu_delay=imu_delay, joint_delay=joint_delay,
     jitter=jitter, rng=np.random.default_rng(seed),
   )  # fmt: skip
-  found = {name: [] for name in path.sizes}
+  found = {name: [] for name in specs.PROPRIOCEPTION}
   for step in range(steps):
     for sub in range(SUBSTEPS):
       time = (step * SUBSTEPS + sub + 1) * TIMESTEP
       path.record(sub, truth_imu(time), truth_joints(time))
-    path.finish_step(np.full(2, step))
+    path.finish_step(np.full(20, step))
     for name in found:
       found[name].append(path.read(name)[-1])
   return path, {name: np.array(values) for name, values in found.items()}
@@ -34,7 +34,7 @@ def _level(_):
 
 
 def _ramp(time):
-  return np.array([time, -2 * time])
+  return np.linspace(1, -2, 20) * time
 
 
 def test_encoders_are_sampled_every_8_ms_and_quantised():
@@ -74,7 +74,7 @@ def test_imu_passes_the_chips_low_pass():
     return np.array([0, 0, np.sin(2 * np.pi * frequency * time), 0, 0, 9.81])
 
   steps = 400
-  _, found = _run(truth, lambda t: np.zeros(2), steps)
+  _, found = _run(truth, lambda t: np.zeros(20), steps)
   times = np.arange(1, steps * SUBSTEPS + 1) * TIMESTEP
   b, a = scipy.signal.butter(1, filters.CHIP_BANDWIDTH_HZ, fs=1 / TIMESTEP)
   expected = scipy.signal.lfilter(b, a, np.sin(2 * np.pi * frequency * times))
@@ -91,7 +91,7 @@ def test_gravity_is_that_of_a_turning_body():
     angle = rate * time
     return np.array([0, rate, 0, -9.81 * np.sin(angle), 0, 9.81 * np.cos(angle)])
 
-  _, found = _run(truth, lambda t: np.zeros(2), 60)
+  _, found = _run(truth, lambda t: np.zeros(20), 60)
   angle = rate * (60 * 0.025 - 0.004)
   expected = [np.sin(angle), 0, -np.cos(angle)]
   np.testing.assert_allclose(found["gravity"][-1], expected, atol=0.02)
@@ -99,7 +99,7 @@ def test_gravity_is_that_of_a_turning_body():
 
 
 def test_history_is_oldest_first_and_starts_full():
-  path, _ = _run(_level, lambda t: np.zeros(2), 3)
+  path, _ = _run(_level, lambda t: np.zeros(20), 3)
   control = path.read("previous_control")
   np.testing.assert_array_equal(control[:, 0], [0, 0, 0, 1, 2])
   assert control.dtype == np.float32 and path.read("accelerometer").shape == (5, 3)
