@@ -15,11 +15,11 @@ from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # the environment is only asked for its specs
 
-from agents.dmpo import config as configs  # noqa: E402
-from agents.dmpo.checkpoints import CheckpointError, read_info  # noqa: E402
-from agents.dmpo.learner import Learner, RunSettings  # noqa: E402
-from agents.link.arguments import add_link_arguments, link_settings  # noqa: E402
-from agents.link.sessions import LinkError  # noqa: E402
+from agents.dmpo import config as configs
+from agents.dmpo.checkpoints import CheckpointError, read_info
+from agents.dmpo.learner import Learner, RunSettings
+from agents.link.arguments import add_link_arguments, link_settings
+from agents.link.sessions import LinkError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 

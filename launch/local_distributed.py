@@ -94,7 +94,8 @@ class Supervisor:
     self.link = sessions.LinkSettings(security=sessions.Security(login=login))
     python = sys.executable
     learner = [python, str(_LAUNCH / "learner.py"), "--run", str(run), "--listen", self.endpoint,
-               "--users", str(users), "--seed", str(arguments.seed), *learner_arguments]  # fmt: skip
+               "--users", str(users), "--seed", str(arguments.seed)]  # fmt: skip
+    learner += learner_arguments
     for name in ("env", "preset", "max_env_steps"):
       if getattr(arguments, name) is not None:
         learner += [f"--{name.replace('_', '-')}", str(getattr(arguments, name))]

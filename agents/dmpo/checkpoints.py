@@ -33,7 +33,8 @@ class Checkpoints:
   def __init__(self, folder: Path):
     self._folder = folder.absolute()
     self._folder.mkdir(parents=True, exist_ok=True)
-    logging.getLogger("absl").setLevel(logging.WARNING)  # orbax reports every step of a save
+    # orbax reports every step of a save, and its threads every error before it is raised here.
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
     self._checkpointer = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
     self._sweep()
 
@@ -72,12 +73,15 @@ class Checkpoints:
     except Exception as error:  # orbax and tensorstore raise many kinds, some of them bare
       self._sweep()
       shutil.rmtree(path, ignore_errors=True)
-      reason = str(error).strip().splitlines()
+      lines = str(error).strip().splitlines()
+      reason = lines[0][:200] if lines else type(error).__name__
+      if "No space left" in str(error):
+        reason = "the disk is full"
       older = ", ".join(p.name for p in self.list(kind)) or "none"
+      free = shutil.disk_usage(self._folder).free / 1e6
       raise CheckpointError(
-        f"Could not write the checkpoint {path.name} ({type(error).__name__}: "
-        f"{reason[0][:300] if reason else ''}). Older ones are untouched ({older}). "
-        f"Free space left: {shutil.disk_usage(self._folder).free / 1e6:.0f} MB; free some."
+        f"Could not write the checkpoint {path.name}: {reason}. Older ones are untouched "
+        f"({older}). Free space left: {free:.0f} MB; make room."
       ) from error
     for old in self.list(kind)[: -_KEEP[kind]]:
       shutil.rmtree(old, ignore_errors=True)

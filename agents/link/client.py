@@ -95,7 +95,7 @@ class ActorLink:
     """
     values = {
       "actor": self.actor, "wanted": wanted, "held": held + self.outbox.steps,
-      "version": max(self.version, 0),
+      "version": max(self.version, 0), "oldest": self.outbox.oldest,
     }  # fmt: skip
     message = self.ask("credit", schema.encode("credit", values), kind="grant")
     if message is None:
@@ -109,8 +109,7 @@ class ActorLink:
 
   def send(self, trajectory: Mapping[str, np.ndarray]) -> None:
     """Puts a trajectory into the outbox and sends what is due."""
-    number = self.outbox.made + 1
-    values = {"actor": self.actor, "number": number, "oldest": min(self.outbox.oldest, number)}
+    values = {"actor": self.actor, "number": self.outbox.made + 1}
     payload = schema.encode("trajectory", values, trajectory)
     self.outbox.add(payload, trajectory["reward"].shape[0] - 1)
     self.flush()

@@ -88,18 +88,15 @@ class Ledger:
     """Whether a trajectory is here already."""
     return number <= self._contiguous.get(actor, 0) or number in self._beyond.get(actor, ())
 
-  def record(self, actor: int, number: int, *, oldest: int) -> None:
-    """Records a trajectory.
+  def record(self, actor: int, number: int) -> None:
+    """Records that a trajectory is here."""
+    self._beyond.setdefault(actor, set()).add(number)
+    self.confirm(actor, oldest=1)
 
-    Args:
-      actor: the actor's key.
-      number: the trajectory's number.
-      oldest: the actor's oldest unacknowledged number when it was made: those before are safe, even
-        if a former learner acknowledged them.
-    """
-    beyond = self._beyond.setdefault(actor, set())
-    beyond.add(number)
+  def confirm(self, actor: int, *, oldest: int) -> None:
+    """Takes the actor's word that all before `oldest` is acknowledged, if by a former learner."""
     top = max(self._contiguous.get(actor, 0), oldest - 1)
+    beyond = self._beyond.get(actor, set())
     while top + 1 in beyond:
       top += 1
     self._contiguous[actor] = top

@@ -86,12 +86,12 @@ class LearnerLink:
     self.counters = Counters()
     self.incarnation = uuid.uuid4().hex
     self._insert = insert
+    self._session = session  # a session without a reference closes itself
     self._prefix = settings.prefix
     self._description = dict(description)
     self._ledger = Ledger()
-    oldest: dict[int, int] = {}
-    for key, number in sorted(known or []):
-      self._ledger.record(key, number, oldest=oldest.setdefault(key, number))
+    for key, number in known or []:
+      self._ledger.record(key, number)
     self._actors: dict[str, ActorRecord] = {}
     self._parameters = b""
     self._held: dict[int, bytes] = {}  # versions that the evaluator fetched
@@ -226,7 +226,9 @@ class LearnerLink:
     wanted = schema.integer(message, "wanted", high=1_000_000)
     held = schema.integer(message, "held", high=100_000_000)
     version = schema.integer(message, "version")
+    oldest = schema.integer(message, "oldest", low=1)
     with self.lock:
+      self._ledger.confirm(actor_key(actor), oldest=oldest)
       granted = 0
       if wanted + held > 0:  # the evaluator asks for nothing: only what has been reached
         self._record(actor).parameters_version = version
@@ -282,7 +284,6 @@ class LearnerLink:
     message = schema.decode(data, kind="trajectory")
     actor = schema.text(message, "actor")
     number = schema.integer(message, "number", low=1)
-    oldest = schema.integer(message, "oldest", low=1, high=number)
     key = actor_key(actor)
     with self.lock:
       if self._ledger.seen(key, number):
@@ -290,7 +291,7 @@ class LearnerLink:
         return
     steps = self._insert(message.arrays, key, number)
     with self.lock:
-      self._ledger.record(key, number, oldest=oldest)
+      self._ledger.record(key, number)
       self.limiter.delivered(actor, steps)
       self.counters.trajectories += 1
       self.counters.bytes += len(data)

@@ -18,6 +18,7 @@ import zenoh
 _WAIT_BEFORE_CLOSE_MICROSECONDS = 120_000_000
 _SHARED_MEMORY_BYTES = 64 << 20  # pool of a process; 16 MiB holds too few trajectories
 _OPEN_TIMEOUT_MS = 3000
+_ATTEMPT_MS = 1500  # of one attempt to join; `connect` tries again until its own timeout
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
@@ -105,7 +106,7 @@ def connect(endpoint: str, settings: LinkSettings, *, timeout: float) -> zenoh.S
   config = _common(settings)
   _insert(config, "mode", "client")
   _insert(config, "connect/endpoints", [endpoint])
-  _insert(config, "connect/timeout_ms", _OPEN_TIMEOUT_MS)
+  _insert(config, "connect/timeout_ms", _ATTEMPT_MS)
   _insert(config, "connect/exit_on_failure", True)
   _insert(config, "connect/retry", _RETRY)
   _insert(config, "listen/endpoints", [])

@@ -1,0 +1,103 @@
+"""The rate limiter: exact over any run, no standstill, credits of the dead come back."""
+
+import numpy as np
+import pytest
+
+from agents.link.limiter import LimiterSettings, RateLimiter
+
+
+def _limiter(**changes):
+  settings = {
+    "steps_per_update": 8.0, "min_replay_steps": 100, "trajectory_steps": 16, "max_steps": 2000,
+  }  # fmt: skip
+  start = {k: changes.pop(k) for k in ("steps", "updates") if k in changes}
+  return RateLimiter(LimiterSettings(**(settings | changes)), **start)
+
+
+def _simulate(limiter, *, actors, seed, deaths=0.0):
+  """Actors with random speeds, episode ends and deaths; a learner that updates now and then."""
+  rng = np.random.default_rng(seed)
+  held = dict.fromkeys(range(actors), 0)
+  for _ in range(200_000):
+    if limiter.finished:
+      return
+    actor = int(rng.integers(actors))
+    if rng.random() < deaths:
+      limiter.forget(str(actor))
+      held[actor] = 0
+    if not held[actor]:
+      held[actor] = limiter.request(str(actor), 16, held=0)
+    elif rng.random() < 0.5:  # a trajectory, cut short by an episode's end at times
+      steps = min(held[actor], int(rng.integers(1, 17)))
+      limiter.delivered(str(actor), steps)
+      held[actor] -= steps
+      paid = max(limiter.updates * limiter.settings.steps_per_update, limiter.refill_until)
+      assert limiter.steps - paid <= limiter.lead + 16 * deaths * 1000
+    if limiter.update_due and rng.random() < 0.7:
+      limiter.updated()
+  raise AssertionError(f"Stands still at {limiter.steps} steps, {limiter.updates} updates.")
+
+
+@pytest.mark.parametrize("actors", [1, 2, 7])
+@pytest.mark.parametrize("deaths", [0.0, 0.02])
+def test_one_update_for_8_steps_over_a_run(actors, deaths):
+  limiter = _limiter()
+  _simulate(limiter, actors=actors, seed=actors, deaths=deaths)
+  assert limiter.updates == 2000 // 8
+  assert abs(limiter.steps - 2000) <= 20  # 1 %; more only if a dead actor's data still arrives
+
+
+@pytest.mark.parametrize("rate", [0.5, 3.0, 8.0, 100.0])
+def test_other_rates(rate):
+  limiter = _limiter(steps_per_update=rate)
+  _simulate(limiter, actors=3, seed=0)
+  assert limiter.updates == int(limiter.steps / rate)
+
+
+def test_no_update_before_the_replay_is_filled_then_those_owed():
+  limiter = _limiter()
+  limiter.delivered("a", 99)
+  assert not limiter.update_due
+  limiter.delivered("a", 1)
+  done = 0
+  while limiter.update_due:
+    limiter.updated()
+    done += 1
+  assert done == 12
+
+
+def test_a_resumed_run_refills_and_keeps_its_counts():
+  limiter = _limiter(steps=800, updates=100)
+  assert not limiter.update_due
+  limiter.delivered("a", 99)
+  assert not limiter.update_due
+  _simulate(limiter, actors=2, seed=1)
+  assert limiter.updates == limiter.steps // 8 == 250
+  restored = _limiter(steps=808, updates=100)
+  restored.already_filled()
+  assert restored.update_due
+
+
+def test_credits_come_whole_and_return():
+  limiter = _limiter(min_replay_steps=16, max_steps=None)
+  limiter.delivered("a", 16)
+  assert [limiter.request("a", 16, held=held) for held in (0, 16, 32, 48, 64)] == [16] * 4 + [0]
+  assert limiter.request("a", 8, held=64) == 8  # room for 8 steps, but not for 16
+  assert limiter.request("b", 16, held=0) == 16  # another actor makes more room
+  limiter.forget("a")
+  assert limiter.outstanding == 16
+
+
+def test_a_lost_answer_is_not_counted_twice():
+  limiter = _limiter()
+  assert limiter.request("a", 16, held=0) == 16  # the answer never arrives
+  assert limiter.request("a", 16, held=0) == 16
+  assert limiter.outstanding == 16
+
+
+def test_the_end_is_exact():
+  limiter = _limiter(max_steps=40, min_replay_steps=10)
+  assert limiter.request("a", 16, held=0) == 16
+  assert limiter.request("b", 16, held=0) == 16
+  assert limiter.request("c", 16, held=0) == 8
+  assert limiter.ending and limiter.request("d", 16, held=0) == 0
