@@ -95,7 +95,8 @@ def measure(result: Reconstruction) -> TruthFigures:
     figures[f"robot_psnr{size}_db"] = float(np.mean([score.psnr_db for score in scores]))
     views = views or scores
   figures |= _contact_figures(result, rigid)
-  return TruthFigures(figures, views)
+  # Where the truth's frame lies: benchmarks compare other pictures of the bundle with the truth.
+  return TruthFigures({**figures, "room_from_world": rigid.to_dict()}, views)
 
 
 def _robot_scores(
