@@ -67,7 +67,8 @@ class Checkpoints:
       self._checkpointer.save(
         path,
         args=ocp.args.Composite(
-          state=ocp.args.StandardSave(_named(state)), info=ocp.args.JsonSave(dict(info))
+          state=ocp.args.StandardSave(_named(state)),
+          info=ocp.args.JsonSave({"info": dict(info), "shapes": _shapes(state)}),
         ),
       )
     except Exception as error:  # orbax and tensorstore raise many kinds, some of them bare
@@ -102,21 +103,26 @@ class Checkpoints:
     paths = [path] if path is not None else self.list()[-1:]
     if not paths:
       raise CheckpointError(f"{self._folder} holds no checkpoint: start without --resume.")
+    record = _read_record(paths[0])
+    if record is None or record["shapes"] != _shapes(example):
+      raise CheckpointError(
+        f"{paths[0]} holds a state of other shapes than these settings give: resume with the "
+        "settings and the environment of the run that wrote it."
+      )
     try:
       restored = self._checkpointer.restore(
         paths[0],
         args=ocp.args.Composite(
-          state=ocp.args.StandardRestore(jax.tree.map(_abstract, _named(example))),
-          info=ocp.args.JsonRestore(),
+          state=ocp.args.StandardRestore(jax.tree.map(_abstract, _named(example)))
         ),
       )
     except (ValueError, KeyError, TypeError, OSError) as error:
       raise CheckpointError(
-        f"Could not read {paths[0]}: {str(error).splitlines()[0][:300]}. Resume with the settings "
-        "and the environment of the run that wrote it."
+        f"Could not read {paths[0]}: {str(error).splitlines()[0][:300]}. Remove it to go on from "
+        "an older one."
       ) from error
     leaves = jax.tree.leaves(restored["state"])
-    return jax.tree.unflatten(jax.tree.structure(example), leaves), dict(restored["info"])
+    return jax.tree.unflatten(jax.tree.structure(example), leaves), record["info"]
 
   def close(self) -> None:
     """Frees orbax's threads."""
@@ -129,8 +135,17 @@ def read_info(run: Path) -> dict[str, Any] | None:
   names = sorted(p for p in folder.glob("newest-*") if _NAME.fullmatch(p.name))
   if not names:
     return None
-  path = names[-1] / "info" / "metadata"
+  record = _read_record(names[-1])
+  return None if record is None else record["info"]
+
+
+def _read_record(checkpoint: Path) -> dict[str, Any] | None:
+  path = checkpoint / "info" / "metadata"
   return json.loads(path.read_text()) if path.exists() else None
+
+
+def _shapes(state: TrainingState) -> list[Any]:
+  return [[str(leaf.dtype), list(leaf.shape)] for leaf in jax.tree.leaves(state)]
 
 
 def _named(state: TrainingState) -> dict[str, Any]:
