@@ -11,15 +11,16 @@ import sys
 import uuid
 
 # One core an actor: its matrices are small, and threads of BLAS would fight over the machine.
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-  os.environ.setdefault(_name, "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MKL_NUM_THREADS", "1")
 os.environ.setdefault("MUJOCO_GL", "disabled")  # no environment here draws with GL
 
-from agents.dmpo.actor import ActorProcess, EvaluatorProcess  # noqa: E402
-from agents.link import sessions  # noqa: E402
-from agents.link.arguments import add_link_arguments, link_settings  # noqa: E402
-from agents.link.client import ActorLink  # noqa: E402
-from agents.link.schema import MessageError  # noqa: E402
+from agents.dmpo.actor import ActorProcess, EvaluatorProcess
+from agents.link import sessions
+from agents.link.arguments import add_link_arguments, link_settings
+from agents.link.client import ActorLink
+from agents.link.schema import MessageError
 
 _EVALUATOR_SEED = 1_000_000  # far from the actors' seeds
 

@@ -1,0 +1,193 @@
+"""Updates a second of this learner beside a plain reference update: `python benchmarks/learner.py`.
+
+State-only settings (preset "state") on cartpole's sizes. The reference is DMPO as the public one is
+written, with rlax (the test extra): single transitions with n-step rewards summed beforehand, in a
+batch of as many transitions, the same networks, samples and optimisers. Both take turns in one run.
+--pictures measures the paper's settings at 30x40 (no reference). Writes
+benchmarks/results/learner.json.
+"""
+
+import argparse
+import functools
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from agents.dmpo import config, learning, losses, networks
+from agents.dmpo.config import DmpoConfig
+from agents.dmpo.replay import trajectory_fields
+from agents.dmpo.specs import Layout
+
+STATE_LAYOUT = Layout(None, None, ("position", "velocity"), (3, 2), (), (), 1)
+PROPRIOCEPTION, PRIVILEGED, ACTIONS = 247, 70, 20  # about the suite's
+
+
+def random_batch(settings: DmpoConfig, layout: Layout) -> dict[str, Any]:
+  """A batch of whole trajectories with random numbers."""
+  rng = np.random.default_rng(0)
+  lstm = settings.network.lstm_size if layout.image_shape and settings.network.recurrent else 0
+  size, time_steps = settings.batch_size, settings.trajectory_length
+  batch: dict[str, Any] = {}
+  for name, field in trajectory_fields(layout, lstm_size=lstm).items():
+    shape = (size, time_steps, *field.shape) if field.per_step else (size, *field.shape)
+    if field.dtype == "uint8":
+      batch[name] = rng.integers(0, 256, shape, dtype=np.uint8)
+    else:
+      batch[name] = rng.normal(size=shape).astype(np.float32)
+  batch["discount"][:] = 1.0
+  return batch | {"last": np.full(size, time_steps - 1, np.int32)}
+
+
+def ours(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
+  """A function that does one update of this learner."""
+  functions = learning.make_learning(settings, layout)
+  state = [jax.jit(functions.init)(jax.random.PRNGKey(0))]
+  batch = random_batch(settings, layout)
+
+  def step() -> None:
+    state[0], metrics = functions.update(state[0], batch)
+    jax.block_until_ready(metrics["loss"])
+
+  return step
+
+
+def reference(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
+  """A function that does one plain update on single transitions, with rlax's losses."""
+  import rlax
+
+  net = settings.network
+  atoms = networks.atoms(net)
+  size = settings.batch_size * (settings.trajectory_length - 1)
+  rng = np.random.default_rng(0)
+  normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+  batch = {
+    "o_tm1": normal(size, layout.state_size), "a_tm1": normal(size, layout.action_size),
+    "r_t": normal(size), "d_t": np.full(size, settings.discount**settings.n_step, np.float32),
+    "o_t": normal(size, layout.state_size),
+  }  # fmt: skip
+  key = jax.random.PRNGKey(0)
+  params = {
+    "policy": networks.init_policy(key, net, layout),
+    "critic": networks.init_critic(key, net, layout),
+    "duals": losses.init_duals(
+      layout.action_size, log_temperature=10.0, log_alpha_mean=10.0, log_alpha_stddev=1000.0
+    ),
+  }
+  clip = optax.clip_by_global_norm(settings.max_gradient_norm)
+  optimiser = optax.multi_transform(
+    {
+      "policy": optax.chain(clip, optax.adam(settings.policy_learning_rate)),
+      "critic": optax.chain(clip, optax.adam(settings.critic_learning_rate)),
+      "duals": optax.adam(settings.dual_learning_rate),
+    },
+    {"policy": "policy", "critic": "critic", "duals": "duals"},
+  )
+
+  def policy(p: Any, observation: jax.Array) -> losses.Gaussian:
+    return networks.policy_head(p, jnp.zeros((size, 0)), observation, net)
+
+  def loss(p: Any, target: Any, batch: Any, key: jax.Array) -> jax.Array:
+    online, old = policy(p["policy"], batch["o_t"]), policy(target["policy"], batch["o_t"])
+    noise = jax.random.normal(key, (settings.num_samples, *old.mean.shape))
+    actions = jax.lax.stop_gradient(old.mean + old.stddev * noise)
+    probabilities = jax.nn.softmax(networks.critic_logits(target["critic"], batch["o_t"], actions))
+    duals = p["duals"]
+    fixed = [losses.Gaussian(online.mean, old.stddev), losses.Gaussian(old.mean, online.stddev)]
+    log_probs = losses.log_prob(fixed[0], actions) + losses.log_prob(fixed[1], actions)
+    penalty = functools.partial(rlax.LagrangePenalty, per_dimension=True)
+    constraints = [
+      (losses.kl_per_dimension(old, fixed[0]),
+       penalty(duals.alpha_mean, jnp.asarray(settings.epsilon_mean))),
+      (losses.kl_per_dimension(old, fixed[1]),
+       penalty(duals.alpha_stddev, jnp.asarray(settings.epsilon_stddev))),
+    ]  # fmt: skip
+    temperature = rlax.LagrangePenalty(duals.temperature, jnp.asarray(settings.epsilon))
+    values = jax.lax.stop_gradient(probabilities @ atoms)
+    loss_mpo, _ = rlax.mpo_loss(log_probs, values, temperature, constraints, losses.positive)
+    cost = losses.out_of_bounds_cost(actions)
+    bound = jnp.asarray(settings.epsilon_action_penalty)
+    loss_penalty, weights, _ = rlax.mpo_compute_weights_and_temperature_loss(
+      cost, rlax.LagrangePenalty(duals.penalty_temperature, bound), losses.positive
+    )
+    loss_penalty -= jnp.sum(jax.lax.stop_gradient(weights) * log_probs, axis=0)
+    positions = batch["r_t"][:, None] + batch["d_t"][:, None] * atoms
+    project = jax.vmap(rlax.categorical_l2_project, (0, 0, None))
+    wanted = project(positions, probabilities.mean(0), atoms)
+    logits = networks.critic_logits(p["critic"], batch["o_tm1"], batch["a_tm1"])
+    loss_critic = -jnp.sum(jax.lax.stop_gradient(wanted) * jax.nn.log_softmax(logits), -1)
+    return jnp.mean(loss_mpo + loss_penalty + loss_critic)
+
+  @jax.jit
+  def update(p: Any, target: Any, state: Any, key: jax.Array) -> Any:
+    key, used = jax.random.split(key)
+    changes, state = optimiser.update(jax.grad(loss)(p, target, batch, used), state)
+    return optax.apply_updates(p, changes), state, key
+
+  carried = [params, optimiser.init(params), key]
+
+  def step() -> None:
+    carried[:] = update(carried[0], params, carried[1], carried[2])
+    jax.block_until_ready(carried[0])
+
+  return step
+
+
+def rates(steps: dict[str, Callable[[], None]], seconds: float) -> dict[str, float]:
+  """Updates a second of each, in turns of about a tenth of the time."""
+  for step in steps.values():
+    step()  # compiles
+  spent, done = dict.fromkeys(steps, 0.0), dict.fromkeys(steps, 0)
+  while min(spent.values()) < seconds:
+    for name, step in steps.items():
+      begin = time.perf_counter()
+      while time.perf_counter() - begin < seconds / 10:
+        step()
+        done[name] += 1
+      spent[name] += time.perf_counter() - begin
+  return {name: done[name] / spent[name] for name in steps}
+
+
+def main() -> None:
+  parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+  )
+  parser.add_argument("--seconds", type=float, default=10.0, help="time for each")
+  parser.add_argument("--pictures", metavar="HxW", help="the paper's settings at 30x40 or 60x80")
+  parser.add_argument("--out", type=Path, default=Path("benchmarks/results/learner.json"))
+  arguments = parser.parse_args()
+  if arguments.pictures:
+    height, width = map(int, arguments.pictures.split("x"))
+    layout = Layout("camera", (height, width, 3), ("s",), (PROPRIOCEPTION,),
+                    ("privileged/p",), (PRIVILEGED,), ACTIONS)  # fmt: skip
+    steps = {"ours": ours(config.preset("paper"), layout)}
+  else:
+    settings = config.preset("state")
+    steps = {"ours": ours(settings, STATE_LAYOUT)}
+    try:
+      steps["reference"] = reference(settings, STATE_LAYOUT)
+    except ImportError:
+      print("rlax (the test extra) is not installed: no reference.")
+  result = rates(steps, arguments.seconds)
+  for name, rate in result.items():
+    print(f"{name:>10}: {rate:.2f} updates/s")
+  record = {
+    "command": "python benchmarks/learner.py"
+    + (f" --pictures {arguments.pictures}" if arguments.pictures else ""),
+    "device": jax.devices()[0].device_kind, "machine": platform.machine(), "cores": os.cpu_count(),
+    "load": os.getloadavg()[0], "updates_per_second": result,
+  }  # fmt: skip
+  arguments.out.parent.mkdir(parents=True, exist_ok=True)
+  arguments.out.write_text(json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+  main()

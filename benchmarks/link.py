@@ -1,0 +1,201 @@
+"""The link beside raw zenoh, with a stalled receiver: `python benchmarks/link.py`.
+
+Sends 48-step trajectories with 30x40 pictures (173 KB) from one process to another; in the middle
+the receiver is stopped for 20 s (SIGSTOP), as a long compilation or a checkpoint on a starved
+machine would. Counted: messages lost and repeated, MB/s and messages/s outside the stall. "zenoh"
+is a plain put with congestion control BLOCK and default settings, "link" this project's. Writes
+benchmarks/results/link.json.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import platform
+import signal
+import socket
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from agents.link import client, sessions
+from agents.link.limiter import LimiterSettings, RateLimiter
+from agents.link.server import LearnerLink
+
+STEPS = 48
+_QUIET = 3.0  # s without a message after which the receiver has all that will come
+
+
+def make_trajectory(number: int) -> dict[str, np.ndarray]:
+  """A trajectory of 173 KB that carries its number."""
+  return {
+    "image": np.zeros((STEPS, 30, 40, 3), np.uint8),
+    "reward": np.full(STEPS, number, np.float32),
+  }
+
+
+class _Count:
+  """Numbers that arrived, and when the last one did."""
+
+  def __init__(self) -> None:
+    self.numbers: list[int] = []
+    self.last = time.monotonic()
+
+  def add(self, number: int) -> None:
+    self.numbers.append(number)
+    self.last = time.monotonic()
+
+
+def _report(count: _Count, pipe: Connection) -> None:
+  pipe.recv()  # the sender is done
+  while time.monotonic() - count.last < _QUIET:
+    time.sleep(0.1)
+  pipe.send((len(set(count.numbers)), len(count.numbers), count.last))
+
+
+def receive_link(endpoint: str, pipe: Connection) -> None:
+  """The receiver with this project's link."""
+  settings, count = sessions.LinkSettings(), _Count()
+  limiter = RateLimiter(
+    LimiterSettings(steps_per_update=1e9, min_replay_steps=10**9, trajectory_steps=STEPS - 1)
+  )
+
+  def insert(trajectory: Any, actor: int, number: int) -> int:
+    count.add(int(trajectory["reward"][0]))
+    return STEPS - 1
+
+  session = sessions.listen(endpoint, settings)
+  link = LearnerLink(session, settings, limiter=limiter, insert=insert, description={})
+  pipe.send("ready")
+  _report(count, pipe)
+  link.close()
+  session.close()
+
+
+def receive_raw(endpoint: str, pipe: Connection) -> None:
+  """The receiver with a plain subscriber."""
+  count = _Count()
+  session = zenoh.open(_raw_config("peer", "listen", endpoint))
+
+  def take(sample: zenoh.Sample) -> None:
+    data = sample.payload.to_bytes()
+    count.add(int(np.frombuffer(data, np.float32, 1)[0]))
+
+  subscriber = session.declare_subscriber("trajectory", take)
+  pipe.send("ready")
+  _report(count, pipe)
+  subscriber.undeclare()
+  session.close()
+
+
+def _raw_config(mode: str, side: str, endpoint: str) -> zenoh.Config:
+  config = zenoh.Config()
+  config.insert_json5("mode", json.dumps(mode))
+  config.insert_json5("scouting/multicast/enabled", "false")
+  config.insert_json5(f"{side}/endpoints", json.dumps([endpoint]))
+  return config
+
+
+def send_link(endpoint: str, messages: int, half: Any) -> None:
+  """Sends with this project's link: credits, numbers, acknowledgements."""
+  settings = sessions.LinkSettings()
+  session = sessions.connect(endpoint, settings, timeout=10)
+  link = client.ActorLink(session, settings, actor="benchmark")
+  for number in range(messages):
+    if number == messages // 2:
+      half()
+    while True:
+      link.flush()
+      grant = link.request(STEPS - 1)
+      if grant is not None and grant["granted"]:
+        break
+    link.send(make_trajectory(number))
+  link.drain(timeout=60)
+  link.close()
+
+
+def send_raw(endpoint: str, messages: int, half: Any) -> None:
+  """Sends with plain puts."""
+  session = zenoh.open(_raw_config("client", "connect", endpoint))
+  publisher = session.declare_publisher(
+    "trajectory", congestion_control=zenoh.CongestionControl.BLOCK
+  )
+  time.sleep(0.5)  # until the subscription is known
+  for number in range(messages):
+    if number == messages // 2:
+      half()
+    trajectory = make_trajectory(number)
+    publisher.put(trajectory["reward"].tobytes() + trajectory["image"].tobytes())
+  session.close()
+
+
+def run(name: str, messages: int, stall: float) -> dict[str, Any]:
+  """Runs one of the two; rates are without the stall."""
+  receive, send = {"zenoh": (receive_raw, send_raw), "link": (receive_link, send_link)}[name]
+  with socket.socket() as probe:
+    probe.bind(("127.0.0.1", 0))
+    endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+  context = multiprocessing.get_context("spawn")
+  ours, theirs = context.Pipe()
+  receiver = context.Process(target=receive, args=(endpoint, theirs), daemon=True)
+  receiver.start()
+  assert ours.recv() == "ready" and receiver.pid is not None
+  waker = None
+
+  def half() -> None:
+    nonlocal waker
+    if stall:
+      os.kill(receiver.pid, signal.SIGSTOP)
+      waker = context.Process(target=_wake, args=(receiver.pid, stall))
+      waker.start()
+
+  begin = time.monotonic()
+  send(endpoint, messages, half)
+  if waker is not None:
+    waker.join()
+  ours.send("done")
+  distinct, arrived, last = ours.recv()
+  receiver.join(timeout=10)
+  seconds = max(last - begin - stall, 1e-3)
+  size = sum(a.nbytes for a in make_trajectory(0).values())
+  return {
+    "messages": messages, "stall_s": stall, "lost": messages - distinct,
+    "repeated": arrived - distinct, "messages_per_second": distinct / seconds,
+    "mb_per_second": distinct * size / seconds / 1e6,
+  }  # fmt: skip
+
+
+def _wake(pid: int, seconds: float) -> None:
+  time.sleep(seconds)
+  os.kill(pid, signal.SIGCONT)
+
+
+def main() -> None:
+  parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+  )
+  parser.add_argument("--messages", type=int, default=4000)
+  parser.add_argument("--stall", type=float, default=20.0, help="s")
+  parser.add_argument("--out", type=Path, default=Path("benchmarks/results/link.json"))
+  arguments = parser.parse_args()
+  results = {}
+  for name in ("zenoh", "link"):
+    results[name] = result = run(name, arguments.messages, arguments.stall)
+    print(
+      f"{name:>6}: {result['lost']} of {result['messages']} lost, {result['repeated']} repeated, "
+      f"{result['messages_per_second']:.0f} messages/s, {result['mb_per_second']:.0f} MB/s"
+    )
+  record = {
+    "command": "python benchmarks/link.py", "machine": platform.machine(), "cores": os.cpu_count(),
+    "load": os.getloadavg()[0], "results": results,
+  }  # fmt: skip
+  arguments.out.parent.mkdir(parents=True, exist_ok=True)
+  arguments.out.write_text(json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+  main()
