@@ -68,7 +68,10 @@ def reference(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
   atoms = networks.atoms(net)
   size = settings.batch_size * (settings.trajectory_length - 1)
   rng = np.random.default_rng(0)
-  normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+
+  def normal(*shape: int) -> np.ndarray:
+    return rng.standard_normal(shape, np.float32)
+
   batch = {
     "o_tm1": normal(size, layout.state_size), "a_tm1": normal(size, layout.action_size),
     "r_t": normal(size), "d_t": np.full(size, settings.discount**settings.n_step, np.float32),

@@ -143,14 +143,15 @@ def run(name: str, messages: int, stall: float) -> dict[str, Any]:
   ours, theirs = context.Pipe()
   receiver = context.Process(target=receive, args=(endpoint, theirs), daemon=True)
   receiver.start()
-  assert ours.recv() == "ready" and receiver.pid is not None
+  assert ours.recv() == "ready"
+  pid = receiver.pid or 0
   waker = None
 
   def half() -> None:
     nonlocal waker
     if stall:
-      os.kill(receiver.pid, signal.SIGSTOP)
-      waker = context.Process(target=_wake, args=(receiver.pid, stall))
+      os.kill(pid, signal.SIGSTOP)
+      waker = context.Process(target=_wake, args=(pid, stall))
       waker.start()
 
   begin = time.monotonic()

@@ -18,6 +18,7 @@ import platform
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +42,11 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
 
   settings = config.preset("paper")
   layout = Layout("camera", (*size, 3), ("s",), (PROPRIOCEPTION,), (), (), ACTIONS)
-  params = jax.jit(lambda key: networks.init_policy(key, settings.network, layout))(
-    jax.random.PRNGKey(0)
+  shapes = jax.eval_shape(
+    lambda: networks.init_policy(jax.random.PRNGKey(0), settings.network, layout)
   )
+  rng = np.random.default_rng(0)
+  params = jax.tree.map(lambda x: 0.05 * rng.normal(size=x.shape).astype(np.float32), shapes)
   export_policy(
     folder, flatten_params({"policy": params}), layout=layout, environment="benchmark",
     settings=config.to_dict(settings), info={},
@@ -54,12 +57,12 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
 def measure(exported: list[ExportedPolicy], steps: int) -> list[dict[str, float]]:
   """Runs the policies in turns; times in ms."""
   rng = np.random.default_rng(0)
-  runs = []
-  for policy in exported:
-    shape = policy.layout.image_shape
+  runs: list[list[Any]] = []
+  for loaded in exported:
+    shape = loaded.layout.image_shape
     image = None if shape is None else rng.integers(0, 256, shape, dtype=np.uint8)
-    state = rng.normal(size=policy.layout.state_size).astype(np.float32)
-    runs.append([policy.policy, image, state, policy.policy.initial_state()])
+    state = rng.standard_normal(loaded.layout.state_size, np.float32)
+    runs.append([loaded.policy, image, state, loaded.policy.initial_state()])
   wall, processor = np.zeros((len(runs), steps)), np.zeros((len(runs), steps))
   for step in range(-20, steps):  # the first 20 warm up
     for index, run in enumerate(runs):

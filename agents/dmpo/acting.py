@@ -82,7 +82,7 @@ class TrajectoryBuilder:
       "discount": np.array([*discounts, 0.0], np.float32),
     }
     if first.image is not None:
-      trajectory["image"] = np.stack([o.image for o in self._observations])
+      trajectory["image"] = np.stack([o.image for o in self._observations if o.image is not None])
     if self._initial.hidden.size:
       trajectory["lstm_hidden"], trajectory["lstm_cell"] = self._initial
     self._observations, self._steps = [self._observations[-1]], []

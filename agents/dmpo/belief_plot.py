@@ -53,14 +53,14 @@ def draw_heat_map(
     pixels_per_cell: edge of a cell in the picture [pixels].
   """
   height, width = density.shape[0] * pixels_per_cell, density.shape[1] * pixels_per_cell
-  level = density / max(float(density.max()), 1e-12)
-  level = cv2.resize(level.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-  colour = cv2.applyColorMap(np.uint8(255 * level), cv2.COLORMAP_INFERNO)[..., ::-1]
-  picture = np.ascontiguousarray(colour)
+  share = (density / max(float(density.max()), 1e-12)).astype(np.float32)
+  level = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))
+  colour = np.asarray(cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_INFERNO))
+  picture = np.ascontiguousarray(colour[..., ::-1])
   if background is not None:
-    below = cv2.resize(background, (width, height), interpolation=cv2.INTER_AREA)
+    below = np.asarray(cv2.resize(background, (width, height), interpolation=cv2.INTER_AREA))
     opacity = np.clip(2 * level, 0, 1)[..., None]
-    picture = np.uint8(opacity * picture + (1 - opacity) * 0.6 * below)
+    picture = (opacity * picture + (1 - opacity) * 0.6 * below).astype(np.uint8)
   size = max(3, round(_MARKER_SIZE * max(height, width)))
   if target is not None:
     column, row = _pixel(target, extent, picture.shape)

@@ -54,7 +54,7 @@ class CueTask(dm_env.Environment):
       columns = _PATCH_LEFT if self._side < 0 else _PATCH_RIGHT
       image[_PATCH_ROWS, columns] = _PATCH_COLOUR
     return {
-      "camera": np.uint8(np.clip(image, 0, 255)),
+      "camera": np.clip(image, 0, 255).astype(np.uint8),
       "clock": np.array([self._steps / EPISODE_STEPS], np.float32),
       "privileged/side": np.array([self._side], np.float32),
     }

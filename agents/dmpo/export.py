@@ -55,7 +55,8 @@ def export_policy(
   folder.mkdir(parents=True, exist_ok=True)
   buffer = io.BytesIO()
   # The policy alone is enough to act; a belief goes along where there is one.
-  np.savez(buffer, **{name: np.asarray(array) for name, array in parameters.items()})
+  arrays: dict[str, Any] = {name: np.asarray(array) for name, array in parameters.items()}
+  np.savez(buffer, **arrays)
   data = buffer.getvalue()
   record = {
     "format_version": FORMAT_VERSION,

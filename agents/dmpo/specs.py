@@ -111,7 +111,10 @@ class Layout:
   @classmethod
   def from_dict(cls, values: Mapping[str, Any]) -> "Layout":
     """Rebuilds a layout that `to_dict` wrote."""
-    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    fields: dict[str, Any] = {
+      name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+    }
+    return cls(**fields)
 
 
 def _concatenate(observation: Mapping[str, Any], names: tuple[str, ...]) -> np.ndarray:

@@ -65,7 +65,8 @@ class ActorLink:
   @property
   def learner_is_there(self) -> bool:
     """Whether something receives this actor's trajectories now."""
-    return bool(self._publisher.matching_status.matching)
+    status: Any = self._publisher.matching_status  # zenoh's type stub says bool
+    return bool(status.matching)
 
   def ask(
     self, question: str, message: bytes, *, kind: str, timeout: float | None = None

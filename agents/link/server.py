@@ -103,17 +103,17 @@ class LearnerLink:
     self.metrics: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
     self._thread = threading.Thread(target=self._ingest, name="ingest", daemon=True)
     self._thread.start()
-    key = self._key
-    self._entities = [
-      session.declare_subscriber(key("trajectory/*"), self._on_message("trajectory")),
-      session.declare_subscriber(key("metrics/*"), self._on_message("metrics")),
-      session.declare_queryable(key("ask/credit"), self._answering(self._answer_credit)),
-      session.declare_queryable(key("ask/parameters"), self._answering(self._answer_parameters)),
-      session.declare_queryable(key("ask/status"), self._answering(self._answer_status)),
+    at = self._key
+    self._entities: list[Any] = [
+      session.declare_subscriber(at("trajectory/*"), self._on_message("trajectory")),
+      session.declare_subscriber(at("metrics/*"), self._on_message("metrics")),
+      session.declare_queryable(at("ask/credit"), self._answering(self._answer_credit)),
+      session.declare_queryable(at("ask/parameters"), self._answering(self._answer_parameters)),
+      session.declare_queryable(at("ask/status"), self._answering(self._answer_status)),
       session.liveliness().declare_subscriber(
-        key("alive/actor/*"), self._on_liveliness, history=True
+        at("alive/actor/*"), self._on_liveliness, history=True
       ),
-      session.liveliness().declare_token(key("alive/learner")),
+      session.liveliness().declare_token(at("alive/learner")),
     ]
 
   def _key(self, rest: str) -> str:

@@ -23,12 +23,27 @@ SMALL = [
 CARTPOLE = ["--env", "dm_control:cartpole:swingup", "--preset", "state"]
 
 
+_started: list[subprocess.Popen] = []
+
+
+@pytest.fixture(autouse=True)
+def _leave_nothing_running():
+  yield
+  for process in _started:
+    if process.poll() is None:
+      process.terminate()
+      process.wait(timeout=90)
+  _started.clear()
+
+
 def start(run, *arguments):
   command = [sys.executable, ROOT / "launch/local_distributed.py", "--run", run, *arguments]
-  return subprocess.Popen(
+  process = subprocess.Popen(
     command, env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "120"},
     stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
   )  # fmt: skip
+  _started.append(process)
+  return process
 
 
 def finish(process, *, timeout, run):
@@ -43,7 +58,8 @@ def finish(process, *, timeout, run):
 
 
 def rows(run, source=""):
-  lines = (run / "metrics.jsonl").read_text().splitlines() if run.exists() else []
+  path = run / "metrics.jsonl"
+  lines = path.read_text().splitlines() if path.exists() else []
   return [r for r in map(json.loads, lines) if r["source"].startswith(source)]
 
 
