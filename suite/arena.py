@@ -67,7 +67,9 @@ class SceneArena(composer.Arena):
     )  # fmt: skip
     self._parts = []
     for index, path in enumerate(collision_parts):
-      mesh = root.asset.add("mesh", name=f"part_{index:03d}", file=str(path), inertia="shell")
+      mesh = root.asset.add(
+        "mesh", name=f"part_{index:03d}", file=str(Path(path).resolve()), inertia="shell"
+      )
       self._parts.append(
         root.worldbody.add(
           "geom",

@@ -445,6 +445,13 @@ def test_a_damaged_bundle_is_one_clear_error(tmp_path):
     suite.load("nerf_nav", scene=broken)
 
 
+def test_a_scene_may_be_named_by_a_relative_path(tmp_path, monkeypatch):
+  room = make_room(tmp_path)
+  monkeypatch.chdir(tmp_path)
+  room.collision_parts = [path.relative_to(tmp_path) for path in room.collision_parts]
+  load("nerf_nav", room, image_size=None).reset()
+
+
 def test_ball_pushing_needs_room_for_its_workspace(tmp_path):
   small = make_room(tmp_path)
   small.extent = (np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.5, 2.0]))
