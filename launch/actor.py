@@ -15,6 +15,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MKL_NUM_THREADS", "1")
 os.environ.setdefault("MUJOCO_GL", "disabled")  # no environment here draws with GL
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the accelerator is the learner's
 
 from agents.dmpo.actor import ActorProcess, EvaluatorProcess
 from agents.link import sessions

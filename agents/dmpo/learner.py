@@ -93,7 +93,7 @@ class Learner:
       steps, saved = info["steps"], info["replay_inserted"]
       self._best = info["best_return"] if info["best_return"] is not None else -np.inf
     self.replay = self._open_replay(resume)
-    if resume and settings.replay_on_disk:
+    if resume and self.replay.on_disk:
       steps += self.replay.steps_after(saved)  # what came after the checkpoint is not lost
     limiter = RateLimiter(
       LimiterSettings(
@@ -129,19 +129,23 @@ class Learner:
       },
     )  # fmt: skip
     self._publish()
+    if not resume:  # so that a learner that dies early has something to go on from
+      self.save()
 
   def _open_replay(self, resume: bool) -> Replay:
     lstm = self._state.policy["lstm"]["b"].shape[0] // 4 if "lstm" in self._state.policy else 0
     self._fields = trajectory_fields(self.layout, lstm_size=lstm)
-    folder = self._settings.run / "replay" if self._settings.replay_on_disk else None
-    if folder is not None and not resume and folder.exists():
-      raise ValueError(f"{folder} holds the replay of another run: resume it, or remove it.")
-    return Replay(
+    folder = self._settings.run / "replay"
+    on_disk = self._settings.replay_on_disk or (resume and folder.exists())
+    replay = Replay(
       self._fields,
       length=self._config.trajectory_length,
       capacity_steps=self._config.replay_steps,
-      folder=folder,
+      folder=folder if on_disk else None,
     )
+    if replay.size and not resume:
+      raise ValueError(f"{folder} holds the replay of another run: resume it, or remove it.")
+    return replay
 
   def _insert(self, trajectory: Any, actor: int, number: int) -> int:
     steps = check_trajectory(trajectory, self._fields, length=self._config.trajectory_length)

@@ -107,6 +107,7 @@ class Replay:
       for name, f in self._fields.items()
     }
     shapes |= {"last": ((self.capacity,), "int32"), _ORIGIN: ((self.capacity, 3), "uint64")}
+    self.on_disk = folder is not None
     existing = folder is not None and _check_index(folder, shapes)
     self._arrays = {
       name: _open_array(folder, name, shape, dtype, existing)

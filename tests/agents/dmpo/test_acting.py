@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import dm_env
 import jax
@@ -78,6 +79,16 @@ def test_exported_policy_needs_neither_jax_nor_the_simulator(cue):
     "assert not bad, bad\n"
   )
   subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_the_readme_s_example_runs(cue):
+  folder, environment, layout = cue
+  readme = (Path(acting.__file__).parent / "README.md").read_text()
+  code = readme.partition("```python\n")[2].partition("```")[0]
+  code = code.replace("runs/nav/policy/best", str(folder))
+  scope = {"observation": environment.reset().observation}
+  exec(code, scope)
+  assert scope["step"].mean.shape == (layout.action_size,)
 
 
 def test_damaged_or_missing_policy_is_refused(tmp_path):
