@@ -109,6 +109,9 @@ def init_params(key: jax.Array, settings: FieldSettings) -> dict[str, jax.Array]
       params[name] = jax.random.uniform(draw, shape, minval=-limit, maxval=limit)
     else:
       params[name] = jnp.zeros(shape)
+  # The variance gives away the camera's distance and direction; a field that starts from those
+  # explains every picture by a fog of its own (measured: 16 instead of 25 dB on held-out views).
+  params["base_w1"] = params["base_w1"].at[-3:].set(0.0)
   return params
 
 

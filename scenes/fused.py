@@ -21,7 +21,9 @@ from scenes.views import BlurPyramid, Views
 
 _CHUNK_SAMPLES = 768  # ours: a thread's activations stay in a second-level cache of 1 MB
 _UNSEEN_DENSITY = 8.0  # ours: density of cells before the first look [1/unit]
-_SWEEP_DECAY = 0.5  # ours: such a cell counts as occupied for the first three looks
+_SWEEP_DECAY = 0.5  # ours
+_COARSEST = 8  # ours: the first marches take steps of 16 cm in a room of 5 m
+_COARSEN_RATIO = 5  # ours: above 1 / 2 squared, so that the march does not go back and forth
 _CELL_STRIDE = 7_368_787  # a prime
 _DISTANCE_CELLS = 12  # ours: empty space is skipped in strides of at most this many cells
 
@@ -140,6 +142,7 @@ def kernel_settings(
     paper_footprint=field.footprint_rule == "paper",
     pixel_angle=f(pixel_angle),
     step=f(field.march_step),
+    variance_step=f(field.march_step),
     near=f(train.near),
     depth_limit=f(train.depth_limit),
     ray_samples=train.ray_samples,
@@ -291,7 +294,7 @@ class FusedTrainer:
       [level for level in range(field.levels) if level % threads == t] for t in range(threads)
     ]
     self._sweep = 0
-    self._coarse_steps = 0 if initial else settings.coarse_steps
+    self._coarseness = 1 if initial else _COARSEST  # the march's step in units of the field's
 
   def prepare(self) -> None:
     """Compiles the kernels without changing anything."""
@@ -313,8 +316,9 @@ class FusedTrainer:
     """Makes one step; returns rays, samples, psnr_db, charbonnier and distortion of its batch."""
     engine, settings = self.engine, self.settings
     threads = len(engine.chunks)
-    coarse = max(4 >> (3 * self.steps_done // self._coarse_steps), 1) if self._coarse_steps else 1
-    kernel = engine.kernel._replace(step=np.float32(engine.settings.march_step * coarse))
+    kernel = engine.kernel._replace(step=np.float32(engine.settings.march_step * self._coarseness))
+    if self.steps_done < settings.occupancy_start:
+      kernel = kernel._replace(depth_limit=np.float32(1e9))
     seed = np.uint64((self.seed * 1_000_003 + self.steps_done) & (2**63 - 1))
     figures = np.zeros((threads, 6))
     resolutions, entries = engine.resolutions, engine.entries
@@ -345,18 +349,31 @@ class FusedTrainer:
     total = self._gradients[0]
     for other in self._gradients[1:]:
       total += other
-    fused_grid.adam(
-      self.flat, self.moments[2], self.moments[3], total, 0, len(total), learning_rate,
-      settings.weight_decay, settings.adam_beta1, settings.adam_beta2, settings.adam_epsilon,
-      self.steps_done + 1,
-    )  # fmt: skip
+    # The rows of base_w1 that see the variance come behind those of the features.
+    first = engine.settings.levels * engine.settings.features * engine.settings.width
+    after = first + 3 * engine.settings.width
+    for start, stop, factor in (
+      (0, first, 1.0),
+      (first, after, settings.variance_rate),
+      (after, len(total), 1.0),
+    ):
+      fused_grid.adam(
+        self.flat, self.moments[2], self.moments[3], total, start, stop, learning_rate * factor,
+        settings.weight_decay, settings.adam_beta1, settings.adam_beta2, settings.adam_epsilon,
+        self.steps_done + 1,
+      )  # fmt: skip
     refresh(engine.settings, engine.network)
     self.steps_done += 1
     sums = figures.sum(0)
     self.rays_done += int(sums[0])
     self.samples_done += int(sums[2])
+    if sums[2] < settings.refine_samples * sums[0] and self._coarseness > 1:
+      self._coarseness //= 2
+    elif sums[2] > _COARSEN_RATIO * settings.refine_samples * sums[0]:
+      self._coarseness = min(self._coarseness * 2, _COARSEST)
     sweeping = self.steps_done <= settings.occupancy_sweep_steps
-    if self.steps_done % (settings.occupancy_interval << sweeping) == 0:
+    due = self.steps_done % (settings.occupancy_interval << sweeping) == 0
+    if due and self.steps_done >= settings.occupancy_start:
       self._update_occupancy()
     return {
       "rays": sums[0],
@@ -379,6 +396,8 @@ class FusedTrainer:
     cells = (self._sweep + np.arange(count)) % total * _CELL_STRIDE % total
     self._sweep = (self._sweep + count) % total
     decay = _SWEEP_DECAY if sweeping else settings.occupancy_decay
+    if self.steps_done < settings.occupancy_start + 2 * settings.occupancy_interval:
+      decay = 0.0  # the first look replaces what was assumed
     engine.update_occupancy(cells[cells < inner], rng, inner=True, decay=decay)
     engine.update_occupancy(cells[cells >= inner] - inner, rng, inner=False, decay=decay)
     engine.refresh_distances(threshold=settings.occupancy_threshold)
@@ -392,7 +411,9 @@ class FusedTrainer:
   def state(self) -> dict[str, np.ndarray]:
     """Returns everything that a later run needs to continue, by name."""
     occupancy = self.engine.occupancy
-    counters = [self.steps_done, self.rays_done, self.samples_done, self._sweep]
+    counters = [
+      self.steps_done, self.rays_done, self.samples_done, self._sweep, self._coarseness
+    ]  # fmt: skip
     return {
       "table": self.table,
       "network": self.flat,
@@ -410,9 +431,10 @@ class FusedTrainer:
       moment[:] = arrays[f"moment_{i}"]
     self.engine.occupancy.inner_density[:] = arrays["inner_density"]
     self.engine.occupancy.outer_density[:] = arrays["outer_density"]
-    self.steps_done, self.rays_done, self.samples_done, self._sweep = map(int, arrays["counters"])
+    numbers = [int(x) for x in arrays["counters"]]
+    self.steps_done, self.rays_done, self.samples_done, self._sweep, self._coarseness = numbers
     refresh(self.engine.settings, self.engine.network)
-    if self.steps_done >= self.settings.occupancy_interval:
+    if self.steps_done >= self.settings.occupancy_start:
       self.engine.refresh_distances(threshold=self.settings.occupancy_threshold)
 
 
@@ -495,15 +517,20 @@ class FusedField:
     return colors.reshape(count, 3), depths, opacities
 
   def render(
-    self, camera: Camera, unit_from_camera: np.ndarray
+    self, camera: Camera, unit_from_camera: np.ndarray, *, pixel_angle: float | None = None
   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Renders a picture: colours uint8 [H, W, 3], z-depths [H, W] [unit], opacities [H, W]."""
+    """Renders a picture: colours uint8 [H, W, 3], z-depths [H, W] [unit], opacities [H, W].
+
+    The field is told that the pixels span `pixel_angle` [rad]; the camera's own if None.
+    """
     rays = camera.rays()
     norms = np.linalg.norm(rays, axis=-1)
     directions = (rays / norms[..., None]) @ unit_from_camera[:3, :3].T
     origins = np.broadcast_to(unit_from_camera[:3, 3], directions.shape)
     colors, distances, opacities = self.render_rays(
-      origins.reshape(-1, 3), directions.reshape(-1, 3), pixel_angle=camera.pixel_angle
+      origins.reshape(-1, 3),
+      directions.reshape(-1, 3),
+      pixel_angle=camera.pixel_angle if pixel_angle is None else pixel_angle,
     )
     shape = norms.shape
     picture = np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8).reshape(*shape, 3)

@@ -53,6 +53,7 @@ class Settings(NamedTuple):
   paper_footprint: bool  # footprint 1 + blur instead of 1 + 12 blur^2
   pixel_angle: float
   step: float
+  variance_step: float  # interval that the variance tells of, inside the unit cube
   near: float
   depth_limit: float  # a ray's march ends where the grid's optical depth passes this
   ray_samples: int  # most samples of a ray
@@ -180,7 +181,7 @@ def place(chunk, settings, count, inputs, coordinates):
   scratch = chunk.d_color
   for n in range(count):
     ray = chunk.rays[13 * chunk.ray_of[n] : 13 * chunk.ray_of[n] + 13]
-    t, length = chunk.distance[n], chunk.length[n]
+    t = chunk.distance[n]
     x, y, z = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
     norm = max(_ONE, max(abs(x), max(abs(y), abs(z))))
     u, v, w = squash(x, y, z, norm)
@@ -189,6 +190,7 @@ def place(chunk, settings, count, inputs, coordinates):
     coordinates[3 * n + 2] = w
     spread = settings.pixel_angle * t
     across = ray[9] * spread * spread * _TWELFTH
+    length = settings.variance_step * norm
     along = length * length * _TWELFTH
     for i in range(3):
       d = ray[3 + i] * ray[3 + i]

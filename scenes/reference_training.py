@@ -17,7 +17,7 @@ from scenes.field import Field, init_params, layer_norm, query, squareplus
 from scenes.train_settings import TrainSettings
 from scenes.views import BlurPyramid, Views
 
-FAR = 24.0  # ours: rays end here [unit]; the squashed space is all but used up
+FAR = 16.0  # ours: rays end here [unit]; the squashed space is all but used up
 _PROPOSAL_BASE = 16  # cells along an axis of the proposal grid's coarsest level
 
 Params = dict[str, jax.Array]

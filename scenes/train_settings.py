@@ -21,6 +21,9 @@ class TrainSettings:
   """Learning rate after the warm-up. Mueller et al. 2022, section 4; the paper's table: 2e-3."""
   final_learning_rate: float = 3e-4
   """Learning rate at the end; the decay is exponential. Ours."""
+  variance_rate: float = 0.1
+  """Factor on the rate of the weights that see the variance. Ours: it gives away the direction and
+  the distance of the camera, and a field that learns those first finds no geometry."""
   warmup_steps: int = 64
   """Steps over which the learning rate rises from a hundredth. Ours; the paper's table: 2048."""
   weight_decay: float = 5e-5
@@ -47,24 +50,26 @@ class TrainSettings:
   """Composite over a random colour, so that dark surfaces cannot be empty. Mueller et al. 2022."""
 
   # Engine "fused".
-  batch_samples: int = 1 << 17
+  batch_samples: int = 1 << 15
   """Samples a step that are evaluated; the number of rays follows. Ours."""
   ray_samples: int = 256
   """Most samples of a ray. Ours."""
   transmittance_threshold: float = 1e-3
   """Samples behind this much light take no part. Ours; Mueller et al. 2022: 1e-4."""
-  depth_limit: float = 40.0
+  depth_limit: float = 10.0
   """A march ends where the occupancy grid's optical depth passes this. Ours."""
-  coarse_steps: int = 192
-  """Steps of the start that march four times, then twice as coarsely: nothing is empty yet. Ours."""
+  refine_samples: float = 24.0
+  """The march starts coarse and its step is halved when a ray has fewer samples than this. Ours."""
   inner_cells: int = 128
   """Occupancy cells along the unit cube: 4 cm in a room of 5 m. Mueller et al. 2022."""
   outer_cells: int = 64
   """Occupancy cells along the squashed space. Ours."""
   occupancy_interval: int = 16
   """Steps between updates of the occupancy. Mueller et al. 2022, appendix C."""
-  occupancy_sweep_steps: int = 256
-  """Steps of the start in which every second update looks at all cells. Mueller et al. 2022."""
+  occupancy_start: int = 192
+  """Step of the first update; until then nothing counts as empty. Mueller et al. 2022."""
+  occupancy_sweep_steps: int = 448
+  """Until this step every second update looks at all cells. Ours."""
   occupancy_samples: int = 1 << 17
   """Cells looked at in an update after that. Ours."""
   occupancy_decay: float = 0.8
