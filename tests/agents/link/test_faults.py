@@ -178,7 +178,8 @@ def test_kill_9_of_an_actor_returns_its_credits(learner, tmp_path):
 
 def test_malformed_messages_are_refused_and_counted(learner):
   link = _join(learner)
-  publisher = link._session.declare_publisher("nerf2real/trajectory/actor-1")
+  while not link.learner_is_there:
+    time.sleep(0.01)
   good = mini_learner.make_trajectory(1)
   values = {"actor": "actor-1", "number": 1}
   bad = [
@@ -191,12 +192,15 @@ def test_malformed_messages_are_refused_and_counted(learner):
     schema.encode("trajectory", values, good | {"image": good["image"][:, :5]}),
   ]
   for data in bad:
-    publisher.put(data)
+    link._publisher.put(data)
   with pytest.raises(schema.MessageError, match="whole number"):
     link.ask("credit", schema.encode("credit", {"actor": "a", "wanted": -1}), kind="grant")
   _act(link, 2)  # goes on
   assert link.drain(timeout=5)
-  status = link.status()["status"]
+  deadline = time.monotonic() + 5
+  while (status := link.status()["status"])["refused"] < len(bad) + 1:
+    assert time.monotonic() < deadline, status
+    time.sleep(0.02)
   assert status["refused"] == len(bad) + 1
   assert status["trajectories"] == 2
 
