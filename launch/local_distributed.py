@@ -204,7 +204,8 @@ class StatusView:
       "replay": f"{s['replay_steps']:,} steps",
       "link": f"queue {s['queue']}, dropped {s['dropped']}, refused {s['refused']}, "
       f"sent again {s['duplicates']}",
-      "parameters": f"{s['parameters_age']:.1f} s old, version {s['parameters_version']}",
+      "parameters": f"{s['parameters_age']:.1f} s old, version {s['parameters_version']}, "
+      f"actors at most {s['parameters_lag']} updates behind",
       "processes": f"{s['actors']} actors alive, {self._supervisor.restarts} restarts",
     }
     if time.monotonic() - self.answered > 5:

@@ -164,6 +164,10 @@ class LearnerLink:
       "outstanding": self.limiter.outstanding,
       "parameters_version": self._version,
       "parameters_age": time.monotonic() - self._published,
+      # Updates that the slowest living actor is behind the newest parameters.
+      "parameters_lag": max(
+        (self._version - r.parameters_version for r in self._actors.values() if r.alive), default=0
+      ),
     }
 
   def _gaps(self, *, alive: bool) -> int:
