@@ -13,6 +13,8 @@ import numpy as np
 from scenes import floor as floors
 from scenes import markers, overrides, similarity
 
+_MAX_DENSE = 300_000  # surface points that take part
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AlignSettings:
@@ -27,6 +29,7 @@ class AlignSettings:
   outliers: float = 0.01  # share of surface cells outside the extent, on each side
   floor: floors.FloorSettings = dataclasses.field(default_factory=floors.FloorSettings)
   floor_threshold: float = 0.04  # matter below this height counts as floor
+  max_floor_gap: float = 0.1  # dense above sparse floor, share of the cameras' height: a bad field
   refine_tolerance: float = 0.04  # of dense points about the floor
 
 
@@ -172,6 +175,10 @@ def align(
   report = progress or (lambda share, word: None)
   warnings: list[str] = []
   positions = frame_from_camera[:, :3, 3]
+  if surface_points is not None and len(surface_points) > _MAX_DENSE:
+    chosen = np.random.default_rng(0).choice(len(surface_points), _MAX_DENSE, replace=False)
+    surface_points = surface_points[chosen]
+    surface_normals = None if surface_normals is None else surface_normals[chosen]
   dense = points if surface_points is None else surface_points
   camera_up = np.array([0.0, 0, 1])
   try:
@@ -194,16 +201,15 @@ def align(
     if override.up is not None:  # a person's up is exact: only the height is searched
       search = dataclasses.replace(search, max_tilt_deg=1.0)
     floor_source = "plane" if override.up is None else "manual_up"
-    plane = None
-    # Dense depth shows the textureless floor that sparse points miss; reflections are rarer in it.
-    candidates = [points] if surface_points is None else [_thin(surface_points), points]
-    for cloud in candidates:
-      try:
-        plane = floors.find_floor(cloud, up=up, camera_positions=positions, settings=search)
-        break
-      except ValueError:
-        if cloud is candidates[-1]:
-          raise
+    plane, trusted = _search(points, surface_points, positions, up, search, settings)
+    if not trusted:
+      warnings.append(
+        "The field's depth shows its floor well above that of the sparse points: the field is "
+        "blurred, and so will be its contact geometry. Train it longer; floor, yaw and extent are "
+        "taken from the sparse points."
+      )
+      surface_points = surface_normals = None
+      dense = points
     if override.up is not None:
       plane = plane._replace(
         normal=up, offset=plane.offset + float((up - plane.normal) @ positions.mean(0))
@@ -285,6 +291,33 @@ def align(
     camera_height=float(np.median(plane.heights(positions))) * metres,
     warnings=tuple(warnings),
   )
+
+
+def _search(points, surface_points, positions, up, search, settings):
+  """Searches the floor in the dense and in the sparse points.
+
+  Dense depth shows the textureless floor that sparse points miss; sparse points are right even
+  where the field is a fog. Returns the floor and whether the dense points can be trusted.
+  """
+  found = []
+  for cloud in (None if surface_points is None else _thin(surface_points), points):
+    try:
+      found.append(
+        None
+        if cloud is None
+        else floors.find_floor(cloud, up=up, camera_positions=positions, settings=search)
+      )
+    except ValueError as error:
+      found.append(None)
+      reason = error
+  dense, sparse = found
+  if dense is None and sparse is None:
+    raise reason
+  if dense is None or sparse is None:
+    return (dense, True) if sparse is None else (sparse, surface_points is None)
+  centre = positions.mean(0)
+  above = 1 - float(dense.heights(centre)) / float(sparse.heights(centre))
+  return (dense, True) if above < settings.max_floor_gap else (sparse, False)
 
 
 def _thin(points: np.ndarray) -> np.ndarray:

@@ -2,10 +2,16 @@
 
 MuJoCo collides convex hulls only, and the hull of a room is a filled block. So the solid is cut
 into cells first; a cell whose hull covers no seen free space is a part as it is, the others are
-decomposed by CoACD; then neighbours are merged for as long as their common hull still keeps out of
-free space. Space that no ray reached counts as solid, unless it borders on seen free space, as
-under a table: so furniture and walls have an inside.
-Shapes: X, Y, Z voxels, P points, F faces.
+cut on, by planes along the axes (default) or by CoACD; then neighbours are merged for as long as
+their common hull still keeps out of free space. Space that no ray reached counts as solid, unless
+it borders on seen free space, as under a table: so furniture and walls have an inside.
+
+On a room of boxes both methods give as many parts (88 and 85) and about the same distances (95 %
+within 4.7 and 5.3 cm of the truth, back within 2.7 and 3.5 cm), but CoACD, which knows nothing of
+what was seen, took 200 s where the cuts took 5 s on the same busy machine.
+
+Source of CoACD: Wei et al. 2022, Approximate convex decomposition for 3D meshes with
+collision-aware concavity and tree search. Shapes: X, Y, Z voxels, P points, F faces.
 """
 
 import dataclasses

@@ -12,6 +12,7 @@ import numpy as np
 
 _MIN_POINTS = 30
 _PLANES = 12  # candidate planes that are peeled off one after another
+_SAME = 0.9  # of the lowest plane's distance from the cameras: 14 cm at 1.4 m
 _PEEL = 2.5  # tolerances taken off with a plane, or its noise would be the next, lower plane
 
 
@@ -166,7 +167,11 @@ def find_floor(
   largest = max(c.cover for c in candidates)
   large = [c for c in candidates if c.cover >= settings.min_cover * largest]
   centre = camera_positions.mean(0)
-  return max(large, key=lambda c: float(c.heights(centre)))
+  depths = [float(c.heights(centre)) for c in large]
+  # What is left of a floor after peeling may pass for a plane of its own: of those near the lowest
+  # the one with the most points is the floor.
+  lowest = [c for c, depth in zip(large, depths, strict=True) if depth > _SAME * max(depths)]
+  return max(lowest, key=lambda c: c.points)
 
 
 def refine_floor(floor: Floor, points: np.ndarray, *, tolerance: float) -> Floor:

@@ -1,9 +1,10 @@
 """The scene's surface as a triangle mesh: marching cubes, without floaters, coloured, as glTF.
 
 Two sources give the same `Grid`: depth pictures fused (`scenes.fusion`, the default) or the field's
-density at a threshold, as the paper does (section "Collision mesh extraction"). On the built-in
-room fusion is the more accurate one; the density needs the carving of `density_to_grid` to lose
-floaters. Shapes: V vertices, F faces, X, Y, Z voxels.
+density at a threshold, as the paper does (section "Collision mesh extraction"). Fusion needs no
+threshold and keeps out of space that no ray reached; a density needs one that depends on how long
+the field was trained, and `density_to_grid` carves its floaters with fused depth.
+Shapes: V vertices, F faces, X, Y, Z voxels.
 """
 
 import dataclasses

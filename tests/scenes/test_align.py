@@ -1,5 +1,6 @@
 """The world frame of an analytic room, seen through an arbitrary similarity."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -79,6 +80,21 @@ def test_sparse_points_alone_suffice(room):
   assert found.tilt_deg(transform.rotation @ [0, 0, 1]) < 0.5
   yaw = np.degrees(np.arctan2(total.rotation[1, 0], total.rotation[0, 0]))
   assert abs((yaw + 45) % 90 - 45) < 1.5
+
+
+def test_a_foggy_field_does_not_lift_the_floor(room):
+  """Depth that ends half way: the sparse points know better, and the warning says so."""
+  views, points = room
+  transform = unit_frame()
+  fog = dataclasses.replace(views, depth=views.depth * np.float32(0.6)).transformed(transform)
+  surface, normals = fog.surface_points(stride=2)
+  found = align.align(
+    points=transform.apply(points), frame_from_camera=fog.frame_from_camera,
+    surface_points=surface, surface_normals=normals, marker=marker(transform),
+  )  # fmt: skip
+  assert "blurred" in found.warnings[0]
+  assert abs((found.world_from_unit @ transform).translation[2]) < 0.03
+  assert found.tilt_deg(transform.rotation @ [0, 0, 1]) < 0.5
 
 
 def test_unknown_scale_is_loud_and_a_known_height_is_used(room):
