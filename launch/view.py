@@ -1,10 +1,11 @@
 """Shows a scene bundle, or a task in it, in the browser.
 
-  python launch/view.py out/livingroom
-  python launch/view.py --task nerf_nav
+python launch/view.py out/livingroom
+python launch/view.py --task nerf_nav
 """
 
 import dataclasses
+import os
 import sys
 import threading
 import time
@@ -47,7 +48,7 @@ class FieldView:
   """Draws the radiance field behind the scene from wherever a client looks."""
 
   def __init__(self, bundle: Bundle):
-    self._renderer = Renderer(Field.load(bundle.field_path))
+    self._renderer = Renderer(Field.load(bundle.field_path), threads=os.cpu_count() or 1)
     self._unit_from_world = bundle.world_from_unit.inverse()
     self._scale = bundle.world_from_unit.scale
     self._lock = threading.Lock()  # one picture at a time: the kernel takes a whole core
@@ -181,9 +182,7 @@ def main() -> None:
     if arguments.task is not None:
       from view_task import view_task  # beside this script
 
-      view_task(
-        arguments.task, scene=arguments.bundle, host=arguments.host, port=arguments.port
-      )
+      view_task(arguments.task, scene=arguments.bundle, host=arguments.host, port=arguments.port)
       return
     server = view_bundle(Bundle.load(arguments.bundle), host=arguments.host, port=arguments.port)
   except (ValueError, OSError) as error:

@@ -7,6 +7,7 @@ Each stage is a function of files and settings to a folder; `scenes.stages` cach
 
 import dataclasses
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -205,7 +206,7 @@ class Job:
     self.stages.run("poses", run, settings=self.settings.localise, inputs=self._keys("keyframes"))
     self.localisation = localising.load(self.folder("poses") / "sfm")
 
-  def _views(self) -> Views:
+  def views(self) -> Views:
     """The registered keyframes at training size."""
     found = self.localisation
     camera = found.camera
@@ -243,7 +244,8 @@ class Job:
   def renderer(self) -> Renderer:
     """The field, ready to render."""
     if self._renderer is None:
-      self._renderer = Renderer(Field.load(self.folder("field") / "field.safetensors"))
+      field = Field.load(self.folder("field") / "field.safetensors")
+      self._renderer = Renderer(field, threads=os.cpu_count() or 1)
     return self._renderer
 
   def figures(self) -> None:

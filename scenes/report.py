@@ -17,7 +17,6 @@ _THUMBNAILS = 18
 _THUMBNAIL_WIDTH = 240
 _SHOWN_VIEWS = 5
 _VIEW_WIDTH = 480
-_MESH_FACES = 40_000  # more makes the page slow to turn
 
 # name in scene.json -> (unit, what it means); names that are not here are shown without a text
 FIGURES: Mapping[str, tuple[str, str]] = {
@@ -91,7 +90,7 @@ def write(path: Path, data: ReportData) -> None:
 def _summary(data: ReportData) -> str:
   rows = []
   for name, value in data.figures.items():
-    if isinstance(value, Mapping):
+    if value is None or isinstance(value, Mapping):
       continue
     unit, text = FIGURES.get(name, ("", ""))
     rows.append((name, value, unit, text))
@@ -163,11 +162,8 @@ def _robot_views(data: ReportData) -> str:
 
 
 def _geometry(data: ReportData) -> str:
-  visual = data.visual
-  if len(visual.faces) > _MESH_FACES:
-    visual = visual.simplify_quadric_decimation(face_count=_MESH_FACES)
   surface = parts.figure_3d(
-    [parts.mesh_trace(visual, name="surface"), parts.path_trace(data.camera_path)]
+    [parts.mesh_trace(data.visual, name="surface"), parts.path_trace(data.camera_path)]
   )
   convex = parts.figure_3d(
     [
