@@ -55,6 +55,11 @@ def backward():
   return trainer, chunk, figures, gradient
 
 
+def _told_length(positions):
+  """Interval length that the variance tells of, however coarse the march is."""
+  return SETTINGS.field.march_step * jnp.maximum(jnp.abs(positions).max(-1), 1.0)
+
+
 def _reference_losses(params, trainer, chunk, count):
   """The same rays and samples in JAX: sums of the Charbonnier and the distortion loss."""
   rays, first = chunk.rays.reshape(-1, 13)[:count], chunk.first[: count + 1]
@@ -68,8 +73,9 @@ def _reference_losses(params, trainer, chunk, count):
   positions = origins[:, None] + directions[:, None] * distance[..., None]
   along = jnp.broadcast_to(directions[:, None], positions.shape)
   variance = sample_variance(
-    along, distance, length, pixel_angle=trainer.pixel_angle, footprint=rays[:, 9, None]
-  )
+    along, distance, _told_length(positions), pixel_angle=trainer.pixel_angle,
+    footprint=rays[:, 9, None],
+  )  # fmt: skip
   density, color = query(SETTINGS.field, params, positions, variance, along)
   weights = sampling.interval_weights(density, length)
   rest = 1 - weights.sum(1)
@@ -140,7 +146,7 @@ def test_render_agrees_with_a_sum_in_jax():
   t, edges, lengths = SETTINGS.near + 0.05, [], []
   while t < fused_march.FAR:
     norm = np.abs(origin + (t + 0.05) * direction).max()
-    length = 0.1 * max(norm, 1.0)
+    length = 0.1 if norm < 1 else 0.2 * norm
     edges.append(t + length / 2)
     lengths.append(length)
     t += length
@@ -148,7 +154,8 @@ def test_render_agrees_with_a_sum_in_jax():
   lengths = np.array(lengths[: SETTINGS.ray_samples], np.float32)[None]
   positions = (origin + edges[..., None] * direction).astype(np.float32)
   along = np.broadcast_to(direction.astype(np.float32), positions.shape)
-  variance = sample_variance(along, edges, lengths, pixel_angle=0.05, footprint=4.0)
+  told = _told_length(positions)
+  variance = sample_variance(along, edges, told, pixel_angle=0.05, footprint=4.0)
   density, colors = query(field.settings, field.params, positions, variance, along)
   weights = sampling.interval_weights(density, lengths)
   np.testing.assert_allclose(color[0], (weights[..., None] * colors).sum(1)[0], atol=2e-3)
