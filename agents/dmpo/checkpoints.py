@@ -20,7 +20,7 @@ from agents.dmpo.learning import TrainingState
 
 NEWEST, BEST = "newest", "best"
 _KEEP = {NEWEST: 2, BEST: 1}
-_NAME = re.compile(r"(newest|best)-(\d{10})")
+_NAME = re.compile(r"(newest|best)-\d{10}-\d{12}")  # kind, updates, environment steps
 
 
 class CheckpointError(RuntimeError):
@@ -54,13 +54,13 @@ class Checkpoints:
 
     Args:
       state: the training state.
-      info: settings and counters; what JSON can hold.
+      info: settings and counters, `steps` (environment steps) among them; what JSON can hold.
       kind: NEWEST or BEST.
 
     Raises:
       CheckpointError: if it cannot be written, such as on a full disk; older ones stay.
     """
-    path = self._folder / f"{kind}-{int(state.steps):010d}"
+    path = self._folder / f"{kind}-{int(state.steps):010d}-{info['steps']:012d}"
     if path in self.list(kind):
       return path
     try:

@@ -103,12 +103,12 @@ def test_a_failing_write_leaves_the_old_checkpoint_whole(state, tmp_path, monkey
   monkeypatch.setattr(saved._checkpointer, "save", fail)
   with pytest.raises(CheckpointError, match="disk is full.*newest-0000000001"):
     saved.save(_at(state, 2), {"steps": 2})
-  assert [p.name for p in tmp_path.iterdir()] == ["newest-0000000001"]
+  assert [p.name for p in tmp_path.iterdir()] == ["newest-0000000001-000000000001"]
   monkeypatch.undo()
   assert saved.restore(state)[1]["steps"] == 1
 
 
 def test_info_is_read_without_the_state(state, tmp_path):
   assert checkpoints.read_info(tmp_path) is None
-  Checkpoints(tmp_path / "checkpoints").save(_at(state, 1), {"environment": "x"})
-  assert checkpoints.read_info(tmp_path) == {"environment": "x"}
+  Checkpoints(tmp_path / "checkpoints").save(_at(state, 1), {"steps": 4})
+  assert checkpoints.read_info(tmp_path) == {"steps": 4}
