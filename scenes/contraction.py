@@ -1,7 +1,7 @@
 """Space squashing: the whole of space fits into the cube [-2, 2]^3, the unit cube stays as it is.
 
-Source: Barron et al. 2022, Mip-NeRF 360, equation 10, with the maximum norm instead of the Euclidean
-one, so that the squashed space is a cube and fills a grid.
+Source: Barron et al. 2022, Mip-NeRF 360, equation 10, with the maximum norm in place of the
+Euclidean one, so that the squashed space is a cube and fills a grid.
 """
 
 import jax

@@ -93,9 +93,9 @@ def spherical_harmonics(directions: jax.Array) -> jax.Array:
 def blur_footprint(blur: jax.Array, *, rule: str) -> jax.Array:
   """Factor by which a Gaussian blur [pixel] widens a pixel's variance.
 
-  "additive": variances add, 1 + 12 blur^2, because a pixel is a box of variance 1/12 (ours; it tells
-  the renderer the blur that equals a coarser camera's pixel). "paper": 1 + blur - sigma_min with
-  sigma_min = 0 (NeRF2Real, section NeRF training).
+  "additive": variances add, 1 + 12 blur^2, because a pixel is a box of variance 1/12 (ours; it
+  tells the renderer the blur that equals a coarser camera's pixel). "paper": 1 + blur -
+  sigma_min with sigma_min = 0 (NeRF2Real, section NeRF training).
   """
   if rule == "additive":
     return 1.0 + 12.0 * blur * blur

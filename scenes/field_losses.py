@@ -1,4 +1,4 @@
-"""Losses of the field's training, each a mean over rays. Shapes: R rays, N intervals, M intervals."""
+"""Losses of the field's training, each a mean over rays. Shapes: R rays, N and M intervals."""
 
 import jax
 import jax.numpy as jnp

@@ -303,7 +303,8 @@ class FusedTrainer:
     resolutions, entries = engine.resolutions, engine.entries
     fused_kernels.train_rays(
       self.pictures, engine.kernel, engine.occupancy, engine.network, self._gradient_networks[0],
-      self.table, resolutions, entries, engine.chunks[0], np.uint64(0), 0, 0, np.float32(0), figures,
+      self.table, resolutions, entries, engine.chunks[0], np.uint64(0), 0, 0, np.float32(0),
+      figures,
     )  # fmt: skip
     fused_grid.scatter_level(self.gradient, 0, resolutions[0], entries, nothing, 0, nothing, 1)
     fused_grid.adam(

@@ -1,6 +1,6 @@
 """The hash grid in numba: interpolation, its gradient and the optimiser's step on the table.
 
-The table is flat float32 [L * T * 2]: row (level * T + index) holds two features. Shapes: N samples.
+The table is flat float32 [L * T * 2]: row (level * T + index) holds two features. Shapes: N points.
 """
 
 import numba

@@ -1,8 +1,8 @@
 """The fused training and rendering kernels: rays in, gradients or colours out, in numba.
 
 A thread works through chunks of a few hundred samples that stay in its cache: march, encode, base
-network, drop what lies behind matter, view network, composite, losses, and all of it backwards. Flat
-float32 arrays. Shapes: N samples of a chunk, R rays of a chunk, S samples of a step.
+network, drop what lies behind matter, view network, composite, losses, and all of it backwards.
+Flat float32 arrays. Shapes: N samples of a chunk, R rays of a chunk, S samples of a step.
 """
 
 from typing import NamedTuple

@@ -20,17 +20,16 @@ def ssim(picture: np.ndarray, truth: np.ndarray) -> float:
   similarity; their constants, windows of 11 pixels with a deviation of 1.5.
   """
   _check(picture, truth)
-  return float(
-    skimage.metrics.structural_similarity(
-      picture,
-      truth,
-      channel_axis=-1,
-      data_range=255,
-      gaussian_weights=True,
-      sigma=1.5,
-      use_sample_covariance=False,
-    )  # fmt: skip
+  value = skimage.metrics.structural_similarity(
+    picture,
+    truth,
+    channel_axis=-1,
+    data_range=255,
+    gaussian_weights=True,
+    sigma=1.5,
+    use_sample_covariance=False,
   )
+  return float(value)
 
 
 def _check(picture: np.ndarray, truth: np.ndarray) -> None:

@@ -1,9 +1,9 @@
 """Small matrix products for numba kernels, with the accumulators held in vector registers.
 
-numba leaves sums over an inner index in memory, which costs a factor of five in products as small as
-the field's layers. Here the inner tile is written as LLVM instructions on 16-lane vectors: a tile of
-rows x 16 columns stays in registers over the whole sum. LLVM maps 16 lanes to whatever the machine
-has (AVX-512, AVX2, NEON).
+numba leaves sums over an inner index in memory, which costs a factor of five in products as small
+as the field's layers. Here the inner tile is written as LLVM instructions on 16-lane vectors: a
+tile of rows x 16 columns stays in registers over the whole sum. LLVM maps 16 lanes to whatever
+the machine has (AVX-512, AVX2, NEON).
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Trains a radiance field on posed pictures; can be interrupted and continued.
 
-Two engines do the steps: the fused kernels for CPU cores, and JAX as the reference and for GPUs. Both
-train the same field and write the same file.
+Two engines do the steps: the fused kernels for CPU cores, and JAX as the reference and for GPUs.
+Both train the same field and write the same file.
 """
 
 import dataclasses

@@ -34,7 +34,7 @@ class Views:
       )
     if self.world_from_camera.shape != (count, 4, 4) or len(self.names) != count:
       raise ValueError(
-        f"Found {count} pictures, poses {self.world_from_camera.shape} and {len(self.names)} names; "
+        f"Found {count} pictures, poses {self.world_from_camera.shape}, {len(self.names)} names; "
         "expected one pose [4, 4] and one name a picture."
       )
     if not np.isfinite(self.world_from_camera).all():
@@ -50,7 +50,7 @@ class Views:
     return Views(self.camera, self.images[indices], self.world_from_camera[indices], names)
 
   def split(self, every: int = 8) -> tuple["Views", "Views"]:
-    """Returns (training, held out): every `every`-th picture is held out, as in LLFF and Mip-NeRF."""
+    """Returns (training, held out): one of `every` pictures is held out, as LLFF does."""
     held = np.arange(len(self)) % every == every // 2
     if held.all() or not held.any():
       raise ValueError(

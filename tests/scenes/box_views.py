@@ -1,4 +1,4 @@
-"""A room that needs no renderer: rays from inside a box, colours a formula of the point they hit."""
+"""A room that needs no renderer: a box seen from inside, colours a formula of the point hit."""
 
 import numpy as np
 
