@@ -42,8 +42,15 @@ class FieldSettings:
   """Numbers that the base network hands to the view network, B. Ours: 1 + 3 + 12 is one vector."""
   view_width: int = 32
   """Width of the view network, V. Paper, NeRF table."""
+  table_init: float = 1e-2
+  """The table's first values are uniform within this. Ours: the layer norm's constant must not hide
+  the first steps; Mueller et al. 2022: 1e-4."""
   density_bias: float = -5.0
   """Added before squareplus. Paper, NeRF table."""
+  density_gain: float = 40.0
+  """Factor on the network's output before the bias; 1 is the paper's. Ours: squareplus falls off as
+  1/x only, so free space stays a fog for thousands of steps with 1 (measured after 60 s of training
+  at half size: 22.1 dB with 1, 23.1 with 10, 24.6 with 40; with 120 training fails)."""
   density_scale: float = 1.0
   """Density [1/unit] per unit of squareplus. Ours: with 10 the tail of squareplus leaves fog."""
   specular_bias: float = -3.0
@@ -98,12 +105,14 @@ def layer_norm(x: jax.Array) -> jax.Array:
 
 
 def init_params(key: jax.Array, settings: FieldSettings) -> dict[str, jax.Array]:
-  """Draws parameters: table uniform in +-1e-4 (Mueller et al. 2022), matrices Glorot uniform."""
+  """Draws parameters: table uniform in +-`table_init`, matrices Glorot uniform."""
   params: dict[str, jax.Array] = {}
   for name, shape in settings.shapes.items():
     key, draw = jax.random.split(key)
     if name == "table":
-      params[name] = jax.random.uniform(draw, shape, minval=-1e-4, maxval=1e-4)
+      params[name] = jax.random.uniform(
+        draw, shape, minval=-settings.table_init, maxval=settings.table_init
+      )
     elif len(shape) == 2:
       limit = float(np.sqrt(6.0 / sum(shape)))
       params[name] = jax.random.uniform(draw, shape, minval=-limit, maxval=limit)
@@ -125,7 +134,9 @@ def _base(
   inputs = jnp.concatenate([features, encoding.variance_features(variances)], axis=-1)
   hidden = layer_norm(jax.nn.swish(inputs @ params["base_w1"] + params["base_b1"]))
   outputs = hidden @ params["base_w2"] + params["base_b2"]
-  density = settings.density_scale * squareplus(outputs[..., 0] + settings.density_bias)
+  density = settings.density_scale * squareplus(
+    settings.density_gain * outputs[..., 0] + settings.density_bias
+  )
   return density, outputs[..., 1:]
 
 

@@ -136,6 +136,7 @@ def kernel_settings(
   """Collects the numbers that the kernels need."""
   f = np.float32
   return fused_kernels.Settings(
+    density_gain=f(field.density_gain),
     density_bias=f(field.density_bias),
     density_scale=f(field.density_scale),
     specular_bias=f(field.specular_bias),

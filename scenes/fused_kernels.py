@@ -47,6 +47,7 @@ class Pictures(NamedTuple):
 class Settings(NamedTuple):
   """Numbers that the kernel needs."""
 
+  density_gain: float
   density_bias: float
   density_scale: float
   specular_bias: float
@@ -205,7 +206,7 @@ def place(chunk, settings, count, inputs, coordinates):
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", inline="always")
 def density_of(raw, settings):
   """Density by squareplus, without cancellation for very negative inputs."""
-  z = raw + settings.density_bias
+  z = settings.density_gain * raw + settings.density_bias
   root = np.sqrt(z * z + _FOUR)
   ramp = _HALF * (z + root) if z > _ZERO else _TWO / (root - z)
   return settings.density_scale * ramp
@@ -333,10 +334,10 @@ def _ray_losses(chunk, settings, r, outputs):
     n = stop - 1 - back
     d_density = chunk.length[n] * (chunk.through[n] * chunk.d_weight[n] - later)
     later += chunk.weight[n] * chunk.d_weight[n]
-    z = chunk.out[n * outputs] + settings.density_bias
+    z = settings.density_gain * chunk.out[n * outputs] + settings.density_bias
     root = np.sqrt(z * z + _FOUR)
     slope = _HALF * (_ONE + z / root) if z > _ZERO else _TWO / (root * (root - z))
-    chunk.d_out[n * outputs] = d_density * settings.density_scale * slope
+    chunk.d_out[n * outputs] = settings.density_gain * settings.density_scale * d_density * slope
   return (e0 * e0 + e1 * e1 + e2 * e2) * _THIRD, photometric, distortion
 
 

@@ -91,7 +91,9 @@ def proposal_density(
     if layer < settings.proposal_depth - 1:
       x = jax.nn.swish(x)
       x = layer_norm(x) if layer == settings.proposal_depth - 2 else x
-  return settings.field.density_scale * squareplus(x[..., 0] + settings.field.density_bias)
+  return settings.field.density_scale * squareplus(
+    settings.field.density_gain * x[..., 0] + settings.field.density_bias
+  )
 
 
 class Rendered(NamedTuple):

@@ -93,6 +93,7 @@ def pack(settings: Any, params: Any) -> Packed:
   w2 = np.zeros((settings.width + 1, lanes))
   w2[:-1, :outputs] = array["base_w2"] - array["base_w2"].mean(0)
   w2[-1, :outputs] = array["base_b2"]
+  w2[:, 0] *= settings.density_gain
   w2[-1, 0] += settings.density_bias
   base = [array["base_b1"], w1[2 * count :], first, second, w2]
   bottleneck, harmonics = np.split(array["view_w1"], [settings.bottleneck])

@@ -115,7 +115,9 @@ def preset(name: str) -> TrainSettings:
     return TrainSettings()
   if name == "paper":
     return TrainSettings(
-      field=FieldSettings(levels=12, log2_table_size=20, growth=(2048 / 16) ** (1 / 11)),
+      field=FieldSettings(
+        levels=12, log2_table_size=20, growth=(2048 / 16) ** (1 / 11), density_gain=1.0
+      ),
       engine="jax",
       max_steps=40_000,
       max_seconds=None,
