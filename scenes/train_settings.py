@@ -38,6 +38,9 @@ class TrainSettings:
   """Padding of the Charbonnier loss, in colours of [0, 1]. Paper, NeRF table."""
   distortion_weight: float = 1e-2
   """Weight of the distortion loss. Paper, NeRF table."""
+  distortion_start: int = 1000
+  """Step at which the distortion loss sets in; it has its weight at twice this step. Ours: from the
+  start it favours fog before the camera. The paper's table has no such value."""
   blur_max: float = 12.0
   """Largest blur of a training ray [training pixel]; 0 turns the augmentation off. Paper."""
   blur_sharp_fraction: float = 0.5
@@ -99,6 +102,12 @@ class TrainSettings:
   sample_dilation: float = 1e-3
   """Proposal weights are spread by this normalised distance. Paper, NeRF table."""
 
+  def distortion_ramp(self, step: int) -> float:
+    """Factor on the distortion loss's weight at a step."""
+    if self.distortion_start == 0:
+      return 1.0
+    return min(max(step / self.distortion_start - 1.0, 0.0), 1.0)
+
   def __post_init__(self):
     if self.engine not in ("fused", "jax"):
       raise ValueError(f"Unknown engine {self.engine!r}; expected 'fused' or 'jax'.")
@@ -124,6 +133,7 @@ def preset(name: str) -> TrainSettings:
       learning_rate=2e-3,
       final_learning_rate=4e-5,
       warmup_steps=2048,
+      distortion_start=0,
       blur_sharp_fraction=0.0,
       blur_power=1.0,
     )
