@@ -122,7 +122,8 @@ BASE = r"""
   LANES for (int k = 0; k < OUTPUTS; ++k)
     out[k] = ((even[k] + odd[k]) + (third[k] + fourth[k])) * gain + rows[WIDTH * OUTPUTS + k];
   float raw = out[0];
-  out[0] = DENSITY_SCALE * 0.5f * (raw + sqrtf(raw * raw + 4.0f));
+  float root = sqrtf(raw * raw + 4.0f);
+  out[0] = DENSITY_SCALE * (raw > 0.0f ? 0.5f * (raw + root) : 2.0f / (root - raw));
   return out;
 """
 

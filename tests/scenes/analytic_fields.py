@@ -1,5 +1,6 @@
 """Fields whose matter is known in closed form, made by writing a distance into the hash grid."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ def from_signed_distance(
 
   Args:
     signed_distance: Maps points [..., 3] of the unit frame to distances [...], positive outside.
-    settings: The shape; its finest dense level carries the distance.
+    settings: The shape; its finest dense level carries the distance. The density is 10 squareplus.
     slope: Feature per unit of distance; small ones make a soft surface where there is texture.
     texture: Amplitude of random features on all levels and of random colour weights.
     seed: Of the random numbers.
@@ -32,6 +33,7 @@ def from_signed_distance(
   settings = settings or FieldSettings(
     levels=2, log2_table_size=15, base_resolution=31, growth=1.0001
   )
+  settings = dataclasses.replace(settings, density_gain=1.0, density_scale=10.0)
   random = np.random.default_rng(seed)
   params = {
     name: (texture * random.normal(size=shape)).astype(np.float32)

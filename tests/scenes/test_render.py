@@ -20,7 +20,7 @@ MATTER = 192.4  # density [1/unit] of analytic matter: 10 squareplus(3 * 64 / sq
 LENS = Camera(
   width=64, height=48, fx=50.0, fy=52.0, cx=31.0, cy=25.0, k1=-0.25, k2=0.06, p1=0.01, p2=-0.008
 )
-FINE = render.RenderSettings(step=0.004, steps_per_footprint=4.0, near=0.0)
+FINE = render.RenderSettings(step=0.004, steps_per_footprint=4.0, near=0.0, stop=0.02)
 
 
 def _soft_field(**settings) -> Field:
@@ -70,7 +70,9 @@ def test_agrees_with_the_jax_reference(shape, angle):
   # Random cells, inside and outside the unit cube, make every kind of skip happen.
   occupied = np.random.default_rng(0).random((32, 32, 32)) < 0.15
   occupancy = Occupancy.from_occupied(occupied)
-  settings = render.RenderSettings(stop=0.0, weight_floor=0.0, far=5.0, specular_per_sample=True)
+  settings = render.RenderSettings(
+    step=0.012, stop=0.0, weight_floor=0.0, far=5.0, specular_per_sample=True
+  )
   renderer = render.Renderer(field, settings=settings, occupancy=occupancy)
   origins, directions = _random_rays(200)
   color, distance, opacity = renderer.render_rays(origins, directions, angle)
