@@ -303,7 +303,7 @@ class Learner:
       self._write("learner", {k: float(v) for k, v in metrics.items()} | self._status())
     self.save()
     self.link.close()
-    self._session.close()
+    sessions.close(self._session)
     self._checkpoints.close()
     self._log.close()
 

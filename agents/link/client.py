@@ -15,6 +15,7 @@ from agents.link import schema
 from agents.link.delivery import Outbox
 from agents.link.schema import MessageError
 from agents.link.sessions import LinkSettings
+from agents.link.sessions import close as close_session
 
 _PARAMETERS_TIMEOUT = 30.0  # s; 8 MB take 0.1 s
 
@@ -157,4 +158,4 @@ class ActorLink:
     """Leaves."""
     for entity in (self._token, self._publisher, self._metrics):
       entity.undeclare()
-    self._session.close()
+    close_session(self._session)

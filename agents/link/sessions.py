@@ -7,11 +7,14 @@ it is stands beside it; the figures were measured with eclipse-zenoh 1.10.
 import dataclasses
 import ipaddress
 import json
+import logging
 import time
 from pathlib import Path
 from typing import Any
 
 import zenoh
+
+_log = logging.getLogger(__name__)
 
 # With congestion control BLOCK a put waits this long for a stalled receiver before it closes the
 # transport, after which puts vanish. The default of 5 s is shorter than a compilation.
@@ -127,6 +130,14 @@ def connect(endpoint: str, settings: LinkSettings, *, timeout: float) -> zenoh.S
           f"the user or the password ({_first_line(error)})."
         ) from error
     time.sleep(0.2)
+
+
+def close(session: zenoh.Session) -> None:
+  """Closes a session; one whose peer is stalled is left to close by itself."""
+  try:
+    session.close()
+  except zenoh.ZError as error:
+    _log.warning("The link was not closed in order: %s", _first_line(error))
 
 
 def is_loopback(endpoint: str) -> bool:

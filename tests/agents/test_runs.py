@@ -17,7 +17,8 @@ from agents.dmpo.export import load_policy
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = [
   "--set", "network.policy_layers=[16,16]", "--set", "network.critic_layers=[16,16]",
-  "--set", "min_replay_steps=200", "--set", "num_samples=4", "--evaluation-period", "300",
+  "--set", "batch_size=4", "--set", "min_replay_steps=200", "--set", "num_samples=4",
+  "--evaluation-period", "300",
   "--evaluation-episodes", "1", "--log-period", "0.5",
 ]  # fmt: skip
 CARTPOLE = ["--env", "dm_control:cartpole:swingup", "--preset", "state"]

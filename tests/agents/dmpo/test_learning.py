@@ -122,12 +122,12 @@ def test_it_learns_a_one_step_problem():
   functions = learning.make_learning(settings, layout)
   state = jax.jit(functions.init)(jax.random.key(0))
   rng = np.random.default_rng(0)
-  for _ in range(300):
-    actions = rng.uniform(-1, 1, (128, 2, 1)).astype(np.float32)
+  for _ in range(200):
+    actions = rng.uniform(-1, 1, (64, 2, 1)).astype(np.float32)
     batch = {
-      "state": np.ones((128, 2, 1), np.float32), "privileged": np.zeros((128, 2, 0), np.float32),
+      "state": np.ones((64, 2, 1), np.float32), "privileged": np.zeros((64, 2, 0), np.float32),
       "action": actions, "reward": 1 - (actions[..., 0] - 0.5) ** 2,
-      "discount": np.zeros((128, 2), np.float32), "last": np.ones(128, np.int32),
+      "discount": np.zeros((64, 2), np.float32), "last": np.ones(64, np.int32),
     }  # fmt: skip
     state, metrics = functions.update(state, batch)
   head = networks.policy_head(state.policy, jnp.zeros((1, 0)), jnp.ones((1, 1)), settings.network)

@@ -26,6 +26,7 @@ def _inputs(seed: int = 0, dtype=np.float32):
   return jax.tree.map(lambda x: jnp.asarray(x, dtype), (duals, online, target, actions, values))
 
 
+@functools.partial(jax.jit, static_argnames="penalty")
 def _ours(duals, online, target, actions, values, *, penalty, weights=None):
   return losses.mpo_loss(
     duals,
@@ -39,6 +40,7 @@ def _ours(duals, online, target, actions, values, *, penalty, weights=None):
   )
 
 
+@functools.partial(jax.jit, static_argnames="penalty")
 def _rlax(duals, online, target, actions, values, *, penalty):
   rlax = pytest.importorskip("rlax", reason="rlax (the test extra) is not installed")
   project = losses.positive
@@ -89,9 +91,10 @@ def test_mpo_agrees_with_rlax(seed, penalty):
 @pytest.mark.parametrize("penalty", [False, True])
 def test_gradients_agree_with_rlax(penalty):
   duals, online, *rest = _inputs(3)
-  ours = jax.grad(lambda d, o: _ours(d, o, *rest, penalty=penalty)[0], (0, 1))(duals, online)
-  theirs = jax.grad(lambda d, o: _rlax(d, o, *rest, penalty=penalty), (0, 1))(duals, online)
-  jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), ours, theirs)
+  ours = jax.jit(jax.grad(lambda d, o: _ours(d, o, *rest, penalty=penalty)[0], (0, 1)))
+  theirs = jax.jit(jax.grad(lambda d, o: _rlax(d, o, *rest, penalty=penalty), (0, 1)))
+  compare = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+  jax.tree.map(compare, ours(duals, online), theirs(duals, online))
 
 
 def test_gradients_agree_with_finite_differences():
@@ -108,7 +111,8 @@ def test_gradients_agree_with_finite_differences():
       total, metrics = _ours(duals, Gaussian(mean, stddev), *rest, penalty=True)
       return total - metrics["loss_alpha"]
 
-    gradients = jax.grad(loss, (0, 1))(online.mean, online.stddev)
+    value = jax.jit(value)
+    gradients = jax.jit(jax.grad(loss, (0, 1)))(online.mean, online.stddev)
     step = 1e-6
     for argument, (array, gradient) in enumerate(zip(online, gradients, strict=True)):
       for index in [(0, 0), (2, 1), (4, 2)]:
