@@ -226,19 +226,21 @@ def build(layout: Layout) -> Kernels:
     deviations: wp.vec2,
     largest: wp.array(dtype=wp.float32),
   ):
-    """Largest density of the centres of a cell's octants, for both sample sizes in turn."""
+    """Largest density of a cell's corners and centre, for both sample sizes in turn."""
     thread = wp.tid()
     cell = cells[thread]
     corner = wp.vec3(
       wp.float32(cell % side), wp.float32((cell // side) % side), wp.float32(cell // (side * side))
     )
     found = wp.float32(0.0)
-    for octant in range(8):
-      x, y, z = octant & 1, (octant >> 1) & 1, octant >> 2
-      centre = wp.vec3(wp.float32(x), wp.float32(y), wp.float32(z)) * 0.5
-      p = (corner + centre + wp.vec3(0.25, 0.25, 0.25)) / wp.float32(side)
+    for point in range(9):
+      x, y, z = point & 1, (point >> 1) & 1, (point >> 2) & 1
+      offset = wp.vec3(wp.float32(x), wp.float32(y), wp.float32(z))
+      if point == 8:
+        offset = wp.vec3(0.5, 0.5, 0.5)
+      p = (corner + offset) / wp.float32(side)
       squashed = wp.max(wp.max(wp.abs(p[0] - 0.5), wp.abs(p[1] - 0.5)), wp.abs(p[2] - 0.5)) * 4.0
-      norm = wp.where(squashed > 1.0, 1.0 / (2.0 - squashed), 1.0)
+      norm = wp.where(squashed > 1.0, 1.0 / wp.max(2.0 - squashed, 1e-3), 1.0)
       deviation = deviations[(x + y + z) % 2] * norm
       variance = deviation * deviation
       base = base_network(

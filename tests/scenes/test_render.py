@@ -159,14 +159,15 @@ def test_early_stop_and_weight_floor_change_little():
   origins, directions = _random_rays(300)
   expected_color, expected_distance, _ = slow.render_rays(origins, directions, 0.01)
   color, distance, _ = fast.render_rays(origins, directions, 0.01)
-  assert 0 < np.abs(color - expected_color).max() < 0.03
+  assert 0 < np.abs(color - expected_color).max() < 0.04
   np.testing.assert_allclose(distance, expected_distance, atol=1e-5)
 
 
 def test_one_specular_colour_a_ray_is_close_to_one_a_sample():
   field = _soft_field(levels=4, log2_table_size=14)
-  each = render.Renderer(field, settings=render.RenderSettings(specular_per_sample=True, far=4.0))
-  mean = render.Renderer(field, settings=render.RenderSettings(far=4.0), occupancy=each.occupancy)
+  each = render.Renderer(field, settings=render.RenderSettings(far=4.0))
+  once = render.RenderSettings(specular_per_sample=False, far=4.0)
+  mean = render.Renderer(field, settings=once, occupancy=each.occupancy)
   origins, directions = _random_rays(300)
   expected, expected_distance, _ = each.render_rays(origins, directions, 0.01)
   color, distance, _ = mean.render_rays(origins, directions, 0.01)
