@@ -106,7 +106,7 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
       views=evaluate.load_scores(job.folder("figures")),
       robot_views=robot_views,
       baseline=baseline,
-      visual=trimesh.load(out / "visual.glb", force="mesh"),
+      visual=trimesh.load_mesh(out / "visual.glb"),
       collision=[trimesh.Trimesh(part.vertices, part.faces) for part in parts],
       free_space_picture=_map_picture(space, goals, path),
     ),

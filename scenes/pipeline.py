@@ -421,7 +421,7 @@ class Job:
       surface = poisson.poisson_mesh(
         found.points, found.point_colors, camera_positions=found.world_from_camera[:, :3, 3]
       )
-      pictures = {}
+      pictures: dict[str, Any] = {}
       for index, name in enumerate(held_out.names):
         pose = held_out.world_from_camera[index]
         pictures[name] = poisson.render_mesh(surface, held_out.camera, pose)[0]

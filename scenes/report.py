@@ -106,7 +106,7 @@ def _keyframes(data: ReportData) -> str:
   chosen = np.unique(np.linspace(0, len(data.keyframes) - 1, _THUMBNAILS).astype(int))
   pictures = []
   for index in chosen:
-    image = cv2.imread(str(data.keyframes[index]))
+    image: Any = cv2.imread(str(data.keyframes[index]))
     height = round(image.shape[0] * _THUMBNAIL_WIDTH / image.shape[1])
     image = cv2.resize(image, (_THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
     pictures.append(parts.picture(image[..., ::-1], data.keyframes[index].stem))
