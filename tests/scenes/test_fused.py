@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_cdt
 
-from scenes import field_losses, fused, fused_grid, fused_kernels, fused_march, sampling
+from scenes import (
+  field_losses,
+  fused,
+  fused_engine,
+  fused_grid,
+  fused_kernels,
+  fused_march,
+  sampling,
+)
 from scenes.encoding import sample_variance
 from scenes.field import Field, FieldSettings, init_params, query, query_density
 from scenes.train_settings import TrainSettings
@@ -50,7 +58,7 @@ def backward():
       trainer.gradient, level, resolution, engine.entries, chunk.coordinates, int(figures[1]),
       chunk.d_features, len(engine.resolutions),
     )  # fmt: skip
-  gradient = fused.unflatten(SETTINGS.field, trainer._gradients[0])
+  gradient = fused_engine.unflatten(SETTINGS.field, trainer._gradients[0])
   gradient["table"] = trainer.gradient.reshape(SETTINGS.field.shapes["table"])
   return trainer, chunk, figures, gradient
 
@@ -201,4 +209,4 @@ def test_march_visits_every_occupied_cell_on_its_way():
 
 def test_shapes_that_the_kernels_cannot_run_are_refused():
   with pytest.raises(ValueError, match=r"levels \* features = 10"):
-    fused.check_supported(FieldSettings(levels=5))
+    fused_engine.check_supported(FieldSettings(levels=5))
