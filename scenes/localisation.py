@@ -21,7 +21,7 @@ from scenes.sources import to_opencv
 _FIGURES = "localisation.json"
 
 
-class LocalisationError(RuntimeError):
+class LocalisationError(ValueError):
   """The keyframes do not connect; the message says how many did, why, and what to film."""
 
 
