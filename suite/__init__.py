@@ -3,6 +3,12 @@
 `suite.load("nerf_nav")` returns a dm_control environment in the built-in room.
 """
 
-from suite.loading import ALL_TASKS, load
+import warnings
+
+# Without MUJOCO_GL, dm_control tries GLFW when it is imported, which warns if there is no display.
+# The simulation needs none; `overview`, which draws with GL, says itself what is missing.
+warnings.filterwarnings("ignore", ".*DISPLAY environment variable is missing", module="glfw")
+
+from suite.loading import ALL_TASKS, load  # noqa: E402  (the filter must come first)
 
 __all__ = ["ALL_TASKS", "load"]
