@@ -100,16 +100,21 @@ class ClientLoop:
 
 def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
   """Adds meshes, parts, cameras and the free-space map, each with a switch."""
-  visual = trimesh.load(bundle.visual_path, force="mesh")
+  visual = trimesh.load_mesh(bundle.visual_path)
   shown = server.scene.add_mesh_trimesh("/visual", visual)
   shown.visible = False
   parts = []
   for index, path in enumerate(bundle.collision_parts):
-    part = trimesh.load(path, force="mesh")
-    rgb = tuple(int(part_color(index)[k : k + 2], 16) for k in (1, 3, 5))
+    part = trimesh.load_mesh(path)
+    red, green, blue = (int(part_color(index)[k : k + 2], 16) for k in (1, 3, 5))
     parts.append(
       server.scene.add_mesh_simple(
-        f"/parts/{index:03d}", part.vertices, part.faces, color=rgb, opacity=0.85, flat_shading=True
+        f"/parts/{index:03d}",
+        part.vertices,
+        part.faces,
+        color=(red, green, blue),
+        opacity=0.85,
+        flat_shading=True,
       )
     )
     parts[-1].visible = False

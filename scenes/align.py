@@ -98,7 +98,7 @@ def wall_yaw(normals: np.ndarray, *, weights: np.ndarray | None = None) -> float
   share = np.ones(len(angle)) if weights is None else weights[upright]
   bins = 90
   counts, _ = np.histogram(angle, bins, (0, np.pi / 2), weights=share)
-  smooth = sum(np.roll(counts, shift) for shift in range(-3, 4))
+  smooth = sum((np.roll(counts, shift) for shift in range(-3, 4)), np.zeros(bins))
   mode = (np.argmax(smooth) + 0.5) * np.pi / 2 / bins
   if smooth.max() < 1.5 * 7 / bins * counts.sum():  # no direction stands out
     return None

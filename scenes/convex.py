@@ -152,7 +152,7 @@ def _piece_points(piece: np.ndarray, start: np.ndarray, matter: _Matter) -> np.n
   for axis in range(3):
     for side in (-1, 1):
       inner = np.roll(piece, -side, axis=axis)  # the neighbour on that side is in the piece too
-      edge = [slice(None)] * 3
+      edge: list[slice | int] = [slice(None)] * 3
       edge[axis] = -1 if side == 1 else 0
       inner[tuple(edge)] = False
       index = np.argwhere(piece & ~inner) + start

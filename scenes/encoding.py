@@ -4,6 +4,7 @@ Shapes: L levels, T entries a level, F features an entry.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +62,7 @@ def hash_encode(
     lower = jnp.clip(jnp.floor(scaled), 0, resolution - 1)
     fraction = scaled - lower
     lower = lower.astype(jnp.uint32)
-    total = 0.0
+    total: Any = 0.0
     for corner in range(8):
       offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1], np.uint32)
       weight = jnp.prod(jnp.where(offset == 1, fraction, 1 - fraction), axis=-1)

@@ -70,7 +70,7 @@ class FreeSpace:
   def is_reachable(self, points: np.ndarray) -> np.ndarray:
     """Whether the robot can be centred at points [..., >= 2], bool [...]."""
     index = self.cell_of(points)
-    inside = ((index >= 0) & (index < self.cells.shape)).all(-1)
+    inside = np.all((index >= 0) & (index < self.cells.shape), axis=-1)
     index = np.where(inside[..., None], index, 0)
     return inside & self.reachable[index[..., 0], index[..., 1]]
 
@@ -96,7 +96,7 @@ class FreeSpace:
     wide = space >= min(self.radius + clearance, np.quantile(space[reachable], 0.7))
     cost = np.where(reachable, 1.0, np.inf)
     starts = [tuple(np.unravel_index(np.argmax(space), space.shape))]
-    goals: list[tuple[int, int]] = []
+    goals: list[tuple[int, ...]] = []
     while len(goals) < count:
       distance, _ = graph.MCP_Geometric(cost).find_costs(goals or starts)
       distance = np.where(wide & np.isfinite(distance), distance, -1)

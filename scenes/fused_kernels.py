@@ -47,22 +47,22 @@ class Pictures(NamedTuple):
 class Settings(NamedTuple):
   """Numbers that the kernel needs."""
 
-  density_gain: float
-  density_bias: float
-  density_scale: float
-  specular_bias: float
+  density_gain: np.float32
+  density_bias: np.float32
+  density_scale: np.float32
+  specular_bias: np.float32
   paper_footprint: bool  # footprint 1 + blur instead of 1 + 12 blur^2
-  pixel_angle: float
-  step: float
-  variance_step: float  # interval that the variance tells of, inside the unit cube
-  near: float
-  depth_limit: float  # a ray's march ends where the grid's optical depth passes this
+  pixel_angle: np.float32
+  step: np.float32
+  variance_step: np.float32  # interval that the variance tells of, inside the unit cube
+  near: np.float32
+  depth_limit: np.float32  # a ray's march ends where the grid's optical depth passes this
   ray_samples: int  # most samples of a ray
-  charbonnier: float
-  distortion: float
-  blur_max: float
-  blur_sharp: float  # fraction of the rays that are not blurred
-  blur_power: float  # blur = blur_max * uniform^power
+  charbonnier: np.float32
+  distortion: np.float32
+  blur_max: np.float32
+  blur_sharp: np.float32  # fraction of the rays that are not blurred
+  blur_power: np.float32  # blur = blur_max * uniform^power
   random_background: bool
 
 

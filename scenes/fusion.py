@@ -112,7 +112,7 @@ def pixel_normals(depth: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.n
     Unit normals towards the camera [H, W, 3] and the cosine of incidence [H, W]; the cosine is 0 on
     silhouettes, where depth is missing, and along the border.
   """
-  smooth = cv2.blur(cv2.medianBlur(depth, 5), (3, 3))
+  smooth: np.ndarray = cv2.blur(cv2.medianBlur(depth, 5), (3, 3))
   local = rays * smooth[..., None]
   normal = np.zeros_like(local)
   right, down = local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1]

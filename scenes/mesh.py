@@ -189,4 +189,6 @@ def save_glb(mesh: Mesh, path: pathlib.Path) -> None:
   """Writes a glTF binary with vertex colours; y up, as glTF prescribes."""
   y_up = mesh.vertices @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
   shown = trimesh.Trimesh(y_up, mesh.faces, vertex_colors=mesh.colors, process=False)
-  path.write_bytes(shown.export(file_type="glb"))
+  content = shown.export(file_type="glb")
+  assert isinstance(content, bytes)  # other formats give text or a mapping
+  path.write_bytes(content)

@@ -77,7 +77,7 @@ def from_dict(values: Any, *, source: str = "overrides") -> Overrides:
     return Overrides()
   if not isinstance(values, dict):
     raise ValueError(f"{source}: expected keys with values, found {type(values).__name__}.")
-  result = {}
+  result: dict[str, Any] = {}
   for name, value in values.items():
     if name not in _SHAPES:
       raise ValueError(f'{source}: unknown key "{name}"; known: {", ".join(_SHAPES)}.')

@@ -83,7 +83,7 @@ def poisson_mesh(points: np.ndarray, colors: np.ndarray, *, camera_positions: np
   size = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=-1))
   faces = np.asarray(made.faces, np.int64)
   faces = faces[(distance < _FAR * size)[faces].all(-1)]
-  if made.visual.kind == "vertex":
+  if isinstance(made.visual, trimesh.visual.ColorVisuals) and made.visual.kind == "vertex":
     rgb = np.asarray(made.visual.vertex_colors)[:, :3].astype(np.uint8)
   else:  # the mesher dropped the colours: take those of the nearest points
     rgb = colors[nearest]

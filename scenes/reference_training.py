@@ -314,7 +314,7 @@ class ReferenceTrainer:
 
   def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
     """Continues from what `state` returned."""
-    structure = jax.tree.structure(self._state)
-    leaves = [jnp.asarray(arrays[f"leaf_{i:03d}"]) for i in range(structure.num_leaves)]
+    current, structure = jax.tree.flatten(self._state)
+    leaves = [jnp.asarray(arrays[f"leaf_{i:03d}"]) for i in range(len(current))]
     self._state = jax.tree.unflatten(structure, leaves)
     self.rays_done, self.samples_done = (int(x) for x in arrays["counters"])
