@@ -1,1 +1,1 @@
-"""The real robot behind the same specification as the simulation, and a virtual one to rehearse with."""
+"""The real robot behind the specification of the simulation, and a virtual one for rehearsals."""

@@ -63,9 +63,7 @@ def walk(count: int) -> np.ndarray:
     a = 2 * np.pi * i / count
     position = [1.3 * np.cos(a) - 0.1, 0.9 * np.sin(a) - 0.2, 1.4 + 0.15 * np.sin(3 * a)]
     b = a + (0.4 if i % 2 else np.pi - 0.5)
-    poses.append(
-      look_at(position, [3 * np.cos(b), 3 * np.sin(b), (0.1, 0.7, 0.2, 1.4)[i % 4]])
-    )
+    poses.append(look_at(position, [3 * np.cos(b), 3 * np.sin(b), (0.1, 0.7, 0.2, 1.4)[i % 4]]))
   return np.array(poses)
 
 
