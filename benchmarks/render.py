@@ -141,8 +141,8 @@ class MujocoDrawer:
 def measure(draws: dict[str, Draw], limits: dict[str, int], truth: list[np.ndarray], repeats: int):
   """Lets the drawers take turns.
 
-  Times are the process's processor time, all threads, because everything shares one core: on an idle
-  core that is the time that passes, on a busy one it leaves out the others' turns.
+  Times are the process's processor time, all threads, because everything shares one core: on an
+  idle core that is the time that passes, on a busy one it leaves out the others' turns.
 
   Returns:
     One dict a drawer: name, median_ms, p95_ms, elapsed_ms (median), psnr_db, views.
@@ -236,8 +236,8 @@ def markdown(result: dict[str, Any]) -> str:
     "# Rendering a robot camera's frame on one core",
     "",
     f"{result['processor']}, {result['date']}. Views of the built-in room from the robot's height; "
-    "Median and p95 are processor time, elapsed is the clock (the machine was shared); PSNR against "
-    "the true picture. `python benchmarks/render.py` makes this page.",
+    "Median and p95 are processor time, elapsed is by the clock; PSNR against the true picture. "
+    "`python benchmarks/render.py` makes this page.",
     "",
     "| size | renderer | median ms | p95 ms | elapsed ms | PSNR dB | views |",
     "|---|---|---|---|---|---|---|",
