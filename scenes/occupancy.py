@@ -21,8 +21,9 @@ _MAX_DISTANCE = 255  # cells; a byte
 class OccupancySettings:
   """How finely and how carefully matter is looked for."""
 
-  cells: int = 256
-  """Cells along an axis, divisible by 4: 4 cm in a room of 5 m. Ours."""
+  cells: int = 128
+  """Cells along an axis, divisible by 4: 8 cm in a room of 5 m. Ours: 256 renders as fast, but
+  takes eight times as long to fill."""
   density: float = 2.0
   """Density [1/unit] from which a cell counts as matter. Ours: a cell of it hides 3 %."""
   coarse_density: float = 0.5
