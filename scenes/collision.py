@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from scipy import ndimage
 
 from scenes import convex, fusion
 from scenes import mesh as meshes
@@ -24,6 +25,7 @@ class CollisionSettings:
   truncation: float = 0.08  # matter is at least this thick behind a seen surface
   top: float = 1.5  # nothing above is needed: three times the height of the robot
   floor_threshold: float = 0.04  # matter below counts as floor
+  smoothing: float = 1.3  # standard deviation of the blur over voxels that takes off depth noise
   min_component: float = 0.15  # smaller floating pieces are dropped, diagonal of their box
   parts: convex.ConvexSettings = dataclasses.field(default_factory=convex.ConvexSettings)
 
@@ -46,6 +48,16 @@ def remove_floor(grid: fusion.Grid, *, threshold: float) -> fusion.Grid:
   weights[:, :, :layer] = grid.weights[:, :, layer : layer + 1]
   values[:, :, :ground] = 1.0
   return grid._replace(values=values, weights=weights)
+
+
+def smooth(grid: fusion.Grid, *, deviation: float) -> fusion.Grid:
+  """Blurs the observed values of a grid; unknown voxels neither give nor take. In voxels."""
+  if deviation <= 0:
+    return grid
+  known = grid.observed.astype(np.float32)
+  share = ndimage.gaussian_filter(known, deviation)
+  mean = ndimage.gaussian_filter(grid.values * known, deviation) / np.maximum(share, 1e-6)
+  return grid._replace(values=np.where(known > 0, mean, grid.values).astype(np.float32))
 
 
 def solid_grid(
@@ -72,7 +84,9 @@ def solid_grid(
     views, lower=lower, upper=upper, voxel=settings.voxel, truncation=settings.truncation,
     progress=progress,
   )  # fmt: skip
-  grid = remove_floor(grid, threshold=settings.floor_threshold)
+  grid = remove_floor(
+    smooth(grid, deviation=settings.smoothing), threshold=settings.floor_threshold
+  )
   return meshes.drop_floaters(grid, min_component=settings.min_component)
 
 

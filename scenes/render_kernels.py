@@ -7,7 +7,10 @@ Empty-space skipping therefore changes the time, not the picture.
 # mypy: ignore-errors
 # Kernels are Python only in their syntax: their annotations are Warp's.
 
+import ctypes.util
 import functools
+import os
+import sys
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -264,8 +267,23 @@ def upload(packed: Packed, variance_step: float, device: str) -> Any:
 
 
 def start_quietly() -> None:
-  """Starts Warp without its banner and without its warning that a machine has no GPU."""
+  """Starts Warp without its banner and without its warning that a machine has no GPU.
+
+  That warning comes from compiled code, past Python's streams, so where there is no driver the
+  process's standard error is turned away while Warp starts.
+  """
   level = wp.config.log_level
   wp.config.log_level = wp.LOG_ERROR
-  wp.init()
+  if ctypes.util.find_library("cuda"):
+    wp.init()
+  else:
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+      os.dup2(nowhere, 2)
+      wp.init()
+    finally:
+      os.dup2(kept, 2)
+      os.close(kept)
+      os.close(nowhere)
   wp.config.log_level = max(level, wp.LOG_WARNING)

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from scenes import cameras, collision, collision_error, convex, free_space
+from scenes import cameras, collision, collision_error, convex, free_space, fusion
 from tests.scenes import furnished_room
 
 LOWER, UPPER = np.array([-2.62, -2.12, 0.0]), np.array([2.62, 2.12, 2.6])
@@ -157,3 +157,18 @@ def test_files_round_trip(parts, tmp_path):
   assert model.nmesh == len(parts)
   with pytest.raises(ValueError, match=r"no part_\*\.obj"):
     collision.read_parts(tmp_path / "empty")
+
+
+def test_smoothing_takes_off_noise_and_leaves_the_unknown_alone():
+  rng = np.random.default_rng(0)
+  plane = np.broadcast_to(np.linspace(-1, 1, 21), (20, 20, 21)).astype(np.float32)
+  weights = np.ones(plane.shape, np.float32)
+  weights[:5] = 0
+  noisy = plane + 0.3 * rng.normal(size=plane.shape).astype(np.float32)
+  noisy[:5] = 1.0
+  grid = fusion.Grid(noisy, weights, np.zeros(3), 0.03, 0.08)
+  smooth = collision.smooth(grid, deviation=1.0).values
+  np.testing.assert_array_equal(smooth[:5], 1.0)
+  inner = (slice(5, None), slice(None), slice(3, -3))
+  assert np.abs(smooth[inner] - plane[inner]).std() < 0.4 * np.abs(noisy[inner] - plane[inner]).std()
+  assert collision.smooth(grid, deviation=0.0) is grid

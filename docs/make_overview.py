@@ -1,0 +1,60 @@
+"""Draws docs/overview.jpg: what the robot sees in the built-in room, four ways (needs EGL).
+
+python docs/make_overview.py
+"""
+
+from pathlib import Path
+
+import cv2
+import mujoco
+import numpy as np
+
+from real.virtual import room, yardstick
+from real.virtual.eye import Eye
+from scenes import collision, report_parts
+from scenes.bundle import Bundle
+from scenes.field import Field
+from scenes.render import Renderer
+from scenes.similarity import Similarity
+
+_SIZE = (360, 480)  # height, width of a picture
+_POSES = (7, 11)  # of the yardstick's robot poses
+
+
+def _contact_model(bundle: Bundle) -> mujoco.MjModel:
+  """The convex parts in colours, lit from above."""
+  spec = collision.spec(collision.read_parts(bundle.folder / "collision"))
+  for index, geom in enumerate(spec.geoms):
+    color = report_parts.part_color(index)
+    geom.rgba = [*(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)), 1]
+    geom.group = 0
+    if geom.name == "floor":
+      geom.rgba = [0.82, 0.82, 0.80, 1]
+  spec.visual.headlight.ambient = [0.45] * 3
+  spec.visual.headlight.diffuse = [0.1] * 3
+  spec.worldbody.add_light(pos=[1, -1, 2.3], dir=[-0.3, 0.3, -1], diffuse=[0.6] * 3)
+  return spec.compile()
+
+
+def main() -> None:
+  """Writes the picture beside this script."""
+  bundle = Bundle.load()
+  world_from_truth = Similarity.from_dict(bundle.figures["room_from_world"]).inverse()
+  unit_from_truth = bundle.world_from_unit.inverse() @ world_from_truth
+  renderer = Renderer(Field.load(bundle.field_path), threads=2)
+  camera = yardstick.robot_camera(*_SIZE)
+  rows = []
+  with room.room_eye() as truth, Eye(_contact_model(bundle)) as contact:
+    for index in _POSES:
+      pose = yardstick.robot_poses()[index]
+      true, _ = room.true_view(camera, pose, eye=truth)
+      color, depth = renderer.render(camera, unit_from_truth.apply_pose(pose))
+      parts, _ = contact.render(camera, world_from_truth.apply_pose(pose), supersample=3)
+      rows.append(np.hstack([true, color, report_parts.depth_map(depth), parts]))
+  picture = np.vstack(rows)[..., ::-1]
+  target = Path(__file__).with_name("overview.jpg")
+  cv2.imwrite(str(target), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+if __name__ == "__main__":
+  main()

@@ -1,0 +1,139 @@
+"""The whole job on a few frames of the shipped film: caching, resuming, the bundle, clear errors.
+
+Poses come with the pictures (transforms.json), so that no time goes into localisation, which has
+tests of its own.
+"""
+
+import dataclasses
+import json
+import shutil
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from real.virtual import filming, yardstick
+from scenes import bundle, pipeline
+from scenes.bundle import Bundle, BundleError
+from scenes.train_settings import preset as train_preset
+
+_FRAMES = 40
+_SIZE = (160, 120)  # width, height
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+  """Frames of the film with their true poses, as nerfstudio writes them."""
+  folder = tmp_path_factory.mktemp("capture")
+  (folder / "images").mkdir()
+  truth = filming.read_truth(yardstick.TRUTH)
+  wanted = np.linspace(0, len(truth["world_from_camera"]) - 1, _FRAMES).astype(int)
+  frames = []
+  with av.open(str(yardstick.VIDEO)) as container:
+    for index, frame in enumerate(container.decode(video=0)):
+      if index in wanted:
+        picture = cv2.resize(frame.to_ndarray(format="bgr24"), _SIZE, interpolation=cv2.INTER_AREA)
+        name = f"images/{index:05d}.png"
+        cv2.imwrite(str(folder / name), picture)
+        pose = truth["world_from_camera"][index] @ np.diag([1, -1, -1, 1])  # OpenGL's axes
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+  camera = truth["camera"].resized(*_SIZE)
+  about = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
+           "k1": camera.k1, "k2": camera.k2, "p1": camera.p1, "p2": camera.p2,
+           "w": camera.width, "h": camera.height, "frames": frames}  # fmt: skip
+  (folder / "transforms.json").write_text(json.dumps(about))
+  return folder / "transforms.json"
+
+
+@pytest.fixture(scope="module")
+def settings():
+  base = pipeline.preset("fast")
+  field = dataclasses.replace(base.train.field, levels=8, log2_table_size=15)
+  return dataclasses.replace(
+    base,
+    train=dataclasses.replace(
+      train_preset("fast"), field=field, max_steps=150, max_seconds=None, batch_samples=1 << 15
+    ),
+    align=dataclasses.replace(base.align, camera_height=1.0),
+    depth_width=120,
+  )
+
+
+@pytest.fixture(scope="module")
+def scene(source, settings, tmp_path_factory):
+  out = tmp_path_factory.mktemp("scenes") / "room"
+  return pipeline.make_scene(source, out, settings=settings, show_progress=False)
+
+
+def test_bundle_is_whole_and_metric(scene):
+  figures = scene.figures
+  assert figures["registered_fraction"] == 1.0
+  assert figures["held_out_psnr_db"] > 15  # seconds of training; an empty field has less than 9
+  assert scene.scene["scale"] == "camera_height"
+  lower, upper = scene.extent
+  assert 3 < (upper - lower)[0] < 9
+  assert scene.goals.shape == (3, 2)
+  assert scene.free_space.is_reachable(scene.goals).all()
+  assert set(scene.scene["seconds"]) >= {"keyframes", "poses", "field", "world", "contact"}
+
+
+def test_report_is_one_file_that_opens_offline(scene):
+  page = (scene.folder / "report.html").read_text()
+  assert page.count("data:image/") > 20
+  for text in ("Held-out views", "Contact geometry", "Free space", "held_out_psnr_db"):
+    assert text in page
+  body = page[page.index("<body>") :]
+  assert "<img" in body and 'src="http' not in page and "src='http" not in page
+
+
+def test_second_run_does_nothing_anew(scene, source, settings):
+  stamp = (scene.folder / pipeline.STAGES / "field" / "field.safetensors").stat().st_mtime_ns
+  again = pipeline.make_scene(source, scene.folder, settings=settings, show_progress=False)
+  assert again.scene["hashes"] == scene.scene["hashes"]
+  assert (
+    scene.folder / pipeline.STAGES / "field" / "field.safetensors"
+  ).stat().st_mtime_ns == stamp
+
+
+def test_changed_alignment_keeps_the_field_but_not_the_contact(scene, source, settings, tmp_path):
+  out = tmp_path / "room"
+  shutil.copytree(scene.folder, out)
+  fixed = tmp_path / "fix.yaml"
+  fixed.write_text("scale: 2.0\n")
+  changed = pipeline.make_scene(source, out, settings=settings, override=fixed, show_progress=False)
+  before, after = scene.scene["hashes"], changed.scene["hashes"]
+  assert after["field"] == before["field"]
+  assert after["world"] != before["world"] and after["contact"] != before["contact"]
+  assert changed.world_from_unit.scale == pytest.approx(2.0)
+  assert changed.scene["scale"] == "manual"
+
+
+def test_incomplete_bundles_are_refused(scene, tmp_path):
+  with pytest.raises(BundleError, match="not a folder"):
+    Bundle.load(tmp_path / "absent")
+  with pytest.raises(BundleError, match=r"no scene\.json"):
+    Bundle.load(tmp_path)
+  out = tmp_path / "room"
+  shutil.copytree(scene.folder, out, ignore=shutil.ignore_patterns(pipeline.STAGES))
+  (out / "field.safetensors").unlink()
+  with pytest.raises(BundleError, match=r"lacks field\.safetensors"):
+    Bundle.load(out)
+  (out / "scene.json").write_text("{broken")
+  with pytest.raises(BundleError, match="damaged"):
+    Bundle.load(out)
+  (out / "scene.json").write_text('{"format": "scene-bundle", "format_version": 99}')
+  with pytest.raises(BundleError, match="expected"):
+    Bundle.load(out)
+
+
+def test_no_source_is_one_clear_line(settings, tmp_path):
+  with pytest.raises(ValueError, match="does not exist"):
+    pipeline.make_scene(tmp_path / "none.mp4", tmp_path / "out", settings=settings)
+  assert not (tmp_path / "out" / "scene.json").exists()
+
+
+def test_built_in_bundle_is_whole():
+  scene = Bundle.load()
+  assert scene.folder == bundle.BUILT_IN
+  assert scene.figures["held_out_psnr_db"] > 30
