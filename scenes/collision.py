@@ -30,6 +30,9 @@ class CollisionSettings:
   parts: convex.ConvexSettings = dataclasses.field(default_factory=convex.ConvexSettings)
 
 
+_CORE = -0.2  # value, in truncations, below which a voxel is matter whatever its neighbours say
+
+
 def remove_floor(grid: fusion.Grid, *, threshold: float) -> fusion.Grid:
   """Takes out the floor: below the threshold there is matter only under matter.
 
@@ -51,13 +54,22 @@ def remove_floor(grid: fusion.Grid, *, threshold: float) -> fusion.Grid:
 
 
 def smooth(grid: fusion.Grid, *, deviation: float) -> fusion.Grid:
-  """Blurs the observed values of a grid; unknown voxels neither give nor take. In voxels."""
+  """Blurs the observed values of a grid; unknown voxels neither give nor take.
+
+  Voxels well inside matter stay matter: a blur alone would dissolve chair legs.
+
+  Args:
+    grid: The grid.
+    deviation: Standard deviation of the blur [voxel]; 0 changes nothing.
+  """
   if deviation <= 0:
     return grid
   known = grid.observed.astype(np.float32)
   share = ndimage.gaussian_filter(known, deviation)
   mean = ndimage.gaussian_filter(grid.values * known, deviation) / np.maximum(share, 1e-6)
-  return grid._replace(values=np.where(known > 0, mean, grid.values).astype(np.float32))
+  core = grid.values < _CORE
+  values = np.where((known > 0) & ~core, mean, np.minimum(grid.values, np.where(core, mean, 1.0)))
+  return grid._replace(values=values.astype(np.float32))
 
 
 def solid_grid(

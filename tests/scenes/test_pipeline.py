@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from real.virtual import filming, yardstick
-from scenes import bundle, pipeline
+from scenes import bundle, convex, pipeline
+from scenes import collision as contact
 from scenes.bundle import Bundle, BundleError
 from scenes.train_settings import preset as train_preset
 
@@ -57,6 +58,9 @@ def settings():
     ),
     align=dataclasses.replace(base.align, camera_height=1.0),
     depth_width=120,
+    collision=contact.CollisionSettings(
+      voxel=0.1, truncation=0.25, parts=convex.ConvexSettings(tolerance=0.2, max_parts=60)
+    ),
   )
 
 
@@ -72,7 +76,7 @@ def test_bundle_is_whole_and_metric(scene):
   assert figures["held_out_psnr_db"] > 15  # seconds of training; an empty field has less than 9
   assert scene.scene["scale"] == "camera_height"
   lower, upper = scene.extent
-  assert 3 < (upper - lower)[0] < 9
+  assert 3 < (upper - lower)[0] < 12
   assert scene.goals.shape == (3, 2)
   assert scene.free_space.is_reachable(scene.goals).all()
   assert set(scene.scene["seconds"]) >= {"keyframes", "poses", "field", "world", "contact"}
