@@ -1,6 +1,9 @@
 # make demo: the main job on the built-in room; make test: all tests. Both install first.
 SHELL := /bin/bash
-PYTHON ?= $(firstword $(foreach p,python3.13 python3.12 python3.11 python3,$(shell command -v $(p) 2>/dev/null)))
+# the first interpreter that runs, is new enough and can make environments
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+  $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 \
+  && { echo $$p; break; }; done)
 BIN := .venv/bin
 
 .PHONY: demo test lint install clean
@@ -19,11 +22,10 @@ lint: install
 install: .venv/installed
 
 .venv/installed: setup.cfg pyproject.toml
-	@test -n "$(PYTHON)" || { echo "error: no Python found; install python3 (3.11 or newer)"; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "error: found $$($(PYTHON) --version), expected Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 1; }
-	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
-	  { echo "error: $(PYTHON) has no venv module; install the package python3-venv"; exit 1; }
+	@test -n "$(PYTHON)" || { echo "error: found no Python 3.11 or newer that has the venv module:" \
+	  "install the packages python3 and python3-venv, or say make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: $(PYTHON) is older than Python 3.11 or has no venv module (package python3-venv)"; exit 1; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,dev]'
 	@touch $@

@@ -18,6 +18,7 @@ from scenes.render import Renderer
 from scenes.similarity import Similarity
 
 _SIZE = (360, 480)  # height, width of a picture
+_SUPERSAMPLE = 3
 _POSES = (7, 11)  # of the yardstick's robot poses
 
 
@@ -30,6 +31,7 @@ def _contact_model(bundle: Bundle) -> mujoco.MjModel:
     geom.group = 0
     if geom.name == "floor":
       geom.rgba = [0.82, 0.82, 0.80, 1]
+  spec.visual.global_.offheight, spec.visual.global_.offwidth = (_SUPERSAMPLE * n for n in _SIZE)
   spec.visual.headlight.ambient = [0.45] * 3
   spec.visual.headlight.diffuse = [0.1] * 3
   spec.worldbody.add_light(pos=[1, -1, 2.3], dir=[-0.3, 0.3, -1], diffuse=[0.6] * 3)
@@ -43,14 +45,18 @@ def main() -> None:
   unit_from_truth = bundle.world_from_unit.inverse() @ world_from_truth
   renderer = Renderer(Field.load(bundle.field_path), threads=2)
   camera = yardstick.robot_camera(*_SIZE)
+  poses = [yardstick.robot_poses()[index] for index in _POSES]
+  with room.room_eye() as eye:
+    true = [room.true_view(camera, pose, eye=eye)[0] for pose in poses]
+  with Eye(_contact_model(bundle)) as eye:  # one GL context at a time
+    parts = [
+      eye.render(camera, world_from_truth.apply_pose(pose), supersample=_SUPERSAMPLE)[0]
+      for pose in poses
+    ]
   rows = []
-  with room.room_eye() as truth, Eye(_contact_model(bundle)) as contact:
-    for index in _POSES:
-      pose = yardstick.robot_poses()[index]
-      true, _ = room.true_view(camera, pose, eye=truth)
-      color, depth = renderer.render(camera, unit_from_truth.apply_pose(pose))
-      parts, _ = contact.render(camera, world_from_truth.apply_pose(pose), supersample=3)
-      rows.append(np.hstack([true, color, report_parts.depth_map(depth), parts]))
+  for index, pose in enumerate(poses):
+    color, depth = renderer.render(camera, unit_from_truth.apply_pose(pose))
+    rows.append(np.hstack([true[index], color, report_parts.depth_map(depth), parts[index]]))
   picture = np.vstack(rows)[..., ::-1]
   target = Path(__file__).with_name("overview.jpg")
   cv2.imwrite(str(target), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
