@@ -127,7 +127,7 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
       server.scene.add_camera_frustum(
         f"/cameras/{name}", fov=float(fov), aspect=sfm.camera.width / sfm.camera.height, scale=0.08,
         wxyz=transforms.SO3.from_matrix(world[:3, :3]).wxyz, position=world[:3, 3],
-        color=(213, 94, 0),
+        color=(213, 94, 0), thickness=0.004,
       )
     )  # fmt: skip
   grid = server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
