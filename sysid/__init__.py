@@ -1,0 +1,1 @@
+"""Measured logs: residual, missing effect, extended model, report."""
