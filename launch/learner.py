@@ -1,7 +1,8 @@
 """Starts a learner: `python launch/learner.py --env suite:nerf_nav --run runs/x`.
 
 Listens on this machine only, unless --listen names another address; then --users is needed. Actors
-join with `launch/actor.py --connect`.
+join with `launch/actor.py --connect`. With --connect it joins a router (`launch/router.py`)
+instead, with the login of that router's first user.
 """
 
 import argparse
@@ -30,7 +31,9 @@ def parse() -> argparse.Namespace:
   )
   parser.add_argument("--env", help="such as suite:nerf_nav or dm_control:cartpole:swingup")
   parser.add_argument("--run", type=Path, required=True, help="the run's folder")
-  parser.add_argument("--listen", default=DEFAULT_ENDPOINT, help="such as tcp/0.0.0.0:7447")
+  where = parser.add_mutually_exclusive_group()
+  where.add_argument("--listen", default=DEFAULT_ENDPOINT, help="such as tcp/0.0.0.0:7447")
+  where.add_argument("--connect", help="a router to join, such as tcp/head:7447")
   parser.add_argument("--preset", default=None, choices=sorted(configs.PRESETS))
   parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
                       help="changes a setting of the agent, such as network.vmax=10")  # fmt: skip
@@ -95,8 +98,8 @@ def main() -> int:
       evaluation_episodes=arguments.evaluation_episodes,
     )
     learner = Learner(
-      settings, config, endpoint=arguments.listen, link=link_settings(arguments),
-      resume=arguments.resume,
+      settings, config, endpoint=arguments.connect or arguments.listen,
+      link=link_settings(arguments), resume=arguments.resume, join=arguments.connect is not None,
     )  # fmt: skip
   except (ValueError, LinkError, CheckpointError) as error:
     print(f"error: {error}", file=sys.stderr)

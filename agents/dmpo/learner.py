@@ -29,6 +29,7 @@ from agents.link.server import LearnerLink
 _log = logging.getLogger(__name__)
 _RECENT_EPISODES = 20  # over which returns are averaged in the status
 _STATUS_PERIOD = 0.5  # s
+_ROUTER_TIMEOUT = 60.0  # s to wait for a router that is to be joined
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,15 +68,17 @@ class Learner:
     endpoint: str,
     link: sessions.LinkSettings,
     resume: bool = False,
+    join: bool = False,
   ):
     """Prepares the state and starts serving.
 
     Args:
       settings: the run's settings.
       config: the agent's settings.
-      endpoint: where to listen, such as tcp/127.0.0.1:7447.
+      endpoint: where to listen, such as tcp/127.0.0.1:7447, or the router to join.
       link: the link's settings.
       resume: continues from the newest checkpoint.
+      join: joins the router at the endpoint instead of being one.
     """
     self._settings, self._config = settings, config
     self._stop = threading.Event()
@@ -114,7 +117,10 @@ class Learner:
     self._last_save = time.monotonic()
     self._evaluated: float | None = None
     self._problem = ""
-    self._session = sessions.listen(endpoint, link)
+    if join:
+      self._session = sessions.connect(endpoint, link, timeout=_ROUTER_TIMEOUT)
+    else:
+      self._session = sessions.listen(endpoint, link)
     self.link = LearnerLink(
       self._session, link, limiter=limiter, insert=self._insert,
       known=self.replay.origins(),

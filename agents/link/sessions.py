@@ -14,6 +14,8 @@ from typing import Any
 
 import zenoh
 
+from agents.link.access import LinkError, access_control, read_users
+
 _log = logging.getLogger(__name__)
 
 # With congestion control BLOCK a put waits this long for a stalled receiver before it closes the
@@ -23,10 +25,6 @@ _SHARED_MEMORY_BYTES = 64 << 20  # pool of a process; 16 MiB holds too few traje
 _OPEN_TIMEOUT_MS = 3000
 _ATTEMPT_MS = 1500  # of one attempt to join; `connect` tries again until its own timeout
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
-
-
-class LinkError(RuntimeError):
-  """A session could not be opened; the message is one line for the user."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,6 +69,23 @@ def listen(endpoint: str, settings: LinkSettings) -> zenoh.Session:
   Raises:
     LinkError: if the endpoint is open to the network without users, or is taken.
   """
+  return _open_router(endpoint, settings, learner_joins=False)
+
+
+def route(endpoint: str, settings: LinkSettings) -> zenoh.Session:
+  """Opens a router that the learner joins as well: its address stays while the learner moves.
+
+  Args:
+    endpoint: such as tcp/0.0.0.0:7447.
+    settings: the link's settings; the first of the users is the learner's, and may do all.
+
+  Raises:
+    LinkError: as `listen`.
+  """
+  return _open_router(endpoint, settings, learner_joins=True)
+
+
+def _open_router(endpoint: str, settings: LinkSettings, *, learner_joins: bool) -> zenoh.Session:
   security = settings.security
   if not is_loopback(endpoint) and security.users is None and not security.allow_anonymous:
     raise LinkError(
@@ -87,7 +102,8 @@ def listen(endpoint: str, settings: LinkSettings) -> zenoh.Session:
     own, password = next(iter(users.items()))
     _insert(config, "transport/auth/usrpwd/user", own)
     _insert(config, "transport/auth/usrpwd/password", password)
-    _insert(config, "access_control", _access_control(sorted(users), settings.prefix))
+    rules = access_control(list(users), settings.prefix, learner=own if learner_joins else None)
+    _insert(config, "access_control", rules)
   if endpoint.startswith("tls/"):
     if security.tls_certificate is None or security.tls_key is None:
       raise LinkError(f"{endpoint} needs a certificate and its key (--tls-certificate, --tls-key).")
@@ -100,7 +116,9 @@ def listen(endpoint: str, settings: LinkSettings) -> zenoh.Session:
 
 
 def connect(endpoint: str, settings: LinkSettings, *, timeout: float) -> zenoh.Session:
-  """Opens a session of an actor or the evaluator; it reconnects by itself later on.
+  """Opens a session of an actor, the evaluator, or a learner that joins a router of its own.
+
+  It reconnects by itself later on.
 
   Raises:
     LinkError: if nothing answers within `timeout` seconds, or the login is refused.
@@ -151,23 +169,6 @@ def is_loopback(endpoint: str) -> bool:
     return False
 
 
-def read_users(path: Path) -> dict[str, str]:
-  """Reads lines `user:password`; raises LinkError for a file without any, or with others."""
-  try:
-    lines = [line.strip() for line in path.read_text().splitlines()]
-  except OSError as error:
-    raise LinkError(f"Cannot read the users in {path}: {error.strerror}.") from error
-  users = {}
-  for line in filter(None, lines):
-    user, colon, password = line.partition(":")
-    if not colon or not user or not password:
-      raise LinkError(f"{path}: every line must read user:password.")
-    users[user] = password
-  if not users:
-    raise LinkError(f"{path} holds no line user:password.")
-  return users
-
-
 def _common(settings: LinkSettings) -> zenoh.Config:
   config = zenoh.Config()
   _insert(config, "scouting/multicast/enabled", False)
@@ -183,35 +184,6 @@ def _common(settings: LinkSettings) -> zenoh.Config:
     # Queries stay off shared memory: a reply must not depend on a pool that is full.
     _insert(config, f"{optimisation}/messages", ["put"])
   return config
-
-
-def _access_control(users: list[str], prefix: str) -> dict[str, Any]:
-  """What a user may do: send trajectories and metrics, ask, and say that it is alive.
-
-  No user can answer queries in the learner's place or publish on its keys.
-  """
-  inward = ["put", "query", "liveliness_token", "liveliness_query"]
-  inward.append("declare_liveliness_subscriber")
-  return {
-    "enabled": True,
-    "default_permission": "deny",
-    "rules": [
-      {
-        "id": "from users", "permission": "allow", "flows": ["ingress"], "messages": inward,
-        "key_exprs": [f"{prefix}/{k}/**" for k in ("trajectory", "metrics", "ask", "alive")],
-      },
-      {
-        "id": "to users", "permission": "allow", "flows": ["egress"],
-        "messages": [
-          "reply", "declare_queryable", "declare_subscriber", "liveliness_token",
-          "declare_liveliness_subscriber",
-        ],
-        "key_exprs": [f"{prefix}/**"],
-      },
-    ],
-    "subjects": [{"id": "users", "usernames": users}],
-    "policies": [{"rules": ["from users", "to users"], "subjects": ["users"]}],
-  }  # fmt: skip
 
 
 def _insert(config: zenoh.Config, key: str, value: Any) -> None:

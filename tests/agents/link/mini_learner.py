@@ -1,6 +1,7 @@
 """A learner without networks, as a process: the link, the limiter and a replay on disk.
 
-python mini_learner.py ENDPOINT FOLDER LEASE [USERS]; prints "ready" when it listens.
+python mini_learner.py ENDPOINT FOLDER LEASE [USERS]; prints "ready" when it listens. With "join" as
+a further argument it joins the router at ENDPOINT, and USERS is its own login.
 """
 
 import sys
@@ -27,7 +28,9 @@ def make_trajectory(mark: int, steps: int = LENGTH) -> dict[str, np.ndarray]:
 def main() -> None:
   endpoint, folder, lease = sys.argv[1], Path(sys.argv[2]), float(sys.argv[3])
   users = Path(sys.argv[4]) if len(sys.argv) > 4 else None
-  settings = sessions.LinkSettings(lease=lease, security=sessions.Security(users=users))
+  join = sys.argv[-1] == "join"
+  security = sessions.Security(login=users) if join else sessions.Security(users=users)
+  settings = sessions.LinkSettings(lease=lease, security=security)
   replay = Replay(FIELDS, length=LENGTH, capacity_steps=1000 * (LENGTH - 1), folder=folder)
   steps = replay.steps
   limiter = RateLimiter(
@@ -42,8 +45,11 @@ def main() -> None:
     replay.insert(trajectory, actor=actor, number=number)
     return size - 1
 
+  session = (
+    sessions.connect(endpoint, settings, timeout=5) if join else sessions.listen(endpoint, settings)
+  )
   link = LearnerLink(
-    sessions.listen(endpoint, settings), settings, limiter=limiter, insert=insert, description={},
+    session, settings, limiter=limiter, insert=insert, description={},
     known=replay.origins(),
   )  # fmt: skip
   link.publish_parameters({"w": np.full(3, 7, np.float32)}, version=1)

@@ -30,16 +30,18 @@ def _environment():
 class Learner:
   """Starts, kills and freezes the mini learner."""
 
-  def __init__(self, folder, *, lease=10.0, users=None):
+  def __init__(self, folder, *, lease=10.0, users=None, router=None):
     with socket.socket() as probe:
       probe.bind(("127.0.0.1", 0))
-      self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+      self.endpoint = router or f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     self._folder, self._lease, self._users = folder, lease, users
+    self._joins = router is not None
     self.start()
 
   def start(self):
     command = [sys.executable, mini_learner.__file__, self.endpoint, str(self._folder),
-               str(self._lease), *([str(self._users)] if self._users else [])]  # fmt: skip
+               str(self._lease), *([str(self._users)] if self._users else []),
+               *(["join"] if self._joins else [])]  # fmt: skip
     self.process = subprocess.Popen(command, stdout=subprocess.PIPE, env=_environment(), text=True)
     assert self.process.stdout.readline() == "ready\n"
 
