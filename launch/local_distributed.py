@@ -6,7 +6,6 @@ not know go to the learner (see `launch/learner.py --help`), such as --set batch
 """
 
 import argparse
-import ctypes
 import dataclasses
 import os
 import secrets
@@ -23,6 +22,7 @@ from rich.live import Live
 from rich.table import Table
 
 from agents.link import sessions
+from agents.link.children import last_lines, start_child
 from agents.link.client import ActorLink
 from agents.link.schema import MessageError
 
@@ -31,7 +31,6 @@ _MAX_RESTARTS = 5  # of one process within _RESTART_WINDOW
 _RESTART_WINDOW = 60.0  # s
 _REFUSED = 2  # exit status of a process whose arguments are wrong: another start would not help
 _END_TIMEOUT = 60.0  # s for a checkpoint at the end
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 @dataclasses.dataclass
@@ -47,13 +46,7 @@ class Child:
   def start(self) -> None:
     """Starts it; its output is appended to its log."""
     self.started.append(time.monotonic())
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    with self.log.open("ab") as stream:
-      self.process = subprocess.Popen(
-        self.command, stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, env=environment,
-        start_new_session=True,  # Ctrl-C reaches this script alone, which ends the others in order
-        preexec_fn=_die_with_parent,
-      )  # fmt: skip
+    self.process = start_child(self.command, log=self.log)
 
   @property
   def exit_status(self) -> int | None:
@@ -73,14 +66,7 @@ class Child:
 
   def last_words(self) -> str:
     """The end of its log."""
-    lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
-    return "\n".join(lines[-8:])
-
-
-def _die_with_parent() -> None:
-  """In the child: asks Linux for SIGTERM when this script is killed."""
-  if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    return last_lines(self.log)
 
 
 class Supervisor:
