@@ -1,0 +1,393 @@
+"""The robot as a `dm_env.Environment` with the policy's observations and actions of `suite`.
+
+A control step: the action goes through the action filter and the limits to the servos at once; the
+step ends 25 ms after the last one ended, and what it returns is what the bus and the camera gave by
+then. The time a policy needs is therefore part of the robot's delay, as everything else is.
+"""
+
+import collections
+import dataclasses
+import logging
+from typing import Any, Protocol
+
+import cv2
+import dm_env
+import numpy as np
+from dm_env import specs
+
+from real.bus import Bus, BusError, BusSettings
+from real.cycle import Cycle
+from real.operator import Operator
+from real.safety import Limiter, Monitor, Reason, SafetyError, SafetySettings, Stop
+from real.sensing import Sensing
+from real.timing import Timing
+from suite import errors, filters
+from suite import specs as policy_specs
+from suite.op3 import constants
+
+SUPPORTED_POSE = constants.standing_targets()  # [J] rad, where the robot starts and ends, held
+_FIRST_READING = 2.0  # s to wait for the first reading of everything
+_log = logging.getLogger(__name__)
+
+
+class CameraSource(Protocol):
+  """Where pictures come from, such as `real.camera.Camera`."""
+
+  def read(self) -> tuple[np.ndarray, float]:
+    """Returns the newest picture, RGB uint8 [H, W, 3], and its age [s]; never waits."""
+
+  def close(self) -> None:
+    """Frees the camera."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RobotSettings:
+  """Settings of the robot."""
+
+  bus: BusSettings = dataclasses.field(default_factory=BusSettings)
+  safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
+  chip_low_pass: bool = True  # the IMU chip filters by itself; False: filtered here
+  settle_time: float = 2.5  # s between being let go and the start of an episode
+  grip_time: float = 1.0  # s between being taken hold of and the first move
+
+
+class RobotEnvironment(dm_env.Environment):
+  """An OP3 on its bus; see `real.load`. Close it: that ends slowly, in the supported pose."""
+
+  def __init__(
+    self, bus: Bus, *, camera: CameraSource | None, operator: Operator,
+    goal_bounds: tuple[np.ndarray, np.ndarray], goals: np.ndarray,
+    image_size: tuple[int, int] | None, time_limit: float, head_pan_limit: float | None = None,
+    settings: RobotSettings | None = None, recorder: Any = None, dry_run: bool = False,
+  ):  # fmt: skip
+    """Switches the supply on, sets the servos up and begins to read; nothing moves.
+
+    Args:
+      bus: The open bus.
+      camera: Source of pictures; None for a robot without.
+      operator: Who holds the robot and may stop it.
+      goal_bounds: Lower and upper corner of the floor [2] each [m].
+      goals: The scene's goals [G, 2] [m]; the first is set.
+      image_size: (height, width) of the picture; None without a camera.
+      time_limit: Length of an episode [s].
+      head_pan_limit: Limit of the head pan, +- rad; None: the paper's table.
+      settings: Settings of the robot.
+      recorder: A `real.recorder.Recorder`, or None.
+      dry_run: Whether to write nothing to the servos: nothing moves.
+
+    Raises:
+      BusError: A device is missing or cannot be set up.
+      ValueError: A camera without image_size, or the other way round.
+    """
+    if (camera is None) != (image_size is None):
+      raise ValueError(
+        "A camera and an image_size belong together: give both, or image_size=None and no camera."
+      )
+    self.settings = settings or RobotSettings()
+    self.goals = np.asarray(goals, np.float64).reshape(-1, 2)
+    self.timing = Timing()
+    self.dry_run = dry_run
+    self._bus, self._clock = bus, bus.clock
+    self._camera, self._operator, self._recorder = camera, operator, recorder
+    self._image_size = image_size
+    self._time_limit = time_limit
+    self._goal_bounds = goal_bounds
+    self._lower, self._upper = constants.joint_limits(head_pan=head_pan_limit)
+    self._middle, self._half_range = (
+      (self._lower + self._upper) / 2,
+      (self._upper - self._lower) / 2,
+    )
+    safety = self.settings.safety
+    self._limiter = Limiter(self._lower, self._upper, max_speed=safety.max_speed)
+    self._action_filter = filters.ExponentialFilter(constants.ACTION_FILTER)
+    self._monitor = Monitor(safety, camera=camera is not None)
+    self._action_spec = policy_specs.action_spec()
+    self._observation_spec = policy_specs.policy_observation_spec(
+      goal_lower=goal_bounds[0], goal_upper=goal_bounds[1],
+      image_shape=None if image_size is None else (*image_size, 3),
+    )  # fmt: skip
+    self.set_goal(self.goals[0])
+    self._control = self._normalised(SUPPORTED_POSE)
+    self._standing = False  # under torque in the supported pose or beyond
+    self._running = False  # an episode is
+    self._last_picture = float("-inf")  # s, when the picture recorded last was taken
+    self._closed = False
+    bus.power_on()
+    if not dry_run:
+      bus.set_up()
+    self._monitor.arm(self._clock.now())
+    self._cycle = Cycle(
+      bus, Sensing(low_pass=not self.settings.chip_low_pass), self._monitor, operator=operator,
+      timing=self.timing, recorder=recorder, dry_run=dry_run,
+    )  # fmt: skip
+
+  # ---- dm_env ----
+
+  def action_spec(self) -> specs.BoundedArray:
+    """Returns the specification of an action: that of `suite`."""
+    return self._action_spec
+
+  def observation_spec(self) -> "collections.OrderedDict[str, specs.Array]":
+    """Returns the specifications of the policy's observations: those of `suite`."""
+    return self._observation_spec.copy()
+
+  def reset(self) -> dm_env.TimeStep:
+    """Has the robot held, moves it slowly to its pose, lets it stand, and starts an episode.
+
+    Raises:
+      SafetyError: The robot must not or does not get there; the message says why.
+    """
+    self._check_open()
+    self._running = False
+    self._clear_stop()
+    self._wait_for_readings()
+    self._take_hold()
+    if not self._standing:
+      self._energize()
+    self._move_slowly(SUPPORTED_POSE)
+    self._operator.support(False)
+    self._pause(self.settings.settle_time)
+    self._monitor.held = False
+    self._raise_if_stopped()
+    self._control = self._normalised(SUPPORTED_POSE)
+    self._action_filter.reset(self._control)
+    self.timing.reset()
+    self._missed_before = self._cycle.missed
+    now = self._clock.now()
+    self._monitor.arm(now)
+    self._cycle.sensing.start(self._control)
+    self._start, self._steps, self._due = now, 0, now
+    self._running = True
+    return dm_env.restart(self._observe())
+
+  def step(self, action: Any) -> dm_env.TimeStep:
+    """Takes one control step; the first one after an episode's end starts the next.
+
+    Raises:
+      ValueError: The action has another shape than the specification.
+    """
+    self._check_open()
+    if not self._running:
+      return self.reset()
+    action = np.asarray(action, np.float64)
+    if action.shape != self._action_spec.shape:
+      raise ValueError(errors.bad_action(action, self._action_spec))
+    asked = self._clock.now()
+    self.timing.add("policy", asked - self._due)
+    stop = self._monitor.action(asked, action)
+    if stop is not None:
+      self._cycle.halt(stop)
+    else:
+      self._act(action, asked)
+    self._wait_for_tick()
+    self._cycle.sensing.push(self._control)
+    observation = self._observe()
+    self._steps += 1
+    stop = self._cycle.stop
+    if stop is not None:
+      return self._end(dm_env.termination(reward=0.0, observation=observation))
+    if self._steps >= round(self._time_limit / constants.CONTROL_TIMESTEP):
+      return self._end(dm_env.truncation(reward=0.0, observation=observation))
+    return dm_env.transition(reward=0.0, observation=observation)
+
+  def close(self) -> None:
+    """Has the robot held, moves it slowly to its pose, switches the torque off, ends everything."""
+    if self._closed:
+      return
+    self._closed = True
+    self._running = False
+    try:
+      if self._standing and self._cycle.stop is None:
+        self._take_hold()
+        self._move_slowly(SUPPORTED_POSE)
+        if not self._cycle.relax():
+          _log.error("not every servo confirmed that its torque is off: switch the robot off")
+    finally:
+      self._cycle.close()
+      if not self.dry_run and not self._cycle.torque_off and not self._bus.torque(False):
+        _log.error("not every servo confirmed that its torque is off: switch the robot off")
+      self._bus.close()
+      self._operator.close()
+      if self._camera is not None:
+        self._camera.close()
+
+  # ---- beyond dm_env ----
+
+  @property
+  def goal(self) -> np.ndarray:
+    """The goal that the policy sees [2] [m]."""
+    return self._goal.copy()
+
+  def set_goal(self, goal: np.ndarray | int) -> None:
+    """Sets the goal: an index into `goals`, or a place [2] [m] in the scene's world frame."""
+    if isinstance(goal, int | np.integer):
+      if not 0 <= goal < len(self.goals):
+        raise ValueError(f"Unknown goal {goal}: the scene has {len(self.goals)}, counted from 0.")
+      goal = self.goals[goal]
+    self._goal = np.asarray(goal, np.float64).reshape(2)
+
+  @property
+  def standing_action(self) -> np.ndarray:
+    """The action [J] that holds the supported pose."""
+    return self._normalised(SUPPORTED_POSE).astype(np.float32)
+
+  @property
+  def stop(self) -> Stop | None:
+    """Why the torque is off, if it was switched off."""
+    return self._cycle.stop
+
+  @property
+  def bus(self) -> Bus:
+    """The bus."""
+    return self._bus
+
+  # ---- acting ----
+
+  def _act(self, action: np.ndarray, asked: float) -> None:
+    self._control = self._action_filter(np.clip(action, -1.0, 1.0))
+    goal = self._middle + self._half_range * self._control
+    if self._cycle.send(self._limiter(goal, constants.CONTROL_TIMESTEP)):
+      sent = self._clock.now()
+      self.timing.add("sending", sent - asked)
+      self.timing.add("observation to goal", sent - self._due)
+      if sent > self._due + constants.CONTROL_TIMESTEP:
+        self.timing.count("missed control deadlines")
+
+  def _wait_for_tick(self) -> None:
+    """Waits for the end of the control step; late steps are not made up for."""
+    self._due += constants.CONTROL_TIMESTEP
+    now = self._clock.now()
+    if now > self._due:
+      skipped = int((now - self._due) / constants.CONTROL_TIMESTEP)
+      self._due += skipped * constants.CONTROL_TIMESTEP
+    self._clock.sleep_until(self._due)
+    self.timing.add("tick lateness", self._clock.now() - self._due)
+
+  def _observe(self) -> "collections.OrderedDict[str, np.ndarray]":
+    sensing, now = self._cycle.sensing, self._clock.now()
+    imu_age, joint_age = sensing.ages(now)
+    self.timing.add("imu age", imu_age)
+    self.timing.add("joint age", joint_age)
+    found = collections.OrderedDict(
+      (name, sensing.read(name)) for name in policy_specs.PROPRIOCEPTION
+    )
+    found["goal"] = self._goal.astype(np.float32)
+    if self._image_size is not None:
+      found["camera"] = self._picture()
+    return found
+
+  def _picture(self) -> np.ndarray:
+    """Returns the newest picture in the policy's size; notes its age."""
+    assert self._camera is not None and self._image_size is not None
+    height, width = self._image_size
+    age: float | None = None
+    picture: np.ndarray = np.zeros((height, width, 3), np.uint8)
+    try:
+      picture, age = self._camera.read()
+    except Exception as error:  # whatever a driver raises, it is a lost picture
+      _log.warning("no picture: %s: %s", type(error).__name__, error)
+    now = self._clock.now()
+    if age is not None:
+      self.timing.add("camera age", age)
+      self._record_picture(picture, now - age)
+    if self._running:
+      stop = self._monitor.camera(now, age)
+      if stop is not None:
+        self._cycle.halt(stop)
+    if picture.shape[:2] != (height, width):
+      picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+    return picture
+
+  def _record_picture(self, picture: np.ndarray, taken: float) -> None:
+    if self._recorder is None or taken < self._last_picture + 0.002:
+      return  # the age of one picture is measured a little differently each time
+    self._last_picture = taken
+    full = getattr(self._camera, "read_full", None)
+    self._recorder.image(self._clock.wall(taken), picture if full is None else full()[0])
+
+  def _end(self, timestep: dm_env.TimeStep) -> dm_env.TimeStep:
+    self._running = False
+    if self._cycle.missed > self._missed_before:
+      self.timing.count("missed bus cycles", self._cycle.missed - self._missed_before)
+    stop = self._cycle.stop
+    ending = "time limit" if stop is None else f"{stop.reason} ({stop.detail})"
+    _log.info("episode of %d steps, ended by %s; %s", self._steps, ending, self.timing.line())
+    if stop is not None:
+      self._standing = False
+    return timestep
+
+  # ---- start and end ----
+
+  def _take_hold(self) -> None:
+    self._operator.support(True)
+    self._monitor.held = True
+    self._pause(self.settings.grip_time)
+
+  def _energize(self) -> None:
+    try:
+      self._cycle.energize()
+    except BusError as error:
+      self._cycle.halt(Stop(Reason.BUS, str(error), self._clock.now()))
+      raise SafetyError(f"Torque stays off: {error}") from error
+    joints = self._cycle.sensing.joints
+    assert joints is not None
+    self._limiter.reset(joints.positions)
+    self._standing = True
+
+  def _move_slowly(self, pose: np.ndarray) -> None:
+    """Moves the goals to a pose [J] [rad] at the slow speed."""
+    start = self._limiter.goal
+    assert start is not None
+    speed, period = self.settings.safety.slow_speed, constants.CONTROL_TIMESTEP
+    count = int(np.ceil(np.abs(pose - start).max() / (speed * period)))
+    slow = Limiter(np.minimum(pose, start), np.maximum(pose, start), max_speed=speed)
+    slow.reset(start)
+    due = self._clock.now()
+    for _ in range(count):
+      self._cycle.send(slow(pose, period))
+      due += period
+      self._clock.sleep_until(due)
+      self._raise_if_stopped()
+    self._limiter.reset(pose)
+
+  def _pause(self, seconds: float) -> None:
+    self._clock.sleep_until(self._clock.now() + seconds)
+    self._raise_if_stopped()
+
+  def _wait_for_readings(self) -> None:
+    end = self._clock.now() + _FIRST_READING
+    while not self._cycle.sensing.ready:
+      if self._clock.now() > end:
+        raise SafetyError("Joints and IMU cannot be read: check the cables.")
+      self._clock.sleep_until(self._clock.now() + constants.BUS_PERIOD)
+
+  def _clear_stop(self) -> None:
+    """Makes a new start possible after a stop, if its cause is gone."""
+    if self._cycle.stop is None:
+      return
+    self._standing = False
+    end = self._clock.now() + _FIRST_READING
+    while not self._cycle.torque_off and self._clock.now() < end:
+      self._clock.sleep_until(self._clock.now() + constants.BUS_PERIOD)
+    errors_found = {} if self.dry_run else self._bus.hardware_errors()
+    if errors_found:
+      raise SafetyError(
+        f"These servos report errors: {errors_found}. Find the cause, then clear them with "
+        "environment.bus.reboot(joint)."
+      )
+    if not self.dry_run and not self._cycle.torque_off:
+      raise SafetyError("Not every servo confirmed that its torque is off: check the bus.")
+    self._cycle.rearm()
+
+  def _raise_if_stopped(self) -> None:
+    stop = self._cycle.stop
+    if stop is not None:
+      self._standing = False
+      raise SafetyError(f"Torque was switched off: {stop.reason} ({stop.detail}).")
+
+  def _check_open(self) -> None:
+    if self._closed:
+      raise RuntimeError("This environment is closed: make a new one with real.load.")
+
+  def _normalised(self, angles: np.ndarray) -> np.ndarray:
+    return (angles - self._middle) / self._half_range

@@ -1,0 +1,86 @@
+"""The operator: a key that stops the robot, and being asked to hold it."""
+
+import contextlib
+import os
+import select
+import sys
+import termios
+import tty
+from typing import Protocol
+
+
+class Operator(Protocol):
+  """Who stands beside the robot."""
+
+  def pressed(self) -> bool:
+    """Returns whether a key was pressed since the last call; never waits."""
+
+  def support(self, held: bool) -> None:
+    """Asks to hold the robot (True) or to let it go (False); returns when that is so."""
+
+  def close(self) -> None:
+    """Gives the terminal back."""
+
+
+class Terminal:
+  """A person at a terminal: any key stops the robot, Enter confirms what is asked."""
+
+  def __init__(self, descriptor: int | None = None):
+    """Takes a terminal; standard input if None. Without a terminal there are no keys."""
+    self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
+    self._open = os.isatty(self._descriptor)
+    self._settings = termios.tcgetattr(self._descriptor) if self._open else None
+    if self._open:
+      tty.setcbreak(self._descriptor, termios.TCSANOW)
+
+  def pressed(self) -> bool:
+    return self._open and bool(self._read(0.0))
+
+  def support(self, held: bool) -> None:
+    if not self._open:
+      raise RuntimeError(
+        "Nobody can be asked to hold the robot: standard input is no terminal. Run it in one."
+      )
+    asked = "HOLD the robot by its torso, feet off the ground" if held else "Set it down, let go"
+    print(f"\n{asked}, then press Enter.", flush=True)
+    while b"\n" not in self._read(None):
+      pass
+
+  def _read(self, seconds: float | None) -> bytes:
+    ready, _, _ = select.select((self._descriptor,), (), (), seconds)
+    if not ready:
+      return b""
+    found = os.read(self._descriptor, 1024)
+    if not found:  # the terminal is gone
+      self._open = False
+    return found
+
+  def close(self) -> None:
+    if self._settings is not None:
+      with contextlib.suppress(termios.error, OSError):
+        termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._settings)
+      self._settings = None
+    self._open = False
+
+
+class Hand:
+  """An operator in a rehearsal: something else holds the robot, and keys are pressed by `press`."""
+
+  def __init__(self, hold=lambda held: None):
+    """Takes a function that holds (True) or releases (False) the robot."""
+    self._hold = hold
+    self._pressed = False
+
+  def press(self) -> None:
+    """Presses the stop key."""
+    self._pressed = True
+
+  def pressed(self) -> bool:
+    found, self._pressed = self._pressed, False
+    return found
+
+  def support(self, held: bool) -> None:
+    self._hold(held)
+
+  def close(self) -> None:
+    """Has nothing to give back."""

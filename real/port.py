@@ -1,0 +1,103 @@
+"""The serial port of the DYNAMIXEL SDK, with waits that do not spin and time-outs of our own.
+
+The SDK polls the port as fast as it can and gives up after 34 ms plus the time on the wire, four
+bus cycles. Here a read sleeps until bytes come, and the time-out is what the caller sets for each
+packet.
+"""
+
+import contextlib
+from pathlib import Path
+
+import dynamixel_sdk
+import serial
+
+from real.clock import Clock
+
+_PATIENCE = 0.03  # s that an answer may be late outside the cycle
+_LATENCY_LIMIT = 1  # ms; the adapter's own default of 16 ms is a hidden delay
+
+
+class PortError(OSError):
+  """The serial port cannot be used; the message says what to do."""
+
+
+class Port(dynamixel_sdk.PortHandler):
+  """A `dynamixel_sdk.PortHandler` on a `Clock`."""
+
+  def __init__(self, path: str, *, baud: int, clock: Clock):
+    """Opens the port.
+
+    Args:
+      path: Such as /dev/ttyUSB0.
+      baud: Bit/s.
+      clock: Time for time-outs.
+
+    Raises:
+      PortError: It cannot be opened, or its adapter holds bytes back.
+    """
+    super().__init__(path)
+    self._clock = clock
+    self.deadline: float | None = None  # s, no wait goes on after it
+    self.byte_time = 10 / baud  # s
+    try:
+      opened = self.setBaudRate(baud)
+    except (serial.SerialException, OSError) as error:
+      raise PortError(
+        f"The serial port {path} cannot be opened ({error}): check the cable, the path, and that "
+        "this user is in the group of the port (often `dialout`)."
+      ) from error
+    if not opened:
+      raise PortError(f"The DYNAMIXEL SDK knows no {baud} bit/s: use 2000000, as the OP3 does.")
+    _check_latency(path)
+
+  def getCurrentTime(self) -> float:
+    return 1000 * self._clock.now()
+
+  def setPacketTimeout(self, packet_length: int) -> None:
+    # The SDK asks with a rough upper bound of the length; `expect` sets the true one.
+    self.setPacketTimeoutMillis(1000 * (packet_length * self.byte_time + _PATIENCE))
+
+  def expect(self, size: int, *, delay: float, margin: float) -> None:
+    """Sets the time-out for an answer; call it between sending and receiving.
+
+    Args:
+      size: Bytes on the wire from now on.
+      delay: s in which the wire is silent.
+      margin: s that the answer may be late before it counts as lost.
+    """
+    wait = delay + size * self.byte_time + margin
+    if self.deadline is not None:
+      wait = min(wait, self.deadline - self._clock.now())
+    self.setPacketTimeoutMillis(1000 * max(wait, 0.0))
+
+  def readPort(self, length: int):
+    left = self.packet_timeout / 1000 - (self._clock.now() - self.packet_start_time / 1000)
+    if left > 0 and length > 0 and self.ser.in_waiting < length:
+      self._clock.wait_readable(self.ser.fd, left)
+    return super().readPort(length)
+
+  def writePort(self, packet) -> int:
+    written = super().writePort(bytes(packet))
+    self._clock.settle()
+    return written
+
+  def close(self) -> None:
+    """Closes the port."""
+    if self.ser is not None:
+      with contextlib.suppress(OSError):
+        self.closePort()
+
+
+def _check_latency(path: str) -> None:
+  """Makes a USB adapter deliver bytes at once, or says how to."""
+  timer = Path("/sys/bus/usb-serial/devices") / Path(path).name / "latency_timer"
+  if not timer.exists():
+    return
+  if int(timer.read_text()) > _LATENCY_LIMIT:
+    try:
+      timer.write_text(str(_LATENCY_LIMIT))
+    except OSError as error:
+      raise PortError(
+        f"The adapter of {path} holds bytes back for {timer.read_text().strip()} ms, and this user "
+        f"may not change that: echo {_LATENCY_LIMIT} | sudo tee {timer}"
+      ) from error

@@ -1,0 +1,125 @@
+"""The motors of the virtual servos: position error to duty, duty to current, current to torque.
+
+XM430-W350 in P-only position mode is a voltage law (e-Manual, "Position PID gain", and the data
+sheet): duty = P / 128 * (goal - present) / 885, clipped to the PWM limit; voltage = duty * supply.
+Then a DC motor behind a gear, in quantities of the output shaft:
+
+  current = (voltage - k * speed) / R          k = 12 V / 46 rpm, R = 12 V / 2.3 A
+  torque  = k * current
+  friction = dry + share * |torque|            opposes motion; the solver of MuJoCo applies it
+
+The constants of speed (no load) and of torque (stall) in the data sheet differ by 28 %: that is the
+`share` of the torque which the gear takes away. N servos.
+"""
+
+import dataclasses
+
+import numpy as np
+
+COUNTS = 4096  # of one turn (12-bit encoder on the output)
+CENTER = 2048  # counts at joint angle 0
+FULL_PWM = 885  # register value of the whole supply voltage
+CURRENT_UNIT = 0.00269  # A
+SPEED_UNIT = 0.229 * 2 * np.pi / 60  # rad/s
+SPEED_CONSTANT = 12.0 / (46 * 2 * np.pi / 60)  # V s/rad at the output: no load, data sheet
+RESISTANCE = 12.0 / 2.3  # Ohm: stall current at 12 V, data sheet
+STALL_TORQUE = 4.1  # N m at 12 V, data sheet
+GEAR_SHARE = 1 - STALL_TORQUE / (SPEED_CONSTANT * 12.0 / RESISTANCE)  # 0.28
+_P_DIVISOR = 128.0
+# Ours: a small metal gear motor warms by 8 K for each watt, with a time constant of ten minutes.
+_HEATING, _WARMING_TIME, _AMBIENT = 8.0, 600.0, 25.0  # K/W, s, degrees C
+_COMPUTER_CURRENT = 1.5  # A that everything but the servos draws: ours
+_DIP_TIME = 0.1  # s, time constant with which servos judge the supply: ours
+_BROWN_OUT = 6.0  # V below which a servo's controller resets: ours
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MotorParameters:
+  """What differs from servo to servo and from battery to battery."""
+
+  strength: np.ndarray  # [N] factor on the torque
+  gear_share: np.ndarray  # [N] friction as a share of the torque
+  dry_friction: np.ndarray  # [N] N m
+  encoder_offset: np.ndarray  # [N] counts that the encoder reads too much
+  goal_delay: float = 0.0  # s from the arrival of a goal to its effect
+  battery_voltage: float = 12.0  # V without load
+  battery_resistance: float = 0.08  # Ohm
+
+  @classmethod
+  def nominal(cls, count: int) -> "MotorParameters":
+    """Returns servos as the data sheet has them."""
+    return cls(
+      strength=np.ones(count),
+      gear_share=np.full(count, GEAR_SHARE),
+      dry_friction=np.full(count, 0.03),
+      encoder_offset=np.zeros(count),
+    )
+
+
+class Motors:
+  """The state of N servos' motors and of the battery."""
+
+  def __init__(self, parameters: MotorParameters):
+    """Starts with torque off, at ambient temperature."""
+    count = len(parameters.strength)
+    self.parameters = parameters
+    # What the registers say.
+    self.goal = np.full(count, CENTER, np.float64)  # counts
+    self.enabled = np.zeros(count, bool)
+    self.p_gain = np.full(count, 800.0)
+    self.pwm_limit = np.full(count, 885.0)
+    # What is measured.
+    self.counts = np.full(count, CENTER, np.int64)
+    self.speed = np.zeros(count)  # rad/s
+    self.duty = np.zeros(count)
+    self.current = np.zeros(count)  # A
+    self.temperature = np.full(count, _AMBIENT)
+    self.supply = parameters.battery_voltage  # V
+    self.slow_supply = self.supply  # V, as the servos judge it: without short dips
+    self.stuck = np.zeros(count, bool)
+    self.forced_voltage: float | None = None
+    self._late_goals: list[tuple[float, np.ndarray]] = []
+    self._effective_goal = self.goal.copy()
+    self._offset = CENTER + parameters.encoder_offset
+    self._back_emf = SPEED_CONSTANT
+
+  @property
+  def browned_out(self) -> bool:
+    """Whether the supply is too low for the servos' controllers."""
+    return self.supply < _BROWN_OUT
+
+  def measure(self, angle: np.ndarray, speed: np.ndarray) -> None:
+    """Reads the encoders: joint angles [N] [rad] and speeds [N] [rad/s]."""
+    counts = np.floor(angle * (COUNTS / (2 * np.pi)) + self._offset + 0.5).astype(np.int64)
+    self.counts = np.where(self.stuck, self.counts, counts) if self.stuck.any() else counts
+    self.speed = speed.copy()
+
+  def set_goal(self, index: int, counts: int, time: float) -> None:
+    """Takes a goal that arrived at a time [s]."""
+    self.goal[index] = counts
+    if self.parameters.goal_delay > 0:
+      self._late_goals.append((time + self.parameters.goal_delay, self.goal.copy()))
+    else:
+      self._effective_goal[index] = counts
+
+  def torque(self, time: float, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns torque [N] and largest dry friction [N] [N m] for the next period [s]."""
+    while self._late_goals and self._late_goals[0][0] <= time:
+      self._effective_goal = self._late_goals.pop(0)[1]
+    values = self.parameters
+    duty = (self.p_gain / _P_DIVISOR) * (self._effective_goal - self.counts)
+    np.clip(duty, -self.pwm_limit, self.pwm_limit, out=duty)
+    duty *= self.enabled / FULL_PWM
+    current = (duty * self.supply - self._back_emf * self.speed) / RESISTANCE
+    current *= self.enabled
+    torque = SPEED_CONSTANT * values.strength * current
+    self.duty, self.current = duty, current
+    drawn = _COMPUTER_CURRENT + max(0.0, float(duty @ current))
+    if self.forced_voltage is not None:
+      self.supply = self.forced_voltage
+    else:
+      self.supply = values.battery_voltage - values.battery_resistance * drawn
+    self.slow_supply += (self.supply - self.slow_supply) * (period / _DIP_TIME)
+    heat = _HEATING * RESISTANCE * current * current + _AMBIENT
+    self.temperature += (heat - self.temperature) * (period / _WARMING_TIME)
+    return torque, values.dry_friction + values.gear_share * np.abs(torque)
