@@ -1,0 +1,104 @@
+"""Explains one joint: the calibrated null model, single effects, pairs; each with its evidence.
+
+Nothing is decided here; `decision` reads the ladder.
+"""
+
+import dataclasses
+
+from sysid import candidates, race, signatures
+from sysid.fitting import Problem
+from sysid.race import Entry
+from sysid.terms import Term
+
+
+@dataclasses.dataclass(frozen=True)
+class Effort:
+  """How much is computed."""
+
+  finalists: int = 6
+  """Candidates of a race that are fitted to the end."""
+  parents: int = 3
+  """Single effects on top of which a second one is raced."""
+  parent_margin: float = 1.2
+  """nats; single effects further behind are no parents."""
+  adequate: float = 0.35
+  """nats above the noise floor at which a hypothesis leaves nothing for a second effect."""
+
+
+@dataclasses.dataclass
+class Ladder:
+  """The evidence about one joint, from the declared model upwards. Scores are in nats of error."""
+
+  problem: Problem
+  calibration: Term
+  declared: Entry
+  null: Entry
+  singles: list[Entry]
+  pairs: list[Entry]
+
+  @property
+  def best_single(self) -> Entry:
+    """The single effect that explains most."""
+    return self.singles[0]
+
+  def best(self) -> Entry:
+    """The hypothesis of the lowest score."""
+    return min([self.null, *self.singles, *self.pairs], key=lambda e: e.score)
+
+
+def bare(problem: Problem, calibration: Term | None = None) -> tuple[Term, Entry, Entry]:
+  """Returns the calibration term, and the declared and the calibrated model's entries."""
+  term = candidates.calibration(problem.plant) if calibration is None else calibration
+  declared = race.entry(problem, problem.fit([]))
+  null = race.entry(problem, problem.fit([term]))
+  return term, declared, null
+
+
+def kinds_for(problem: Problem, null: Entry) -> list[Term]:
+  """Returns the candidates for a joint, with those whose starts need its residual."""
+  plant = problem.plant
+  return [
+    *candidates.library(plant),
+    candidates.cogging(plant, signatures.waves(problem, null.fit)),
+  ]
+
+
+def climb(
+  problem: Problem,
+  calibration: Term,
+  declared: Entry,
+  null: Entry,
+  *,
+  effort: Effort = Effort(),
+) -> Ladder:
+  """Races single effects, then pairs where the best single one leaves something."""
+  library = kinds_for(problem, null)
+  start = null.fit.x
+  singles = race.run(problem, [calibration], library, start=start, finalists=effort.finalists)
+  ladder = Ladder(problem, calibration, declared, null, singles, [])
+  if race.above_floor(singles[0]) > effort.adequate:
+    ladder.pairs = pairs(ladder, effort=effort)
+  return ladder
+
+
+def pairs(ladder: Ladder, *, effort: Effort) -> list[Entry]:
+  """Races a second effect on top of each of the best single ones."""
+  best = ladder.singles[0].score
+  found: list[Entry] = []
+  seen: set[frozenset[str]] = set()
+  for parent in ladder.singles[: effort.parents]:
+    if parent.score > best + effort.parent_margin:
+      continue
+    problem = ladder.problem
+    waves = signatures.waves(problem, parent.fit)
+    library = [
+      *candidates.library(problem.plant),
+      candidates.cogging(problem.plant, waves),
+    ]
+    others = [
+      c for c in library if c.kind != parent.kind and frozenset((c.kind, parent.kind)) not in seen
+    ]
+    seen |= {frozenset((c.kind, parent.kind)) for c in others}
+    base = parent.fit.terms
+    found += race.run(problem, base, others, start=parent.fit.x, finalists=4)
+  return sorted(found, key=lambda e: e.score)

@@ -1,0 +1,244 @@
+"""Fits hypotheses to logs: least squares on positions and efforts, several starts.
+
+Residuals are divided by the noise of their channel. Levenberg-Marquardt on the normal equations:
+scipy's trust-region solver factorises the whole Jacobian (10 000 residuals) at every step, which
+took as long as all simulations together, and tries one damping at a time.
+
+Shapes: n values of a hypothesis, R residuals.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from sysid.plant import JointPlant, quantum
+from sysid.terms import Term, compose
+
+Array = np.ndarray
+
+_DIFFERENCE = 0.02  # of a value's scale; ours: wide, as stick and slip make the error rough
+_DAMPINGS = (1e-6, 1e-3, 0.1, 3.0)
+_CONVERGED = 1e-4  # relative gain of a step at which a fit ends
+_SOFT = 4.0  # noise units; larger residuals count linearly
+_PRIOR_COUNT = 25.0  # residuals that one independent observation is spread over; ours
+_TRIMMED = (
+  0.01  # share of the largest residuals that a score leaves out: stale reads, command edges
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+  """A fitted hypothesis of one joint."""
+
+  terms: tuple[Term, ...]
+  x: Array
+  """[n]."""
+  cost: float
+  effort_scale: float
+  evaluations: int
+
+  def part(self, index: int) -> Array:
+    """Returns the values of one term."""
+    at = sum(len(term.names) for term in self.terms[:index])
+    return self.x[at : at + len(self.terms[index].names)]
+
+  def values(self, kind: str) -> dict[str, float]:
+    """Returns the values of the term of a kind, by name; empty if it has none."""
+    for index, term in enumerate(self.terms):
+      if term.kind == kind:
+        return dict(zip(term.names, map(float, self.part(index)), strict=True))
+    return {}
+
+  def at_bound(self, kind: str) -> bool:
+    """Tells whether a value of the term of that kind ended on a bound that is not its zero."""
+    for index, term in enumerate(self.terms):
+      if term.kind != kind:
+        continue
+      for value, low, high in zip(self.part(index), term.low, term.high, strict=True):
+        width = high - low
+        if value > high - 1e-3 * width or (value < low + 1e-3 * width and low != 0.0):
+          return True
+    return False
+
+
+class Problem:
+  """The logs of one joint with the noise of their channels: turns hypotheses into residuals."""
+
+  def __init__(self, plant: JointPlant, *, masks: Sequence[Array] | None = None):
+    """Notes noise levels.
+
+    Args:
+      plant: the joint.
+      masks: [N] bool a log: which samples count; all for None.
+    """
+    self.plant = plant
+    logs = plant.logs
+    self.masks = [log.valid.copy() for log in logs]
+    if masks is not None:
+      self.masks = [a & b for a, b in zip(self.masks, masks, strict=True)]
+    self.position_noise = position_noise(plant)
+    self.channel = "effort"
+    if any(log.effort is None for log in logs):
+      self.channel = "duty" if all(log.duty is not None for log in logs) else "none"
+    self.effort_noise = self._effort_noise()
+
+  def masked(self, masks: Sequence[Array]) -> "Problem":
+    """Returns the same problem on part of the samples."""
+    return Problem(self.plant, masks=masks)
+
+  def _effort_noise(self) -> float:
+    if self.channel == "none":
+      return 1.0
+    steps = [quantum(self.effort(i)) for i in range(len(self.plant.logs))]
+    jitter = [
+      float(np.median(np.abs(np.diff(self.effort(i), n=2)))) / 1.65
+      for i in range(len(self.plant.logs))
+    ]
+    return max(*steps, float(np.median(jitter)), 1e-9)
+
+  def effort(self, index: int) -> Array:
+    """Returns the measured effort, or duty, of a log [N]."""
+    log = self.plant.logs[index]
+    values = log.effort if self.channel == "effort" else log.duty
+    assert values is not None
+    return values
+
+  def simulate(self, terms: Sequence[Term], xs: Array) -> list[list[tuple[Array, Array, Array]]]:
+    """Returns the motion of each set of values [B, n]."""
+    composed = [compose(self.plant, terms, x) for x in np.atleast_2d(xs)]
+    return self.plant.simulate(
+      np.array([p for p, _ in composed]), surroundings=[s for _, s in composed]
+    )
+
+  def effort_scale(self, outputs: Sequence[tuple[Array, Array, Array]]) -> float:
+    """Returns measured effort over simulated torque, by least squares over all logs."""
+    if self.channel == "none":
+      return 1.0
+    above, below = 0.0, 1e-12
+    for index, (_, _, torque) in enumerate(outputs):
+      chosen = self.masks[index]
+      above += float(self.effort(index)[chosen] @ torque[chosen])
+      below += float(torque[chosen] @ torque[chosen])
+    scale = above / below
+    return float(np.clip(scale, 0.3, 3.0)) if self.channel == "effort" else float(scale)
+
+  def errors(
+    self, outputs: Sequence[tuple[Array, Array, Array]]
+  ) -> list[tuple[Array, Array | None]]:
+    """Returns measured minus simulated position and effort of each log, in noise units."""
+    scale = self.effort_scale(outputs)
+    result: list[tuple[Array, Array | None]] = []
+    for index, (position, _, torque) in enumerate(outputs):
+      log = self.plant.logs[index]
+      along = (log.position - position) / self.position_noise
+      effort = None
+      if self.channel != "none":
+        effort = (self.effort(index) - scale * torque) / self.effort_noise
+      result.append((along, effort))
+    return result
+
+  def residuals(self, terms: Sequence[Term], xs: Array) -> Array:
+    """Returns soft residuals [B, R] of sets of values, priors included."""
+    xs = np.atleast_2d(xs)
+    rows = []
+    for x, outputs in zip(xs, self.simulate(terms, xs), strict=True):
+      parts = []
+      for index, (along, effort) in enumerate(self.errors(outputs)):
+        chosen = self.masks[index]
+        parts.append(soft(along[chosen]))
+        if effort is not None:
+          parts.append(0.5 * soft(effort[chosen]))
+      parts.append(_prior(terms, x))
+      rows.append(np.concatenate(parts))
+    return np.array(rows)
+
+  def fit(self, terms: Sequence[Term], start: Array | None = None, *, evaluations: int = 25) -> Fit:
+    """Fits a hypothesis, from every combination of its terms' starts or from one start [n]."""
+    low = np.concatenate([np.zeros(0), *[term.low for term in terms]])
+    high = np.concatenate([np.zeros(0), *[term.high for term in terms]])
+    scale = np.concatenate([np.zeros(0), *[term.scale for term in terms]])
+    starts = [start] if start is not None else self._starts(terms)
+    starts = [np.clip(s, low + 1e-9 * scale, high - 1e-9 * scale) for s in starts]
+    if len(starts) > 2:  # look at all, descend from the best two
+      costs = np.sum(self.residuals(terms, np.array(starts)) ** 2, axis=1)
+      starts = [starts[i] for i in np.argsort(costs)[:2]]
+    best: Fit | None = None
+    for begin in starts:
+      fit = self._descend(terms, begin, low, high, scale, evaluations)
+      if best is None or fit.cost < best.cost:
+        best = fit
+    assert best is not None
+    return best
+
+  def _starts(self, terms: Sequence[Term]) -> list[Array]:
+    starts = [np.zeros(0)]
+    for term in terms:
+      starts = [np.concatenate([s, np.array(t, float)]) for s in starts for t in term.starts]
+    return starts
+
+  def _descend(
+    self, terms: Sequence[Term], start: Array, low: Array, high: Array, scale: Array, limit: int
+  ) -> Fit:
+    """Levenberg-Marquardt with bounds; several dampings are tried side by side."""
+    x, count, cost = start, 0, float("inf")
+    steps = _DIFFERENCE * scale
+    while count < limit:
+      signed = np.where(x + steps > high, -steps, steps)
+      rows = self.residuals(terms, np.vstack([x, x + np.diag(signed)]))
+      cost = 0.5 * float(rows[0] @ rows[0])
+      count += 1
+      if not len(x):
+        break
+      jacobian = (rows[1:] - rows[0]) / steps_column(signed, scale)
+      normal, gradient = jacobian @ jacobian.T, jacobian @ rows[0]
+      normal += 1e-12 * np.trace(normal) * np.eye(len(x))
+      free = ~(((x <= low + 1e-9 * scale) & (gradient > 0)) | ((x >= high) & (gradient < 0)))
+      tried = np.repeat(x[None], len(_DAMPINGS), axis=0)
+      for row, damping in zip(tried, _DAMPINGS, strict=True):
+        block = normal[np.ix_(free, free)]
+        damped = block + damping * np.diag(np.diag(block))
+        row[free] -= np.linalg.solve(damped, gradient[free]) * scale[free]
+        np.clip(row, low, high, out=row)
+      values = self.residuals(terms, tried)
+      costs = 0.5 * np.sum(np.square(values), axis=1)
+      best = int(np.argmin(costs))
+      gained = cost - costs[best]
+      if gained > 0:
+        x, cost = tried[best], float(costs[best])
+      if gained < _CONVERGED * cost:
+        break
+    outputs = self.simulate(terms, x)[0]
+    return Fit(tuple(terms), x, cost, self.effort_scale(outputs), count)
+
+
+def steps_column(steps: Array, scale: Array) -> Array:
+  """Returns the steps in units of the scale as a column [n, 1]."""
+  return (steps / scale)[:, None]
+
+
+def soft(values: Array) -> Array:
+  """Returns residuals whose squares grow linearly beyond a few noise units (pseudo-Huber)."""
+  return np.sign(values) * _SOFT * np.sqrt(2.0 * (np.sqrt(1.0 + (values / _SOFT) ** 2) - 1.0))
+
+
+def _prior(terms: Sequence[Term], x: Array) -> Array:
+  rows, at = [], 0
+  for term in terms:
+    part = x[at : at + len(term.names)]
+    at += len(term.names)
+    if term.prior:
+      centre = np.array(term.centre) if term.centre else 0.0
+      rows.append((part - centre) / np.array(term.prior) * np.sqrt(_PRIOR_COUNT))
+  return np.concatenate(rows) if rows else np.zeros(0)
+
+
+def position_noise(plant: JointPlant) -> float:
+  """Returns the noise of the position readings: scatter about a local cubic, at least the
+  rounding to the sensor's steps."""
+  scatter, steps = [], []
+  for log in plant.logs:
+    third = np.diff(log.position, n=3)
+    scatter.append(float(np.median(np.abs(third))) / 0.6745 / np.sqrt(20.0))
+    steps.append(quantum(log.position))
+  return max(float(np.median(scatter)), min(steps) / np.sqrt(12.0), 1e-9)
