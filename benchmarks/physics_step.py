@@ -20,7 +20,7 @@ from dm_control import composer, mjcf
 
 from suite import filters, inertia
 from suite.op3 import constants, op3
-from suite.tasks.base import standing_posture
+from suite.tasks.state import standing_posture
 
 REFERENCE = 0.000125  # s
 STEPS = (0.00625, 0.005, 0.0025, 0.00125, 0.0005)  # s, each divides the control step

@@ -9,7 +9,8 @@ from suite.effects import read_effects
 from suite.environment import Environment
 from suite.randomisation import RandomisationSettings
 from suite.tasks import ball_push, nerf_nav
-from suite.tasks.base import PHYSICS_TIMESTEP, RobotTask, TaskSettings
+from suite.tasks.base import RobotTask
+from suite.tasks.settings import PHYSICS_TIMESTEP, TaskSettings
 
 # Name to (class, length of an episode [s]).
 _TASKS: dict[str, tuple[type[RobotTask], float]] = {

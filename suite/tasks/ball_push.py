@@ -5,14 +5,17 @@ Byravan et al. 2022, NeRF2Real, section "Tasks" and appendix "Rewards".
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from suite import protocols, rewards
 from suite.ball import Ball
 from suite.camera import RobotCamera
 from suite.op3 import constants
-from suite.tasks.base import RobotTask, Start, TaskSettings
+from suite.tasks import touch
+from suite.tasks.base import RobotTask
+from suite.tasks.privileged import Quantity
+from suite.tasks.settings import TaskSettings
+from suite.tasks.state import Start
 from suite.tasks.workspace import Workspace, find_workspace
 
 NAME = "ball_push"
@@ -131,7 +134,7 @@ class BallPush(RobotTask):
     return points[np.argmin(np.linalg.norm(points - xy, axis=1))]
 
   def _in_front(self, random_state: np.random.RandomState) -> np.ndarray:
-    root = self._root_qpos
+    root = self._indices.root_qpos
     w, x, y, z = self._data.qpos[root + 3 : root + 7]
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     ahead, aside = random_state.uniform(*_AHEAD), random_state.uniform(-_ASIDE, _ASIDE)
@@ -148,9 +151,7 @@ class BallPush(RobotTask):
 
   def _ball_touches_anything(self) -> bool:
     """Returns whether the ball, where it is now, touches more than the floor."""
-    mujoco.mj_kinematics(self._model, self._data)
-    mujoco.mj_comPos(self._model, self._data)
-    mujoco.mj_collision(self._model, self._data)
+    touch.collide(self._model, self._data)
     floor = self._model.geom(self._arena.floor.full_identifier).id
     pairs = self._data.contact.geom
     touching = (pairs == self._ball_id).any(axis=1) & ~(pairs == floor).any(axis=1)
@@ -182,16 +183,16 @@ class BallPush(RobotTask):
   def _failure(self) -> str | None:
     return FALL if self.fallen else None
 
-  def _privileged(self) -> dict[str, tuple[int, Any]]:
+  def _privileged(self) -> dict[str, Quantity]:
+    def ball_from_robot() -> np.ndarray:
+      return (self.ball_position - self._state.position) @ self._state.aligned
+
+    def goal_from_ball() -> np.ndarray:
+      return self.relative(self.workspace.target) - self.relative(self.ball_position[:2])
+
     return {
-      "ball_position": (3, lambda: self.ball_position),
-      "ball_velocity": (3, lambda: self.ball_velocity @ self._state.aligned),
-      "ball_from_robot": (
-        3,
-        lambda: (self.ball_position - self._state.position) @ self._state.aligned,
-      ),
-      "goal_from_ball": (
-        2,
-        lambda: self.relative(self.workspace.target) - self.relative(self.ball_position[:2]),
-      ),
+      "ball_position": Quantity(3, lambda: self.ball_position),
+      "ball_velocity": Quantity(3, lambda: self.ball_velocity @ self._state.aligned),
+      "ball_from_robot": Quantity(3, ball_from_robot),
+      "goal_from_ball": Quantity(2, goal_from_ball),
     }

@@ -4,78 +4,31 @@ import abc
 import collections
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import composer
 from dm_env import specs
 
-from suite import filters, rewards
+from suite import filters
 from suite import randomisation as randomising
 from suite import specs as policy_specs
 from suite.arena import SceneArena
 from suite.camera import RobotCamera
-from suite.effects import Effect, EffectStack
+from suite.effects import EffectStack
 from suite.environment import Reading
 from suite.op3 import constants, op3
 from suite.proprioception import Proprioception
+from suite.tasks import privileged, touch
+from suite.tasks.delayed_picture import DelayedPicture
+from suite.tasks.settings import TaskSettings
+from suite.tasks.state import RobotIndices, RobotState, Start
 
-PHYSICS_TIMESTEP = 0.0025  # s: benchmarks/physics_step.py, results in suite/README.md
 MIN_UPRIGHT = 0.5  # cosine of the torso's tilt below which it has fallen (60 degrees): ours
 MIN_HEIGHT = 0.14  # m of the torso's origin above the floor (standing: 0.246): ours
 _MAX_START_ATTEMPTS = 100
-_TOUCHES_SCENE, _TOUCHES_FLOOR = 1, 2  # bits of what a part other than the feet touches
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TaskSettings:
-  """Settings of a task."""
-
-  time_limit: float  # s
-  physics_timestep: float = PHYSICS_TIMESTEP  # s; the control step is a multiple of it
-  privileged: bool = True  # whether to give the observations that only the critic may see
-  effects: Sequence[Effect] = ()  # what the nominal model lacks; targets with or without "op3/"
-  randomisation: randomising.RandomisationSettings = dataclasses.field(
-    default_factory=randomising.RandomisationSettings
-  )
-
-  def __post_init__(self):
-    if not self.time_limit > 0:
-      raise ValueError(f"The time_limit must be positive [s], found {self.time_limit}.")
-    steps = constants.CONTROL_TIMESTEP / self.physics_timestep if self.physics_timestep > 0 else 0
-    if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
-      raise ValueError(
-        f"The physics_timestep must divide the control step of {constants.CONTROL_TIMESTEP} s, "
-        f"found {self.physics_timestep}."
-      )
-
-
-class RobotState(NamedTuple):
-  """The robot's true state at the end of a control step."""
-
-  position: np.ndarray  # torso [3] in the world [m]
-  rotation: np.ndarray  # world from torso [3, 3]
-  aligned: np.ndarray  # world from gravity-aligned frame [3, 3] (suite.rewards)
-  velocity: np.ndarray  # torso [3] in the world [m/s]
-  angular_velocity: np.ndarray  # torso [3] in the world [rad/s]
-  feet_velocity: np.ndarray  # midpoint of the feet [3], gravity-aligned frame [m/s]
-  yaw_speed: float  # of the gravity-aligned frame [rad/s]
-  joints: np.ndarray  # [20] rad
-  joint_velocities: np.ndarray  # [20] rad/s
-
-  @property
-  def yaw(self) -> float:
-    """Heading in the world [rad]."""
-    return float(np.arctan2(self.aligned[1, 0], self.aligned[0, 0]))
-
-
-class Start(NamedTuple):
-  """Where the robot stands at the start of an episode."""
-
-  xy: tuple[float, float]  # m
-  yaw: float  # rad
 
 
 class Outcome(NamedTuple):
@@ -85,31 +38,6 @@ class Outcome(NamedTuple):
   success_time: float  # s from the start; NaN without success
   ending: str | None  # why it ended early; None: it runs, or reached its time limit
   duration: float  # s
-
-
-@functools.cache
-def standing_posture() -> np.ndarray:
-  """Returns qpos [27] of the robot standing at rest at the origin on a flat floor, facing +x.
-
-  The servos are soft: under its weight the robot settles a little away from what they are told.
-  """
-  arena = composer.Arena()
-  robot = op3.OP3()
-  arena.mjcf_model.worldbody.add("geom", type="plane", size=(2, 2, 0.1))
-  arena.add_free_entity(robot)
-  arena.mjcf_model.option.timestep = PHYSICS_TIMESTEP
-  physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
-  targets = constants.standing_targets()
-  joints = physics.bind(robot.joints)
-  with physics.reset_context():
-    physics.data.qpos[2] = 0.26
-    joints.qpos = targets
-    physics.set_control(targets)
-  physics.step(round(2.0 / PHYSICS_TIMESTEP))
-  qpos = np.concatenate([physics.data.qpos[:7], joints.qpos])
-  qpos[:2] = 0.0
-  qpos.setflags(write=False)
-  return qpos
 
 
 def _single(read: Callable[[], np.ndarray]) -> np.ndarray:
@@ -215,8 +143,8 @@ class RobotTask(composer.Task):
     """Returns the name of the ball's geom, if there is a ball."""
     return None
 
-  def _privileged(self) -> dict[str, tuple[int, Any]]:
-    """Returns further privileged observations: name to (size, function)."""
+  def _privileged(self) -> dict[str, privileged.Quantity]:
+    """Returns further privileged observations by name."""
     return {}
 
   # ---- composer's life cycle ----
@@ -224,34 +152,20 @@ class RobotTask(composer.Task):
   def after_compile(self, physics: Any, random_state: np.random.RandomState) -> None:
     self._model, self._data = physics.model.ptr, physics.data.ptr
     model = self._model
-    joints = physics.bind(self._robot.joints).element_id
-    self._joint_qpos = np.asarray(model.jnt_qposadr[joints])
-    self._joint_dofs = np.asarray(model.jnt_dofadr[joints])
-    self._torso = int(physics.bind(self._robot.torso).element_id)
-    root = model.body_rootid[self._torso]
-    free = model.body_jntadr[root]
-    self._root_qpos, self._root_dof = int(model.jnt_qposadr[free]), int(model.jnt_dofadr[free])
-    self._feet = [int(physics.bind(foot).element_id) for foot in self._robot.feet]
-    gyroscope = physics.bind(self._robot.mjcf_model.find("sensor", "gyroscope")).element_id
-    first = int(model.sensor_adr[gyroscope])
-    self._imu_slice = slice(first, first + 6)  # the accelerometer follows the gyroscope
-    self._touch_table = self._make_touch_table(root)
+    self._indices = RobotIndices(physics, self._robot)
+    self._touch = touch.Touch(model, root=self._indices.root, feet=self._indices.feet)
     self._effects = self._bind_effects()
     self._randomiser = randomising.Randomiser(
       model, torso=self._robot.torso.full_identifier, ball=self._ball_geom(),
       imu_sites=(self._robot.imu.full_identifier,),
     )  # fmt: skip
-    self._past = mujoco.MjData(model)  # the state that a delayed picture shows
+    self._picture: DelayedPicture | None = None
     if self.robot_camera is not None:
       self.robot_camera.bind(model, int(physics.bind(self._robot.camera).element_id))
-      latency = self.robot_camera.settings.latency
-    else:
-      latency = 0.0
-    draws = self.settings.randomisation
-    oldest = latency + draws.delay_range[1] + draws.jitter_half_width
-    rows = int(np.ceil(oldest / self._timestep)) + self._substeps + 1
-    self._qpos_trace = np.zeros((rows, model.nq))  # newest last
-    self._camera_latency = latency
+      self._picture = DelayedPicture(
+        model, self.robot_camera, randomisation=self.settings.randomisation,
+        timestep=self._timestep, substeps=self._substeps,
+      )  # fmt: skip
     self._substep = 0
 
   def _bind_effects(self) -> EffectStack:
@@ -270,15 +184,6 @@ class RobotTask(composer.Task):
     self._effects_act = not stack.is_constant
     return stack
 
-  def _make_touch_table(self, root: int) -> np.ndarray:
-    """Returns uint8 [geoms, geoms]: what a robot part other than a foot touches in a contact."""
-    model = self._model
-    robot = (model.body_rootid[model.geom_bodyid] == root) & ~np.isin(model.geom_bodyid, self._feet)
-    static = model.body_weldid[model.geom_bodyid] == 0
-    bits = np.where(model.geom_group == op3.FLOOR_GROUP, _TOUCHES_FLOOR, _TOUCHES_SCENE)
-    one_way = np.outer(robot, static * bits)
-    return (one_way | one_way.T).astype(np.uint8)
-
   def initialize_episode(self, physics: Any, random_state: np.random.RandomState) -> None:
     self.draws = randomising.draw_episode(
       self.settings.randomisation, random_state, time_limit=self.settings.time_limit
@@ -290,7 +195,7 @@ class RobotTask(composer.Task):
     self._action_filter.reset(self._control)
     self._targets = self._middle + self._half_range * self._control
     physics.set_control(self._targets)
-    self._touched = 0
+    self._touch.reset()
     self.success, self.success_time, self.ending = False, float("nan"), None
 
   def start_sensors(self, physics: Any, random_state: np.random.RandomState) -> None:
@@ -300,12 +205,14 @@ class RobotTask(composer.Task):
     mujoco.mj_forward(self._model, self._data)
     self._random_state = random_state
     self._proprioception.reset(
-      self._data.sensordata[self._imu_slice], self._data.qpos[self._joint_qpos], self._control,
+      self._data.sensordata[self._indices.imu], self._data.qpos[self._indices.joint_qpos],
+      self._control,
       imu_delay=self.draws.imu_delay, joint_delay=self.draws.joint_delay,
       jitter=self.draws.jitter, rng=np.random.default_rng(random_state.randint(2**31)),
     )  # fmt: skip
-    self._qpos_trace[:] = self._data.qpos
-    self._update_state()
+    if self._picture is not None:
+      self._picture.reset(self._data.qpos)
+    self._state = self._indices.read()
 
   def before_step(
     self, physics: Any, action: np.ndarray, random_state: np.random.RandomState
@@ -314,12 +221,12 @@ class RobotTask(composer.Task):
     self._targets = self._middle + self._half_range * self._control
     self._data.ctrl[:] = self._targets
     assert self.draws is not None
-    self._data.xfrc_applied[self._torso, :3] = (
+    self._data.xfrc_applied[self._indices.torso, :3] = (
       self.draws.pushes.at(self._data.time) + self.hand_force
     )
     self._substep = 0
-    count = self._substeps
-    self._qpos_trace[:-count] = self._qpos_trace[count:]
+    if self._picture is not None:
+      self._picture.start_step()
 
   def before_substep(
     self, physics: Any, action: np.ndarray, random_state: np.random.RandomState
@@ -331,17 +238,16 @@ class RobotTask(composer.Task):
     data = self._data
     qpos = data.qpos
     self._proprioception.record(
-      self._substep, data.sensordata[self._imu_slice], qpos[self._joint_qpos]
+      self._substep, data.sensordata[self._indices.imu], qpos[self._indices.joint_qpos]
     )
+    if self._picture is not None:
+      self._picture.record(self._substep, qpos)
+    self._touch.note(data)
     self._substep += 1
-    self._qpos_trace[self._substep - 1 - self._substeps] = qpos
-    if data.ncon:
-      pairs = data.contact.geom
-      self._touched |= int(np.bitwise_or.reduce(self._touch_table[pairs[:, 0], pairs[:, 1]]))
 
   def after_step(self, physics: Any, random_state: np.random.RandomState) -> None:
     self._proprioception.finish_step(self._control)
-    self._update_state()
+    self._state = self._indices.read()
     self.reward_terms = self._compute_rewards()
     self.ending = self._failure()
     if self.ending is None and not self.success and self._reached():
@@ -369,7 +275,7 @@ class RobotTask(composer.Task):
   @property
   def touches_scene(self) -> bool:
     """Whether a part other than the feet has touched the room in this episode."""
-    return bool(self._touched & _TOUCHES_SCENE)
+    return self._touch.scene
 
   @property
   def fallen(self) -> bool:
@@ -377,67 +283,27 @@ class RobotTask(composer.Task):
     return (
       self._state.rotation[2, 2] < MIN_UPRIGHT
       or self._state.position[2] < MIN_HEIGHT
-      or bool(self._touched & _TOUCHES_FLOOR)
+      or self._touch.floor
     )
-
-  def _update_state(self) -> None:
-    model, data = self._model, self._data
-    rotation = data.xmat[self._torso].reshape(3, 3).copy()
-    aligned = rewards.gravity_aligned_frame(rotation, model.opt.gravity)
-    dof = self._root_dof
-    angular = rotation @ data.qvel[dof + 3 : dof + 6]
-    twist, feet = np.empty(6), np.zeros(3)
-    for foot in self._feet:
-      mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, foot, twist, 0)
-      feet += twist[3:] / 2
-    self._state = RobotState(
-      position=data.xpos[self._torso].copy(),
-      rotation=rotation,
-      aligned=aligned,
-      velocity=data.qvel[dof : dof + 3].copy(),
-      angular_velocity=angular,
-      feet_velocity=feet @ aligned,
-      yaw_speed=rewards.yaw_rate(rotation, angular, model.opt.gravity),
-      joints=data.qpos[self._joint_qpos],
-      joint_velocities=data.qvel[self._joint_dofs],
-    )
-
-  def _stand_at(self, start: Start) -> None:
-    """Writes the standing posture at a place."""
-    posture = standing_posture()
-    qpos, root = self._data.qpos, self._root_qpos
-    qpos[root : root + 2] = start.xy
-    qpos[root + 2] = posture[2]
-    turn = np.array([np.cos(start.yaw / 2), 0, 0, np.sin(start.yaw / 2)])
-    mujoco.mju_mulQuat(qpos[root + 3 : root + 7], turn, posture[3:7])
-    qpos[self._joint_qpos] = posture[7:]
 
   def _stand_somewhere(self, draw: Callable[[], Start]) -> None:
     """Stands the robot at `start`, or at a drawn place where it touches nothing but the floor."""
     if self.start is not None:
-      self._stand_at(self.start)
+      self._indices.stand_at(self.start)
       return
     for _ in range(_MAX_START_ATTEMPTS):
-      self._stand_at(draw())
-      if not self._touches_anything():
+      self._indices.stand_at(draw())
+      touch.collide(self._model, self._data)
+      if not self._touch.now(self._data):
         return
     raise composer.EpisodeInitializationError(
       f"Found no start pose free of contact in {_MAX_START_ATTEMPTS} attempts: the free space of "
       f"the scene {getattr(self.scene, 'name', '')!r} does not fit its collision parts."
     )
 
-  def _touches_anything(self) -> bool:
-    mujoco.mj_kinematics(self._model, self._data)
-    mujoco.mj_comPos(self._model, self._data)
-    mujoco.mj_collision(self._model, self._data)
-    pairs = self._data.contact.geom
-    return bool(self._touch_table[pairs[:, 0], pairs[:, 1]].any())
-
   def relative(self, xy: np.ndarray) -> np.ndarray:
     """Returns a point of the floor [2] relative to the robot, gravity-aligned frame [2] [m]."""
-    offset = np.array([xy[0], xy[1], 0.0]) - self._state.position
-    offset[2] = 0.0
-    return (offset @ self._state.aligned)[:2]
+    return self._state.relative(xy)
 
   # ---- observations ----
 
@@ -463,37 +329,19 @@ class RobotTask(composer.Task):
       else:
         readings[name] = Reading(functools.partial(self._proprioception.read, name), spec)
     if self.settings.privileged:
-      for name, (size, read) in self._all_privileged().items():
-        readings[f"privileged/{name}"] = Reading(
-          functools.partial(_single, read), specs.Array((size,), np.float32)
+      known = privileged.of_robot(
+        lambda: self._state, goal=self._goal_position, draws=lambda: self.draws
+      )
+      for name, quantity in {**known, **self._privileged()}.items():
+        readings[privileged.PREFIX + name] = Reading(
+          functools.partial(_single, quantity.read), specs.Array((quantity.size,), np.float32)
         )
     return readings
 
-  def _all_privileged(self) -> dict[str, tuple[int, Any]]:
-    return {
-      "robot_position": (3, lambda: self._state.position),
-      "robot_rotation": (9, lambda: self._state.rotation.ravel()),
-      "robot_velocity": (3, lambda: self._state.velocity @ self._state.aligned),
-      "robot_angular_velocity": (3, lambda: self._state.angular_velocity @ self._state.aligned),
-      "joint_positions": (20, lambda: self._state.joints),
-      "joint_velocities": (20, lambda: self._state.joint_velocities),
-      "goal": (2, lambda: self.relative(self._goal_position())),
-      "randomisation": (
-        randomising.NUM_DRAWS,
-        lambda: np.zeros(randomising.NUM_DRAWS) if self.draws is None else self.draws.vector(),
-      ),
-      **self._privileged(),
-    }
-
   def _take_picture(self) -> np.ndarray:
-    """Returns the picture that has arrived by now: it shows the world a little earlier."""
-    assert self.draws is not None and self.robot_camera is not None
-    delay = self._camera_latency + self.draws.camera_delay
-    if self.draws.jitter:
-      delay = max(0.0, delay + self._random_state.uniform(-1, 1) * self.draws.jitter)
-    age = min(round(delay / self._timestep), len(self._qpos_trace) - 1)
-    self._past.qpos[:] = self._qpos_trace[-1 - age]
-    mujoco.mj_kinematics(self._model, self._past)
-    mujoco.mj_camlight(self._model, self._past)
-    picture = self.robot_camera.render(self._past, self._random_state)
+    """Returns the picture that has arrived by now."""
+    assert self.draws is not None and self._picture is not None
+    picture = self._picture.take(
+      self.draws.camera_delay, jitter=self.draws.jitter, random_state=self._random_state
+    )
     return self._effects.observe("camera", picture, float(self._data.time))

@@ -12,7 +12,9 @@ import numpy as np
 from suite import protocols, rewards
 from suite.camera import RobotCamera
 from suite.op3 import constants
-from suite.tasks.base import RobotTask, Start, TaskSettings
+from suite.tasks.base import RobotTask
+from suite.tasks.settings import TaskSettings
+from suite.tasks.state import Start
 
 NAME = "nerf_nav"
 # s: ours, the paper names no limit for navigation; three times its median time to a goal (10.3 s).

@@ -9,7 +9,8 @@ import pytest
 from dm_control import composer, mjcf
 
 from suite.op3 import constants, op3
-from suite.tasks import base
+from suite.tasks.settings import PHYSICS_TIMESTEP
+from suite.tasks.state import standing_posture
 
 
 def _table():
@@ -23,7 +24,7 @@ def physics():
   arena.mjcf_model.compiler.set_attributes(boundmass=0, boundinertia=0)
   arena.mjcf_model.worldbody.add("geom", name="floor", type="plane", size=(3, 3, 0.1))
   arena.add_free_entity(op3.OP3())
-  arena.mjcf_model.option.timestep = base.PHYSICS_TIMESTEP
+  arena.mjcf_model.option.timestep = PHYSICS_TIMESTEP
   return mjcf.Physics.from_mjcf_model(arena.mjcf_model)
 
 
@@ -117,7 +118,7 @@ def test_hip_pair_is_excluded_and_feet_are_the_published_boxes(physics):
 
 
 def test_stands_still_for_a_minute_on_its_feet_alone(physics):
-  posture, targets = base.standing_posture(), constants.standing_targets()
+  posture, targets = standing_posture(), constants.standing_targets()
   with physics.reset_context():
     physics.data.qpos[:7] = posture[:7]
     for name, value in zip(constants.JOINT_NAMES, posture[7:], strict=True):

@@ -1,0 +1,67 @@
+"""The robot's picture, late: it shows the state that the world was in a little earlier."""
+
+import mujoco
+import numpy as np
+
+from suite.camera import RobotCamera
+from suite.randomisation import RandomisationSettings
+
+
+class DelayedPicture:
+  """Remembers the last states and renders the one that the newest picture to arrive shows."""
+
+  def __init__(
+    self,
+    model: mujoco.MjModel,
+    camera: RobotCamera,
+    *,
+    randomisation: RandomisationSettings,
+    timestep: float,
+    substeps: int,
+  ):
+    """Allocates the memory.
+
+    Args:
+      model: The compiled model.
+      camera: The camera, bound to it.
+      randomisation: Ranges of delay and jitter.
+      timestep: Physics step [s].
+      substeps: Physics steps in a control step.
+    """
+    self._model, self._camera = model, camera
+    self._timestep, self._substeps = timestep, substeps
+    oldest = (
+      camera.settings.latency + randomisation.delay_range[1] + randomisation.jitter_half_width
+    )
+    rows = int(np.ceil(oldest / timestep)) + substeps + 1
+    self._trace = np.zeros((rows, model.nq))  # newest last
+    self._past = mujoco.MjData(model)  # the state that is shown
+
+  def reset(self, qpos: np.ndarray) -> None:
+    """Starts an episode in which the world has been as it is now for a long time."""
+    self._trace[:] = qpos
+
+  def start_step(self) -> None:
+    """Makes room for the states of a control step."""
+    self._trace[: -self._substeps] = self._trace[self._substeps :]
+
+  def record(self, substep: int, qpos: np.ndarray) -> None:
+    """Notes the state at the end of a physics step (0 to S-1) of this control step."""
+    self._trace[substep - self._substeps] = qpos
+
+  def take(self, delay: float, *, jitter: float, random_state: np.random.RandomState) -> np.ndarray:
+    """Returns the picture that has arrived by now, uint8 [H, W, 3].
+
+    Args:
+      delay: The episode's delay [s]; the camera's own latency is added.
+      jitter: Half width of the uniform jitter [s].
+      random_state: Source of the jitter and of the sensor's noise.
+    """
+    delay += self._camera.settings.latency
+    if jitter:
+      delay = max(0.0, delay + random_state.uniform(-1, 1) * jitter)
+    age = min(round(delay / self._timestep), len(self._trace) - 1)
+    self._past.qpos[:] = self._trace[-1 - age]
+    mujoco.mj_kinematics(self._model, self._past)
+    mujoco.mj_camlight(self._model, self._past)
+    return self._camera.render(self._past, random_state)

@@ -1,0 +1,36 @@
+"""Settings that both tasks take."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from suite.effects import Effect
+from suite.op3 import constants
+from suite.randomisation import RandomisationSettings
+
+PHYSICS_TIMESTEP = 0.0025  # s: benchmarks/physics_step.py, results in suite/README.md
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TaskSettings:
+  """Settings of a task."""
+
+  time_limit: float
+  """Length of an episode [s]."""
+  physics_timestep: float = PHYSICS_TIMESTEP
+  """s; the control step is a multiple of it."""
+  privileged: bool = True
+  """Whether to give the observations that only the critic may see."""
+  effects: Sequence[Effect] = ()
+  """What the nominal model lacks; targets with or without "op3/"."""
+  randomisation: RandomisationSettings = dataclasses.field(default_factory=RandomisationSettings)
+  """Which parts of an episode are random."""
+
+  def __post_init__(self):
+    if not self.time_limit > 0:
+      raise ValueError(f"The time_limit must be positive [s], found {self.time_limit}.")
+    steps = constants.CONTROL_TIMESTEP / self.physics_timestep if self.physics_timestep > 0 else 0
+    if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
+      raise ValueError(
+        f"The physics_timestep must divide the control step of {constants.CONTROL_TIMESTEP} s, "
+        f"found {self.physics_timestep}."
+      )
