@@ -7,8 +7,10 @@ not know go to the learner (see `launch/learner.py --help`), such as --set batch
 
 import argparse
 import dataclasses
+import json
 import os
 import secrets
+import shlex
 import signal
 import socket
 import subprocess
@@ -207,6 +209,20 @@ def _number(value: float | None) -> str:
   return "-" if value is None else f"{value:.3g}"
 
 
+def _note_launch(run: Path) -> None:
+  """Appends the command, the time and the hardware to launches.jsonl of the run."""
+  info = Path("/proc/cpuinfo")
+  lines = info.read_text().splitlines() if info.exists() else []
+  row = {
+    "time": time.time(),
+    "command": shlex.join(["python", *sys.argv]),
+    "processor": next((n.partition(":")[2].strip() for n in lines if "model name" in n), ""),
+    "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
+  }
+  with (run / "launches.jsonl").open("a") as stream:
+    stream.write(json.dumps(row) + "\n")
+
+
 def _free_port() -> int:
   with socket.socket() as probe:
     probe.bind(("127.0.0.1", 0))
@@ -254,6 +270,7 @@ def main() -> int:
           file=sys.stderr)  # fmt: skip
     return 2
   supervisor = Supervisor(arguments, rest)
+  _note_launch(arguments.run)
   view = StatusView(supervisor)
   stopped: list[int] = []
   for number in (signal.SIGINT, signal.SIGTERM):

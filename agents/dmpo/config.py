@@ -189,7 +189,10 @@ def state() -> DmpoConfig:
 
 
 def vision_small() -> DmpoConfig:
-  """Settings for small tasks from pictures on a CPU: the paper's structure, narrower."""
+  """Settings for small tasks from pictures on a CPU: the paper's structure, narrower.
+
+  First temperatures, the bound on the out-of-bounds objective and learning rates as in `state`.
+  """
   return DmpoConfig(
     network=NetworkConfig(
       policy_layers=(128, 128),
@@ -198,16 +201,20 @@ def vision_small() -> DmpoConfig:
       image_blocks=1,
       image_features=64,
       lstm_size=64,
-      vmin=-5.0,
-      vmax=5.0,
+      vmin=-25.0,
+      vmax=25.0,
     ),
     augmentation=AugmentationConfig(enabled=False),
-    policy_learning_rate=5e-4,
-    critic_learning_rate=5e-4,
+    policy_learning_rate=1e-3,
+    critic_learning_rate=1e-3,
     epsilon_mean=0.01,
+    epsilon_action_penalty=0.1,
+    init_log_temperature=0.0,
+    init_log_alpha_mean=1.0,
     trajectory_length=16,
-    batch_size=32,
-    steps_per_update=16.0,
+    batch_size=16,
+    steps_per_update=8.0,
+    target_critic_period=50,
     min_replay_steps=1000,
     replay_steps=100_000,
   )

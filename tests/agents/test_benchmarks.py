@@ -6,6 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -30,3 +33,38 @@ def test_link(tmp_path):
   for name in ("zenoh", "link"):
     assert record["results"][name]["messages_per_second"] > 1
   assert record["results"]["link"]["lost"] == record["results"]["link"]["repeated"] == 0
+
+
+def _write_run(folder, *, slope):
+  folder.mkdir()
+  rows = [
+    {"time": 100.0 + i, "source": source, "steps": 1000 * i, "updates": 250 * i,
+     "return": slope * i, "episodes": 5}
+    for i in range(1, 5) for source in ("actor-0-a", "evaluator-0-b")
+  ]  # fmt: skip
+  (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+  launch = {"time": 99.0, "command": "python x", "processor": "p", "cores": 1}
+  (folder / "launches.jsonl").write_text(json.dumps(launch) + "\n")
+
+
+def test_curves(tmp_path):
+  for name, slope in (("a", 100.0), ("b", 200.0)):
+    _write_run(tmp_path / name, slope=slope)
+  subprocess.run(
+    [sys.executable, ROOT / "benchmarks/curves.py", "--name", "x", "--out", tmp_path,
+     tmp_path / "a", tmp_path / "b", "--target", "700"],
+    check=True, capture_output=True, timeout=60, env=os.environ | {"PYTHONPATH": str(ROOT)},
+  )  # fmt: skip
+  rows = [json.loads(line) for line in (tmp_path / "curves_x.jsonl").read_text().splitlines()]
+  assert [r["seconds"] for r in rows if r["row"] == "run"] == [5, 5]
+  assert [r["return"] for r in rows if r["row"] == "evaluation"] == [
+    100, 200, 300, 400, 200, 400, 600, 800
+  ]  # fmt: skip
+  picture = cv2.imread(str(tmp_path / "curves_x.png")).astype(int)
+  red, blue = (
+    np.argwhere(np.abs(picture - colour[::-1]).max(-1) == 0)
+    for colour in ((214, 39, 40), (31, 119, 180))
+  )
+  plot = red[red[:, 0] > 60]  # below the title and the names
+  assert plot[:, 0].min() < blue[blue[:, 0] > 60][:, 0].min()  # the better run stands higher
+  assert plot[:, 1].max() > 900  # and both end at the right edge
