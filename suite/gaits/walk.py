@@ -1,0 +1,204 @@
+"""A gait for the OP3: swaying, lifting and stepping along sines, held upright by feedback.
+
+The pattern is open loop: one phase runs on, the feet follow curves of it in a frame that stands
+upright over the floor, and `legs` turns them into joint positions. Because the servos are P-only
+and the control signal is filtered, the targets lead the pattern; the filter is inverted exactly
+within its bounds. Feedback of the turning rates and the tilt acts on ankles and hips. Parameters
+were searched for with `launch/tune_gait.py`.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from suite import filters
+from suite.gaits import legs
+from suite.op3 import constants
+
+_TIMESTEP = constants.CONTROL_TIMESTEP
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GaitSettings:
+  """Parameters of the gait; all but the first three were found by search."""
+
+  stop_time: float = 0.4
+  """s over which steps grow from nothing and shrink again; ours."""
+  max_turn: float = 0.25
+  """rad of hip yaw in a turning step; the joints' limit is 0.3."""
+  period: float = 0.4241
+  """s for a left and a right step."""
+  height: float = 0.2014
+  """m from the ankles up to the hips, standing."""
+  spread: float = 0.0409
+  """m that each foot stands outside of its hip."""
+  sway: float = 0.0126
+  """m of the hips' sideways motion."""
+  sway_lead: float = 0.9164
+  """rad by which the sway is ahead of the steps."""
+  lift: float = 0.0338
+  """m that a foot is lifted."""
+  swing: float = 0.4715
+  """Share of the period that a foot is lifted."""
+  stride: float = 0.0529
+  """m of a full step of one foot forward."""
+  backset: float = 0.0299
+  """m that the feet stand behind the hips."""
+  lean: float = 0.0832
+  """rad that the torso leans forward."""
+  tilt: float = 0.0391
+  """rad that the stance hip is raised against sagging."""
+  lead: float = 0.017
+  """s that the targets are ahead of the pattern: the servos' lag."""
+  pitch_rate_gain: float = 0.0052
+  """s: rad of ankle pitch per rad/s of pitching."""
+  roll_rate_gain: float = -0.0316
+  """s: rad of ankle roll per rad/s of rolling."""
+  pitch_gain: float = 0.0188
+  """rad of ankle pitch per rad of pitch error."""
+  roll_gain: float = -0.2117
+  """rad of ankle roll per rad of roll."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+  """What the walker shall do."""
+
+  forward: float = 0.0  # -1 to 1: share of the full stride
+  turn: float = 0.0  # -1 to 1: share of the full turning step, positive to the left
+  step: bool = True  # False: come to a stand
+
+
+class Gait:
+  """The gait: one action a control step."""
+
+  def __init__(
+    self,
+    settings: GaitSettings | None = None,
+    *,
+    head_pan_limit: float | None = None,
+  ):
+    """Creates a gait.
+
+    Args:
+      settings: Parameters.
+      head_pan_limit: As the task's robot has it; see `suite.op3.constants.joint_limits`.
+    """
+    self.settings = settings or GaitSettings()
+    lower, upper = constants.joint_limits(head_pan=head_pan_limit)
+    self._middle, self._half_range = (lower + upper) / 2, (upper - lower) / 2
+    self._standing = constants.standing_targets()
+    self._filter = filters.ExponentialFilter(constants.ACTION_FILTER)
+    self.reset()
+
+  def reset(self) -> None:
+    """Begins an episode: the robot stands in the reference pose."""
+    self._filter.reset((self._standing - self._middle) / self._half_range)
+    self._phase = 0.0
+    self._amplitude = 0.0
+    self._forward = self._turn = 0.0
+    self._crouched = 0.0  # share of the way from the reference pose to the gait's own
+
+  @property
+  def phase(self) -> float:
+    """Phase of the gait [rad]; the left foot swings about pi / 2, the right about 3 pi / 2."""
+    return self._phase
+
+  def act(
+    self,
+    command: Command,
+    *,
+    gyroscope: np.ndarray | None = None,
+    gravity: np.ndarray | None = None,
+  ) -> np.ndarray:
+    """Returns the next action [20], normalised, float32.
+
+    Args:
+      command: What to do.
+      gyroscope: Turning rates of the torso [3] [rad/s]; None: no feedback.
+      gravity: Direction of gravity in the torso's frame [3]; None: no feedback.
+    """
+    settings = self.settings
+    change = _TIMESTEP / settings.stop_time
+    self._crouched = min(1.0, self._crouched + change)
+    ready = self._crouched >= 1.0 and command.step
+    self._amplitude += float(np.clip(ready - self._amplitude, -change, change))
+    self._forward += float(np.clip(command.forward - self._forward, -change, change))
+    self._turn += float(np.clip(command.turn - self._turn, -change, change))
+    if self._amplitude > 0:
+      self._phase = (self._phase + 2 * np.pi * _TIMESTEP / settings.period) % (2 * np.pi)
+    else:
+      self._phase = 0.0
+    targets = self._targets(self._phase, gyroscope, gravity)
+    return self._invert(targets)
+
+  def _targets(self, phase, gyroscope, gravity) -> np.ndarray:
+    """Returns the position targets [20] that shall leave the action filter."""
+    settings = self.settings
+    ahead = phase + 2 * np.pi * settings.lead / settings.period
+    pattern = self.pattern(ahead, self._forward, self._turn, self._amplitude)
+    targets = self._standing.copy()
+    if gyroscope is not None:
+      roll = settings.roll_rate_gain * gyroscope[0]
+      pitch = settings.pitch_rate_gain * gyroscope[1]
+      if gravity is not None:
+        roll += settings.roll_gain * -np.arctan2(gravity[1], -gravity[2])
+        pitch += settings.pitch_gain * (np.arctan2(gravity[0], -gravity[2]) - settings.lean)
+      # An ankle that gives way to the fall pushes the floor back.
+      pattern[:, 4] += pitch
+      pattern[:, 5] += roll
+    joints = legs.joint_positions(*pattern)
+    share = self._crouched
+    targets[legs.COLUMNS] = (1 - share) * targets[legs.COLUMNS] + share * joints
+    return targets
+
+  def pattern(self, phase: float, forward: float, turn: float, amplitude: float) -> np.ndarray:
+    """Returns both legs' angles [2, 6] [rad], right-hand rule, at a phase [rad]."""
+    settings = self.settings
+    sway = amplitude * settings.sway * np.sin(phase + settings.sway_lead)  # positive: to the right
+    angles = []
+    for side, own_phase in zip(legs.SIDES, (phase, phase - np.pi), strict=True):
+      progress, lifted = _foot(own_phase, settings.swing)
+      reach = amplitude * progress  # -1 behind, 1 ahead
+      ankle = np.array(
+        [
+          reach * forward * settings.stride / 2 - settings.backset,
+          side * settings.spread + sway,
+          amplitude * lifted * settings.lift - settings.height,
+        ]
+      )
+      cosine, sine = np.cos(settings.lean), np.sin(settings.lean)
+      x, z = cosine * ankle[0] - sine * ankle[2], sine * ankle[0] + cosine * ankle[2]
+      leg = legs.leg_angles(
+        np.array([x, ankle[1], z]), foot_roll=0.0, foot_pitch=-settings.lean,
+        yaw=reach * turn * settings.max_turn / 2,
+      )  # fmt: skip
+      # The other foot is lifted: this hip carries the torso and sags inwards.
+      _, other = _foot(own_phase - np.pi, settings.swing)
+      leg[1] += side * amplitude * other * settings.tilt
+      angles.append(leg)
+    return np.stack(angles)
+
+  def _invert(self, targets: np.ndarray) -> np.ndarray:
+    """Returns the action whose filtered value comes nearest to the targets."""
+    strength = self._filter.strength
+    wanted = (np.clip(targets, self._middle - self._half_range, self._middle + self._half_range)
+              - self._middle) / self._half_range  # fmt: skip
+    assert self._filter.value is not None
+    action = np.clip((wanted - strength * self._filter.value) / (1 - strength), -1.0, 1.0)
+    action = action.astype(np.float32)
+    self._filter(action)
+    return action
+
+
+def _foot(phase: float, swing: float) -> tuple[float, float]:
+  """Returns where a foot is in its step (-1 behind to 1 ahead) and how high (0 to 1).
+
+  The swing lies symmetrically about the phase pi / 2.
+  """
+  turns = (phase / (2 * np.pi) - 0.25 + swing / 2) % 1.0
+  if turns < swing:
+    share = turns / swing
+    return float(-np.cos(np.pi * share)), float(np.sin(np.pi * share) ** 2)
+  share = (turns - swing) / (1 - swing)
+  return 1.0 - 2.0 * share, 0.0
