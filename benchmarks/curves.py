@@ -40,6 +40,8 @@ def read_run(folder: Path) -> dict[str, Any]:
       "environment": info.get("environment"), "seed": info.get("seed"),
       "processor": launches[0]["processor"], "cores": launches[0]["cores"],
       "seconds": round(seconds), "steps": last["steps"], "updates": last["updates"],
+      "steps_per_second": round(last["steps"] / max(seconds, 1e-9), 1),
+      "updates_per_second": round(last["updates"] / max(seconds, 1e-9), 2),
       "settings": info.get("config"),
     },
     "evaluations": [
@@ -172,7 +174,8 @@ def main() -> None:
     best = max((r["return"] for r in run["evaluations"]), default=float("nan"))
     about = run["about"]
     print(f"seed {about['seed']}: best {best:.1f}, {about['steps']:,} steps in "
-          f"{about['seconds'] / 60:.1f} min")  # fmt: skip
+          f"{about['seconds'] / 60:.1f} min ({about['steps_per_second']} steps/s, "
+          f"{about['updates_per_second']} updates/s)")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 State-only settings (preset "state") on cartpole's sizes. The reference is DMPO as the public one is
 written, with rlax (the test extra): single transitions with n-step rewards summed beforehand, in a
 batch of as many transitions, the same networks, samples and optimisers. Both take turns in one run.
---pictures measures the paper's settings at 30x40 (no reference). Writes
-benchmarks/results/learner.json.
+--pictures 30x40 60x80 measures the paper's settings instead (no reference), for a GPU. Writes
+benchmarks/results/learner.json, or learner_pictures.json.
 """
 
 import argparse
@@ -12,6 +12,8 @@ import functools
 import json
 import os
 import platform
+import shlex
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -164,16 +166,28 @@ def main() -> None:
     description=__doc__, formatter_class=argparse.RawTextHelpFormatter
   )
   parser.add_argument("--seconds", type=float, default=10.0, help="time for each")
-  parser.add_argument("--pictures", metavar="HxW", help="the paper's settings at 30x40 or 60x80")
-  parser.add_argument("--out", type=Path, default=Path("benchmarks/results/learner.json"))
+  parser.add_argument("--pictures", metavar="HxW", nargs="+",
+                      help="the paper's settings at these sizes, such as 30x40 60x80")  # fmt: skip
+  parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
+                      help="changes a setting of the agent, such as batch_size=4")  # fmt: skip
+  parser.add_argument("--out", type=Path)
   arguments = parser.parse_args()
+  changes = {
+    name: json.loads(value) for name, _, value in (a.partition("=") for a in arguments.set)
+  }
+  out = arguments.out or Path(
+    f"benchmarks/results/learner{'_pictures' if arguments.pictures else ''}.json"
+  )
   if arguments.pictures:
-    height, width = map(int, arguments.pictures.split("x"))
-    layout = Layout("camera", (height, width, 3), ("s",), (PROPRIOCEPTION,),
-                    ("privileged/p",), (PRIVILEGED,), ACTIONS)  # fmt: skip
-    steps = {"ours": ours(config.preset("paper"), layout)}
+    settings = config.override(config.preset("paper"), changes)
+    steps = {}
+    for size in arguments.pictures:
+      height, width = map(int, size.split("x"))
+      layout = Layout("camera", (height, width, 3), ("s",), (PROPRIOCEPTION,),
+                      ("privileged/p",), (PRIVILEGED,), ACTIONS)  # fmt: skip
+      steps[size] = ours(settings, layout)
   else:
-    settings = config.preset("state")
+    settings = config.override(config.preset("state"), changes)
     steps = {"ours": ours(settings, STATE_LAYOUT)}
     try:
       steps["reference"] = reference(settings, STATE_LAYOUT)
@@ -183,13 +197,12 @@ def main() -> None:
   for name, rate in result.items():
     print(f"{name:>10}: {rate:.2f} updates/s")
   record = {
-    "command": "python benchmarks/learner.py"
-    + (f" --pictures {arguments.pictures}" if arguments.pictures else ""),
+    "command": shlex.join(["python", *sys.argv]),
     "device": jax.devices()[0].device_kind, "machine": platform.machine(), "cores": os.cpu_count(),
     "load": os.getloadavg()[0], "updates_per_second": result,
   }  # fmt: skip
-  arguments.out.parent.mkdir(parents=True, exist_ok=True)
-  arguments.out.write_text(json.dumps(record, indent=1) + "\n")
+  out.parent.mkdir(parents=True, exist_ok=True)
+  out.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":
