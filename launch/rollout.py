@@ -5,14 +5,11 @@ python launch/rollout.py --task ball_push --scene out/livingroom --policy random
 """
 
 import dataclasses
-import os
 import sys
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
-
-os.environ.setdefault("MUJOCO_GL", "egl")
 
 import av
 import cv2
@@ -22,7 +19,8 @@ from rich.progress import track
 
 import suite
 from suite.op3 import constants
-from suite.overview import ThirdPerson, TopDown
+from suite.overview import TopDown
+from suite.third_person import ThirdPerson
 
 _HEIGHT, _WIDTH = 360, 480  # pixels of the third person's picture and of the enlarged robot's view
 _FRAME_STEPS = 2  # control steps between frames: 20 frames/s
@@ -119,7 +117,6 @@ def run(arguments: Arguments) -> list[str]:
   finally:  # an interrupted run leaves a video that plays
     if views is not None and video is not None:
       video.close()
-      views[0].close()
 
 
 def _run_steps(arguments, environment, timestep, policy, views, video) -> list[str]:
@@ -149,7 +146,7 @@ def main() -> None:
   arguments = tyro.cli(Arguments, description=__doc__)
   try:
     lines = run(arguments)
-  except (ValueError, OSError, RuntimeError) as error:
+  except (ValueError, OSError) as error:
     sys.exit(f"error: {error}")
   for line in lines or [f"no episode ended within {arguments.seconds:g} s"]:
     print(line)

@@ -7,11 +7,11 @@ python launch/view.py --task nerf_nav
 import dataclasses
 import os
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Annotated
 
+import field_view  # beside this script
 import numpy as np
 import trimesh
 import tyro
@@ -20,13 +20,10 @@ from viser import transforms
 
 from scenes import localise
 from scenes.bundle import Bundle
-from scenes.cameras import Camera
 from scenes.field import Field
 from scenes.render import Renderer
 from scenes.report_parts import part_color
 
-_MOVING_WIDTH = 160  # pixels of a picture while the view moves
-_STILL_WIDTHS = (320, 640, 960)  # pixels of the pictures that follow once it rests
 _CAMERA_STEP = 3  # every third camera is drawn
 
 
@@ -42,60 +39,6 @@ class Arguments:
   """Address to serve on; 0.0.0.0 lets other machines connect."""
   port: int = 8080
   """Port to serve on."""
-
-
-class FieldView:
-  """Draws the radiance field behind the scene from wherever a client looks."""
-
-  def __init__(self, bundle: Bundle):
-    self._renderer = Renderer(Field.load(bundle.field_path), threads=os.cpu_count() or 1)
-    self._unit_from_world = bundle.world_from_unit.inverse()
-    self._scale = bundle.world_from_unit.scale
-    self._lock = threading.Lock()  # one picture at a time: the kernel takes a whole core
-
-  def render(self, camera: viser.CameraHandle, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns colour [H, W, 3] (uint8) and depth [H, W] [m] as a client's camera sees them."""
-    height = max(1, round(width / camera.aspect))
-    pose = np.eye(4)
-    pose[:3, :3] = transforms.SO3(camera.wxyz).as_matrix()
-    pose[:3, 3] = camera.position
-    lens = Camera.from_vertical_fov(camera.fov, width, height)
-    with self._lock:
-      color, depth = self._renderer.render(lens, self._unit_from_world.apply_pose(pose))
-    return color, depth * self._scale
-
-
-class ClientLoop:
-  """Keeps one client's background up to date: coarse while moving, then finer and finer."""
-
-  def __init__(self, client: viser.ClientHandle, view: FieldView, enabled: viser.GuiCheckboxHandle):
-    self._client, self._view, self._enabled = client, view, enabled
-    self._changed = threading.Event()
-    self._changed.set()
-    self.closed = False
-    client.camera.on_update(lambda _: self._changed.set())
-    threading.Thread(target=self._run, daemon=True).start()
-
-  def refresh(self) -> None:
-    """Draws anew, as after a switch was turned."""
-    self._changed.set()
-
-  def _run(self) -> None:
-    while not self.closed:
-      self._changed.wait(timeout=1.0)
-      if not self._changed.is_set():
-        continue
-      self._changed.clear()
-      if not self._enabled.value:
-        self._client.scene.set_background_image(None)
-        continue
-      for width in (_MOVING_WIDTH, *_STILL_WIDTHS):
-        color, depth = self._view.render(self._client.camera, width)
-        self._client.scene.set_background_image(
-          color, depth=np.where(np.isfinite(depth), depth, 1e3)[..., None], jpeg_quality=90
-        )
-        if self._changed.wait(timeout=0.05):
-          break
 
 
 def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
@@ -159,24 +102,9 @@ def view_bundle(bundle: Bundle, *, host: str, port: int) -> viser.ViserServer:
   centre = 0.5 * (lower + upper)
   server.initial_camera.position = (centre[0] - 0.35 * (upper - lower)[0], centre[1], 1.2)
   server.initial_camera.look_at = (centre[0], centre[1], 0.8)
-  view = FieldView(bundle)
-  enabled = server.gui.add_checkbox("radiance field", True)
+  renderer = Renderer(Field.load(bundle.field_path), threads=os.cpu_count() or 1)
+  field_view.serve_field(server, field_view.FieldView(renderer, bundle.world_from_unit))
   _add_scene(server, bundle)
-  loops: dict[int, ClientLoop] = {}
-
-  @server.on_client_connect
-  def _(client: viser.ClientHandle) -> None:
-    loops[client.client_id] = ClientLoop(client, view, enabled)
-
-  @server.on_client_disconnect
-  def _(client: viser.ClientHandle) -> None:
-    loops.pop(client.client_id).closed = True
-
-  @enabled.on_update
-  def _(event) -> None:
-    for loop in loops.values():
-      loop.refresh()
-
   return server
 
 

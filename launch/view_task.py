@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import field_view  # beside this script
 import mujoco
 import numpy as np
 import trimesh
@@ -16,13 +17,18 @@ import viser
 from viser import transforms
 
 import suite
+from suite import loading
 from suite.op3 import constants, op3
+from suite.third_person import best_azimuth, clear_distance, direction
 
 _SPRING = 40.0  # N/m between the handle that is dragged and the torso
 _MAX_FORCE = 20.0  # N
 _PUSH_SECONDS = 0.15  # length of a push by a button
 _BACKLOG = 0.25  # s that the clock may fall behind before it is set anew
 _PICTURE_SCALE = 6  # of the robot's picture on the page
+_SHOW_STEPS, _PICTURE_STEPS = 2, 4  # control steps between showings of the motion, of the page
+_HANDLE_HEIGHT = 0.28  # m of the handle above the torso, so that it does not hide the robot
+_SETBACK = 0.02  # m by which the field's floor is lowered, so that it does not swallow the feet
 _BAR_RANGE = 1.5  # a bar's full length is a reward term of this size
 _DIRECTIONS = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}
 
@@ -63,41 +69,97 @@ def bars(terms: dict[str, float]) -> str:
 class TaskViewer:
   """One environment, shown and controlled through a viser server."""
 
-  def __init__(self, environment: Any, server: viser.ViserServer):
+  def __init__(
+    self,
+    environment: Any,
+    server: viser.ViserServer,
+    *,
+    field: field_view.FieldView | None = None,
+  ):
+    """Fills the page.
+
+    Args:
+      environment: From `suite.load`.
+      server: The page's server.
+      field: Draws the room as a radiance field; None: only as a mesh.
+    """
     self._environment, self._server = environment, server
+    self._steps = 0
+    self._last_episode = ""
     self._rng = np.random.default_rng(0)
     self._push_until, self._push = 0.0, np.zeros(3)
     self._dragging = False
     self._reset_asked = False
     environment.reset()
     self._geoms = self._add_geoms()
-    self._add_room()
     self._add_controls()
+    self._add_room(field)
     self._show()
 
-  def _add_room(self) -> None:
-    server, scene = self._server, self._environment.task.scene
+  def _add_room(self, field: field_view.FieldView | None) -> None:
+    server, task = self._server, self._environment.task
     server.scene.set_up_direction("+z")
-    lower, upper = (np.asarray(corner)[:2] for corner in scene.extent)
-    center = (lower + upper) / 2
-    server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
-    visual = getattr(scene, "visual_path", None)
-    if visual is not None and Path(visual).is_file():
-      server.scene.add_mesh_trimesh("/room", trimesh.load_mesh(visual))
-    else:
-      for index, path in enumerate(scene.collision_parts):
-        part = trimesh.load_mesh(path)
-        server.scene.add_mesh_simple(
-          f"/room/{index:03d}", part.vertices, part.faces, color=(150, 165, 180), opacity=0.6,
-          flat_shading=True,
-        )  # fmt: skip
-    for index, goal in enumerate(getattr(self._environment.task, "goals", ())):
+    meshes = self._add_meshes(visible=field is None)
+    if field is not None:
+      switch = field_view.serve_field(server, field, setback=_SETBACK)
+
+      @switch.on_update
+      def _(event: Any) -> None:
+        for mesh in meshes:
+          mesh.visible = not switch.value
+
+    self._goals = [
       server.scene.add_icosphere(
         f"/goals/{index}", radius=0.05, color=(0, 158, 115), position=(*goal, 0.05)
       )
-    position = self._environment.task.state.position
-    server.initial_camera.position = (*(position[:2] + 0.25 * (center - position[:2])), 1.5)
-    server.initial_camera.look_at = tuple(position)
+      for index, goal in enumerate(getattr(task, "goals", ()))
+    ]
+    workspace = getattr(task, "workspace", None)
+    if workspace is not None:
+      self._add_square("/workspace", workspace.lower, workspace.upper, (120, 126, 135))
+      self._add_square("/target", workspace.target - 0.5, workspace.target + 0.5, (0, 158, 115))
+
+    self._face(server.initial_camera)
+
+    @server.on_client_connect
+    def _(client: viser.ClientHandle) -> None:
+      self._face(client.camera)
+
+  def _face(self, camera: Any) -> None:
+    """Puts a camera of the page where nothing stands between it and the robot."""
+    environment = self._environment
+    state, physics = environment.task.state, environment.physics
+    way = direction(best_azimuth(physics, state.position, state.yaw))
+    distance = clear_distance(physics, state.position, way)
+    camera.position = tuple(state.position + distance * way)
+    camera.look_at = tuple(state.position)
+
+  def _add_meshes(self, *, visible: bool) -> list[Any]:
+    """Adds the room's surface, or else its convex parts, and a grid on the floor."""
+    server, scene = self._server, self._environment.task.scene
+    found: list[Any] = [server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)]
+    visual = getattr(scene, "visual_path", None)
+    if visual is not None and Path(visual).is_file():
+      found.append(server.scene.add_mesh_trimesh("/room", trimesh.load_mesh(visual)))
+    else:
+      for index, path in enumerate(scene.collision_parts):
+        part = trimesh.load_mesh(path)
+        found.append(server.scene.add_mesh_simple(
+          f"/room/{index:03d}", part.vertices, part.faces, color=(150, 165, 180), opacity=0.6,
+          flat_shading=True,
+        ))  # fmt: skip
+    for mesh in found:
+      mesh.visible = visible
+    return found
+
+  def _add_square(
+    self, name: str, lower: np.ndarray, upper: np.ndarray, color: tuple[int, int, int]
+  ) -> None:
+    """Draws a square on the floor."""
+    x, y = (np.array([lower[i], upper[i]]) for i in range(2))
+    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    points = np.array([[(*corners[k], 0.02), (*corners[(k + 1) % 4], 0.02)] for k in range(4)])
+    self._server.scene.add_line_segments(name, points, color, thickness=3.0)
 
   def _add_geoms(self) -> dict[int, Any]:
     model = self._environment.physics.model.ptr
@@ -118,6 +180,7 @@ class TaskViewer:
     gui = self._server.gui
     self._running = gui.add_checkbox("run", True)
     self._policy = gui.add_dropdown("policy", ("stand", "random"))
+    self._follow = gui.add_checkbox("find the robot when it starts anew", True)
     gui.add_button("reset").on_click(lambda _: setattr(self, "_reset_asked", True))
     camera = self._environment.task.robot_camera
     self._picture = None
@@ -132,12 +195,17 @@ class TaskViewer:
         lambda event: self._start_push(event.target.value)
       )
     self._handle = self._server.scene.add_transform_controls(
-      "/hand", scale=0.25, disable_rotations=True, position=self._environment.task.state.position
-    )
+      "/hand", scale=0.16, disable_rotations=True, disable_sliders=True,
+      position=self._handle_place(),
+    )  # fmt: skip
 
     @self._handle.on_update
     def _(event: Any) -> None:
       self._dragging = event.phase != "end"
+
+  def _handle_place(self) -> np.ndarray:
+    """Returns where the handle rests [3] [m]."""
+    return self._environment.task.state.position + np.array([0.0, 0.0, _HANDLE_HEIGHT])
 
   def _start_push(self, direction: str) -> None:
     aligned = self._environment.task.state.aligned
@@ -146,10 +214,9 @@ class TaskViewer:
 
   def _hand_force(self) -> np.ndarray:
     """Returns the force of the hand on the torso [3] [N]."""
-    task = self._environment.task
     force = np.zeros(3)
     if self._dragging:
-      force = _SPRING * (np.array(self._handle.position) - task.state.position)
+      force = _SPRING * (np.array(self._handle.position) - self._handle_place())
       force *= min(1.0, _MAX_FORCE / max(float(np.linalg.norm(force)), 1e-9))
     if self._environment.physics.time() < self._push_until:
       force = force + self._push
@@ -159,17 +226,33 @@ class TaskViewer:
     """Takes one control step and shows it."""
     environment = self._environment
     if self._reset_asked:
-      self._reset_asked, self._push_until = False, 0.0
+      self._reset_asked = False
       environment.reset()
+      self._start_episode()
     task = environment.task
     task.hand_force = self._hand_force()
     action = task.standing_action
     if self._policy.value == "random":
       action = np.clip(action + self._rng.normal(0, 0.5, action.shape), -1, 1)
     timestep = environment.step(action)
+    if timestep.last():
+      outcome = task.outcome
+      self._last_episode = (
+        f"last episode: {'success' if outcome.success else 'no success'}, "
+        f"{outcome.ending or 'time limit'} after {outcome.duration:.2f} s"
+      )
     if timestep.first():
-      self._push_until = 0.0
-    self._show(timestep.observation.get("camera"))
+      self._start_episode()
+    self._steps += 1
+    if self._steps % _SHOW_STEPS == 0:
+      self._show(timestep.observation.get("camera"))
+
+  def _start_episode(self) -> None:
+    """Forgets a push and shows the robot where it stands now."""
+    self._push_until = 0.0
+    if self._follow.value:
+      for client in self._server.get_clients().values():
+        self._face(client.camera)
 
   def _show(self, picture: np.ndarray | None = None) -> None:
     environment = self._environment
@@ -185,15 +268,16 @@ class TaskViewer:
         if geom in self._radii:  # an episode draws the ball's radius anew
           handle.scale = float(model.geom_size[geom, 0]) / self._radii[geom]
       if not self._dragging:
-        self._handle.position = task.state.position
+        self._handle.position = self._handle_place()
+      for goal, handle in zip(getattr(task, "goals", ()), self._goals, strict=True):
+        handle.color = (0, 158, 115) if np.array_equal(goal, task.goal) else (150, 150, 150)
+      if self._steps % _PICTURE_STEPS:
+        return
       if picture is not None and self._picture is not None:
         self._picture.image = picture.repeat(_PICTURE_SCALE, 0).repeat(_PICTURE_SCALE, 1)
       self._bars.content = bars(task.reward_terms)
-      outcome = task.outcome
-      self._status.content = (
-        f"{outcome.duration:.2f} s · {'**success**' if outcome.success else 'no success yet'}"
-        + (f" · ended by {outcome.ending}" if outcome.ending else "")
-      )
+      success = "**success**" if task.outcome.success else "no success yet"
+      self._status.content = f"{task.outcome.duration:.2f} s, {success}\n\n{self._last_episode}"
 
   def run(self, stop: threading.Event) -> None:
     """Steps in real time until told to stop."""
@@ -216,9 +300,12 @@ def view_task(
     host: Address to serve on.
     port: Port to serve on.
   """
-  environment = suite.load(task, scene=scene)
+  bundle = loading.open_scene(scene)
+  renderer = loading.load_renderer(bundle)
+  environment = suite.load(task, scene=bundle, renderer=renderer)
   server = viser.ViserServer(host=host, port=port, label=f"task {task}", verbose=False)
-  viewer = TaskViewer(environment, server)
+  field = field_view.FieldView(renderer, bundle.world_from_unit)
+  viewer = TaskViewer(environment, server, field=field)
   print(f"open http://{host}:{server.get_port()} (Ctrl-C ends)")
   try:
     viewer.run(threading.Event())

@@ -6,7 +6,7 @@
 import warnings
 
 # Without MUJOCO_GL, dm_control tries GLFW when it is imported, which warns if there is no display.
-# The simulation needs none; `overview`, which draws with GL, says itself what is missing.
+# The simulation needs none.
 warnings.filterwarnings("ignore", ".*DISPLAY environment variable is missing", module="glfw")
 
 from suite.loading import ALL_TASKS, load  # noqa: E402  (the filter must come first)

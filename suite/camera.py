@@ -97,24 +97,30 @@ def world_from_camera(data: mujoco.MjData, camera_id: int) -> np.ndarray:
 
 
 class GeomCaster:
-  """Casts a camera's rays against the geoms of one group that can move."""
+  """Casts a camera's rays against the geoms that can move."""
 
-  def __init__(self, model: mujoco.MjModel, camera: Camera, *, group: int = op3.VISIBLE_GROUP):
+  def __init__(
+    self,
+    model: mujoco.MjModel,
+    camera: Camera,
+    *,
+    groups: tuple[int, ...] = (op3.VISIBLE_GROUP,),
+  ):
     """Prepares the rays.
 
     Args:
       model: The compiled model; its `geom_rgba` and sizes are read at every call.
       camera: The camera model.
-      group: The MuJoCo geom group that is seen.
+      groups: The MuJoCo geom groups that are seen.
     """
     self._model = model
     self._shape = (camera.height, camera.width)
     self._rays = camera.rays().reshape(-1, 3)  # [N, 3], z = 1
     self._directions = self._rays / np.linalg.norm(self._rays, axis=1, keepdims=True)
     moving = model.body_weldid[model.geom_bodyid] != 0
-    self._geoms = np.flatnonzero((model.geom_group == group) & moving)
+    self._geoms = np.flatnonzero(np.isin(model.geom_group, groups) & moving)
     self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
-    self._groups[group] = 1
+    self._groups[list(groups)] = 1
     count = len(self._rays)
     self._ids, self._depth = np.empty(count, np.int32), np.empty(count)
     self._normals = np.empty(3 * count)
@@ -206,9 +212,17 @@ class RobotCamera:
     self.caster = GeomCaster(model, self.camera)
     self.camera_id = camera_id
 
-  def render_field(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Renders the scene alone: colour uint8 [H, W, 3] and z-depth [H, W] [m]."""
-    color, depth = self._renderer.render(self.camera, self._unit_from_world.apply_pose(pose))
+  def render_field(
+    self, pose: np.ndarray, lens: Camera | None = None
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Renders the scene alone: colour uint8 [H, W, 3] and z-depth [H, W] [m].
+
+    Args:
+      pose: World from camera [4, 4], OpenCV's axes.
+      lens: Another camera model than the robot's, for a spectator's view.
+    """
+    unit_from_camera = self._unit_from_world.apply_pose(pose)
+    color, depth = self._renderer.render(lens or self.camera, unit_from_camera)
     return color, depth * self._meters_per_unit
 
   def render(self, data: mujoco.MjData, random_state: np.random.RandomState | None = None) -> Any:

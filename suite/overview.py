@@ -1,23 +1,18 @@
-"""Pictures for people: the scene from above with the robot's trail, and a third person's view.
+"""A map for people: the scene from above with the robot's trail.
 
 Shapes: H height, W width.
 """
 
-from typing import Any
-
 import cv2
-import mujoco
 import numpy as np
 
 from suite import rewards
 from suite.tasks.base import RobotTask
 
 _FREE, _OCCUPIED, _OUTSIDE = (246, 243, 238), (120, 126, 135), (205, 208, 212)  # RGB
-_TRAIL, _ROBOT, _GOAL, _BALL = (0, 114, 178), (213, 94, 0), (0, 158, 115), (219, 107, 26)
+_TRAIL, _ROBOT, _GOAL, _BALL = (86, 180, 233), (0, 90, 150), (0, 158, 115), (219, 107, 26)
 _MARGIN = 0.1  # m around the scene's extent
 _CELL = 0.04  # m of a cell of the free floor
-_CAMERA_DISTANCE, _CAMERA_ELEVATION = 1.3, -22.0  # m, degrees: the third person's view
-_FOLLOW = 0.04  # share of the way by which that view follows the robot in a frame
 
 
 class TopDown:
@@ -90,49 +85,3 @@ class TopDown:
     if ball is not None:
       cv2.circle(picture, self._pixel(ball), round(0.12 * self._scale), _BALL, -1, cv2.LINE_AA)
     return picture
-
-
-class ThirdPerson:
-  """A view that follows the robot, drawn by MuJoCo with GL: the room's convex parts and geoms."""
-
-  def __init__(self, task: RobotTask, physics: Any, *, height: int, width: int):
-    """Opens the renderer.
-
-    Args:
-      task: The task.
-      physics: Its compiled model.
-      height: Height of the picture [pixel].
-      width: Width of the picture [pixel].
-
-    Raises:
-      RuntimeError: There is no GL; the message names what to install.
-    """
-    self._task, self._physics = task, physics
-    try:
-      self._renderer = mujoco.Renderer(physics.model.ptr, height, width)
-    except Exception as error:  # the GL backends raise errors of many kinds
-      raise RuntimeError(
-        f"Found no GL for the third-person picture ({error}); on Debian or Ubuntu install "
-        "libegl1, libegl-mesa0 and libgl1-mesa-dri, and set MUJOCO_GL=egl."
-      ) from error
-    self._options = mujoco.MjvOption()
-    self._options.geomgroup[:] = (1, 1, 1, 1, 0, 0)
-    self._camera = mujoco.MjvCamera()
-    self._camera.distance, self._camera.elevation = _CAMERA_DISTANCE, _CAMERA_ELEVATION
-    self.restart()
-
-  def restart(self) -> None:
-    """Puts the view behind and beside the robot."""
-    state = self._task.state
-    self._camera.azimuth = np.rad2deg(state.yaw) + 40.0
-    self._camera.lookat[:] = state.position
-
-  def draw(self) -> np.ndarray:
-    """Returns the picture now, RGB uint8 [H, W, 3]."""
-    self._camera.lookat[:] += _FOLLOW * (self._task.state.position - self._camera.lookat)
-    self._renderer.update_scene(self._physics.data.ptr, self._camera, self._options)
-    return self._renderer.render()
-
-  def close(self) -> None:
-    """Frees the GL context."""
-    self._renderer.close()

@@ -58,3 +58,19 @@ def test_start_places_are_clear_of_furniture(room):
     assert environment.task.outcome.ending is None and not timestep.last()
     assert room.free_space.is_reachable(environment.task.state.position[None])[0]
   assert room.free_space.is_reachable(environment.task.goals).all()
+
+
+@pytest.mark.parametrize("task", suite.ALL_TASKS)
+@pytest.mark.parametrize("steps", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_random_actions_give_no_warning_and_no_nan(task, steps, room):
+  environment = suite.load(task, scene=room, random=5, image_size=None)
+  rng = np.random.default_rng(5)
+  environment.reset()
+  endings = set()
+  for _ in range(steps):
+    timestep = environment.step(rng.uniform(-1, 1, 20))  # raises on a MuJoCo warning
+    assert timestep.reward is None or np.isfinite(timestep.reward)
+    assert all(np.isfinite(value).all() for value in timestep.observation.values())
+    endings.add(environment.task.outcome.ending)
+  assert not environment.physics.data.ptr.warning.number.any()
+  assert "fall" in endings  # it did thrash about
