@@ -1,0 +1,181 @@
+"""The scripted walker: the gait, steered to a goal over a path, or pushing a ball.
+
+It is a baseline that needs no training: it knows where it is, from a pose that is given to it
+(privileged in simulation, an observer's on the virtual robot) or else by dead reckoning: its own
+turning rate and the steps that it has commanded.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from suite.gaits.planner import Planner
+from suite.gaits.walk import Command, Gait, GaitSettings
+from suite.op3 import constants
+
+_TIMESTEP = constants.CONTROL_TIMESTEP
+
+
+class Pose(NamedTuple):
+  """Where the robot is on the floor."""
+
+  x: float  # m
+  y: float  # m
+  yaw: float  # rad
+
+  @property
+  def xy(self) -> np.ndarray:
+    """The place [2] [m]."""
+    return np.array([self.x, self.y])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SteeringSettings:
+  """How the walker steers; ours."""
+
+  speed: float = 0.22
+  """m/s at full stride, for dead reckoning."""
+  lookahead: float = 0.3
+  """m along the path that it aims at."""
+  turn_gain: float = 1.2
+  """Turning step per rad of heading error."""
+  turn_first: float = 0.7
+  """rad of heading error from which it turns on the spot."""
+  arrival: float = 0.08
+  """m from the goal at which it stops."""
+  replan: float = 1.0
+  """s between paths."""
+  behind: float = 0.30
+  """m behind the ball from where it pushes."""
+  lane: float = 0.06
+  """m beside the line through ball and target within which it pushes."""
+  detour: float = 0.38
+  """m from the ball's centre at which it walks around it."""
+
+
+class Walker:
+  """Walks to goals; one action a control step."""
+
+  def __init__(
+    self,
+    scene: Any,
+    *,
+    gait: GaitSettings | None = None,
+    steering: SteeringSettings | None = None,
+    head_pan_limit: float | None = None,
+  ):
+    """Creates a walker.
+
+    Args:
+      scene: The bundle, for its free space.
+      gait: Parameters of the gait.
+      steering: Parameters of the steering.
+      head_pan_limit: As the task's robot has it.
+    """
+    self._planner = Planner(scene)
+    self._gait = Gait(gait, head_pan_limit=head_pan_limit)
+    self.steering = steering or SteeringSettings()
+    self.reset(Pose(0.0, 0.0, 0.0))
+
+  def reset(self, start: Pose) -> None:
+    """Begins an episode, standing at a place."""
+    self._gait.reset()
+    self.pose = start  # where it believes to be
+    self._command = Command(step=False)
+    self._path: np.ndarray | None = None
+    self._planned = -np.inf
+    self._time = 0.0
+    self._pushing = False
+
+  def act(
+    self,
+    observation: Mapping[str, np.ndarray],
+    *,
+    goal: np.ndarray,
+    pose: Pose | None = None,
+    ball: np.ndarray | None = None,
+  ) -> np.ndarray:
+    """Returns the next action [20], normalised.
+
+    Args:
+      observation: With `gyroscope` and `gravity` as a policy has them.
+      goal: Where to walk, or where to push the ball [2] [m].
+      pose: Where the robot is; None: by dead reckoning.
+      ball: Where the ball is [2] [m]; None: there is none.
+    """
+    gyroscope, gravity = observation["gyroscope"][-1], observation["gravity"][-1]
+    self._locate(pose, gyroscope)
+    goal = np.asarray(goal, np.float64)
+    if ball is None:
+      self._command = self._walk_to(goal)
+    else:
+      self._command = self._push(np.asarray(ball, np.float64)[:2], goal)
+    self._time += _TIMESTEP
+    return self._gait.act(self._command, gyroscope=gyroscope, gravity=gravity)
+
+  def _locate(self, pose: Pose | None, gyroscope: np.ndarray) -> None:
+    if pose is not None:
+      self.pose = pose
+      return
+    if self._time == 0.0:
+      return
+    yaw = self.pose.yaw + float(gyroscope[2]) * _TIMESTEP
+    advance = self._command.forward * self.steering.speed * _TIMESTEP * self._command.step
+    self.pose = Pose(
+      self.pose.x + advance * np.cos(yaw), self.pose.y + advance * np.sin(yaw), float(yaw)
+    )
+
+  def _walk_to(self, goal: np.ndarray) -> Command:
+    if np.linalg.norm(goal - self.pose.xy) < self.steering.arrival:
+      return Command(step=False)
+    if self._path is None or self._time >= self._planned + self.steering.replan or (
+      self._path[-1] != goal
+    ).any():  # fmt: skip
+      self._path, self._planned = self._planner.path(self.pose.xy, goal), self._time
+    return self._aim(self._lookahead(self._path))
+
+  def _lookahead(self, path: np.ndarray) -> np.ndarray:
+    """Returns the point of a path [N, 2] to aim at: ahead, and in sight past every corner."""
+    distance = np.linalg.norm(path - self.pose.xy, axis=1)
+    nearest = int(np.argmin(distance))
+    ahead = np.flatnonzero(distance[nearest:] >= self.steering.lookahead)
+    if not len(ahead):
+      return path[-1]
+    return path[nearest + int(ahead[0])]
+
+  def _aim(self, point: np.ndarray, *, speed: float = 1.0) -> Command:
+    """Returns the command that turns and walks to a point [2]."""
+    steering = self.steering
+    offset = point - self.pose.xy
+    error = np.arctan2(offset[1], offset[0]) - self.pose.yaw
+    error = float((error + np.pi) % (2 * np.pi) - np.pi)
+    turn = float(np.clip(steering.turn_gain * error, -1.0, 1.0))
+    forward = speed * max(0.0, 1.0 - abs(error) / steering.turn_first)
+    return Command(forward=forward, turn=turn)
+
+  def _push(self, ball: np.ndarray, target: np.ndarray) -> Command:
+    """Returns the command that brings the ball to a target: around it first, then through it."""
+    steering = self.steering
+    to_target = target - ball
+    direction = to_target / max(float(np.linalg.norm(to_target)), 1e-6)
+    aside = np.array([-direction[1], direction[0]])
+    offset = self.pose.xy - ball
+    along, lateral = float(offset @ direction), float(offset @ aside)
+    lane = steering.lane * (2.0 if self._pushing else 1.0)
+    self._pushing = along < -0.05 and abs(lateral) < lane and along > -2 * steering.behind
+    if self._pushing:
+      # Aim beyond the ball and at the line: what is left of the offset is steered away.
+      return self._aim(ball + 0.4 * direction - lateral * aside)
+    place = ball - steering.behind * direction
+    if along > -0.6 * steering.behind:  # beside or before the ball: around it
+      side = np.sign(lateral) if abs(lateral) > 0.02 else 1.0
+      place = ball + side * steering.detour * aside - 0.5 * steering.behind * direction
+      if along > 0.1:
+        place = ball + side * steering.detour * aside
+    if np.linalg.norm(place - self.pose.xy) < 0.04:
+      return self._aim(ball)
+    if self._planner.is_clear(self.pose.xy, place):
+      return self._aim(place)
+    return self._aim(self._lookahead(self._planner.path(self.pose.xy, place)))
