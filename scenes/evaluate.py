@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scenes import image_quality
+from scenes import image_quality, photometry
 from scenes.render import Renderer
 from scenes.stages import Progress, no_progress
 from scenes.views import Views
@@ -32,12 +32,18 @@ class ViewScore:
 
 
 def compare(renderer: Renderer, views: Views, index: int, height: int, width: int) -> ViewScore:
-  """Renders one view at a size and compares it with the picture averaged over its pixels."""
+  """Renders one view at a size and compares it with the picture averaged over its pixels.
+
+  Where the exposure changed, the field's picture gets the exposure of the view, which was found
+  from the points that it shares with other pictures.
+  """
   truth = views.images[index]
   if truth.shape[:2] != (height, width):
     truth = cv2.resize(truth, (width, height), interpolation=cv2.INTER_AREA)
   camera = views.camera.resized(width, height)
   image, depth = renderer.render(camera, views.world_from_camera[index])
+  if views.gains is not None:
+    image = photometry.expose(image, views.gains[index])
   return ViewScore(
     views.names[index], truth, image, depth,
     image_quality.psnr(truth, image), image_quality.ssim(truth, image),

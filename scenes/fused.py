@@ -59,7 +59,7 @@ class FusedTrainer:
     self.pictures = make_pictures(views, blur_max=settings.blur_max)
     threads = num_threads()
     self._budget = settings.batch_samples // threads
-    stored = self._budget + _CHUNK_SAMPLES
+    stored = self._budget + 2 * _CHUNK_SAMPLES
     self._gradients = [np.zeros_like(self.flat) for _ in range(threads)]
     self._gradient_networks = [network_arrays(field, g) for g in self._gradients]
     network = network_arrays(field, self.flat)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from scenes import fused_kernels, fused_march, fused_network
+from scenes.anchors import EMPTY_CELLS, empty_cells
 from scenes.field import FieldSettings
 from scenes.train_settings import TrainSettings
 from scenes.views import BlurPyramid, Views
@@ -107,7 +108,7 @@ def make_chunk(settings: FieldSettings, *, samples: int, stored: int) -> fused_k
     "inverse_std": n, "out": n * outputs, "alpha": n, "view_pre": n * view,
     "view_hidden": n * view, "color": 6 * n, "d_color": 3 * n, "d_out": n * outputs,
     "d_hidden": n * width, "d_view": n * view, "weight": n, "through": n, "d_weight": n,
-    "rays": 13 * r, "harmonics": 9 * r, "offsets": r * view, "d_rays": r * view,
+    "rays": 14 * r, "harmonics": 9 * r, "offsets": r * view, "d_rays": r * view,
     "coordinates": 3 * stored, "d_features": features * stored,
   }  # fmt: skip
   arrays = {name: np.zeros(size, np.float32) for name, size in sizes.items()}
@@ -139,6 +140,11 @@ def kernel_settings(
     blur_sharp=f(train.blur_sharp_fraction),
     blur_power=f(train.blur_power),
     random_background=train.random_background,
+    anchor_fraction=f(train.anchor_fraction),
+    anchor_weight=f(train.anchor_weight),
+    empty_samples=train.empty_samples // num_threads(),
+    empty_weight=f(train.empty_weight),
+    empty_size=EMPTY_CELLS,
   )
 
 
@@ -156,6 +162,8 @@ def make_pictures(views: Views, *, blur_max: float) -> fused_kernels.Pictures:
     directions=views.camera.rays().astype(np.float32).ravel(),
     rotations=views.world_from_camera[:, :3, :3].astype(np.float32).ravel(),
     origins=views.world_from_camera[:, :3, 3].astype(np.float32).ravel(),
+    anchors=views.anchors.astype(np.float32).ravel(),
+    empty=empty_cells(views),
   )
 
 

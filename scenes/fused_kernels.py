@@ -42,6 +42,8 @@ class Pictures(NamedTuple):
   directions: np.ndarray  # float32 [H * W * 3]: camera rays, z = 1
   rotations: np.ndarray  # float32 [N * 9]: unit frame from camera
   origins: np.ndarray  # float32 [N * 3]
+  anchors: np.ndarray  # float32 [A * 4]: picture, pixel x and y, distance along the ray [unit]
+  empty: np.ndarray  # int64 [E]: cells of the unit cube known to be empty
 
 
 class Settings(NamedTuple):
@@ -64,6 +66,11 @@ class Settings(NamedTuple):
   blur_sharp: np.float32  # fraction of the rays that are not blurred
   blur_power: np.float32  # blur = blur_max * uniform^power
   random_background: bool
+  anchor_fraction: np.float32  # fraction of the rays that end at a known point
+  anchor_weight: np.float32
+  empty_samples: int  # points a call in cells known to be empty
+  empty_weight: np.float32
+  empty_size: int  # such cells along an axis of the unit cube
 
 
 class Chunk(NamedTuple):
@@ -89,7 +96,7 @@ class Chunk(NamedTuple):
   through: np.ndarray  # [N]: transmittance behind the sample
   d_weight: np.ndarray  # [N]
   first: np.ndarray  # int64 [R + 1]: a ray's first sample
-  rays: np.ndarray  # [R, 13]: origin, direction, target, footprint, background
+  rays: np.ndarray  # [R, 14]: origin, direction, target, footprint, background, anchor or 0
   harmonics: np.ndarray  # [R, 9]
   offsets: np.ndarray  # [R, V]
   d_rays: np.ndarray  # [R, V]
@@ -123,14 +130,22 @@ def _look_up(pictures, level, image, px, py, c):
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy")
 def draw_ray(pictures, settings, seed, index, ray):
-  """Draws a pixel and a blur; writes origin, direction, target, footprint, background to `ray`."""
+  """Draws a pixel and a blur, or an anchor; writes what Chunk.rays says to `ray`."""
   images = len(pictures.origins) // 3
   height, width = pictures.heights[0], pictures.widths[0]
   image = min(np.int64(uniform(seed, index, 0) * np.float32(images)), images - 1)
   px = min(np.int64(uniform(seed, index, 1) * np.float32(width)), width - 1)
   py = min(np.int64(uniform(seed, index, 2) * np.float32(height)), height - 1)
+  ray[13] = _ZERO
+  known = len(pictures.anchors) > 0 and uniform(seed, index, 9) < settings.anchor_fraction
+  if known:
+    count = len(pictures.anchors) // 4
+    at = 4 * min(np.int64(uniform(seed, index, 10) * np.float32(count)), count - 1)
+    image = np.int64(pictures.anchors[at])
+    px, py = np.int64(pictures.anchors[at + 1]), np.int64(pictures.anchors[at + 2])
+    ray[13] = pictures.anchors[at + 3]
   blur = _ZERO
-  if settings.blur_max > _ZERO and uniform(seed, index, 3) >= settings.blur_sharp:
+  if not known and settings.blur_max > _ZERO and uniform(seed, index, 3) >= settings.blur_sharp:
     blur = settings.blur_max * np.float32(uniform(seed, index, 4) ** settings.blur_power)
   pixel = 3 * (py * width + px)
   cx, cy, cz = (
@@ -181,7 +196,7 @@ def place(chunk, settings, count, inputs, coordinates):
   """Writes the samples' grid coordinates and variance features."""
   scratch = chunk.d_color
   for n in range(count):
-    ray = chunk.rays[13 * chunk.ray_of[n] : 13 * chunk.ray_of[n] + 13]
+    ray = chunk.rays[14 * chunk.ray_of[n] : 14 * chunk.ray_of[n] + 14]
     t = chunk.distance[n]
     x, y, z = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
     norm = max(_ONE, max(abs(x), max(abs(y), abs(z))))
@@ -265,7 +280,7 @@ def forward(
     chunk.alpha[n] = _ONE - fast_exp(-density * chunk.length[n])
   count = _keep_visible(chunk, rays, count, inputs, width, outputs, coordinates, threshold)
   for r in range(rays):
-    ray = chunk.rays[13 * r : 13 * r + 13]
+    ray = chunk.rays[14 * r : 14 * r + 14]
     spherical_harmonics(ray[3], ray[4], ray[5], chunk.harmonics[9 * r : 9 * r + 9])
   view_offsets(network, chunk.harmonics, rays, chunk.offsets)
   view_forward(
@@ -288,7 +303,7 @@ def _ray_losses(chunk, settings, r, outputs):
   Gradients: dC/dsigma_i = length_i (T_{i+1} c_i - sum_{j>i} w_j c_j), and likewise for the
   distortion loss, whose derivative by w_i is 2 sum_j w_j |m_i - m_j| + 2/3 w_i l_i in O(n).
   """
-  ray = chunk.rays[13 * r : 13 * r + 13]
+  ray = chunk.rays[14 * r : 14 * r + 14]
   start, stop = chunk.first[r], chunk.first[r + 1]
   red, green, blue, total, moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
   for n in range(start, stop):
@@ -308,6 +323,8 @@ def _ray_losses(chunk, settings, r, outputs):
   g0, g1, g2 = e0 / q0 * _THIRD, e1 / q1 * _THIRD, e2 / q2 * _THIRD
   behind = g0 * ray[10] + g1 * ray[11] + g2 * ray[12]
   below, moment_below, distortion = _ZERO, _ZERO, _ZERO
+  anchored = settings.anchor_weight if ray[13] > _ZERO else _ZERO
+  goal = _spacing(ray[13])
   for n in range(start, stop):
     w = chunk.weight[n]
     t, half = chunk.distance[n], chunk.length[n] * _HALF
@@ -323,6 +340,7 @@ def _ray_losses(chunk, settings, r, outputs):
       + g2 * (chunk.color[6 * n + 2] + chunk.color[6 * n + 5])
       - behind
       + settings.distortion * _TWO * (spread + _THIRD * w * extent)
+      + anchored * (abs(m - goal) - (_ONE - goal))
     )
     chunk.d_color[3 * n] = g0 * w
     chunk.d_color[3 * n + 1] = g1 * w
@@ -339,6 +357,60 @@ def _ray_losses(chunk, settings, r, outputs):
     slope = _HALF * (_ONE + z / root) if z > _ZERO else _TWO / (root * (root - z))
     chunk.d_out[n * outputs] = settings.density_gain * settings.density_scale * d_density * slope
   return (e0 * e0 + e1 * e1 + e2 * e2) * _THIRD, photometric, distortion
+
+
+@numba.njit(fastmath=True, nogil=True, error_model="numpy")
+def _push_empty(
+  pictures, settings, network, gradient, table, resolutions, entries, chunk, seed, first, total,
+  rays,
+):  # fmt: skip
+  """Adds the gradient of empty_weight * log(1 + density), a mean over points known to be empty.
+
+  It is multiplied by the number of rays, over which the other losses are sums.
+  Their samples come behind the `total` that `chunk` holds already; returns how many there are.
+  """
+  features = 2 * len(resolutions)
+  inputs = features + 3
+  outputs = len(network.base_b2)
+  count, size = settings.empty_samples, settings.empty_size
+  weight = settings.empty_weight * np.float32(rays) / np.float32(count)
+  coordinates = chunk.coordinates[3 * total :]
+  scale = _TWO / np.float32(size)
+  for n in range(count):
+    index = first + n
+    found = np.int64(uniform(seed, index, 16) * np.float32(len(pictures.empty)))
+    cell = pictures.empty[min(found, len(pictures.empty) - 1)]
+    x = (np.float32(cell // (size * size)) + uniform(seed, index, 17)) * scale - _ONE
+    y = (np.float32(cell // size % size) + uniform(seed, index, 18)) * scale - _ONE
+    z = (np.float32(cell % size) + uniform(seed, index, 19)) * scale - _ONE
+    u, v, w = squash(x, y, z, _ONE)
+    coordinates[3 * n] = u
+    coordinates[3 * n + 1] = v
+    coordinates[3 * n + 2] = w
+    # Standard deviations from a thousandth to a tenth of the unit, alike on a logarithmic scale.
+    extent = _ONE + np.float32(0.1 * np.log2(10.0)) * (
+      np.float32(-3) + _TWO * uniform(seed, index, 20)
+    )
+    for i in range(3):
+      chunk.x[n * inputs + features + i] = extent
+  encode(table, resolutions, entries, coordinates, count, chunk.x, inputs)
+  base_forward(
+    network, chunk.x, inputs, count, chunk.pre, chunk.hidden, chunk.inverse_std, chunk.out
+  )
+  for n in range(count):
+    z = settings.density_gain * chunk.out[n * outputs] + settings.density_bias
+    root = np.sqrt(z * z + _FOUR)
+    slope = _HALF * (_ONE + z / root) if z > _ZERO else _TWO / (root * (root - z))
+    slope *= settings.density_gain * settings.density_scale
+    density = density_of(chunk.out[n * outputs], settings)
+    for i in range(outputs):
+      chunk.d_out[n * outputs + i] = _ZERO
+    chunk.d_out[n * outputs] = weight * slope / (_ONE + density)
+  base_backward(
+    network, gradient, chunk.x, inputs, count, chunk.pre, chunk.hidden, chunk.inverse_std,
+    chunk.d_out, chunk.d_hidden, chunk.d_features[features * total :],
+  )  # fmt: skip
+  return count
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=KERNEL_CACHE)
@@ -368,7 +440,7 @@ def train_rays(
   while marched < budget:
     rays, count = 0, 0
     while rays < CHUNK_RAYS and count + settings.ray_samples <= capacity:
-      ray = chunk.rays[13 * rays : 13 * rays + 13]
+      ray = chunk.rays[14 * rays : 14 * rays + 14]
       index = first_ray + rays_done + rays
       draw_ray(pictures, settings, seed, index, ray)
       chunk.first[rays] = count
@@ -402,6 +474,11 @@ def train_rays(
       chunk.d_out, chunk.d_hidden, chunk.d_features[features * total :],
     )  # fmt: skip
     total += count
+  if len(pictures.empty) > 0:
+    total += _push_empty(
+      pictures, settings, network, gradient, table, resolutions, entries, chunk, seed, first_ray,
+      total, rays_done,
+    )  # fmt: skip
   figures[0], figures[1], figures[2] = rays_done, total, marched
   figures[3], figures[4], figures[5] = square_sum, loss_sum, distortion_sum
 
@@ -421,7 +498,7 @@ def render_rays(
   while at < stop:
     rays, count = 0, 0
     while at + rays < stop and rays < CHUNK_RAYS and count + settings.ray_samples <= capacity:
-      ray = chunk.rays[13 * rays : 13 * rays + 13]
+      ray = chunk.rays[14 * rays : 14 * rays + 14]
       for i in range(6):
         ray[i] = rays_in[6 * (at + rays) + i]
       ray[9] = footprint

@@ -14,9 +14,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 
 from scenes import align as aligning
 from scenes import (
+  anchors,
   assembly,
   bundle,
   collision_error,
@@ -27,6 +29,7 @@ from scenes import (
   keyframes,
   markers,
   overrides,
+  photometry,
   poisson,
   stages,
 )
@@ -222,7 +225,11 @@ class Job:
       if image.shape[:2] != (camera.height, camera.width):
         image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
       images.append(image[..., ::-1])
-    return Views(camera, np.stack(images), found.world_from_camera, found.names)
+    model, pictures = pycolmap.Reconstruction(str(self.folder("poses") / "sfm")), np.stack(images)
+    seen = photometry.point_colors(model, found.names, pictures)
+    gains = photometry.picture_gains(*seen, count=len(images))
+    known = anchors.known_points(model, found.names, found.world_from_camera, camera=camera)
+    return Views(camera, pictures, found.world_from_camera, found.names, gains, known)
 
   def train(self) -> None:
     """Trains the field on all views that are not held out."""
@@ -232,7 +239,10 @@ class Job:
     def run(folder: Path, progress: stages.Progress) -> None:
       training, _ = self.views().split(self.settings.held_out_every)
       field, outcome = train(
-        training, self.settings.train, progress=progress, checkpoint_dir=folder / "checkpoints"
+        training.evened(),
+        self.settings.train,
+        progress=progress,
+        checkpoint_dir=folder / "checkpoints",
       )
       field.save(folder / "field.safetensors")
       (folder / "training.json").write_text(json.dumps(stages.to_plain(outcome), indent=1))
@@ -424,7 +434,10 @@ class Job:
       pictures: dict[str, Any] = {}
       for index, name in enumerate(held_out.names):
         pose = held_out.world_from_camera[index]
-        pictures[name] = poisson.render_mesh(surface, held_out.camera, pose)[0]
+        picture = poisson.render_mesh(surface, held_out.camera, pose)[0]
+        if held_out.gains is not None:
+          picture = photometry.expose(picture, held_out.gains[index])
+        pictures[name] = picture
         progress((index + 1) / (len(held_out) + 1), f"view {index + 1} of {len(held_out)}")
       np.savez(folder / "views.npz", **pictures)
       quality = [

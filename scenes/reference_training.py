@@ -31,6 +31,7 @@ class Pictures(NamedTuple):
   factors: jax.Array  # [K]
   directions: jax.Array  # [H, W, 3], z = 1
   poses: jax.Array  # [P, 3, 4]
+  anchors: jax.Array  # [A, 4], see views.Views
 
 
 class Rays(NamedTuple):
@@ -40,6 +41,7 @@ class Rays(NamedTuple):
   directions: jax.Array  # unit vectors [R, 3]
   targets: jax.Array  # [R, 3]
   footprints: jax.Array  # [R]
+  anchors: jax.Array  # [R]: known distances, 0 where unknown
 
 
 class State(NamedTuple):
@@ -165,6 +167,7 @@ def make_pictures(views: Views, *, blur_max: float) -> Pictures:
     jnp.asarray(pyramid.factors, jnp.float32),
     jnp.asarray(views.camera.rays(), jnp.float32),
     jnp.asarray(views.world_from_camera[:, :3], jnp.float32),
+    jnp.asarray(views.anchors, jnp.float32),
   )
 
 
@@ -184,7 +187,7 @@ def _look_up(level: jax.Array, factor: jax.Array, image, x, y) -> jax.Array:
 
 def draw_rays(pictures: Pictures, settings: TrainSettings, key: jax.Array) -> Rays:
   """Draws pixels and blurs, and reads the blurred colours by mixing neighbouring levels."""
-  keys = jax.random.split(key, 5)
+  keys = jax.random.split(key, 7)
   count, (height, width) = settings.batch_rays, pictures.directions.shape[:2]
   image = jax.random.randint(keys[0], (count,), 0, pictures.poses.shape[0])
   x = jax.random.randint(keys[1], (count,), 0, width)
@@ -192,6 +195,14 @@ def draw_rays(pictures: Pictures, settings: TrainSettings, key: jax.Array) -> Ra
   blurred = jax.random.uniform(keys[3], (count,)) >= settings.blur_sharp_fraction
   blur = settings.blur_max * jax.random.uniform(keys[4], (count,)) ** settings.blur_power
   blur = jnp.where(blurred, blur, 0.0)
+  known = jnp.zeros(count)
+  if len(pictures.anchors):
+    chosen = pictures.anchors[jax.random.randint(keys[5], (count,), 0, len(pictures.anchors))]
+    use = jax.random.uniform(keys[6], (count,)) < settings.anchor_fraction
+    image = jnp.where(use, chosen[:, 0].astype(jnp.int32), image)
+    x = jnp.where(use, chosen[:, 1].astype(jnp.int32), x)
+    y = jnp.where(use, chosen[:, 2].astype(jnp.int32), y)
+    blur, known = jnp.where(use, 0.0, blur), jnp.where(use, chosen[:, 3], 0.0)
   targets = _look_up(pictures.levels[0], pictures.factors[0], image, x, y)
   for k in range(1, len(pictures.levels)):
     low, high = pictures.blurs[k - 1], pictures.blurs[k]
@@ -202,7 +213,7 @@ def draw_rays(pictures: Pictures, settings: TrainSettings, key: jax.Array) -> Ra
   directions = jnp.einsum("rij,rj->ri", rotation, pictures.directions[y, x])
   directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
   footprints = encoding.blur_footprint(blur, rule=settings.field.footprint_rule)
-  return Rays(pictures.poses[image, :, 3], directions, targets, footprints)
+  return Rays(pictures.poses[image, :, 3], directions, targets, footprints, known)
 
 
 def loss_of_rays(
@@ -223,14 +234,21 @@ def loss_of_rays(
   interlevel = field_losses.interlevel(
     out.edges, out.weights, out.proposal_edges, out.proposal_weights
   )
+  anchor = field_losses.anchor(
+    out.weights, out.edges, sampling.spacing(rays.anchors), rays.anchors > 0
+  )
   loss = (
-    photometric + settings.distortion_weight * distortion + settings.interlevel_weight * interlevel
+    photometric
+    + settings.distortion_weight * distortion
+    + settings.interlevel_weight * interlevel
+    + settings.anchor_weight * anchor
   )
   error = jnp.mean(jnp.square(color - rays.targets))
   return loss, {
     "charbonnier": photometric,
     "distortion": distortion,
     "interlevel": interlevel,
+    "anchor": anchor,
     "psnr_db": -10.0 * jnp.log10(jnp.maximum(error, 1e-12)),
   }
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from scenes import photometry
 from scenes.cameras import Camera
 
 BLUR_LEVELS = (0.0, 0.7, 1.4, 2.8, 5.6, 12.0)  # ours: about an octave apart, up to the paper's 12
@@ -23,6 +24,9 @@ class Views:
   images: np.ndarray  # uint8 [N, H, W, 3]
   world_from_camera: np.ndarray  # float64 [N, 4, 4], OpenCV camera axes
   names: tuple[str, ...]
+  gains: np.ndarray | None = None  # float64 [N, 3]: exposure of each picture; None: all 1
+  anchors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.float32))
+  """Known points [A, 4]: picture, pixel x and y, distance along the pixel's ray [unit]."""
 
   def __post_init__(self):
     count = len(self.images)
@@ -37,6 +41,8 @@ class Views:
         f"Found {count} pictures, poses {self.world_from_camera.shape}, {len(self.names)} names; "
         "expected one pose [4, 4] and one name a picture."
       )
+    if self.gains is not None and self.gains.shape != (count, 3):
+      raise ValueError(f"Found gains {self.gains.shape}; expected [{count}, 3], a channel each.")
     if not np.isfinite(self.world_from_camera).all():
       raise ValueError("A camera pose is not finite; drop the pictures that were not localised.")
 
@@ -47,7 +53,22 @@ class Views:
     """Returns the chosen pictures."""
     indices = np.asarray(indices, np.int64)
     names = tuple(self.names[i] for i in indices)
-    return Views(self.camera, self.images[indices], self.world_from_camera[indices], names)
+    row = np.full(len(self), -1)
+    row[indices] = np.arange(len(indices))
+    anchors = self.anchors.copy()
+    anchors[:, 0] = row[anchors[:, 0].astype(np.int64)]
+    anchors = anchors[anchors[:, 0] >= 0]
+    poses = self.world_from_camera[indices]
+    gains = None if self.gains is None else self.gains[indices]
+    return Views(self.camera, self.images[indices], poses, names, gains, anchors)
+
+  def evened(self) -> "Views":
+    """Returns the pictures as they would be with one exposure, see `scenes.photometry`."""
+    if self.gains is None:
+      return self
+    pairs = zip(self.images, self.gains, strict=True)
+    images = np.stack([photometry.even_out(image, gain) for image, gain in pairs])
+    return dataclasses.replace(self, images=images, gains=None)
 
   def split(self, every: int = 8) -> tuple["Views", "Views"]:
     """Returns (training, held out): one of `every` pictures is held out, as LLFF does."""
@@ -64,7 +85,10 @@ class Views:
       cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in self.images
     ]
     camera = self.camera.resized(width, height)
-    return Views(camera, np.stack(images), self.world_from_camera, self.names)
+    anchors = self.anchors.copy()
+    anchors[:, 1] *= width / self.camera.width
+    anchors[:, 2] *= height / self.camera.height
+    return dataclasses.replace(self, camera=camera, images=np.stack(images), anchors=anchors)
 
   def rays(self, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns origin [3] and unit directions [H, W, 3] of a picture's pixels in the unit frame."""
@@ -91,29 +115,29 @@ class BlurPyramid:
       return cls((views.images,), (0.0,), (1,))
     blurs = tuple(level * blur_max / BLUR_LEVELS[-1] for level in BLUR_LEVELS)
     levels, factors = [], []
-    height, width = views.camera.height, views.camera.width
     for blur in blurs:
       factor = 1
-      while (
-        blur / (2 * factor) >= _SAMPLES_PER_BLUR
-        and height % (2 * factor) == 0
-        and width % (2 * factor) == 0
-      ):
+      while blur / (2 * factor) >= _SAMPLES_PER_BLUR:
         factor *= 2
       if blur == 0:
         levels.append(views.images)
       else:
-        size = (width // factor, height // factor)
         # Averaging over factor^2 pixels and reading bilinearly both blur a little themselves.
         own = (factor**2 - 1) / 12 + (factor**2 / 6 if factor > 1 else 0)
         rest = float(np.sqrt(max(blur**2 - own, 0.01)))
-        levels.append(np.stack([_blurred(image, rest, size) for image in views.images]))
+        levels.append(np.stack([_blurred(image, rest, factor) for image in views.images]))
       factors.append(factor)
     return cls(tuple(levels), blurs, tuple(factors))
 
 
-def _blurred(image: np.ndarray, blur: float, size: tuple[int, int]) -> np.ndarray:
-  smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur, borderType=cv2.BORDER_REFLECT)
-  if size != (image.shape[1], image.shape[0]):
-    smooth = cv2.resize(smooth, size, interpolation=cv2.INTER_AREA)
+def _blurred(image: np.ndarray, blur: float, factor: int) -> np.ndarray:
+  """Averages over factor x factor pixels (the last ones over a repeated border), then blurs."""
+  height, width = image.shape[:2]
+  bottom, right = -height % factor, -width % factor
+  small: np.ndarray = image.astype(np.float32)
+  if factor > 1:
+    small = cv2.copyMakeBorder(small, 0, bottom, 0, right, cv2.BORDER_REFLECT)
+    size = ((width + right) // factor, (height + bottom) // factor)
+    small = cv2.resize(small, size, interpolation=cv2.INTER_AREA)
+  smooth = cv2.GaussianBlur(small, (0, 0), blur / factor, borderType=cv2.BORDER_REFLECT)
   return np.clip(np.rint(smooth), 0, 255).astype(np.uint8)

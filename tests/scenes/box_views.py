@@ -20,12 +20,14 @@ def wall_color(points: np.ndarray) -> np.ndarray:
   return 0.5 + 0.4 * np.sin(points * [9.0, 11.0, 13.0] + [0.0, 1.0, 2.0])
 
 
-def make_views(count: int, *, width: int = 32, height: int = 24, seed: int = 0) -> Views:
-  """Films the box from inside with random turns."""
+def make_views(
+  count: int, *, width: int = 32, height: int = 24, seed: int = 0, anchors: int = 0
+) -> Views:
+  """Films the box from inside with random turns; `anchors` pixels a picture know their distance."""
   camera = Camera(width=width, height=height, fx=0.8 * width, fy=0.8 * width, cx=width / 2,
                   cy=height / 2, k1=0.03)  # fmt: skip
   rng = np.random.default_rng(seed)
-  images, poses = [], []
+  images, poses, known = [], [], [np.zeros((0, 4), np.float32)]
   for _ in range(count):
     forward = rng.normal(size=3) * [1, 1, 0.4]
     forward /= np.linalg.norm(forward)
@@ -39,5 +41,10 @@ def make_views(count: int, *, width: int = 32, height: int = 24, seed: int = 0) 
     hits = pose[:3, 3] + wall_distance(pose[:3, 3], rays)[..., None] * rays
     images.append(np.rint(255 * wall_color(hits)).astype(np.uint8))
     poses.append(pose)
+    x, y = rng.integers(0, width, anchors), rng.integers(0, height, anchors)
+    distances = wall_distance(pose[:3, 3], rays[y, x])
+    known.append(
+      np.stack([np.full(anchors, len(poses) - 1), x, y, distances], -1, dtype=np.float32)
+    )
   names = tuple(f"{i:04d}" for i in range(count))
-  return Views(camera, np.stack(images), np.stack(poses), names)
+  return Views(camera, np.stack(images), np.stack(poses), names, anchors=np.concatenate(known))

@@ -46,3 +46,12 @@ def test_interlevel_by_hand_and_its_gradient():
   by_field, by_proposal = jax.grad(loss, argnums=(0, 1))(weights, proposal)
   assert float(jnp.abs(by_field).max()) == 0.0
   np.testing.assert_allclose(by_proposal, [[-0.8, -0.8, 0.0]], rtol=1e-5)
+
+
+def test_anchor_is_the_mean_distance_of_the_light_from_its_point():
+  edges = jnp.array([[0.0, 0.2, 0.6], [0.0, 0.2, 0.6]])
+  weights = jnp.array([[0.5, 0.25], [0.5, 0.25]])
+  goals, known = jnp.array([0.4, 0.0]), jnp.array([True, False])
+  by_hand = 0.5 * 0.3 + 0.25 * 0.0 + 0.25 * 0.6  # the middles lie at 0.1 and 0.4
+  found = field_losses.anchor(weights, edges, goals, known)
+  np.testing.assert_allclose(found, by_hand / 2, rtol=1e-6)

@@ -42,13 +42,21 @@ def _rough_field(pixel_angle=0.05):
 @pytest.fixture(scope="module")
 def backward():
   """A trainer, one chunk's rays and samples, its figures and its gradient."""
-  views = box_views.make_views(3, width=16, height=16)
+  return _backward(with_empty=False)
+
+
+def _backward(*, with_empty):
+  views = box_views.make_views(3, width=16, height=16, anchors=40)
   trainer = fused.FusedTrainer(
     views, SETTINGS, seed=1, initial=_rough_field(views.camera.pixel_angle)
   )
   engine, figures = trainer.engine, np.zeros(6)
+  pictures = trainer.pictures
+  assert len(pictures.empty) > 100
+  if not with_empty:
+    pictures = pictures._replace(empty=np.zeros(0, np.int64))
   fused_kernels.train_rays(
-    trainer.pictures, engine.kernel, engine.occupancy, engine.network,
+    pictures, engine.kernel, engine.occupancy, engine.network,
     trainer._gradient_networks[0], trainer.table, engine.resolutions, engine.entries,
     engine.chunks[0], np.uint64(5), 0, 300, np.float32(0), figures,
   )  # fmt: skip
@@ -70,7 +78,7 @@ def _told_length(positions):
 
 def _reference_losses(params, trainer, chunk, count):
   """The same rays and samples in JAX: sums of the Charbonnier and the distortion loss."""
-  rays, first = chunk.rays.reshape(-1, 13)[:count], chunk.first[: count + 1]
+  rays, first = chunk.rays.reshape(-1, 14)[:count], chunk.first[: count + 1]
   most = np.diff(first).max()
   distance, length = np.ones((count, most), np.float32), np.zeros((count, most), np.float32)
   for ray in range(count):
@@ -98,7 +106,43 @@ def _reference_losses(params, trainer, chunk, count):
   distortion = field_losses.distortion_of_intervals(
     sort(weights), sort(sampling.spacing(distance)), sort(extent)
   ).sum()
-  return photometric + SETTINGS.distortion_weight * distortion, (photometric, distortion)
+  goals = sampling.spacing(rays[:, 13])
+  off = (weights * jnp.abs(sampling.spacing(distance) - goals[:, None])).sum(1) + rest * (1 - goals)
+  anchored = SETTINGS.anchor_weight * jnp.where(rays[:, 13] > 0, off, 0).sum()
+  loss = photometric + SETTINGS.distortion_weight * distortion + anchored
+  return loss, (photometric, distortion)
+
+
+def test_anchored_rays_know_their_distance(backward):
+  _, chunk, figures, _ = backward
+  rays = chunk.rays.reshape(-1, 14)[: int(figures[0])]
+  anchored = rays[:, 13] > 0
+  assert 0 < anchored.sum() < len(rays)
+  np.testing.assert_array_equal(rays[anchored, 9], 1.0)
+  distance = box_views.wall_distance(rays[anchored, :3], rays[anchored, 3:6])
+  np.testing.assert_allclose(rays[anchored, 13], distance, rtol=1e-4)
+
+
+def test_empty_space_has_the_gradient_of_its_density(backward):
+  """The difference that empty cells make, against autodiff of weight * log(1 + density)."""
+  *_, without = backward
+  trainer, chunk, figures, gradient = _backward(with_empty=True)
+  count = trainer.engine.kernel.empty_samples
+  total = int(figures[1])
+  points = 4 * chunk.coordinates[3 * (total - count) : 3 * total].reshape(-1, 3) - 2
+  assert (np.abs(points) < box_views.HALF_SIZE).all()  # within the walls
+  sigmas = [10.0 ** (2 * fused_march.uniform(np.uint64(5), n, 20) - 3) for n in range(count)]
+  variances = np.square(np.array(sigmas, np.float32))[:, None].repeat(3, axis=1)
+
+  def loss(params):
+    density = query_density(SETTINGS.field, params, points, variances)
+    return figures[0] * SETTINGS.empty_weight * jnp.log1p(density).mean()
+
+  expected = jax.grad(loss)(_rough_field().params)
+  for name in ("table", "base_w1", "base_b1", "base_w2", "base_b2"):
+    change = gradient[name] - without[name]
+    error = np.linalg.norm(change - expected[name]) / np.linalg.norm(expected[name])
+    assert error < 1e-3, (name, error)
 
 
 def test_gradients_agree_with_autodiff(backward):
@@ -116,7 +160,7 @@ def test_gradients_agree_with_autodiff(backward):
 
 def test_rays_are_pixels_of_the_pictures(backward):
   trainer, chunk, figures, _ = backward
-  rays = chunk.rays.reshape(-1, 13)[: int(figures[0])]
+  rays = chunk.rays.reshape(-1, 14)[: int(figures[0])]
   sharp = rays[rays[:, 9] == 1.0]
   assert 3 < len(sharp) < len(rays)
   distance = box_views.wall_distance(sharp[:, :3], sharp[:, 3:6])

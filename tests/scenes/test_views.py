@@ -57,3 +57,24 @@ def test_blur_levels_have_the_variance_they_claim():
     mean = (profile * x).sum() / profile.sum()
     variance = (profile * (x - mean) ** 2).sum() / profile.sum()
     assert np.sqrt(max(variance - own, 0)) == pytest.approx(blur, rel=0.06, abs=0.1), factor
+
+
+def test_selecting_keeps_gains_and_anchors_of_the_chosen_pictures():
+  views = box_views.make_views(4, anchors=5)
+  views = dataclasses.replace(views, gains=np.arange(12.0).reshape(4, 3) + 1)
+  chosen = views.select([3, 1])
+  np.testing.assert_array_equal(chosen.gains, views.gains[[3, 1]])
+  of_three = views.anchors[views.anchors[:, 0] == 3]
+  np.testing.assert_array_equal(chosen.anchors[chosen.anchors[:, 0] == 0, 1:], of_three[:, 1:])
+  assert set(chosen.anchors[:, 0]) == {0, 1}
+
+
+def test_evening_out_divides_by_the_gain():
+  views = box_views.make_views(2)
+  doubled = dataclasses.replace(
+    views, images=(views.images // 4) * 2, gains=np.array([[2.0] * 3, [1.0] * 3])
+  )
+  evened = doubled.evened()
+  np.testing.assert_array_equal(evened.images[0], views.images[0] // 4)
+  np.testing.assert_array_equal(evened.images[1], (views.images[1] // 4) * 2)
+  assert evened.gains is None
