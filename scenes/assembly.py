@@ -18,6 +18,7 @@ from scenes.stages import to_plain
 if TYPE_CHECKING:
   from scenes.pipeline import Job
 
+_NOTICEABLE_EXPOSURE = 1.25  # ours: a ratio above this is warned of
 _ROBOT_VIEWS = 8  # held-out views shown at robot resolution where no truth gives better ones
 _MAP_SCALE = 6  # pixels of the report's map per cell
 
@@ -86,6 +87,12 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
   results = job.stages.results
   seconds = {stage: result.seconds for stage, result in results.items()}
   warnings = [*job.capture.warnings, *job.localisation.warnings, *job.alignment.warnings]
+  ratio = figures.get("exposure_ratio", 1.0)
+  if ratio > _NOTICEABLE_EXPOSURE:
+    warnings.append(
+      f"Exposure changed by a factor of {ratio:.1f} while filming. It was evened out, but clipped "
+      "highlights stay; lock the phone's exposure."
+    )
   settings = to_plain(job.settings)
   transform = job.alignment.world_from_unit
   path = transform.apply(job.localisation.world_from_camera[:, :3, 3])

@@ -104,6 +104,14 @@ def _fit(pictures: np.ndarray, points: np.ndarray, values: np.ndarray, count: in
   return gains
 
 
+def exposure_ratio(gains: np.ndarray | None) -> float:
+  """How many times as bright the brightest pictures are as the darkest: 95th to 5th percentile."""
+  if gains is None:
+    return 1.0
+  low, high = np.percentile(gains.mean(-1), [5, 95])
+  return float(high / low)
+
+
 def even_out(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
   """Returns a picture uint8 [H, W, 3] as it would be with gain 1; clipped values stay bright."""
   values = image.astype(np.float32)

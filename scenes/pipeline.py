@@ -264,6 +264,7 @@ class Job:
     def run(folder: Path, progress: stages.Progress) -> None:
       _, held_out = self.views().split(self.settings.held_out_every)
       scores, figures = evaluate.evaluate(self.renderer, held_out, progress=progress)
+      figures["exposure_ratio"] = photometry.exposure_ratio(held_out.gains)
       evaluate.save_scores(scores, folder)
       (folder / "figures.json").write_text(json.dumps(figures, indent=1))
 

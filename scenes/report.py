@@ -28,6 +28,7 @@ FIGURES: Mapping[str, tuple[str, str]] = {
   "held_out_psnr_db": ("dB", "peak signal-to-noise ratio on held-out views, full size, mean"),
   "held_out_ssim": ("", "structural similarity on held-out views, full size, mean"),
   "held_out_psnr_30x40_db": ("dB", "the same views at 30x40"),
+  "exposure_ratio": ("", "brightest to darkest exposure of the capture; it was evened out"),
   "held_out_psnr_60x80_db": ("dB", "the same views at 60x80"),
   "held_out_ssim_30x40": ("", "the same views at 30x40"),
   "held_out_ssim_60x80": ("", "the same views at 60x80"),

@@ -61,3 +61,9 @@ def test_evening_out_inverts_exposing_where_nothing_clips(gain):
 def test_clipped_values_stay_bright():
   white = np.full((2, 2, 3), 255, np.uint8)
   np.testing.assert_array_equal(photometry.even_out(white, np.full(3, 1.6)), white)
+
+
+def test_exposure_ratio_by_hand():
+  assert photometry.exposure_ratio(None) == 1.0
+  gains = np.linspace(1.0, 3.0, 101)[:, None].repeat(3, axis=1)
+  np.testing.assert_allclose(photometry.exposure_ratio(gains), 2.9 / 1.1)
