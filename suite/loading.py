@@ -1,11 +1,12 @@
 """Builds an environment from a task's name and a scene bundle."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from suite import errors
 from suite.camera import CameraSettings, FieldRenderer, RobotCamera
-from suite.effects import read_effects
+from suite.effects import Effect, read_effects
 from suite.environment import Environment
 from suite.randomisation import RandomisationSettings
 from suite.tasks import ball_push, nerf_nav
@@ -33,6 +34,7 @@ def load(
   time_limit: float | None = None,
   physics_timestep: float = PHYSICS_TIMESTEP,
   renderer: FieldRenderer | None = None,
+  furnish: Callable[[Any], None] | None = None,
 ) -> Environment:
   """Loads a task in a scene.
 
@@ -48,6 +50,7 @@ def load(
     time_limit: Length of an episode [s]; the task's own if None.
     physics_timestep: s.
     renderer: Renders the scene instead of the bundle's field, in the bundle's unit frame.
+    furnish: Called with the arena's MJCF model before it is compiled, to put things into it.
 
   Returns:
     The environment, a `composer.Environment`.
@@ -72,9 +75,11 @@ def load(
     physics_timestep=physics_timestep,
     privileged=privileged,
     randomisation=randomisation or RandomisationSettings(),
-    effects=read_effects(effects) if isinstance(effects, str | Path) else tuple(effects or ()),
+    effects=_effects(effects),
   )
   built = task_class(bundle, camera=robot_camera, settings=settings)
+  if furnish is not None:
+    furnish(built.root_entity.mjcf_model)
   try:
     return Environment(built, time_limit=settings.time_limit, random_state=random)
   except ValueError as error:
@@ -87,7 +92,25 @@ def open_scene(scene: Any) -> Any:
     from scenes.bundle import Bundle
 
     return Bundle.load(scene)
+  if not hasattr(scene, "collision_parts"):
+    raise ValueError(
+      f"scene must be the folder of a scene bundle, an opened bundle, or None for the built-in "
+      f"room; found {scene!r}."
+    )
   return scene
+
+
+def _effects(effects: Any) -> tuple[Effect, ...]:
+  """Returns effects from a file or a sequence."""
+  if isinstance(effects, str | Path):
+    return tuple(read_effects(effects))
+  found = tuple(effects or ())
+  for effect in found:
+    if not isinstance(effect, Effect):
+      raise ValueError(
+        f"effects must be an effects.json or a sequence of suite.effects.Effect, found {effect!r}."
+      )
+  return found
 
 
 def load_renderer(bundle: Any) -> FieldRenderer:

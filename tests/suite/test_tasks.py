@@ -412,6 +412,10 @@ def test_bad_input_is_one_clear_error(room, tmp_path, nav):
     load("nerf_nav", room, physics_timestep=0.002)
   with pytest.raises(ValueError, match="l_kne"):
     load("nerf_nav", room, effects=[Effect("encoder_offset", "l_kne", {"offset": 0.1})])
+  with pytest.raises(ValueError, match="sequence of suite.effects.Effect, found 3"):
+    load("nerf_nav", room, effects=[3])
+  with pytest.raises(ValueError, match="folder of a scene bundle.*found 5"):
+    suite.load("nerf_nav", scene=5)
   with pytest.raises(ValueError, match="not a folder"):
     suite.load("nerf_nav", scene=tmp_path / "nowhere")
   with pytest.raises(ValueError, match=r"shape \(20,\)"):
