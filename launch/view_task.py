@@ -128,11 +128,11 @@ class TaskViewer:
   def _face(self, camera: Any) -> None:
     """Puts a camera of the page where nothing stands between it and the robot."""
     environment = self._environment
-    state, physics = environment.task.state, environment.physics
-    way = direction(best_azimuth(physics, state.position, state.yaw))
-    distance = clear_distance(physics, state.position, way)
-    camera.position = tuple(state.position + distance * way)
-    camera.look_at = tuple(state.position)
+    position, physics = environment.task.state.position, environment.physics
+    way = direction(best_azimuth(environment.task, physics))
+    distance = clear_distance(physics, position, way)
+    camera.position = tuple(position + distance * way)
+    camera.look_at = tuple(position)
 
   def _add_meshes(self, *, visible: bool) -> list[Any]:
     """Adds the room's surface, or else its convex parts, and a grid on the floor."""

@@ -19,6 +19,7 @@ _DISTANCE, _ELEVATION = 1.4, np.deg2rad(22.0)  # m and rad from the robot
 _FIELD_OF_VIEW = np.deg2rad(42.0)  # vertical
 _PREFERRED = np.deg2rad(130.0)  # rad from the robot's heading: beside and a little behind it
 _DIRECTIONS = 24  # directions that are tried
+_FLOOR_BONUS, _TURN_COST = 0.7, 0.05  # worth of free floor below the view [m], of turning [m/rad]
 _CLEARANCE = 0.15  # m kept from what stands behind the view
 _FOLLOW = 0.06  # share of the way by which the view follows the robot in a frame
 _FIELD_SHARE = 2  # the field is rendered at this fraction of the size: it takes most of the time
@@ -44,19 +45,26 @@ def clear_distance(physics: Any, start: np.ndarray, way: np.ndarray) -> float:
   return float(np.clip(free, 0.3, _DISTANCE))
 
 
-def best_azimuth(physics: Any, position: np.ndarray, yaw: float) -> float:
-  """Returns the direction [rad] with a clear view of the robot that is nearest to the preferred.
+def best_azimuth(task: RobotTask, physics: Any) -> float:
+  """Returns the direction [rad] from the robot in which a view sees it best.
+
+  It is clear of the room's parts and, if there is such a one, above floor where the robot could
+  walk: there the field has been filmed from all around. Of several, the one nearest to the
+  preferred direction.
 
   Args:
-    physics: The compiled model and its state.
-    position: The robot's torso [3] [m].
-    yaw: Its heading [rad].
+    task: The task.
+    physics: Its compiled model and state.
   """
+  position, preferred = task.state.position, task.state.yaw + _PREFERRED
   turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
   turns = np.where(turns > np.pi, turns - 2 * np.pi, turns)  # from the preferred direction
-  free = [clear_distance(physics, position, direction(yaw + _PREFERRED + turn)) for turn in turns]
-  score = np.array(free) - 0.05 * np.abs(turns)
-  return float(yaw + _PREFERRED + turns[np.argmax(score)])
+  ways = np.array([direction(preferred + turn) for turn in turns])
+  free = np.array([clear_distance(physics, position, way) for way in ways])
+  places = (position + free[:, None] * ways)[:, :2]
+  above_floor = np.asarray(task.scene.free_space.is_reachable(places), np.float64)
+  score = free + _FLOOR_BONUS * above_floor - _TURN_COST * np.abs(turns)
+  return float(preferred + turns[np.argmax(score)])
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -101,9 +109,8 @@ class ThirdPerson:
 
   def restart(self) -> None:
     """Chooses the view anew, as at the start of an episode."""
-    state = self._task.state
-    self._target = state.position.copy()
-    self._azimuth = best_azimuth(self._physics, self._target, state.yaw)
+    self._target = self._task.state.position.copy()
+    self._azimuth = best_azimuth(self._task, self._physics)
 
   def draw(self) -> np.ndarray:
     """Returns the picture now, RGB uint8 [H, W, 3]."""

@@ -33,7 +33,7 @@ def _stand(environment, x, y, yaw=0.0):
 def test_nothing_of_the_room_stands_before_the_robot(environment, place, yaw):
   _stand(environment, *place, yaw)
   physics, position = environment.physics, environment.task.state.position
-  azimuth = third_person.best_azimuth(physics, position, yaw)
+  azimuth = third_person.best_azimuth(environment.task, physics)
   way = third_person.direction(azimuth)
   assert np.linalg.norm(way) == pytest.approx(1.0)
   distance = third_person.clear_distance(physics, position, way)
