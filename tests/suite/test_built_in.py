@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import suite
-from suite import loading
+from suite import loading, protocols
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +74,23 @@ def test_random_actions_give_no_warning_and_no_nan(task, steps, room):
     endings.add(environment.task.outcome.ending)
   assert not environment.physics.data.ptr.warning.number.any()
   assert "fall" in endings  # it did thrash about
+
+
+@pytest.mark.parametrize(
+  ("task", "names"),
+  [("nerf_nav", ("navigation", "camera_gain")), ("ball_push", ("ball_center", "ball_wall"))],
+)
+def test_every_trial_of_the_protocols_can_start(task, names, room):
+  environment = suite.load(task, scene=room, random=0, image_size=None)
+  for trial in (trial for name in names for trial in protocols.PROTOCOLS[name]()):
+    environment.task.set_trial(trial)
+    environment.reset()
+    environment.step(environment.task.standing_action)
+    outcome = environment.task.outcome
+    assert outcome.ending is None and not outcome.success, trial
+    if task == "ball_push":  # here the furniture leaves the whole workspace of the paper free
+      center = environment.task.workspace.center
+      ball = environment.task.ball_position[:2] - center
+      np.testing.assert_allclose(ball, trial.ball_xy, atol=1e-6)
+      robot = environment.task.state.position[:2] - center
+      np.testing.assert_allclose(robot, trial.robot_xy, atol=1e-3)

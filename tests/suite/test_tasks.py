@@ -327,6 +327,22 @@ def test_own_arm_appears_in_the_picture(nav):
   assert (camera.render(physics.data.ptr).reshape(-1, 3)[pixels] != (40, 80, 120)).any()
 
 
+def test_the_ball_appears_in_the_picture_unless_the_room_is_before_it(ball):
+  renderer = ball.task.robot_camera._renderer
+  ball.task.set_start(Start((-1.0, 0.0), 0.0), ball_xy=(0.0, 0.0))
+  orange = {}
+  for depth in (np.inf, 0.3 / ball.task.scene.world_from_unit.scale):
+    renderer.depth = depth
+    picture = ball.reset().observation["camera"].astype(int)
+    orange[depth] = np.argwhere((picture[..., 0] > 90) & (picture[..., 2] < 40))
+  renderer.depth = np.inf
+  visible, hidden = orange.values()
+  assert len(visible) > 30 and len(hidden) == 0
+  # A metre ahead a ball of 24 cm spans atan(0.24 / 1) of 43.3 degrees in 30 rows: about 9 rows.
+  assert np.ptp(visible[:, 0]) + 1 == pytest.approx(9, abs=2)
+  assert visible[:, 1].mean() == pytest.approx(19.5, abs=3)  # straight ahead
+
+
 def test_picture_is_late_by_the_camera_latency(room):
   poses = {}
   for latency in (0.0, 0.05):
