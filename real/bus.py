@@ -5,6 +5,7 @@ order of `suite.op3.constants.JOINT_NAMES`.
 """
 
 import dataclasses
+import functools
 import threading
 from collections.abc import Callable
 from typing import NamedTuple
@@ -236,9 +237,17 @@ class Bus:
     """Switches all torque off at once, without waiting for answers."""
     self._write_all(TORQUE_ENABLE, 1, [0] * len(self._ids))
 
-  def torque_states(self) -> list[int] | None:
-    """Returns the servos' torque enable [J]; None if they cannot be read."""
-    return self._read_all(TORQUE_ENABLE, 1)
+  def torque_states(self) -> list[int | None]:
+    """Returns the servos' torque enable [J]; None where a servo does not answer."""
+    states = self._read_all(TORQUE_ENABLE, 1, attempts=1)
+    if states is not None:
+      return list(states)
+    found: list[int | None] = []
+    for device in self._ids:  # a dead servo silences those behind it in a common answer
+      read = functools.partial(self._handler.read1ByteTxRx, self._port, device, TORQUE_ENABLE)
+      answer = self._try(read, attempts=1)
+      found.append(None if answer is None else answer[0])
+    return found
 
   def hardware_errors(self) -> dict[str, list[str]]:
     """Returns the names of the errors that servos report, by joint."""
@@ -359,9 +368,9 @@ class Bus:
   def _expect(self, size: int, *, delay: float) -> None:
     self._port.expect(size, delay=delay, margin=self.settings.margin)
 
-  def _try(self, transaction: Callable[[], tuple]) -> tuple | None:
+  def _try(self, transaction: Callable[[], tuple], *, attempts: int = _ATTEMPTS) -> tuple | None:
     """Repeats a transaction (result second last, error last) until it is answered."""
-    for _ in range(_ATTEMPTS):
+    for _ in range(attempts):
       with self._lock:
         try:
           found = transaction()
@@ -402,12 +411,12 @@ class Bus:
       finally:
         self._port.is_using = False
 
-  def _read_all(self, address: int, size: int) -> list[int] | None:
+  def _read_all(self, address: int, size: int, *, attempts: int = _ATTEMPTS) -> list[int] | None:
     """Reads a register of every servo (unsigned); None if one does not answer."""
     group = sdk.GroupSyncRead(self._port, self._handler, address, size)
     for device in self._ids:
       group.addParam(device)
-    found = self._try(lambda: (group.txRxPacket(), 0))
+    found = self._try(lambda: (group.txRxPacket(), 0), attempts=attempts)
     if found is None:
       return None
     return [group.getData(device, address, size) for device in self._ids]

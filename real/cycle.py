@@ -157,7 +157,7 @@ class Cycle:
     with self._commands:
       self._bus.drop_torque()
       states = self._bus.torque_states()
-      self._torque_off = states is not None and not any(states)
+      self._torque_off = all(state == 0 for state in states)
 
   def _record(
     self, imu: ImuReading | None, gravity: np.ndarray | None, joints: JointReading | None

@@ -26,6 +26,7 @@ from suite import specs as policy_specs
 from suite.op3 import constants
 
 SUPPORTED_POSE = constants.standing_targets()  # [J] rad, where the robot starts and ends, held
+_LEVEL_TIME = 0.1  # s in which at least one of a dozen IMU readings arrives
 _FIRST_READING = 2.0  # s to wait for the first reading of everything
 _log = logging.getLogger(__name__)
 
@@ -145,10 +146,12 @@ class RobotEnvironment(dm_env.Environment):
     if not self._standing:
       self._energize()
     self._move_slowly(SUPPORTED_POSE)
-    self._operator.support(False)
-    self._pause(self.settings.settle_time)
-    self._monitor.held = False
-    self._raise_if_stopped()
+    self._level()
+    if not self.dry_run:  # without torque it could not stand
+      self._monitor.held = False
+      self._operator.support(False)
+      self._pause(self.settings.settle_time)
+      self._level()
     self._control = self._normalised(SUPPORTED_POSE)
     self._action_filter.reset(self._control)
     self.timing.reset()
@@ -227,6 +230,11 @@ class RobotEnvironment(dm_env.Environment):
     self._goal = np.asarray(goal, np.float64).reshape(2)
 
   @property
+  def time_limit(self) -> float:
+    """Length of an episode [s]."""
+    return self._time_limit
+
+  @property
   def standing_action(self) -> np.ndarray:
     """The action [J] that holds the supported pose."""
     return self._normalised(SUPPORTED_POSE).astype(np.float32)
@@ -235,6 +243,11 @@ class RobotEnvironment(dm_env.Environment):
   def stop(self) -> Stop | None:
     """Why the torque is off, if it was switched off."""
     return self._cycle.stop
+
+  @property
+  def missed_bus_cycles(self) -> int:
+    """How many cycles of the bus were not begun, because the one before still ran."""
+    return self._cycle.missed
 
   @property
   def bus(self) -> Bus:
@@ -350,6 +363,11 @@ class RobotEnvironment(dm_env.Environment):
       self._raise_if_stopped()
     self._limiter.reset(pose)
 
+  def _level(self) -> None:
+    """Lets the accelerometer say which way is up: the robot rests, and the filter is slow."""
+    self._cycle.sensing.level()
+    self._pause(_LEVEL_TIME)
+
   def _pause(self, seconds: float) -> None:
     self._clock.sleep_until(self._clock.now() + seconds)
     self._raise_if_stopped()
@@ -376,7 +394,10 @@ class RobotEnvironment(dm_env.Environment):
         "environment.bus.reboot(joint)."
       )
     if not self.dry_run and not self._cycle.torque_off:
-      raise SafetyError("Not every servo confirmed that its torque is off: check the bus.")
+      silent = ", ".join(self._bus.silent()) or "none at the moment"
+      raise SafetyError(
+        f"Not every servo confirmed that its torque is off. Devices that do not answer: {silent}."
+      )
     self._cycle.rearm()
 
   def _raise_if_stopped(self) -> None:

@@ -5,8 +5,13 @@ import os
 import select
 import sys
 import termios
+import threading
+import time
 import tty
+from collections.abc import Callable
 from typing import Protocol
+
+_LOOK_PERIOD = 0.02  # s between looks for the answer to a question
 
 
 class Operator(Protocol):
@@ -23,18 +28,25 @@ class Operator(Protocol):
 
 
 class Terminal:
-  """A person at a terminal: any key stops the robot, Enter confirms what is asked."""
+  """A person at a terminal: any key stops the robot, Enter confirms what is asked.
+
+  The bus's thread looks for keys all the time, also while a question waits for its Enter.
+  """
 
   def __init__(self, descriptor: int | None = None):
     """Takes a terminal; standard input if None. Without a terminal there are no keys."""
     self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
     self._open = os.isatty(self._descriptor)
     self._settings = termios.tcgetattr(self._descriptor) if self._open else None
+    self._lock = threading.Lock()
+    self._asking = self._confirmed = self._stopped = False
     if self._open:
       tty.setcbreak(self._descriptor, termios.TCSANOW)
 
   def pressed(self) -> bool:
-    return self._open and bool(self._read(0.0))
+    self._take()
+    found, self._stopped = self._stopped, False
+    return found
 
   def support(self, held: bool) -> None:
     if not self._open:
@@ -42,18 +54,28 @@ class Terminal:
         "Nobody can be asked to hold the robot: standard input is no terminal. Run it in one."
       )
     asked = "HOLD the robot by its torso, feet off the ground" if held else "Set it down, let go"
-    print(f"\n{asked}, then press Enter.", flush=True)
-    while b"\n" not in self._read(None):
-      pass
+    print(f"\n{asked}, then press Enter. Any other key stops.", flush=True)
+    self._confirmed, self._asking = False, True
+    while self._open and not self._confirmed:
+      self._take()
+      time.sleep(_LOOK_PERIOD)
+    self._asking = False
 
-  def _read(self, seconds: float | None) -> bytes:
-    ready, _, _ = select.select((self._descriptor,), (), (), seconds)
-    if not ready:
-      return b""
-    found = os.read(self._descriptor, 1024)
-    if not found:  # the terminal is gone
-      self._open = False
-    return found
+  def _take(self) -> None:
+    """Takes the keys that were pressed."""
+    with self._lock:
+      if not self._open or not select.select((self._descriptor,), (), (), 0)[0]:
+        return
+      try:
+        keys = os.read(self._descriptor, 1024)
+      except OSError:
+        keys = b""
+      if not keys:  # the terminal is gone, and with it who could stop the robot
+        self._open, self._stopped = False, True
+      elif self._asking and set(keys) <= set(b"\r\n"):
+        self._confirmed = True
+      else:
+        self._stopped = True
 
   def close(self) -> None:
     if self._settings is not None:
@@ -66,7 +88,7 @@ class Terminal:
 class Hand:
   """An operator in a rehearsal: something else holds the robot, and keys are pressed by `press`."""
 
-  def __init__(self, hold=lambda held: None):
+  def __init__(self, hold: Callable[[bool], None] = lambda held: None):
     """Takes a function that holds (True) or releases (False) the robot."""
     self._hold = hold
     self._pressed = False

@@ -14,6 +14,7 @@ import serial
 from real.clock import Clock
 
 _PATIENCE = 0.03  # s that an answer may be late outside the cycle
+_TICK = 1e-6  # s beyond a time-out: the SDK ends a wait only when it has passed
 _LATENCY_LIMIT = 1  # ms; the adapter's own default of 16 ms is a hidden delay
 
 
@@ -72,8 +73,8 @@ class Port(dynamixel_sdk.PortHandler):
 
   def readPort(self, length: int):
     left = self.packet_timeout / 1000 - (self._clock.now() - self.packet_start_time / 1000)
-    if left > 0 and length > 0 and self.ser.in_waiting < length:
-      self._clock.wait_readable(self.ser.fd, left)
+    if length > 0 and self.ser.in_waiting < length:
+      self._clock.wait_readable(self.ser.fd, max(left, 0.0) + _TICK)
     return super().readPort(length)
 
   def writePort(self, packet) -> int:

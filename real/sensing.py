@@ -55,6 +55,12 @@ class Sensing:
     """Takes a reading of the joints."""
     self._joints = reading
 
+  def level(self) -> None:
+    """Lets the next IMU reading set the attitude anew; the robot is at rest then."""
+    self._madgwick.reset()
+    if self._low_pass is not None:
+      self._low_pass.reset()
+
   @property
   def ready(self) -> bool:
     """Whether both have been read."""

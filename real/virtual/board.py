@@ -30,8 +30,14 @@ class Board:
   answers = True
   alert = False
 
-  def __init__(self) -> None:
-    """Starts with the servos' supply off, as the board does."""
+  def __init__(self, noise: np.ndarray, rng: np.random.Generator):
+    """Starts with the servos' supply off, as the board does.
+
+    Args:
+      noise: Standard deviations of the IMU's readings [6] [rad/s, m/s^2].
+      rng: Source of the noise.
+    """
+    self._noise, self._rng = noise, rng
     self.table = registers.Table(registers.OPENCR)
     self._line = filters.DelayLine(filters.CHIP_DELAY)
     self._next = 0.0  # s, of the next reading of the chip
@@ -55,13 +61,14 @@ class Board:
     """Whether it has booted."""
     return True
 
-  def sense(self, time: float, imu: np.ndarray, noise: np.ndarray, volts: float) -> None:
+  def sense(self, time: float, imu: np.ndarray, volts: float) -> None:
     """Takes what chip and supply give at a time [s]; the table follows at the firmware's rate."""
     self._line.push(time, imu)
     if time + 1e-9 < self._next:
       return
     self._next = max(self._next + _READ_PERIOD, time)
-    counts = np.clip(np.rint((self._line.read(time) + noise) * _SCALE), -32768, 32767)
+    values = self._line.read(time) + self._noise * self._rng.standard_normal(6)
+    counts = np.clip(np.rint(values * _SCALE), -32768, 32767)
     tenths = int(np.clip(round(10 * volts), 0, 255))
     _MEASURED.pack_into(self.table.memory, _MEASURED_ADDRESS, tenths, *counts.astype(int).tolist())
 

@@ -22,6 +22,7 @@ from suite.op3 import constants, op3
 STEP = 0.001  # s
 WORLDS = ("floor", "room")
 PREFIX = "op3/"
+_STOP_MARGIN = 0.5  # rad from the control limits to a joint's mechanical stop: ours
 _HELD_HEIGHT = 0.30  # m of the torso: legs hang free
 _HAND_SPEED = 0.1  # m/s
 _LET_GO_LAG = 0.002  # m that the torso stays above the sinking hand when the feet carry it
@@ -85,6 +86,10 @@ class Body:
     self._hand, self._weld = model.body("hand").mocapid[0], model.equality("hand").id
     first = model.sensor(PREFIX + "gyroscope").adr[0]
     self._imu_slice = slice(first, first + 6)
+    # Views: every access to a field of MjData makes a new array.
+    self._force, self._friction = self.data.qfrc_applied, model.dof_frictionloss
+    self._positions, self._velocities = self.data.qpos, self.data.qvel
+    self._sensors = self.data.sensordata[self._imu_slice]
     self._low_pass = filters.LowPass(filters.CHIP_BANDWIDTH_HZ, 1 / STEP)
     self.imu = np.zeros(6)  # what the chip gives: rad/s [3], m/s^2 [3]
     self._bias = np.array([*self.hidden.gyroscope_bias, *self.hidden.accelerometer_bias])
@@ -140,18 +145,21 @@ class Body:
       while self.time + STEP <= time + 1e-9:
         self._step()
 
+  def skip(self, time: float) -> None:
+    """Stands still until a time [s], if that has not come yet: what was missed is not made up."""
+    with self.lock:
+      self.time = max(self.time, time)
+
   def _step(self) -> None:
     model, data = self.model, self.data
     torque, friction = self.motors.torque(self.time, STEP)
-    data.qfrc_applied[self._dofs] = torque
-    model.dof_frictionloss[self._dofs] = friction
+    self._force[self._dofs] = torque
+    self._friction[self._dofs] = friction
     data.xfrc_applied[self._torso, :3] = self.push
     if data.eq_active[self._weld]:
       self._move_hand()
     mujoco.mj_step(model, data)
     self.time += STEP
-    if data.ncon:
-      self._note_touches()
     self._sense()
     if self.after_step is not None:
       self.after_step(self.time)
@@ -159,11 +167,12 @@ class Body:
       row = self._traced % _TRACE_LENGTH
       self._trace_times[row], self._trace[row] = self.time, data.qpos
       self._traced += 1
+      if data.ncon:
+        self._note_touches()
 
   def _sense(self) -> None:
-    data = self.data
-    self.motors.measure(data.qpos[self._qpos], data.qvel[self._dofs])
-    self.imu = self._low_pass(data.sensordata[self._imu_slice] + self._bias)
+    self.motors.measure(self._positions[self._qpos], self._velocities[self._dofs])
+    self.imu = self._low_pass(self._sensors + self._bias)
 
   def _move_hand(self) -> None:
     position = self.data.mocap_pos[self._hand]
@@ -262,9 +271,13 @@ def _robot(hidden: Hidden) -> mujoco.MjSpec:
   spec = mujoco.MjSpec.from_string(op3.OP3().mjcf_model.to_xml_string())
   for actuator in list(spec.actuators):
     spec.delete(actuator)
+  lower, upper = constants.joint_limits(head_pan=constants.BALL_PUSHING_HEAD_PAN)
+  stops = dict(zip(constants.JOINT_NAMES, zip(lower, upper, strict=True), strict=True))
   for joint in spec.joints:
     joint.damping[0] = hidden.bearing_damping
     joint.armature = hidden.armature
+    low, high = stops[joint.name]
+    joint.limited, joint.range = True, [low - _STOP_MARGIN, high + _STOP_MARGIN]
   torso = spec.body(constants.TORSO_LINK)
   torso.add_freejoint(name="root")
   if hidden.payload > 0:

@@ -62,11 +62,10 @@ class Devices:
       IDS[name]: Servo(IDS[name], index, body.motors, start=start)
       for index, name in enumerate(constants.JOINT_NAMES)
     }
-    self.board = Board()
+    noise = np.repeat([body.hidden.gyroscope_noise, body.hidden.accelerometer_noise], 3)
+    self.board = Board(noise, np.random.default_rng([seed, 7]))
     self._all: dict[int, Servo | Board] = {**self.servos, self.board.device: self.board}
     self._ids = np.array([IDS[name] for name in constants.JOINT_NAMES])
-    hidden = body.hidden
-    self._noise = np.repeat([hidden.gyroscope_noise, hidden.accelerometer_noise], 3)
     self._powered = False
     self._next_check = body.time
     body.after_step = self._after_step
@@ -237,14 +236,13 @@ class Devices:
 
   def _after_step(self, time: float) -> None:
     body, motors = self.body, self.body.motors
-    noise = self._noise * self._rng.standard_normal(6) if self._noise.any() else self._noise
-    self.board.sense(time, body.imu, noise, motors.supply)
+    self.board.sense(time, body.imu, motors.supply)
     if time < self._next_check:
       return
     self._next_check = time + _PROTECT_PERIOD
     faults = self.faults
     motors.forced_voltage = faults.voltage
-    motors.stuck = np.isin(self._ids, list(faults.stuck))
+    motors.stuck, motors.is_stuck = np.isin(self._ids, list(faults.stuck)), bool(faults.stuck)
     for device_id, degrees in faults.heat.items():
       motors.temperature[self._ids == device_id] = degrees
     for device_id in faults.dead:

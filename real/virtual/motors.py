@@ -69,19 +69,19 @@ class Motors:
     self.p_gain = np.full(count, 800.0)
     self.pwm_limit = np.full(count, 885.0)
     # What is measured.
-    self.counts = np.full(count, CENTER, np.int64)
+    self.counts = np.full(count, float(CENTER))
     self.speed = np.zeros(count)  # rad/s
     self.duty = np.zeros(count)
     self.current = np.zeros(count)  # A
     self.temperature = np.full(count, _AMBIENT)
     self.supply = parameters.battery_voltage  # V
     self.slow_supply = self.supply  # V, as the servos judge it: without short dips
-    self.stuck = np.zeros(count, bool)
+    self.stuck, self.is_stuck = np.zeros(count, bool), False
     self.forced_voltage: float | None = None
     self._late_goals: list[tuple[float, np.ndarray]] = []
     self._effective_goal = self.goal.copy()
     self._offset = CENTER + parameters.encoder_offset
-    self._back_emf = SPEED_CONSTANT
+    self._torque_constant = SPEED_CONSTANT * parameters.strength
 
   @property
   def browned_out(self) -> bool:
@@ -90,9 +90,9 @@ class Motors:
 
   def measure(self, angle: np.ndarray, speed: np.ndarray) -> None:
     """Reads the encoders: joint angles [N] [rad] and speeds [N] [rad/s]."""
-    counts = np.floor(angle * (COUNTS / (2 * np.pi)) + self._offset + 0.5).astype(np.int64)
-    self.counts = np.where(self.stuck, self.counts, counts) if self.stuck.any() else counts
-    self.speed = speed.copy()
+    counts = np.rint(angle * (COUNTS / (2 * np.pi)) + self._offset)
+    self.counts = np.where(self.stuck, self.counts, counts) if self.is_stuck else counts
+    self.speed = speed
 
   def set_goal(self, index: int, counts: int, time: float) -> None:
     """Takes a goal that arrived at a time [s]."""
@@ -108,11 +108,12 @@ class Motors:
       self._effective_goal = self._late_goals.pop(0)[1]
     values = self.parameters
     duty = (self.p_gain / _P_DIVISOR) * (self._effective_goal - self.counts)
-    np.clip(duty, -self.pwm_limit, self.pwm_limit, out=duty)
+    np.minimum(duty, self.pwm_limit, out=duty)
+    np.maximum(duty, -self.pwm_limit, out=duty)
     duty *= self.enabled / FULL_PWM
-    current = (duty * self.supply - self._back_emf * self.speed) / RESISTANCE
-    current *= self.enabled
-    torque = SPEED_CONSTANT * values.strength * current
+    current = duty * (self.supply / RESISTANCE)
+    current -= self.speed * (self.enabled * (SPEED_CONSTANT / RESISTANCE))
+    torque = self._torque_constant * current
     self.duty, self.current = duty, current
     drawn = _COMPUTER_CURRENT + max(0.0, float(duty @ current))
     if self.forced_voltage is not None:
@@ -120,6 +121,7 @@ class Motors:
     else:
       self.supply = values.battery_voltage - values.battery_resistance * drawn
     self.slow_supply += (self.supply - self.slow_supply) * (period / _DIP_TIME)
-    heat = _HEATING * RESISTANCE * current * current + _AMBIENT
-    self.temperature += (heat - self.temperature) * (period / _WARMING_TIME)
+    share = period / _WARMING_TIME
+    self.temperature *= 1 - share
+    self.temperature += (_HEATING * RESISTANCE * share) * current * current + _AMBIENT * share
     return torque, values.dry_friction + values.gear_share * np.abs(torque)

@@ -151,6 +151,10 @@ class Table:
       if eeprom or not register.eeprom:
         self[name] = register.default
 
+  def begins(self, address: int) -> bool:
+    """Whether a register begins at an address."""
+    return address in self._by_address
+
   def split(self, address: int, data: bytes) -> list[tuple[Register, int]] | None:
     """Returns the registers and values that bytes at an address stand for; None: they cut one."""
     found, place = [], 0

@@ -84,8 +84,7 @@ class Servo:
     """Writes bytes that arrived at a time [s]; returns the error number."""
     values = self.table.split(address, data)
     if values is None:
-      known = self.table.split(address, data + bytes(3))
-      return Error.LENGTH if known else Error.ACCESS
+      return Error.LENGTH if self.table.begins(address) else Error.ACCESS
     for register, value in values:
       error = self._check(register, value)
       if error:

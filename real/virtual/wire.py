@@ -16,6 +16,7 @@ from real.virtual.devices import BYTE_TIME, Answer, Devices
 from real.virtual.protocol import Parser
 
 _CHUNK = 4096
+_MAX_LAG = 0.2  # s that the body may be behind the clock
 _IDLE = 0.004  # s after which the body is brought up to date when nothing is asked
 
 
@@ -61,6 +62,8 @@ class Wire:
     clock = self._clock
     while not self._stop.is_set():
       ready, _, _ = select.select((self._master,), (), (), _IDLE)
+      # A machine too slow for the body must not fall behind for ever.
+      self._devices.body.skip(clock.now() - _MAX_LAG)
       if not ready:
         self._devices.body.advance(clock.now())
         continue

@@ -1,0 +1,129 @@
+"""Starts a virtual OP3: prints its serial port and the address of its camera, runs until Ctrl-C.
+
+python launch/virtual_robot.py --world room --seed 1
+python launch/virtual_robot.py --loss 0.05          # a bad cable
+python launch/virtual_robot.py --link /tmp/op3      # the port under a name that stays
+
+Keys, each followed by Enter: h takes hold of the robot, l lets it go, p pushes it, q quits.
+"""
+
+import contextlib
+import dataclasses
+import os
+import select
+import sys
+import time
+from pathlib import Path
+from typing import Literal
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import numpy as np
+import tyro
+
+from real.virtual.robot import VirtualRobot
+
+_PUSH = 10.0  # N
+_PUSH_TIME = 0.2  # s
+_REPORT_INTERVAL = 10.0  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+  """Starts a virtual OP3."""
+
+  world: Literal["floor", "room"] = "room"
+  """Bare floor, or the built-in room."""
+  seed: int | None = None
+  """Draws the robot's hidden properties; as in the data sheets if not given."""
+  camera: bool = True
+  """Whether to stream pictures; without EGL there are none."""
+  ball: bool = False
+  """Whether there is a ball, 0.6 m in front of the robot."""
+  x: float = 0.0
+  """Where the robot is put [m]."""
+  y: float = 0.0
+  """Where the robot is put [m]."""
+  yaw: float = 0.0
+  """Its heading [rad]."""
+  loss: float = 0.0
+  """Share of packets that are lost."""
+  link: Path | None = None
+  """A symbolic link to the port, for a name that stays the same."""
+  seconds: float | None = None
+  """Ends after this time; runs until it is stopped if not given."""
+
+
+def run(arguments: Arguments) -> None:
+  """Starts the robot and waits."""
+  with VirtualRobot(
+    world=arguments.world, seed=arguments.seed, camera=arguments.camera, ball=arguments.ball
+  ) as robot:
+    robot.faults.loss = arguments.loss
+    robot.place(arguments.x, arguments.y, arguments.yaw)
+    if arguments.ball:
+      ahead = 0.6 * np.array([np.cos(arguments.yaw), np.sin(arguments.yaw)])
+      robot.place_ball(arguments.x + ahead[0], arguments.y + ahead[1])
+    print(f"port: {robot.port}", flush=True)
+    if robot.stream is not None:
+      print(f"camera: {robot.stream.url}", flush=True)
+    with _linked(arguments.link, robot.port):
+      _wait(robot, arguments.seconds)
+
+
+@contextlib.contextmanager
+def _linked(link: Path | None, port: str):
+  if link is None:
+    yield
+    return
+  link.symlink_to(port)
+  try:
+    yield
+  finally:
+    link.unlink(missing_ok=True)
+
+
+def _wait(robot: VirtualRobot, seconds: float | None) -> None:
+  end = float("inf") if seconds is None else time.monotonic() + seconds
+  report = time.monotonic() + _REPORT_INTERVAL
+  keys = [sys.stdin] if sys.stdin.isatty() else []
+  while time.monotonic() < end:
+    ready, _, _ = select.select(keys, (), (), min(0.5, max(0.0, end - time.monotonic())))
+    if ready:
+      key = sys.stdin.readline().strip()
+      if key == "q":
+        return
+      _do(robot, key)
+    if time.monotonic() >= report and sys.stdout.isatty():
+      report += _REPORT_INTERVAL
+      truth = robot.truth()
+      x, y, z = truth.position
+      held = ", held" if truth.held else ""
+      print(f"torso at {x:+.2f} {y:+.2f} {z:.2f} m, yaw {truth.yaw:+.2f} rad{held}", flush=True)
+
+
+def _do(robot: VirtualRobot, key: str) -> None:
+  if key in ("h", "l"):
+    robot.hold(key == "h")
+  elif key == "p":
+    angle = np.random.default_rng().uniform(0, 2 * np.pi)
+    robot.push(_PUSH * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    time.sleep(_PUSH_TIME)
+    robot.push(np.zeros(3))
+  else:
+    print("h: hold, l: let go, p: push, q: quit", flush=True)
+
+
+def main() -> None:
+  """Parses the command line and runs."""
+  arguments = tyro.cli(Arguments, description=__doc__)
+  try:
+    run(arguments)
+  except KeyboardInterrupt:
+    pass
+  except (ValueError, OSError, RuntimeError) as error:
+    sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+  main()
