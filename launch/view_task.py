@@ -29,6 +29,7 @@ _PICTURE_SCALE = 6  # of the robot's picture on the page
 _SHOW_STEPS, _PICTURE_STEPS = 2, 4  # control steps between showings of the motion, of the page
 _HANDLE_HEIGHT = 0.28  # m of the handle above the torso, so that it does not hide the robot
 _SETBACK = 0.02  # m by which the field's floor is lowered, so that it does not swallow the feet
+_LINE_WIDTH = 0.015  # m of the lines on the floor
 _BAR_RANGE = 1.5  # a bar's full length is a reward term of this size
 _DIRECTIONS = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}
 
@@ -155,11 +156,18 @@ class TaskViewer:
   def _add_square(
     self, name: str, lower: np.ndarray, upper: np.ndarray, color: tuple[int, int, int]
   ) -> None:
-    """Draws a square on the floor."""
-    x, y = (np.array([lower[i], upper[i]]) for i in range(2))
-    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
-    points = np.array([[(*corners[k], 0.02), (*corners[(k + 1) % 4], 0.02)] for k in range(4)])
-    self._server.scene.add_line_segments(name, points, color, thickness=3.0)
+    """Draws the sides of a square on the floor, as thin boxes."""
+    middle, size = (lower + upper) / 2, upper - lower
+    for axis in range(2):
+      length = np.full(2, _LINE_WIDTH)
+      length[axis] += size[axis]
+      for sign in (-1, 1):
+        place = middle.copy()
+        place[1 - axis] += sign * size[1 - axis] / 2
+        self._server.scene.add_box(
+          f"{name}/{axis}{sign}", color=color, dimensions=(*length, 0.004),
+          position=(*place, 0.01),
+        )  # fmt: skip
 
   def _add_geoms(self) -> dict[int, Any]:
     model = self._environment.physics.model.ptr
