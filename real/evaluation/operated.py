@@ -1,0 +1,156 @@
+"""A robot as a plant: a person places it, one episode after another, and says how it went."""
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import dm_env
+import numpy as np
+
+import real
+from real.camera import Controls
+from real.evaluation import episodes, perturbations, starts
+from real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
+from real.recorder import Recorder
+from real.safety import Reason
+from suite.gaits.walker import Pose
+from suite.protocols import DEFAULT_GAIN, BallTrial
+from suite.tasks.workspace import find_workspace
+
+_VERDICTS = {"s": episodes.SUCCESS, "c": episodes.COLLISION, "f": episodes.FALL, "l": episodes.LOST}
+_QUESTION = "What happened? [s]uccess, [c]ollision, [f]all, [l]ost, [r]epeat the episode: "
+
+
+class RepeatError(Exception):
+  """The operator wants the episode again."""
+
+
+class OperatedPlant(Plant):
+  """Episodes on a robot. Any key ends one; there is no pose unless an observer gives it."""
+
+  name = "robot"
+
+  def __init__(
+    self,
+    scene: Any,
+    protocol: str,
+    perturbation: str = perturbations.NONE,
+    *,
+    robot: Any,
+    camera: Any,
+    image_size: tuple[int, int] | None,
+    robot_name: str = "op3",
+    time_limit: float | None = None,
+    record: Path | None = None,
+    offsets: Path | None = None,
+    observer: Callable[[], Sight] | None = None,
+    ask: Callable[[str], str] = input,
+    say: Callable[[str], None] = print,
+  ):
+    """Connects to the robot; nothing moves yet.
+
+    Args:
+      scene: An opened bundle of the room.
+      protocol: One of `plants.PROTOCOLS`.
+      perturbation: One of `perturbations.PERTURBATIONS`.
+      robot: Serial port, or a `real.loading.Connection`.
+      camera: Device number, file or URL.
+      image_size: Height and width of the policy's picture; None for no camera.
+      robot_name: Which robot, for the tables.
+      time_limit: Length of an episode [s]; the task's own if None.
+      record: Where the run is recorded; not recorded if None.
+      offsets: The robot's `offset.yaml`.
+      observer: Motion capture, if there is any.
+      ask: Puts a question to the operator and returns the answer.
+      say: Tells the operator something.
+    """
+    super().__init__(scene, protocol, perturbation)
+    self.plant_id = robot_name
+    self._observer, self._ask, self._say = observer, ask, say
+    self._starts = starts.navigation_starts(scene)
+    self._workspace = find_workspace(scene) if protocol == BALL else None
+    self._recorder = None if record is None else Recorder(record)
+    self._environment = real.load(
+      TASKS[protocol], robot=robot, camera=camera, scene=scene, image_size=image_size,
+      time_limit=time_limit, recorder=self._recorder, offsets=offsets,
+    )  # fmt: skip
+    self._goal_index = 0
+    self._steps = 0
+
+  @property
+  def environment(self) -> dm_env.Environment:
+    return self._environment
+
+  @property
+  def goal(self) -> np.ndarray:
+    return self._environment.goal
+
+  @property
+  def time_limit(self) -> float:
+    return float(self._environment._time_limit)
+
+  def start(self, trial: Trial) -> dm_env.TimeStep:
+    if isinstance(trial, BallTrial):
+      assert self._workspace is not None
+      pose, ball = starts.ball_start(self.scene, self._workspace, trial)
+      self._say(f"Put the ball at x = {ball[0]:.2f} m, y = {ball[1]:.2f} m.")
+    else:
+      x, y = (float(value) for value in self._starts[trial.position])
+      pose = Pose(x, y, trial.yaw)
+      self._environment.set_goal(trial.goal)
+      self._say(f"Goal {trial.goal + 1} at x = {self.goal[0]:.2f} m, y = {self.goal[1]:.2f} m.")
+      self._set_gain(trial.camera_gain * DEFAULT_GAIN)
+    if self.perturbation in perturbations.INSTRUCTIONS:
+      self._say(perturbations.INSTRUCTIONS[self.perturbation])
+    self._ask(
+      f"Place the robot at x = {pose.x:.2f} m, y = {pose.y:.2f} m, heading "
+      f"{np.rad2deg(pose.yaw):.0f} degrees from the x axis; Enter when it is there: "
+    )
+    self._start_pose = pose
+    self._steps = 0
+    return self._environment.reset()
+
+  def _set_gain(self, gain: float) -> None:
+    camera = getattr(self._environment, "_camera", None)
+    if camera is None or not hasattr(camera, "set_controls"):
+      return
+    found = camera.set_controls(Controls(gain=gain))["gain"]
+    if not found.holds:
+      self._say(f"The camera does not take the gain {gain:g}, found {found.found}: set it by hand.")
+
+  def step(self, action: np.ndarray) -> dm_env.TimeStep:
+    self._steps += 1
+    return self._environment.step(action)
+
+  def sight(self) -> Sight:
+    if self._observer is not None:
+      return self._observer()
+    stop = self._environment.stop
+    fallen = stop is not None and stop.reason == Reason.FALL
+    pose = self._start_pose if self._steps == 0 else None
+    return Sight(pose, None, False, fallen)
+
+  def stopped(self) -> str:
+    stop = self._environment.stop
+    return "" if stop is None else f"{stop.reason}: {stop.detail}"
+
+  def judge(self) -> tuple[str, float | None, str] | None:
+    if self._observer is not None:
+      return None
+    time = self._steps * 0.025
+    while True:
+      answer = self._ask(_QUESTION).strip().lower()[:1]
+      if answer == "r":
+        raise RepeatError
+      if answer in _VERDICTS:
+        break
+      self._say("Expected one of the letters s, c, f, l, r.")
+    outcome = _VERDICTS[answer]
+    return outcome, time if outcome == episodes.SUCCESS else None, self.stopped()
+
+  def close(self) -> None:
+    self._environment.close()
+    if self._recorder is not None:
+      with contextlib.suppress(OSError):
+        self._recorder.close()
