@@ -9,11 +9,15 @@ import dataclasses
 import json
 import multiprocessing
 import pathlib
+import sys
 import time
 from typing import Literal
 
 import tyro
-from blind_sets import sets
+
+# One name for the package whoever imports it: numba's cache keeps the name.
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+from benchmarks.blind_sets import sets
 
 
 @dataclasses.dataclass(frozen=True)

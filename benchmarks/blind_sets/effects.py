@@ -195,7 +195,7 @@ LIBRARY: dict[str, Maker] = {
   "command_delay": Maker({"delay": Range(0.008, 0.06)}, ("delay",), _adds(latency="delay")),
   "measurement_delay": Maker({"delay": Range(0.008, 0.06)}, ("delay",), _measurement_delay),
   "clock_drift": Maker(
-    {"rate": Range(0.002, 0.015, signed=True)}, ("rate",), _clock_drift, True, finish=_drift
+    {"rate": Range(0.0015, 0.008, signed=True)}, ("rate",), _clock_drift, True, finish=_drift
   ),
   "coulomb_friction": Maker({"torque": Range(0.06, 0.45)}, ("torque",), _adds(coulomb="torque")),
   "viscous_friction": Maker(

@@ -40,16 +40,21 @@ class _Draft:
   reading: Reading
   machine: Machine
   commands: dict[str, np.ndarray]
+  runs: dict[str, recording.Recording] = dataclasses.field(default_factory=dict)
+  """Recordings made, by log and effects: measuring an effect's size and writing need the same."""
 
   def run(self, log: str, drawn: list[effects.Drawn]) -> recording.Recording:
     """Returns a recording of the machine with effects."""
-    machine = copy.deepcopy(self.machine)
-    for effect in drawn:
-      effect.apply(machine)
-    noise = (*self.seed, list(self.commands).index(log))
-    return recording.record(
-      self.apparatus, machine, self.reading, commands=self.commands[log], seed=noise
-    )
+    key = f"{log} {drawn}"
+    if key not in self.runs:
+      machine = copy.deepcopy(self.machine)
+      for effect in drawn:
+        effect.apply(machine)
+      noise = (*self.seed, list(self.commands).index(log))
+      self.runs[key] = recording.record(
+        self.apparatus, machine, self.reading, commands=self.commands[log], seed=noise
+      )
+    return self.runs[key]
 
   def held_errors(self, drawn: list[effects.Drawn]) -> np.ndarray:
     """Returns the declared model's error on the held-out logs, RMSE of each joint [J] rad."""

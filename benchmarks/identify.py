@@ -1,0 +1,192 @@
+"""Judges the analyser on blind sets: `python benchmarks/identify.py`.
+
+Runs `launch/identify.py` on every set of a folder made by `make_blind_sets.py` (made first if it is
+not there), compares the reports with answers.json, prints the table and the confusions, and keeps
+both in `benchmarks/results/`. Sets that were analysed already are not analysed again, so it can be
+stopped and run on. Seeds 100 to 199 are for development; figures are reported of others.
+"""
+
+import concurrent.futures
+import dataclasses
+import datetime
+import json
+import os
+import pathlib
+import platform
+import resource
+import subprocess
+import sys
+import time
+from typing import Any
+
+import tyro
+
+# One name for the package whoever imports it: numba's cache keeps the name.
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+from benchmarks.blind_sets import scoring
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """What to judge."""
+
+  sets: pathlib.Path = pathlib.Path("out/blind")
+  """Folder of sets with answers.json."""
+  out: pathlib.Path = pathlib.Path("out/identified")
+  """Folder for the analyser's reports."""
+  seed: int = 7001
+  """Seed of the sets where they must be made."""
+  count: int = 72
+  """Number of sets where they must be made."""
+  only: tuple[str, ...] = ()
+  """Names of sets; empty: all."""
+  processes: int = 2
+  """Sets analysed at the same time, each on one core."""
+  timeout: float = 900.0
+  """s that one analysis may take; longer is a failure."""
+  redo: bool = False
+  """Analyse again what was analysed."""
+  name: str = "identify"
+  """Of the files in benchmarks/results."""
+  results: pathlib.Path = RESULTS
+  """Folder of the table and the scores."""
+
+
+def main(settings: Settings) -> None:
+  """Makes sets if needed, analyses them, prints and keeps the table."""
+  if not (settings.sets / "answers.json").is_file():
+    _run(
+      [
+        *(sys.executable, str(ROOT / "benchmarks/make_blind_sets.py")),
+        *("--out", str(settings.sets), "--seed", str(settings.seed)),
+        *("--count", str(settings.count)),
+      ]
+    )
+  answers = json.loads((settings.sets / "answers.json").read_text())
+  unknown = [name for name in settings.only if name not in answers]
+  if unknown:
+    raise ValueError(f"Found no sets {unknown} in {settings.sets}, expected some of its answers.")
+  names = [name for name in answers if not settings.only or name in settings.only]
+  rows: list[dict[str, Any]] = []
+  with concurrent.futures.ThreadPoolExecutor(settings.processes) as pool:
+    futures = {pool.submit(_analyse, settings, name): name for name in names}
+    for future in concurrent.futures.as_completed(futures):
+      name = futures[future]
+      report, used = future.result()
+      score = scoring.score(answers[name], report)
+      rows.append({"set": name, "plant": answers[name]["plant"], "used": used, "score": score})
+      print(f"{name} {answers[name]['plant']}: {score.truth} -> {score.said}", flush=True)
+  rows.sort(key=lambda row: row["set"])
+  text = render(rows, answers, settings)
+  print(text)
+  settings.results.mkdir(parents=True, exist_ok=True)
+  (settings.results / f"{settings.name}.md").write_text(text)
+  record = {
+    "sets": sorted(answers),
+    "figures": [dataclasses.asdict(row) for row in scoring.table([r["score"] for r in rows])],
+    "scores": [{**row, "score": dataclasses.asdict(row["score"])} for row in rows],
+    "answers": {name: answers[name] for name in names},
+  }
+  (settings.results / f"{settings.name}.json").write_text(json.dumps(record, indent=1) + "\n")
+
+
+def _analyse(settings: Settings, name: str) -> tuple[dict[str, Any], dict[str, float]]:
+  """Returns a set's report and the time that it took; a failure is `{"failed": message}`."""
+  folder, out = settings.sets / name, settings.out / name
+  done = out / "harness.json"
+  if done.is_file() and not settings.redo:
+    kept = json.loads(done.read_text())
+    return kept["report"], kept["used"]
+  out.mkdir(parents=True, exist_ok=True)
+  command = [sys.executable, str(ROOT / "launch/identify.py"), "--model", str(folder / "model.xml")]
+  for option, pattern in (("logs", "train"), ("held", "held"), ("reference", "reference")):
+    paths = sorted(str(path) for path in folder.glob(f"{pattern}_*.mcap"))
+    command += [f"--{option}", *paths] if paths else []
+  before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+  report: dict[str, Any] = {}
+  try:
+    result = subprocess.run(
+      [*command, "--out", str(out)], capture_output=True, text=True, timeout=settings.timeout,
+      check=False,
+      env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    if result.returncode:
+      lines = result.stderr.strip().splitlines() or ["no message"]
+      report = {"failed": lines[-1]}
+    else:
+      report = json.loads((out / "report.json").read_text())
+  except subprocess.TimeoutExpired:
+    report = {"failed": f"took longer than {settings.timeout:g} s"}
+  after = resource.getrusage(resource.RUSAGE_CHILDREN)
+  used = {"wall_s": time.perf_counter() - start}
+  if settings.processes == 1:  # otherwise the children's times are mixed
+    used["cpu_s"] = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+  done.write_text(json.dumps({"report": report, "used": used}))
+  return report, used
+
+
+def _run(command: list[str]) -> None:
+  subprocess.run(command, check=True)
+
+
+def render(rows: list[dict[str, Any]], answers: dict[str, Any], settings: Settings) -> str:
+  """Returns the table, the confusions and how they came about, as Markdown."""
+  scores: list[scoring.Score] = [row["score"] for row in rows]
+  mixes = {
+    mix: sum(s.mix == mix for s in scores) for mix in ("single", "pair", "outside", "healthy")
+  }
+  plants = {p: sum(r["plant"] == p for r in rows) for p in sorted({r["plant"] for r in rows})}
+  lines = [
+    "# The analyser on blind sets",
+    "",
+    f"`python benchmarks/identify.py`, {datetime.date.today()}, {platform.machine()}, "
+    f"{os.cpu_count()} cores. {len(rows)} sets of seeds "
+    f"{', '.join(sorted({name.split('_')[0] for name in answers}))}: "
+    + ", ".join(f"{n} {mix}" for mix, n in mixes.items())
+    + "; "
+    + ", ".join(f"{n} {plant}" for plant, n in plants.items())
+    + f". {sum(s.below_floor for s in scores)} with effects below the floor, in no figure.",
+    "",
+    "| figure | measured | of | target | met |",
+    "|---|---|---|---|---|",
+  ]
+  for figure in scoring.table(scores):
+    value = "-" if figure.value is None else f"{figure.value:.3g}"
+    if figure.value is not None and "%" in figure.target:
+      value = f"{100 * figure.value:.0f} %"
+    met = {True: "yes", False: "no", None: "-"}[figure.met]
+    lines.append(f"| {figure.question} | {value} | {figure.of} | {figure.target} | {met} |")
+  for plant in plants:
+    seconds = sorted(r["used"]["wall_s"] for r in rows if r["plant"] == plant)
+    lines.append(
+      f"| {plant}: seconds a set, median (most {seconds[-1]:.0f}) "
+      f"| {seconds[len(seconds) // 2]:.0f} | {len(seconds)} | - | - |"
+    )
+  lines += ["", "## What was said of what", "", "| set | is | said | right |", "|---|---|---|---|"]
+  for row in rows:
+    s = row["score"]
+    right = _right(s)
+    note = " (below the floor)" if s.below_floor else ""
+    mark = {True: "yes", False: "**no**", None: "-"}[right]
+    lines.append(f"| {row['set']} {row['plant']} | {s.truth}{note} | {s.said} | {mark} |")
+  return "\n".join(lines) + "\n"
+
+
+def _right(score: scoring.Score) -> bool | None:
+  """Returns whether a set was answered as its mix asks."""
+  if score.below_floor:
+    return None
+  if score.mix == "healthy":
+    return not score.accused
+  if score.mix == "outside":
+    return score.unexplained
+  if score.mix == "pair":
+    return bool(score.all_right and score.none_wrong)
+  return bool(score.right_first and score.none_wrong)
+
+
+if __name__ == "__main__":
+  main(tyro.cli(Settings, description=__doc__))
