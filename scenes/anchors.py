@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
+from scipy import ndimage
 
 from scenes.cameras import Camera
 
@@ -88,7 +89,12 @@ def empty_cells(views: Views) -> np.ndarray:
     cells = cells[((cells >= 0) & (cells < EMPTY_CELLS)).all(-1)]
     flat = (cells[:, 0] * EMPTY_CELLS + cells[:, 1]) * EMPTY_CELLS + cells[:, 2]
     counts += np.bincount(flat, minlength=len(counts))
-  empty = (counts >= _CROSSINGS).reshape((EMPTY_CELLS,) * 3)
+  crossed = (counts >= _CROSSINGS).reshape((EMPTY_CELLS,) * 3)
+  # Lines graze floors and walls: cells beside a point or beside an uncrossed cell do not count.
+  ends = np.floor((origins + anchors[:, 3:] * directions + 1) / step).astype(np.int64)
+  ends = ends[((ends >= 0) & (ends < EMPTY_CELLS)).all(-1)]
+  crossed[tuple(ends.T)] = False
+  empty = ndimage.binary_erosion(crossed, np.ones((3, 3, 3)))
   radius = _CLEARANCE * float(np.percentile(anchors[:, 3], 1))
   axis = (np.arange(EMPTY_CELLS) + 0.5) * step - 1
   for eye in views.world_from_camera[:, :3, 3]:

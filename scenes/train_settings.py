@@ -62,7 +62,7 @@ class TrainSettings:
   empty_samples: int = 1024
   """Points a step in cells that sight lines to localised points cross; at most 768 a thread. Ours:
   walls without texture are explained as well by fog before the cameras."""
-  empty_weight: float = 0.05
+  empty_weight: float = 0.01
   """Weight of the mean of log(1 + density) there. Ours."""
   batch_samples: int = 1 << 15
   """Samples a step that are evaluated; the number of rays follows. Ours."""
