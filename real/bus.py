@@ -31,7 +31,7 @@ _ROW = np.dtype(
 _PRESENT_LENGTH = _ROW.itemsize - 4
 _FAST_HEAD, _STATUS_SIZE, _INSTRUCTION_SIZE = 8, 11, 14  # bytes of packets without their data
 _ALERT = 0x80
-_ATTEMPTS = 5  # of a transaction outside the cycle
+_ATTEMPTS, _PINGS = 5, 4  # of a transaction outside the cycle, of a ping
 _BOOT_TIME = 0.5  # s for servos to answer after their supply is switched on
 _WATCHDOG_UNIT = 0.020  # s
 _REST_PATIENCE, _REST_INTERVAL, _REST_COUNTS = 5.0, 0.05, 20  # s, s, counts: 0.6 rad/s at most
@@ -383,7 +383,7 @@ class Bus:
     return None
 
   def _ping(self, device: int) -> int | None:
-    found = self._try(lambda: self._handler.ping(self._port, device))
+    found = self._try(lambda: self._handler.ping(self._port, device), attempts=_PINGS)
     return None if found is None else found[0]
 
   def _read(self, device: int, address: int, size: int) -> bytes:

@@ -13,7 +13,7 @@ import serial
 
 from real.clock import Clock
 
-_PATIENCE = 0.03  # s that an answer may be late outside the cycle
+_PATIENCE = 0.1  # s that an answer may be late outside the cycle
 _TICK = 1e-6  # s beyond a time-out: the SDK ends a wait only when it has passed
 _LATENCY_LIMIT = 1  # ms; the adapter's own default of 16 ms is a hidden delay
 

@@ -241,7 +241,10 @@ def _build(world: str, hidden: Hidden, ball: bool, furnish) -> mujoco.MjModel:
     spec.worldbody.add_geom(
       name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], group=3
     )
-    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.shadowsize = spec.visual.quality.offsamples = 0
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 2560, 2048
+    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 12.0
+    spec.stat.extent = 1.0
   if furnish is not None:
     furnish(spec)
   spec.option.timestep = STEP
