@@ -1,89 +1,50 @@
-"""Measured logs: MCAP files with ROS 2 messages, read into arrays.
+"""Measured logs: MCAP files with ROS 2 messages, read into arrays and checked.
 
-N messages of a topic, J joints. Times are seconds from the first stamp in the file; `stamp` is the
-message's header stamp, `log_time` the moment it was written down, on the same zero.
+`topics` reads the file, `series` makes the arrays; what a log must be to be usable is here.
 """
 
 import dataclasses
 import pathlib
-import struct
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import mujoco
-import numpy as np
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
-from mcap_ros2.decoder import DecoderFactory
 
-COMMANDS = "/joint_commands"
-STATES = "/joint_states"
-PWM = "/joint_pwm"
-IMU = "/imu/data_raw"
-BATTERY = "/battery_state"
-TEMPERATURE_TYPE = "sensor_msgs/msg/Temperature"
-"""Temperatures are found by type: the topic's name is free, frame_id names the joint."""
+from sysid.series import (
+  ImuSeries,
+  JointSeries,
+  ScalarSeries,
+  battery,
+  imu,
+  joint_series,
+  temperatures,
+)
+from sysid.topics import (
+  BATTERY,
+  COMMANDS,
+  IMU,
+  PWM,
+  STATES,
+  LogError,
+  check_time,
+  read_topics,
+)
+
+__all__ = [
+  "BATTERY",
+  "COMMANDS",
+  "IMU",
+  "PWM",
+  "STATES",
+  "ImuSeries",
+  "JointSeries",
+  "Log",
+  "LogError",
+  "ScalarSeries",
+  "check_against_model",
+  "read_log",
+]
 
 MINIMUM_DURATION = 1.0
 """s; ours: a shorter log holds not one period of the slowest excitation of a servo joint."""
-
-_NANO = 1e-9
-
-# What the parsers of MCAP, of its two compressions and of ROS messages raise on damaged bytes.
-_DAMAGE = (
-  *(McapError, zstandard.ZstdError, struct.error, EOFError),
-  *(ValueError, KeyError, IndexError, RuntimeError, MemoryError, OverflowError),
-)
-
-
-class LogError(ValueError):
-  """A log that cannot be used: one line with what was found, what was expected, what to do."""
-
-
-@dataclasses.dataclass(frozen=True)
-class JointSeries:
-  """Messages of sensor_msgs/JointState; a field that the messages leave empty is None."""
-
-  joints: tuple[str, ...]
-  """J names, in the order of the columns."""
-  stamp: np.ndarray
-  """[N] s."""
-  log_time: np.ndarray
-  """[N] s."""
-  position: np.ndarray | None
-  """[N, J] rad or m."""
-  velocity: np.ndarray | None
-  """[N, J] rad/s or m/s."""
-  effort: np.ndarray | None
-  """[N, J] N m or N; of `/joint_pwm` the duty, -1 to 1."""
-
-  def column(self, joint: str) -> int:
-    """Returns the column of a joint."""
-    return self.joints.index(joint)
-
-
-@dataclasses.dataclass(frozen=True)
-class ImuSeries:
-  """Messages of sensor_msgs/Imu: the raw rates and accelerations."""
-
-  stamp: np.ndarray
-  log_time: np.ndarray
-  angular_velocity: np.ndarray
-  """[N, 3] rad/s."""
-  linear_acceleration: np.ndarray
-  """[N, 3] m/s2."""
-  frame: str
-
-
-@dataclasses.dataclass(frozen=True)
-class ScalarSeries:
-  """One number over time: a voltage [V] or a temperature [degrees Celsius]."""
-
-  stamp: np.ndarray
-  log_time: np.ndarray
-  value: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,17 +76,6 @@ class Log:
     return float(min(self.commands.stamp[-1], self.states.stamp[-1]) - first)
 
 
-@dataclasses.dataclass
-class _Topic:
-  """The decoded messages of one topic in the order of the file."""
-
-  name: str
-  schema: str
-  stamp_ns: list[int] = dataclasses.field(default_factory=list)
-  log_ns: list[int] = dataclasses.field(default_factory=list)
-  messages: list[Any] = dataclasses.field(default_factory=list)
-
-
 def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
   """Reads a measured log.
 
@@ -141,9 +91,9 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
   path = pathlib.Path(path)
   if not path.is_file():
     raise FileNotFoundError(f"Found no file {path}, expected a measured log (.mcap).")
-  topics, damaged = _read_topics(path, recover)
+  topics, damaged = read_topics(path, recover)
   for topic in topics.values():
-    _check_time(path.name, topic)
+    check_time(path.name, topic)
   for name, holds in ((COMMANDS, "commands"), (STATES, "states")):
     if name not in topics:
       raise LogError(
@@ -151,8 +101,8 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
         f"{sorted(topics) or 'none'}; record that topic too."
       )
   start = min(min(topic.stamp_ns) for topic in topics.values())
-  commands = _joint_series(path.name, topics[COMMANDS], start)
-  states = _joint_series(path.name, topics[STATES], start)
+  commands = joint_series(path.name, topics[COMMANDS], start)
+  states = joint_series(path.name, topics[STATES], start)
   if commands.position is None and commands.effort is None:
     raise LogError(
       f"{path.name} has no commands: {COMMANDS} holds neither positions nor efforts in its "
@@ -165,10 +115,10 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
     start_ns=start,
     commands=commands,
     states=states,
-    pwm=_joint_series(path.name, topics[PWM], start) if PWM in topics else None,
-    imu=_imu(path.name, topics[IMU], start) if IMU in topics else None,
-    battery=_battery(topics[BATTERY], start) if BATTERY in topics else None,
-    temperatures=_temperatures(topics.values(), start),
+    pwm=joint_series(path.name, topics[PWM], start) if PWM in topics else None,
+    imu=imu(path.name, topics[IMU], start) if IMU in topics else None,
+    battery=battery(topics[BATTERY], start) if BATTERY in topics else None,
+    temperatures=temperatures(topics.values(), start),
     recovered=damaged,
   )
   if log.duration < MINIMUM_DURATION:
@@ -214,177 +164,3 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
         f"{log.name} has no {takes}s in {COMMANDS}, which the model's actuator on {name!r} takes: "
         f"record {takes}s, or give a model with the actuator that was driven."
       )
-
-
-def _read_topics(path: pathlib.Path, recover: bool) -> tuple[dict[str, _Topic], bool]:
-  """Returns the known topics with messages, and whether the file was damaged."""
-  topics: dict[str, _Topic] = {}
-  decoders = DecoderFactory()
-  known: dict[int, Callable[[bytes], Any] | None] = {}
-  channels: dict[int, Channel] = {}
-  schemas: dict[int, Schema] = {}
-  try:
-    with path.open("rb") as stream:
-      for record in StreamReader(stream, validate_crcs=True).records:
-        if isinstance(record, Schema):
-          schemas[record.id] = record
-        elif isinstance(record, Channel):
-          channels[record.id] = record
-        elif isinstance(record, Message):
-          channel = channels[record.channel_id]
-          schema = schemas[channel.schema_id]
-          if channel.id not in known:
-            wanted = channel.topic in (COMMANDS, STATES, PWM, IMU, BATTERY)
-            wanted = wanted or schema.name == TEMPERATURE_TYPE
-            known[channel.id] = (
-              decoders.decoder_for(channel.message_encoding, schema) if wanted else None
-            )
-          decode = known[channel.id]
-          if decode is not None:
-            topic = topics.setdefault(channel.topic, _Topic(channel.topic, schema.name))
-            _append(topic, record, decode(record.data))
-  except _DAMAGE as error:
-    if not recover:
-      raise LogError(_damage(path, error, topics)) from error
-    return topics, True
-  return topics, False
-
-
-def _append(topic: _Topic, record: Message, message: Any) -> None:
-  stamp = message.header.stamp
-  # A driver that leaves the stamp empty means: the moment of writing.
-  stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec or record.log_time
-  topic.stamp_ns.append(stamp_ns)
-  topic.log_ns.append(record.log_time)
-  topic.messages.append(message)
-
-
-def _damage(path: pathlib.Path, error: Exception, topics: dict[str, _Topic]) -> str:
-  """Returns the message for a file that cannot be read to its end."""
-  with path.open("rb") as stream:
-    head = stream.read(5)
-  if not head:
-    return f"{path.name} is empty, expected an MCAP file: record it again."
-  if not b"\x89MCAP".startswith(head):
-    return f"{path.name} is not an MCAP file: it starts with {head!r}, expected b'\\x89MCAP'."
-  count = sum(len(topic.messages) for topic in topics.values())
-  reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-  return (
-    f"{path.name} is truncated or damaged ({reason}): {count} messages are readable; copy it "
-    "again, or read what is there with recover=True."
-  )
-
-
-def _check_time(name: str, topic: _Topic) -> None:
-  for which, times in (("header stamps", topic.stamp_ns), ("log times", topic.log_ns)):
-    steps = np.diff(np.array(times, dtype=np.int64))
-    if np.any(steps < 0):
-      at = int(np.argmax(steps < 0))
-      raise LogError(
-        f"{name}: time runs backwards on {topic.name} by {-steps[at] * _NANO:.6g} s at message "
-        f"{at + 1} ({which}), {np.count_nonzero(steps < 0)} times in all; expected increasing "
-        "stamps: record with one monotonic clock."
-      )
-
-
-def _seconds(times_ns: Sequence[int], start: int) -> np.ndarray:
-  return (np.array(times_ns, dtype=np.int64) - start) * _NANO
-
-
-def _joint_series(name: str, topic: _Topic, start: int) -> JointSeries:
-  """Returns the arrays of a JointState topic, columns in the order of the first message."""
-  joints = tuple(topic.messages[0].name)
-  if not joints or len(set(joints)) < len(joints):
-    raise LogError(f"{name}: {topic.name} names the joints {joints}, expected unique names.")
-  orders: dict[tuple[str, ...], list[int]] = {}
-  for index, message in enumerate(topic.messages):
-    names = tuple(message.name)
-    if names not in orders:
-      if set(names) != set(joints):
-        raise LogError(
-          f"{name}: message {index} of {topic.name} names {list(names)}, the first one "
-          f"{list(joints)}; expected the same joints in all: merge them before recording."
-        )
-      orders[names] = [names.index(joint) for joint in joints]
-  fields: dict[str, np.ndarray | None] = {}
-  for field in ("position", "velocity", "effort"):
-    rows = [getattr(message, field) for message in topic.messages]
-    lengths = {len(row) for row in rows}
-    if lengths == {0}:
-      fields[field] = None
-      continue
-    if lengths != {len(joints)}:
-      raise LogError(
-        f"{name}: {field}s of {topic.name} have lengths {sorted(lengths)}, expected "
-        f"{len(joints)} in every message, one a joint."
-      )
-    values = np.array(rows, dtype=float)
-    if len(orders) > 1:
-      order = np.array([orders[tuple(message.name)] for message in topic.messages])
-      values = np.take_along_axis(values, order, axis=1)
-    # ros2_control fills interfaces that a servo lacks with NaN throughout: not measured.
-    if field != "position" and np.all(np.isnan(values)):
-      fields[field] = None
-      continue
-    _check_finite(name, f"{field}s of {topic.name}", values, topic, start)
-    fields[field] = values
-  return JointSeries(
-    joints, _seconds(topic.stamp_ns, start), _seconds(topic.log_ns, start), **fields
-  )
-
-
-def _check_finite(name: str, what: str, values: np.ndarray, topic: _Topic, start: int) -> None:
-  bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-  if bad.any():
-    at = (topic.stamp_ns[int(np.argmax(bad))] - start) * _NANO
-    raise LogError(
-      f"{name}: NaN or infinite {what} in {np.count_nonzero(bad)} of {len(bad)} messages, first at "
-      f"{at:.3f} s; expected finite numbers: cut those messages out or record again."
-    )
-
-
-def _imu(name: str, topic: _Topic, start: int) -> ImuSeries:
-  rates = np.array(
-    [(m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z) for m in topic.messages]
-  )
-  accelerations = np.array(
-    [
-      (m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z)
-      for m in topic.messages
-    ]
-  )
-  _check_finite(name, f"values of {topic.name}", np.hstack([rates, accelerations]), topic, start)
-  return ImuSeries(
-    _seconds(topic.stamp_ns, start),
-    _seconds(topic.log_ns, start),
-    rates,
-    accelerations,
-    topic.messages[0].header.frame_id,
-  )
-
-
-def _scalar(rows: Sequence[tuple[int, int, float]], start: int) -> ScalarSeries:
-  stamps, logs, values = zip(*rows, strict=True)
-  return ScalarSeries(_seconds(stamps, start), _seconds(logs, start), np.array(values, dtype=float))
-
-
-def _battery(topic: _Topic, start: int) -> ScalarSeries | None:
-  """Returns the voltage; by the message's definition NaN means not measured."""
-  rows = [
-    (stamp, log, message.voltage)
-    for stamp, log, message in zip(topic.stamp_ns, topic.log_ns, topic.messages, strict=True)
-    if np.isfinite(message.voltage)
-  ]
-  return _scalar(rows, start) if rows else None
-
-
-def _temperatures(topics: Iterable[_Topic], start: int) -> dict[str, ScalarSeries]:
-  """Returns the temperatures by joint, from whatever topics carry them."""
-  rows: dict[str, list[tuple[int, int, float]]] = {}
-  for topic in topics:
-    if topic.schema != TEMPERATURE_TYPE:
-      continue
-    for stamp, log, message in zip(topic.stamp_ns, topic.log_ns, topic.messages, strict=True):
-      if np.isfinite(message.temperature):
-        rows.setdefault(message.header.frame_id, []).append((stamp, log, message.temperature))
-  return {joint: _scalar(sorted(series), start) for joint, series in rows.items()}
