@@ -5,12 +5,14 @@ Each set is a folder with the declared `model.xml`, three logs to identify from 
 `blind_sets`, which shares no code with the analyser. The same seed gives the same logs.
 """
 
+import contextlib
 import dataclasses
 import json
 import multiprocessing
 import pathlib
 import sys
 import time
+from collections.abc import Iterable
 from typing import Literal
 
 import tyro
@@ -51,8 +53,12 @@ def main(settings: Settings) -> None:
   answers = json.loads(path.read_text()) if path.is_file() else {}
   indices = range(settings.first, settings.first + settings.count)
   jobs = [(settings, index) for index in indices if _name(settings, index) not in answers]
-  with multiprocessing.get_context("spawn").Pool(settings.processes) as pool:
-    for name, answer, seconds in pool.imap(_make, jobs):
+  with contextlib.ExitStack() as stack:
+    made: Iterable[tuple[str, dict, float]] = map(_make, jobs)
+    if settings.processes > 1:
+      pool = multiprocessing.get_context("spawn").Pool(settings.processes)
+      made = stack.enter_context(pool).imap(_make, jobs)
+    for name, answer, seconds in made:
       answers[name] = answer
       path.write_text(json.dumps(answers, indent=1))
       kinds = ", ".join(f"{e['kind']}@{e['joint']}" for e in answer["effects"]) or "none"
