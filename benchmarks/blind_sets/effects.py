@@ -159,6 +159,10 @@ def _drift(rng: np.random.Generator, drawn: Parameters) -> Parameters:
   return {"rate": drawn["rate"], "stamps_only": float(rng.random() < 0.5)}
 
 
+def _load(rng: np.random.Generator, drawn: Parameters) -> Parameters:
+  return {**drawn, "of_motor": float(rng.random() < 0.5)}
+
+
 def _motor_side(rng: np.random.Generator, drawn: Parameters) -> Parameters:
   return {"gap": drawn["gap"], "encoder_on_motor": float(rng.random() < 0.3)}
 
@@ -205,7 +209,8 @@ LIBRARY: dict[str, Maker] = {
     {"breakaway": Range(0.08, 0.5), "velocity": Range(0.05, 0.4)}, ("breakaway",), _stribeck
   ),
   "load_friction": Maker(
-    {"coefficient": Range(0.08, 0.4)}, ("coefficient",), _adds(load="coefficient")
+    {"coefficient": Range(0.08, 0.4)}, ("coefficient",),
+    _sets(load="coefficient", load_of_motor="of_motor"), finish=_load,
   ),
   "asymmetric_friction": Maker(
     {"positive": Range(0.02, 0.08), "negative": Range(0.12, 0.5)}, ("positive", "negative"),

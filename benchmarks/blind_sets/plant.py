@@ -33,7 +33,8 @@ class Servo(NamedTuple):
   coulomb: np.ndarray  # N m
   breakaway: np.ndarray  # N m above coulomb, at rest
   stribeck_velocity: np.ndarray  # rad/s
-  load: np.ndarray  # friction per torque through the gear
+  load: np.ndarray  # friction per torque
+  load_of_motor: np.ndarray  # 1: that torque is the motor's, 0: the one through the gear
   positive: np.ndarray  # N m, more friction while turning forward
   negative: np.ndarray  # N m, more friction while turning backward
   quadratic: np.ndarray  # N m s^2/rad^2
@@ -162,11 +163,11 @@ def simulate(
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _friction_level(servo, j, v, gear_torque, q, time):
+def _friction_level(servo, j, v, gear_torque, motor_torque, q, time):
   """Returns the dry friction [N m] that fully yielded bristles give, and its bias by direction."""
   ratio = v / servo.stribeck_velocity[j]
   level = servo.coulomb[j] + servo.breakaway[j] * np.exp(-ratio * ratio)
-  level += servo.load[j] * abs(gear_torque)
+  level += servo.load[j] * abs(motor_torque if servo.load_of_motor[j] > 0.5 else gear_torque)
   level += servo.positive[j] if v > 0 else servo.negative[j]
   if servo.stick_depth[j] != 0.0:
     place = (q - servo.stick_center[j]) / servo.stick_width[j]
@@ -281,7 +282,7 @@ def _run(
           )
         # LuGre on the motor's side; the bristle's own equation is solved over the step.
         v = motor_speed[j]
-        level = _friction_level(servo, j, v, gear, q[j], time)
+        level = _friction_level(servo, j, v, gear, drive[j], q[j], time)
         before = bristle[j]
         direction = 1.0 if v > 0 else -1.0
         bristle[j] = direction + (before - direction) * np.exp(-abs(v) * dt / servo.presliding[j])
