@@ -133,8 +133,15 @@ def read(path: pathlib.Path) -> FreeSpace:
   path = path.with_suffix(".yaml")
   if not path.is_file():
     raise ValueError(f"The map {path} does not exist.")
-  about = yaml.safe_load(path.read_text(encoding="utf-8"))
-  missing = {"image", "resolution", "origin"} - set(about or {})
+  try:
+    about = yaml.safe_load(path.read_text(encoding="utf-8"))
+  except (yaml.YAMLError, UnicodeDecodeError) as error:
+    reason = " ".join(str(error).split())
+    message = f"The map {path} is no YAML file ({reason}): make the bundle again."
+    raise ValueError(message) from error
+  if not isinstance(about, dict):
+    raise ValueError(f"The map {path} holds {about!r}; expected names and values.")
+  missing = {"image", "resolution", "origin"} - set(about)
   if missing:
     raise ValueError(f"The map {path} lacks {', '.join(sorted(missing))}.")
   if len(about["origin"]) > 2 and about["origin"][2]:

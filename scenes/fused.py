@@ -100,6 +100,8 @@ class FusedTrainer:
     kernel = engine.kernel._replace(step=np.float32(engine.settings.march_step * self._coarseness))
     if self.steps_done < settings.occupancy_start:
       kernel = kernel._replace(depth_limit=np.float32(1e9))
+    if self.steps_done >= settings.known_steps:
+      kernel = kernel._replace(anchor_fraction=np.float32(0), empty_samples=0)
     distortion = settings.distortion_weight * settings.distortion_ramp(self.steps_done)
     kernel = kernel._replace(distortion=np.float32(distortion))
     seed = np.uint64((self.seed * 1_000_003 + self.steps_done) & (2**63 - 1))

@@ -474,7 +474,7 @@ def train_rays(
       chunk.d_out, chunk.d_hidden, chunk.d_features[features * total :],
     )  # fmt: skip
     total += count
-  if len(pictures.empty) > 0:
+  if len(pictures.empty) > 0 and settings.empty_samples > 0:
     total += _push_empty(
       pictures, settings, network, gradient, table, resolutions, entries, chunk, seed, first_ray,
       total, rays_done,

@@ -185,7 +185,9 @@ def _look_up(level: jax.Array, factor: jax.Array, image, x, y) -> jax.Array:
   return (upper * (1 - wy) + lower * wy) / 255.0
 
 
-def draw_rays(pictures: Pictures, settings: TrainSettings, key: jax.Array) -> Rays:
+def draw_rays(
+  pictures: Pictures, settings: TrainSettings, key: jax.Array, *, step: jax.Array | int = 0
+) -> Rays:
   """Draws pixels and blurs, and reads the blurred colours by mixing neighbouring levels."""
   keys = jax.random.split(key, 7)
   count, (height, width) = settings.batch_rays, pictures.directions.shape[:2]
@@ -198,7 +200,8 @@ def draw_rays(pictures: Pictures, settings: TrainSettings, key: jax.Array) -> Ra
   known = jnp.zeros(count)
   if len(pictures.anchors):
     chosen = pictures.anchors[jax.random.randint(keys[5], (count,), 0, len(pictures.anchors))]
-    use = jax.random.uniform(keys[6], (count,)) < settings.anchor_fraction
+    fraction = jnp.where(step < settings.known_steps, settings.anchor_fraction, 0.0)
+    use = jax.random.uniform(keys[6], (count,)) < fraction
     image = jnp.where(use, chosen[:, 0].astype(jnp.int32), image)
     x = jnp.where(use, chosen[:, 1].astype(jnp.int32), x)
     y = jnp.where(use, chosen[:, 2].astype(jnp.int32), y)
@@ -293,7 +296,7 @@ class ReferenceTrainer:
     def step(state: State, pictures: Pictures, learning_rate: jax.Array):
       key = jax.random.fold_in(jax.random.PRNGKey(self._seed), state.step)
       draw_key, loss_key = jax.random.split(key)
-      rays = draw_rays(pictures, settings, draw_key)
+      rays = draw_rays(pictures, settings, draw_key, step=state.step)
       gradient, metrics = jax.grad(loss_of_rays, has_aux=True)(
         state.params, settings, loss_key, rays, pixel_angle=pixel_angle
       )

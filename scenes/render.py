@@ -112,6 +112,7 @@ class Renderer:
     self._data = render_kernels.upload(packed, field.settings.march_step, device)
     self._distance: Any = wp.array(occupancy.distance.ravel(), dtype=wp.uint8, device=device)
     self._camera_rays = functools.lru_cache(maxsize=16)(self._upload_rays)
+    self._march = functools.lru_cache(maxsize=16)(self._march_data)
 
   def render(self, camera: Camera, unit_from_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Renders one picture.
@@ -205,7 +206,7 @@ class Renderer:
     rays = camera.rays().reshape(-1, 3).astype(np.float32)
     return wp.array(rays, dtype=wp.vec3, device=self.device)
 
-  def _march(self, pixel_angle: float) -> Any:
+  def _march_data(self, pixel_angle: float) -> Any:
     how: Any = render_kernels.MarchData()
     how.distance = self._distance
     how.cells = self.occupancy.cells

@@ -52,6 +52,9 @@ class TrainSettings:
   random_background: bool = True
   """Composite over a random colour, so that dark surfaces cannot be empty. Mueller et al. 2022."""
 
+  known_steps: int = 1200
+  """Steps after which localised points take no part: fog forms early, and later their errors of a
+  pixel cost 1 dB and more. Ours."""
   anchor_fraction: float = 0.15
   """Fraction of the rays that go to a localised point, where there are any. Ours."""
   anchor_weight: float = 0.3

@@ -111,3 +111,12 @@ def test_no_place_to_stand_is_said():
     ground.sample(np.random.default_rng(0), 1)
   with pytest.raises(free_space.FreeSpaceError):
     ground.default_goals()
+
+
+@pytest.mark.parametrize("text", ["image: [", "just words", "\x00"])
+def test_a_damaged_map_is_one_clear_line(tmp_path, text):
+  path = tmp_path / "free_space.yaml"
+  path.write_text(text)
+  with pytest.raises(ValueError, match=r"^The map .* (is no YAML file|holds)") as error:
+    free_space.read(path)
+  assert "\n" not in str(error.value)
