@@ -11,14 +11,13 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-import field_view  # beside this script
 import numpy as np
 import trimesh
 import tyro
 import viser
 from viser import transforms
 
-from scenes import localise
+from scenes import field_view, localise
 from scenes.bundle import Bundle
 from scenes.field import Field
 from scenes.render import Renderer

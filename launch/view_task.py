@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import field_view  # beside this script
 import mujoco
 import numpy as np
 import trimesh
@@ -17,6 +16,7 @@ import viser
 from viser import transforms
 
 import suite
+from scenes import field_view
 from suite import loading
 from suite.op3 import constants, op3
 from suite.third_person import best_azimuth, clear_distance, direction
