@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from suite import errors
 from suite.camera import CameraSettings, FieldRenderer, RobotCamera
@@ -12,6 +12,9 @@ from suite.randomisation import RandomisationSettings
 from suite.tasks import ball_push, nerf_nav
 from suite.tasks.base import RobotTask
 from suite.tasks.settings import PHYSICS_TIMESTEP, TaskSettings
+
+if TYPE_CHECKING:
+  from scenes.render import Renderer
 
 # Name to (class, length of an episode [s]).
 _TASKS: dict[str, tuple[type[RobotTask], float]] = {
@@ -113,7 +116,7 @@ def _effects(effects: Any) -> tuple[Effect, ...]:
   return found
 
 
-def load_renderer(bundle: Any) -> FieldRenderer:
+def load_renderer(bundle: Any) -> "Renderer":
   """Returns a renderer of a bundle's field on this machine's CPU."""
   import safetensors
 
