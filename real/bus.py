@@ -1,11 +1,10 @@
-"""The robot's bus through the DYNAMIXEL SDK: goals out, readings in, registers verified.
+"""The robot's bus through the DYNAMIXEL SDK: goals out, readings in.
 
 Addresses and units: ROBOTIS e-Manual, XM430-W350; the board's: `real/opencr.py`. J joints, in the
 order of `suite.op3.constants.JOINT_NAMES`.
 """
 
 import dataclasses
-import functools
 import threading
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,8 +17,7 @@ from real import op3, opencr
 from real.clock import Clock, RealClock
 from real.port import Port
 
-TORQUE_ENABLE, HARDWARE_ERROR, BUS_WATCHDOG, GOAL_POSITION = 64, 70, 98, 116
-XM430_W350 = 1020  # model number
+TORQUE_ENABLE, GOAL_POSITION = 64, 116
 _PRESENT = 124  # PWM, current, velocity, position, two trajectories, voltage, temperature
 _ROW = np.dtype(
   [
@@ -32,13 +30,6 @@ _PRESENT_LENGTH = _ROW.itemsize - 4
 _FAST_HEAD, _STATUS_SIZE, _INSTRUCTION_SIZE = 8, 11, 14  # bytes of packets without their data
 _ALERT = 0x80
 _ATTEMPTS, _PINGS = 5, 4  # of a transaction outside the cycle, of a ping
-_BOOT_TIME = 0.5  # s for servos to answer after their supply is switched on
-_WATCHDOG_UNIT = 0.020  # s
-_REST_PATIENCE, _REST_INTERVAL, _REST_COUNTS = 5.0, 0.05, 20  # s, s, counts: 0.6 rad/s at most
-ERROR_BITS = {
-  0x01: "input voltage", 0x04: "overheating", 0x08: "encoder", 0x10: "electrical shock",
-  0x20: "overload",
-}  # fmt: skip
 
 
 class BusError(OSError):
@@ -105,6 +96,7 @@ class Bus:
     self.settings = settings or BusSettings()
     self.wiring = wiring or op3.Wiring()
     self.clock = clock or RealClock()
+    self.path = path
     self.counts = BusCounts()
     self._ids = self.wiring.ids
     self._directions, self._id_row = self.wiring.directions, np.array(self._ids)
@@ -113,170 +105,19 @@ class Bus:
     self._handler = sdk.Protocol2PacketHandler()
     self._return_delay = 2e-6 * self.settings.return_delay
 
-  # ---- start and end ----
-
-  def power_on(self) -> None:
-    """Switches the servos' supply on and waits until all devices answer.
-
-    Raises:
-      BusError: The board or a servo does not answer, or is another model.
-    """
-    if self._ping(op3.BOARD_ID) is None:
-      raise BusError(
-        f"The OpenCR board (id {op3.BOARD_ID}) does not answer on {self._port.port_name}: is the "
-        "robot switched on, is this its port, does another program use it?"
-      )
-    if not self._read(op3.BOARD_ID, opencr.POWER, 1)[0]:
-      self._write(op3.BOARD_ID, opencr.POWER, 1, 1)
-      self.clock.sleep_until(self.clock.now() + _BOOT_TIME)
-    silent = self.silent()
-    if silent:
-      raise BusError(f"These devices do not answer: {', '.join(silent)}. Check their cables.")
-    for joint in self.wiring.joints:
-      model = self._ping(joint.device)
-      if model != XM430_W350:
-        raise BusError(
-          f"Servo {joint.device} ({joint.name}) has model number {model}, expected {XM430_W350} "
-          "(XM430-W350)."
-        )
-
-  def silent(self) -> list[str]:
-    """Returns the devices that do not answer a ping."""
-    return [
-      f"{device} ({self.wiring.name_of(device)})"
-      for device in (*sorted(self._ids), op3.BOARD_ID)
-      if self._ping(device) is None
-    ]
-
-  def set_up(self) -> None:
-    """Switches torque off, writes the servos' registers and verifies them by reading back.
-
-    Raises:
-      BusError: A register holds another value afterwards.
-    """
-    values = self.settings
-    self.torque(False)
-    self._write_all(BUS_WATCHDOG, 1, [0] * len(self._ids))
-    wanted = {  # address: (size, value, name)
-      9: (1, values.return_delay, "return delay time"),
-      10: (1, 0, "drive mode"),
-      11: (1, 3, "operating mode"),  # position control
-      20: (4, 0, "homing offset"),
-      36: (2, values.pwm_limit, "PWM limit"),
-      48: (4, 4095, "max position limit"),
-      52: (4, 0, "min position limit"),
-      80: (2, 0, "position D gain"),
-      82: (2, 0, "position I gain"),
-      84: (2, values.position_gain, "position P gain"),
-      108: (4, 0, "profile acceleration"),
-      112: (4, 0, "profile velocity"),
-    }
-    for address, (size, value, name) in wanted.items():
-      self._set_all(address, size, [value] * len(self._ids), name=name)
-
-  def _set_all(self, address: int, size: int, values: list[int], *, name: str) -> None:
-    """Writes a register of every servo and reads it back."""
-    found: list[int] | None = None
-    for _ in range(_ATTEMPTS):
-      self._write_all(address, size, values)
-      found = self._read_all(address, size)
-      if found == values:
-        return
-    if found is None:
-      raise BusError(f"The servos do not answer: {', '.join(self.silent()) or 'lost packets'}.")
-    rows = zip(self.wiring.joints, found, values, strict=True)
-    joint, got, value = next(row for row in rows if row[1] != row[2])
-    raise BusError(
-      f"Servo {joint.device} ({joint.name}) keeps {name} = {got}, expected {value}: its registers "
-      "are locked or it has an error; see its hardware error status."
-    )
-
-  def start(self) -> None:
-    """Switches torque on with every joint's goal where it is, and the servos' watchdog on.
-
-    Raises:
-      BusError: The joints cannot be read or do not come to rest, or a servo refuses.
-    """
-    counts = self._resting_counts()
-    self._set_all(GOAL_POSITION, 4, counts, name="goal position")
-    self._set_all(TORQUE_ENABLE, 1, [1] * len(self._ids), name="torque enable")
-    watchdog = round(self.settings.watchdog / _WATCHDOG_UNIT)
-    if watchdog:
-      self._set_all(BUS_WATCHDOG, 1, [watchdog] * len(self._ids), name="bus watchdog")
-
-  def _resting_counts(self) -> list[int]:
-    """Waits until no joint moves; returns the servos' positions."""
-    end = self.clock.now() + _REST_PATIENCE
-    moving: list[str] = []
-    before: np.ndarray | None = None
-    while self.clock.now() < end:
-      values = self._read_all(132, 4)
-      if values is None:
-        raise BusError("The joints' positions cannot be read, so torque stays off.")
-      counts = np.array(values, np.uint32).astype(np.int32)
-      if before is not None:
-        still = np.abs(counts - before) <= _REST_COUNTS
-        if still.all():
-          return np.clip(counts, 0, 4095).tolist()
-        moving = [joint.name for joint, rest in zip(self.wiring.joints, still, strict=True)
-                  if not rest]  # fmt: skip
-      before = counts
-      self.clock.sleep_until(self.clock.now() + _REST_INTERVAL)
-    raise BusError(f"These joints keep moving, so torque stays off: {', '.join(moving)}.")
-
-  def torque(self, enabled: bool) -> bool:
-    """Switches the torque of all servos; returns whether all confirmed it."""
-    value = int(enabled)
-    for _ in range(_ATTEMPTS):
-      self._write_all(TORQUE_ENABLE, 1, [value] * len(self._ids))
-      if self._read_all(TORQUE_ENABLE, 1) == [value] * len(self._ids):
-        return True
-    return False
-
-  def drop_torque(self) -> None:
-    """Switches all torque off at once, without waiting for answers."""
-    self._write_all(TORQUE_ENABLE, 1, [0] * len(self._ids))
-
-  def torque_states(self) -> list[int | None]:
-    """Returns the servos' torque enable [J]; None where a servo does not answer."""
-    states = self._read_all(TORQUE_ENABLE, 1, attempts=1)
-    if states is not None:
-      return list(states)
-    found: list[int | None] = []
-    for device in self._ids:  # a dead servo silences those behind it in a common answer
-      read = functools.partial(self._handler.read1ByteTxRx, self._port, device, TORQUE_ENABLE)
-      answer = self._try(read, attempts=1)
-      found.append(None if answer is None else answer[0])
-    return found
-
-  def hardware_errors(self) -> dict[str, list[str]]:
-    """Returns the names of the errors that servos report, by joint."""
-    found = {}
-    for joint in self.wiring.joints:
-      try:
-        status = self._read(joint.device, HARDWARE_ERROR, 1)[0]
-      except BusError:
-        continue
-      if status:
-        found[joint.name] = [name for bit, name in ERROR_BITS.items() if status & bit]
-    return found
-
-  def reboot(self, name: str) -> None:
-    """Restarts the servo of a joint, which clears its hardware errors."""
-    device = self._ids[[joint.name for joint in self.wiring.joints].index(name)]
-    with self._lock:
-      self._handler.reboot(self._port, device)
-    self.clock.sleep_until(self.clock.now() + _BOOT_TIME)
-
   def close(self) -> None:
     """Closes the port; torque stays as it is."""
     self._port.close()
+
+  def drop_torque(self) -> None:
+    """Switches all torque off at once, without waiting for answers."""
+    self.write_all(TORQUE_ENABLE, 1, [0] * len(self._ids))
 
   # ---- the cycle ----
 
   def write_goals(self, angles: np.ndarray) -> None:
     """Sends position goals [J] [rad] to all servos in one packet, which nobody answers."""
-    self._write_all(GOAL_POSITION, 4, self.wiring.to_counts(angles).tolist())
+    self.write_all(GOAL_POSITION, 4, self.wiring.to_counts(angles).tolist())
 
   def read_joints(self, *, deadline: float | None = None) -> JointReading | None:
     """Reads all joints with one fast sync read.
@@ -382,23 +223,42 @@ class Bus:
         return found
     return None
 
-  def _ping(self, device: int) -> int | None:
+  def ping(self, device: int) -> int | None:
+    """Returns the model number of a device; None if it does not answer."""
     found = self._try(lambda: self._handler.ping(self._port, device), attempts=_PINGS)
     return None if found is None else found[0]
 
-  def _read(self, device: int, address: int, size: int) -> bytes:
-    found = self._try(lambda: self._handler.readTxRx(self._port, device, address, size))
+  def read(self, device: int, address: int, size: int, *, attempts: int = _ATTEMPTS) -> bytes:
+    """Returns the bytes of a device's registers.
+
+    Raises:
+      BusError: It does not answer.
+    """
+    found = self._try(
+      lambda: self._handler.readTxRx(self._port, device, address, size), attempts=attempts
+    )
     if found is None:
       raise BusError(f"Device {device} ({self.wiring.name_of(device)}) does not answer.")
     return bytes(found[0])
 
-  def _write(self, device: int, address: int, size: int, value: int) -> None:
+  def write(self, device: int, address: int, size: int, value: int) -> None:
+    """Writes a register of a device.
+
+    Raises:
+      BusError: It does not answer.
+    """
     data = list(value.to_bytes(size, "little", signed=value < 0))
     found = self._try(lambda: self._handler.writeTxRx(self._port, device, address, size, data))
     if found is None:
       raise BusError(f"Device {device} ({self.wiring.name_of(device)}) does not answer.")
 
-  def _write_all(self, address: int, size: int, values: list[int]) -> None:
+  def reboot(self, device: int) -> None:
+    """Restarts a device."""
+    with self._lock:
+      self._handler.reboot(self._port, device)
+
+  def write_all(self, address: int, size: int, values: list[int]) -> None:
+    """Writes a register of every servo in one packet, which nobody answers."""
     data: list[int] = []
     for device, value in zip(self._ids, values, strict=True):
       data.append(device)
@@ -411,7 +271,7 @@ class Bus:
       finally:
         self._port.is_using = False
 
-  def _read_all(self, address: int, size: int, *, attempts: int = _ATTEMPTS) -> list[int] | None:
+  def read_all(self, address: int, size: int, *, attempts: int = _ATTEMPTS) -> list[int] | None:
     """Reads a register of every servo (unsigned); None if one does not answer."""
     group = sdk.GroupSyncRead(self._port, self._handler, address, size)
     for device in self._ids:

@@ -15,6 +15,7 @@ from real.opencr import ImuReading
 from real.operator import Operator
 from real.safety import Monitor, Reason, Stop
 from real.sensing import Sensing
+from real.servos import Servos
 from real.timing import Timing
 from suite.op3 import constants
 
@@ -28,13 +29,14 @@ class Cycle:
   """Reads the robot periodically and switches the torque off when it must be."""
 
   def __init__(
-    self, bus: Bus, sensing: Sensing, monitor: Monitor, *, operator: Operator, timing: Timing,
-    recorder: Any = None, dry_run: bool = False,
+    self, bus: Bus, servos: Servos, sensing: Sensing, monitor: Monitor, *, operator: Operator,
+    timing: Timing, recorder: Any = None, dry_run: bool = False,
   ):  # fmt: skip
     """Starts reading.
 
     Args:
       bus: The bus.
+      servos: The servos on it, set up.
       sensing: Takes the readings.
       monitor: Judges them.
       operator: Whose key stops the robot.
@@ -44,7 +46,7 @@ class Cycle:
     """
     self.stop: Stop | None = None
     self.sensing = sensing
-    self._bus, self._monitor, self._operator = bus, monitor, operator
+    self._bus, self._servos, self._monitor, self._operator = bus, servos, monitor, operator
     self._timing, self._recorder, self._dry_run = timing, recorder, dry_run
     self._commands = threading.Lock()  # a goal must not follow a stop
     self._torque_off = True
@@ -70,7 +72,7 @@ class Cycle:
     with self._commands:
       if self.stop is None and not self._dry_run:
         self._torque_off = False
-        self._bus.start()
+        self._servos.start()
 
   def send(self, angles: np.ndarray) -> bool:
     """Sends goals [J] [rad] unless the robot was stopped; returns whether they were sent."""
@@ -102,7 +104,7 @@ class Cycle:
     with self._commands:
       self._monitor.goals = None
       if not self._dry_run:
-        self._torque_off = self._bus.torque(False)
+        self._torque_off = self._servos.torque(False)
     return self._torque_off
 
   def rearm(self) -> None:
@@ -156,7 +158,7 @@ class Cycle:
     """Goes on switching the torque off until every servo says that it is."""
     with self._commands:
       self._bus.drop_torque()
-      states = self._bus.torque_states()
+      states = self._servos.torque_states()
       self._torque_off = all(state == 0 for state in states)
 
   def _record(

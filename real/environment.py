@@ -6,7 +6,6 @@ then. The time a policy needs is therefore part of the robot's delay, as everyth
 """
 
 import collections
-import dataclasses
 import logging
 from typing import Any, Protocol
 
@@ -15,19 +14,18 @@ import dm_env
 import numpy as np
 from dm_env import specs
 
-from real.bus import Bus, BusError, BusSettings
+from real.bus import Bus
 from real.cycle import Cycle
+from real.motion import SUPPORTED_POSE, Motion, RobotSettings
 from real.operator import Operator
-from real.safety import Limiter, Monitor, Reason, SafetyError, SafetySettings, Stop
+from real.safety import Limiter, Monitor, Stop
 from real.sensing import Sensing
+from real.servos import Servos
 from real.timing import Timing
 from suite import errors, filters
 from suite import specs as policy_specs
 from suite.op3 import constants
 
-SUPPORTED_POSE = constants.standing_targets()  # [J] rad, where the robot starts and ends, held
-_LEVEL_TIME = 0.1  # s in which at least one of a dozen IMU readings arrives
-_FIRST_READING = 2.0  # s to wait for the first reading of everything
 _log = logging.getLogger(__name__)
 
 
@@ -39,17 +37,6 @@ class CameraSource(Protocol):
 
   def close(self) -> None:
     """Frees the camera."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RobotSettings:
-  """Settings of the robot."""
-
-  bus: BusSettings = dataclasses.field(default_factory=BusSettings)
-  safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
-  chip_low_pass: bool = True  # the IMU chip filters by itself; False: filtered here
-  settle_time: float = 2.5  # s between being let go and the start of an episode
-  grip_time: float = 1.0  # s between being taken hold of and the first move
 
 
 class RobotEnvironment(dm_env.Environment):
@@ -109,17 +96,21 @@ class RobotEnvironment(dm_env.Environment):
     )  # fmt: skip
     self.set_goal(self.goals[0])
     self._control = self._normalised(SUPPORTED_POSE)
-    self._standing = False  # under torque in the supported pose or beyond
     self._running = False  # an episode is
     self._last_picture = float("-inf")  # s, when the picture recorded last was taken
     self._closed = False
-    bus.power_on()
+    self.servos = Servos(bus)
+    self.servos.power_on()
     if not dry_run:
-      bus.set_up()
+      self.servos.set_up()
     self._monitor.arm(self._clock.now())
     self._cycle = Cycle(
-      bus, Sensing(low_pass=not self.settings.chip_low_pass), self._monitor, operator=operator,
-      timing=self.timing, recorder=recorder, dry_run=dry_run,
+      bus, self.servos, Sensing(low_pass=not self.settings.chip_low_pass), self._monitor,
+      operator=operator, timing=self.timing, recorder=recorder, dry_run=dry_run,
+    )  # fmt: skip
+    self._motion = Motion(
+      self._cycle, self.servos, self._monitor, self._limiter, operator=operator,
+      clock=self._clock, settings=self.settings, dry_run=dry_run,
     )  # fmt: skip
 
   # ---- dm_env ----
@@ -140,18 +131,7 @@ class RobotEnvironment(dm_env.Environment):
     """
     self._check_open()
     self._running = False
-    self._clear_stop()
-    self._wait_for_readings()
-    self._take_hold()
-    if not self._standing:
-      self._energize()
-    self._move_slowly(SUPPORTED_POSE)
-    self._level()
-    if not self.dry_run:  # without torque it could not stand
-      self._monitor.held = False
-      self._operator.support(False)
-      self._pause(self.settings.settle_time)
-      self._level()
+    self._motion.stand()
     self._control = self._normalised(SUPPORTED_POSE)
     self._action_filter.reset(self._control)
     self.timing.reset()
@@ -199,15 +179,12 @@ class RobotEnvironment(dm_env.Environment):
       return
     self._closed = True
     self._running = False
+    relaxed = False
     try:
-      if self._standing and self._cycle.stop is None:
-        self._take_hold()
-        self._move_slowly(SUPPORTED_POSE)
-        if not self._cycle.relax():
-          _log.error("not every servo confirmed that its torque is off: switch the robot off")
+      relaxed = self._motion.rest()
     finally:
       self._cycle.close()
-      if not self.dry_run and not self._cycle.torque_off and not self._bus.torque(False):
+      if not relaxed and not self.dry_run and not self.servos.torque(False):
         _log.error("not every servo confirmed that its torque is off: switch the robot off")
       self._bus.close()
       self._operator.close()
@@ -326,85 +303,8 @@ class RobotEnvironment(dm_env.Environment):
     ending = "time limit" if stop is None else f"{stop.reason} ({stop.detail})"
     _log.info("episode of %d steps, ended by %s; %s", self._steps, ending, self.timing.line())
     if stop is not None:
-      self._standing = False
+      self._motion.standing = False
     return timestep
-
-  # ---- start and end ----
-
-  def _take_hold(self) -> None:
-    self._operator.support(True)
-    self._monitor.held = True
-    self._pause(self.settings.grip_time)
-
-  def _energize(self) -> None:
-    try:
-      self._cycle.energize()
-    except BusError as error:
-      self._cycle.halt(Stop(Reason.BUS, str(error), self._clock.now()))
-      raise SafetyError(f"Torque stays off: {error}") from error
-    joints = self._cycle.sensing.joints
-    assert joints is not None
-    self._limiter.reset(joints.positions)
-    self._standing = True
-
-  def _move_slowly(self, pose: np.ndarray) -> None:
-    """Moves the goals to a pose [J] [rad] at the slow speed."""
-    start = self._limiter.goal
-    assert start is not None
-    speed, period = self.settings.safety.slow_speed, constants.CONTROL_TIMESTEP
-    count = int(np.ceil(np.abs(pose - start).max() / (speed * period)))
-    slow = Limiter(np.minimum(pose, start), np.maximum(pose, start), max_speed=speed)
-    slow.reset(start)
-    due = self._clock.now()
-    for _ in range(count):
-      self._cycle.send(slow(pose, period))
-      due += period
-      self._clock.sleep_until(due)
-      self._raise_if_stopped()
-    self._limiter.reset(pose)
-
-  def _level(self) -> None:
-    """Lets the accelerometer say which way is up: the robot rests, and the filter is slow."""
-    self._cycle.sensing.level()
-    self._pause(_LEVEL_TIME)
-
-  def _pause(self, seconds: float) -> None:
-    self._clock.sleep_until(self._clock.now() + seconds)
-    self._raise_if_stopped()
-
-  def _wait_for_readings(self) -> None:
-    end = self._clock.now() + _FIRST_READING
-    while not self._cycle.sensing.ready:
-      if self._clock.now() > end:
-        raise SafetyError("Joints and IMU cannot be read: check the cables.")
-      self._clock.sleep_until(self._clock.now() + constants.BUS_PERIOD)
-
-  def _clear_stop(self) -> None:
-    """Makes a new start possible after a stop, if its cause is gone."""
-    if self._cycle.stop is None:
-      return
-    self._standing = False
-    end = self._clock.now() + _FIRST_READING
-    while not self._cycle.torque_off and self._clock.now() < end:
-      self._clock.sleep_until(self._clock.now() + constants.BUS_PERIOD)
-    errors_found = {} if self.dry_run else self._bus.hardware_errors()
-    if errors_found:
-      raise SafetyError(
-        f"These servos report errors: {errors_found}. Find the cause, then clear them with "
-        "environment.bus.reboot(joint)."
-      )
-    if not self.dry_run and not self._cycle.torque_off:
-      silent = ", ".join(self._bus.silent()) or "none at the moment"
-      raise SafetyError(
-        f"Not every servo confirmed that its torque is off. Devices that do not answer: {silent}."
-      )
-    self._cycle.rearm()
-
-  def _raise_if_stopped(self) -> None:
-    stop = self._cycle.stop
-    if stop is not None:
-      self._standing = False
-      raise SafetyError(f"Torque was switched off: {stop.reason} ({stop.detail}).")
 
   def _check_open(self) -> None:
     if self._closed:

@@ -9,7 +9,8 @@ import numpy as np
 from real import op3
 from real.bus import Bus
 from real.clock import Clock
-from real.environment import CameraSource, RobotEnvironment, RobotSettings
+from real.environment import CameraSource, RobotEnvironment
+from real.motion import RobotSettings
 from real.operator import Operator, Terminal
 from suite import errors, loading
 from suite.op3 import constants

@@ -42,7 +42,7 @@ LENS = Camera(
   p2=-0.0003,
 )
 FRAME_RATE = 30.0  # Hz
-_SUPERSAMPLE = 2
+_SUPERSAMPLE = 1  # 45 dB from 4 x 4 samples at 30x40, and half the time of 2 x 2
 _HEAD_CAMERA = "op3/head_camera"
 _OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 

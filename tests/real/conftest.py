@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 import real
-from real.environment import RobotSettings
+from real.motion import RobotSettings
 from real.virtual.hidden import Hidden
 from real.virtual.robot import VirtualRobot
 

@@ -5,6 +5,7 @@ import pytest
 
 from real.bus import Bus, BusError, BusSettings
 from real.port import PortError
+from real.servos import Servos
 from real.virtual.devices import IDS
 from suite.op3 import constants
 
@@ -17,9 +18,14 @@ def bus(robot):
 
 
 @pytest.fixture
-def ready(bus):
-  bus.power_on()
-  bus.set_up()
+def servos(bus):
+  return Servos(bus)
+
+
+@pytest.fixture
+def ready(bus, servos):
+  servos.power_on()
+  servos.set_up()
   return bus
 
 
@@ -33,27 +39,27 @@ def test_a_missing_port_is_said(tmp_path):
     Bus(str(tmp_path / "nothing_here"))
 
 
-def test_missing_devices_are_named(robot, bus):
+def test_missing_devices_are_named(robot, bus, servos):
   robot.faults.dead |= {13, 4}
   with pytest.raises(BusError, match=r"4 \(l_sho_roll\), 13 \(r_knee\)"):
-    bus.power_on()
+    servos.power_on()
   robot.faults.cut = True
   with pytest.raises(BusError, match="OpenCR board"):
-    bus.power_on()
+    servos.power_on()
 
 
-def test_another_model_is_refused(robot, bus):
+def test_another_model_is_refused(robot, bus, servos):
   robot.devices.servos[7].table["model_number"] = 1030
   with pytest.raises(BusError, match=r"Servo 7 \(r_hip_yaw\) has model number 1030"):
-    bus.power_on()
+    servos.power_on()
 
 
-def test_set_up_writes_the_registers_of_every_servo(robot, bus):
+def test_set_up_writes_the_registers_of_every_servo(robot, bus, servos):
   for servo in robot.devices.servos.values():  # as somebody else left them
     servo.table["position_i_gain"], servo.table["operating_mode"] = 300, 5
     servo.table["profile_velocity"] = 50
-  bus.power_on()
-  bus.set_up()
+  servos.power_on()
+  servos.set_up()
   for servo in robot.devices.servos.values():
     table = servo.table
     names = ("operating_mode", "return_delay_time", "position_p_gain", "position_i_gain")
@@ -62,20 +68,20 @@ def test_set_up_writes_the_registers_of_every_servo(robot, bus):
     assert table["torque_enable"] == 0
 
 
-def test_a_register_that_does_not_hold_is_an_error(robot, bus):
-  bus.power_on()
+def test_a_register_that_does_not_hold_is_an_error(robot, bus, servos):
+  servos.power_on()
   table = robot.devices.servos[IDS["l_knee"]].table
   table.registers["position_p_gain"] = table.registers["position_p_gain"]._replace(high=700)
   table._by_address[84] = table.registers["position_p_gain"]
   with pytest.raises(BusError, match=r"l_knee\) keeps position P gain = 800, expected 850"):
     bus.settings = BusSettings(position_gain=850)
-    bus.set_up()
+    servos.set_up()
 
 
-def test_set_up_survives_lost_packets(robot, bus):
+def test_set_up_survives_lost_packets(robot, bus, servos):
   robot.faults.loss = 0.02
-  bus.power_on()
-  bus.set_up()
+  servos.power_on()
+  servos.set_up()
   assert all(s.table["return_delay_time"] == 0 for s in robot.devices.servos.values())
 
 
@@ -94,7 +100,7 @@ def test_readings_are_the_truth_in_si_units(robot, ready):
   assert ready.read_joints().velocities[index] > 0.8
 
 
-def test_each_joint_is_stamped_with_the_moment_at_which_it_was_sampled(robot, ready):
+def test_each_joint_is_stamped_with_the_moment_at_which_it_was_sampled(robot, ready, servos):
   seen = {}
   for device, servo in robot.devices.servos.items():
     original = servo.read
@@ -117,8 +123,8 @@ def test_the_imu_is_read_in_the_torsos_axes(robot, ready):
   assert found.voltage == pytest.approx(robot.body.motors.supply, abs=0.06)
 
 
-def test_goals_go_to_the_joints_they_are_meant_for(robot, ready):
-  ready.start()
+def test_goals_go_to_the_joints_they_are_meant_for(robot, ready, servos):
+  servos.start()
   goal = constants.standing_targets()
   goal[constants.JOINT_NAMES.index("head_pan")] = 0.5
   ready.write_goals(goal)
@@ -127,16 +133,16 @@ def test_goals_go_to_the_joints_they_are_meant_for(robot, ready):
     ready.read_imu()
   away = robot.truth().joints - goal
   assert np.abs(away).max() < 0.08
-  assert ready.torque(False)
+  assert servos.torque(False)
   assert not robot.body.motors.enabled.any()
 
 
-def test_switching_on_moves_nothing(robot, ready):
+def test_switching_on_moves_nothing(robot, ready, servos):
   """The goals left from before lie elsewhere."""
   ready.write_goals(np.zeros(20))
   _wait(robot, 1.0)
   before = robot.truth().joints
-  ready.start()
+  servos.start()
   peak = 0.0
   for _ in range(30):
     _wait(robot, 0.01)
@@ -145,9 +151,9 @@ def test_switching_on_moves_nothing(robot, ready):
   assert peak < 0.03
 
 
-def test_switching_on_waits_until_the_joints_rest(robot, ready):
-  ready.start()
-  ready.torque(False)
+def test_switching_on_waits_until_the_joints_rest(robot, ready, servos):
+  servos.start()
+  servos.torque(False)
   body = robot.body
   body.model.jnt_limited[:] = 0
   index = body._dofs[constants.JOINT_NAMES.index("head_pan")]
@@ -158,7 +164,7 @@ def test_switching_on_waits_until_the_joints_rest(robot, ready):
 
   body.after_step = spin
   with pytest.raises(BusError, match="head_pan"):
-    ready.start()
+    servos.start()
   assert not body.motors.enabled.any()
 
 
@@ -179,18 +185,18 @@ def test_waiting_ends_at_the_deadline(robot, ready):
   assert robot.clock.now() - start < 0.0015
 
 
-def test_hardware_errors_are_named(robot, ready):
+def test_hardware_errors_are_named(robot, ready, servos):
   robot.faults.heat[13] = 90.0
   _wait(robot, 0.1)
-  assert ready.hardware_errors() == {"r_knee": ["overheating"]}
+  assert servos.hardware_errors() == {"r_knee": ["overheating"]}
   assert ready.read_joints().alerts.tolist() == [n == "r_knee" for n in constants.JOINT_NAMES]
   robot.faults.heat[13] = 40.0
-  ready.reboot("r_knee")
-  assert ready.hardware_errors() == {}
+  servos.reboot("r_knee")
+  assert servos.hardware_errors() == {}
 
 
-def test_servos_stop_by_themselves_when_the_host_is_gone(robot, ready):
-  ready.start()
+def test_servos_stop_by_themselves_when_the_host_is_gone(robot, ready, servos):
+  servos.start()
   ready.write_goals(constants.standing_targets() + 0.2)
   _wait(robot, 0.15)
   watchdogs = {s.table["bus_watchdog"] for s in robot.devices.servos.values()}

@@ -6,7 +6,7 @@ import pytest
 
 import real
 import suite
-from real.environment import SUPPORTED_POSE, RobotSettings
+from real.motion import SUPPORTED_POSE, RobotSettings
 from suite import filters
 from suite.op3 import constants
 from suite.tasks.state import standing_posture

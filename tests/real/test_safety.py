@@ -214,7 +214,7 @@ def test_a_servo_with_an_error_must_be_rebooted_first(robot, standing):
   robot.faults.heat[device] = 30.0
   with pytest.raises(SafetyError, match=r"l_knee.*overheating"):
     standing.reset()
-  standing.bus.reboot("l_knee")
+  standing.servos.reboot("l_knee")
   robot.place(0.0, 0.0, 0.0)
   assert standing.reset().first()
 

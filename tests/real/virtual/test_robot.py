@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from real.bus import Bus
+from real.servos import Servos
 from real.virtual.eye import EglMissingError
 from real.virtual.process import VirtualRobotProcess
 from real.virtual.robot import LENS, VirtualRobot
@@ -78,8 +79,9 @@ def test_in_real_time_it_is_read_through_its_port():
   with VirtualRobot() as robot:
     bus = Bus(robot.port)
     try:
-      bus.power_on()
-      bus.set_up()
+      servos = Servos(bus)
+      servos.power_on()
+      servos.set_up()
       end = time.monotonic() + 10
       found = None
       while found is None and time.monotonic() < end:  # a busy machine loses some
