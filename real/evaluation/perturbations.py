@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
+from suite.op3 import constants
+
 NONE, BLOCKED_CAMERA, MOVED_OBJECT, PERSON = "none", "blocked_camera", "moved_object", "person"
 PERTURBATIONS = (NONE, BLOCKED_CAMERA, MOVED_OBJECT, PERSON)
 BLOCKED = (3.0, 6.0)  # s of an episode in which the camera sees nothing: ours
@@ -105,7 +107,10 @@ class Intruder:
     """Finds itself in the compiled model."""
     names = [model.geom(index).name for index in range(model.ngeom)]
     self._geoms = np.flatnonzero([name.startswith(f"{_PREFIX}_") for name in names])
-    self._robot = np.flatnonzero([name.startswith(ROBOT_PREFIX) for name in names])
+    feet = tuple(ROBOT_PREFIX + link for link in constants.FOOT_LINKS)
+    self._robot = np.flatnonzero(
+      [name.startswith(ROBOT_PREFIX) and not name.startswith(feet) for name in names]
+    )
     self._mocap = int(model.body(_PREFIX).mocapid[0])
 
   def move(self, data: mujoco.MjData, time: float) -> None:
@@ -115,7 +120,7 @@ class Intruder:
     data.mocap_quat[self._mocap] = (np.cos(heading / 2), 0, 0, np.sin(heading / 2))
 
   def touched(self, data: mujoco.MjData) -> bool:
-    """Returns whether the robot touches it now."""
+    """Returns whether a part of the robot other than the feet touches it now."""
     if not data.ncon:
       return False
     pairs = data.contact.geom

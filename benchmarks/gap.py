@@ -1,0 +1,273 @@
+"""The gap between the simulation and the virtual robot: the same commands through both.
+
+Two motions of the standing robot: swaying (every joint follows a slow sine of its own) and walking
+(the gait's actions of a walk in simulation, without feedback). Every figure is over what a policy
+observes, control step by control step: joint positions, turning rates, specific force, direction of
+gravity, pictures at 30x40. The simulation is the nominal one, without randomisation; its lens is
+the virtual camera's, as a calibration would find it. `picture, same pose` shows the difference of
+field and sensor alone: the simulation's picture from where the virtual robot's camera was.
+
+python benchmarks/gap.py --out benchmarks/results/gap.md
+"""
+
+# ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+  os.environ.setdefault(_name, "1")
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import cv2
+import mujoco
+import numpy as np
+import tyro
+
+import real
+import suite
+from real.virtual.body import Truth
+from real.virtual.robot import LENS, VirtualRobot
+from scenes.image_quality import psnr
+from suite.camera import CameraSettings
+from suite.gaits.walk import Command, Gait
+from suite.op3 import constants
+from suite.randomisation import RandomisationSettings
+from suite.tasks.base import Start
+
+_STEP = constants.CONTROL_TIMESTEP
+_LEG_SWAY, _ARM_SWAY = 0.05, 0.2  # rad
+_NOMINAL = RandomisationSettings(
+  pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
+)
+MOTIONS = ("sway", "walk")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """Settings of the comparison."""
+
+  seconds: float = 6.0
+  """Length of a motion."""
+  robots: tuple[int, ...] = (1, 2, 3)
+  """Seeds of the virtual robots; figures are means over them."""
+  picture_steps: int = 8
+  """Control steps between pictures that are compared; 0: no pictures."""
+  start: tuple[float, float, float] = (0.3, -0.6, 2.2)
+  """Where the robot starts: x [m], y [m], heading [rad]."""
+  seed: int = 0
+  """Of the swaying's frequencies."""
+  out: Path | None = None
+  """Where to write the table (Markdown)."""
+
+
+@dataclasses.dataclass
+class Trace:
+  """What was observed, T control steps."""
+
+  joints: np.ndarray  # [T, 20] rad
+  gyroscope: np.ndarray  # [T, 3] rad/s
+  accelerometer: np.ndarray  # [T, 3] m/s^2
+  gravity: np.ndarray  # [T, 3]
+  place: np.ndarray  # [T, 2] of the torso, by an observer [m]
+  pictures: dict[int, np.ndarray]  # by step, uint8 [30, 40, 3]
+  same_pose: dict[int, np.ndarray]  # the simulation's, from the virtual camera's pose
+  fell: bool = False
+
+
+def sway_actions(count: int, seed: int) -> np.ndarray:
+  """Returns actions [T, 20]: sines about the standing pose that grow from nothing."""
+  rng = np.random.default_rng(seed)
+  lower, upper = constants.joint_limits()
+  middle, half = (lower + upper) / 2, (upper - lower) / 2
+  standing = (constants.standing_targets() - middle) / half
+  upper_body = [name.startswith(("head", "l_sho", "r_sho", "l_el", "r_el"))
+                for name in constants.JOINT_NAMES]  # fmt: skip
+  amplitude = np.where(upper_body, _ARM_SWAY, _LEG_SWAY) / half
+  frequency, phase = rng.uniform(0.3, 1.2, 20), rng.uniform(0, 2 * np.pi, 20)
+  time = _STEP * np.arange(count)[:, None]
+  growth = np.minimum(time, 1.0)
+  actions = standing + growth * amplitude * np.sin(2 * np.pi * frequency * time + phase)
+  return np.clip(actions, -1, 1).astype(np.float32)
+
+
+def walk_actions(count: int) -> np.ndarray:
+  """Returns the gait's actions [T, 20], straight ahead, without feedback."""
+  gait = Gait()
+  return np.stack([gait.act(Command(1.0)) for _ in range(count)])
+
+
+def _collect(timestep: Any, rows: dict[str, list]) -> None:
+  for name in ("joint_positions", "gyroscope", "accelerometer", "gravity"):
+    rows[name].append(timestep.observation[name][-1])
+
+
+def _trace(rows: dict[str, list], places: list, pictures: dict, same: dict, fell: bool) -> Trace:
+  return Trace(
+    joints=np.array(rows["joint_positions"]), gyroscope=np.array(rows["gyroscope"]),
+    accelerometer=np.array(rows["accelerometer"]), gravity=np.array(rows["gravity"]),
+    place=np.array(places), pictures=pictures, same_pose=same, fell=fell,
+  )  # fmt: skip
+
+
+def _new_rows() -> dict[str, list]:
+  return {name: [] for name in ("joint_positions", "gyroscope", "accelerometer", "gravity")}
+
+
+class Simulation:
+  """The suite's navigation task, started at a place."""
+
+  def __init__(self, settings: Settings):
+    size = (30, 40) if settings.picture_steps else None
+    self.environment = suite.load(
+      "nerf_nav", image_size=size, random=0, randomisation=_NOMINAL, privileged=False,
+      camera=CameraSettings(lens=LENS), time_limit=settings.seconds + 1.0,
+    )  # fmt: skip
+    x, y, yaw = settings.start
+    self.environment.task.set_start(Start((x, y), yaw))
+    self._data = mujoco.MjData(self.environment.physics.model.ptr)
+
+  def run(self, actions: np.ndarray, settings: Settings) -> Trace:
+    """Runs actions [T, 20]."""
+    task, rows, places, pictures = self.environment.task, _new_rows(), [], {}
+    self.environment.reset()
+    fell = False
+    for step, action in enumerate(actions):
+      timestep = self.environment.step(action)
+      _collect(timestep, rows)
+      places.append(task.state.position[:2].copy())
+      if settings.picture_steps and step % settings.picture_steps == 0:
+        pictures[step] = timestep.observation["camera"].copy()
+      if timestep.last():
+        fell = True
+        break
+    return _trace(rows, places, pictures, {}, fell)
+
+  def picture_at(self, truth: Truth) -> np.ndarray:
+    """Returns the simulation's picture of a robot in the virtual robot's true state."""
+    task, data = self.environment.task, self._data
+    model = self.environment.physics.model.ptr
+    free = model.joint(f"{task.robot.mjcf_model.model}/").qposadr[0]
+    data.qpos[free : free + 3] = truth.position
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, truth.rotation.ravel())
+    data.qpos[free + 3 : free + 7] = quaternion
+    for name, angle in zip(constants.JOINT_NAMES, truth.joints, strict=True):
+      data.qpos[model.joint(f"{task.robot.mjcf_model.model}/{name}").qposadr[0]] = angle
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    return task.robot_camera.render(data)
+
+
+def run_virtual(
+  simulation: Simulation, actions: dict[str, np.ndarray], settings: Settings, *, seed: int
+) -> dict[str, Trace]:
+  """Runs every motion on a virtual robot in the true room; returns the traces by motion."""
+  found = {}
+  camera = settings.picture_steps > 0
+  with VirtualRobot(world="room", seed=seed, stepped=True, camera=camera) as robot:
+    environment = real.load(
+      "nerf_nav", robot=robot.connection(), image_size=(30, 40) if camera else None,
+      time_limit=settings.seconds + 1.0,
+    )  # fmt: skip
+    with environment:
+      for name, motion in actions.items():
+        robot.place(*settings.start)
+        environment.reset()
+        rows, places, pictures, same = _new_rows(), [], {}, {}
+        fell = False
+        for step, action in enumerate(motion):
+          timestep = environment.step(action)
+          _collect(timestep, rows)
+          truth = robot.truth()
+          places.append(truth.position[:2].copy())
+          if camera and step % settings.picture_steps == 0:
+            pictures[step] = timestep.observation["camera"].copy()
+            assert robot.eyes is not None
+            now = robot.camera.sensor.develop(robot.eyes.picture())  # type: ignore[union-attr]
+            small = cv2.resize(now, (40, 30), interpolation=cv2.INTER_AREA)
+            same[step] = np.stack([small, simulation.picture_at(truth)])
+          if timestep.last():
+            fell = True
+            break
+        found[name] = _trace(rows, places, pictures, same, fell)
+  return found
+
+
+def _rms(difference: np.ndarray) -> np.ndarray:
+  return np.sqrt(np.mean(difference**2, axis=0))
+
+
+def compare(simulated: Trace, virtual: Trace) -> dict[str, float]:
+  """Returns the figures of one motion on one robot; lengths differ only after a fall."""
+  count = min(len(simulated.joints), len(virtual.joints))
+  joints = np.rad2deg(_rms(simulated.joints[:count] - virtual.joints[:count]))
+  figures = {f"{name} [deg]": float(v)
+             for name, v in zip(constants.JOINT_NAMES, joints, strict=True)}  # fmt: skip
+  figures["all joints, mean [deg]"] = float(joints.mean())
+  for name, unit in (("gyroscope", "rad/s"), ("accelerometer", "m/s^2")):
+    difference = _rms(getattr(simulated, name)[:count] - getattr(virtual, name)[:count])
+    for axis, value in zip("xyz", difference, strict=True):
+      figures[f"{name} {axis} [{unit}]"] = float(value)
+  cosine = np.sum(simulated.gravity[:count] * virtual.gravity[:count], axis=1)
+  lengths = np.linalg.norm(simulated.gravity[:count], axis=1) * np.linalg.norm(
+    virtual.gravity[:count], axis=1
+  )
+  angle = np.arccos(np.clip(cosine / lengths, -1, 1))
+  figures["gravity [deg]"] = float(np.rad2deg(np.sqrt(np.mean(angle**2))))
+  moved = [trace.place[count - 1] - trace.place[0] for trace in (simulated, virtual)]
+  figures["distance travelled, simulation [m]"] = float(np.linalg.norm(moved[0]))
+  figures["distance travelled, virtual robot [m]"] = float(np.linalg.norm(moved[1]))
+  figures["falls [share of robots]"] = float(virtual.fell)
+  steps = sorted(set(simulated.pictures) & set(virtual.pictures))
+  if steps:
+    as_it_went = [psnr(virtual.pictures[k], simulated.pictures[k]) for k in steps]
+    same = [psnr(*pair) for pair in virtual.same_pose.values()]
+    figures["picture, as it went [dB PSNR]"] = float(np.mean(as_it_went))
+    figures["picture, same pose [dB PSNR]"] = float(np.mean(same))
+  return figures
+
+
+def table(results: dict[str, list[dict[str, float]]], settings: Settings) -> str:
+  """Returns the table in Markdown: mean over the robots, and their spread."""
+  motions = list(results)
+  robots = ", ".join(str(seed) for seed in settings.robots)
+  lines = [
+    f"Simulation against virtual robots {robots}, {settings.seconds:g} s of each motion; RMS over "
+    "control steps, mean over the robots (smallest to largest).",
+    "",
+    "| observed | " + " | ".join(motions) + " |",
+    "| --- |" + " --- |" * len(motions),
+  ]
+  for name in results[motions[0]][0]:
+    cells = []
+    for motion in motions:
+      values = np.array([figures[name] for figures in results[motion]])
+      spread = f" ({values.min():.3g} to {values.max():.3g})" if len(values) > 1 else ""
+      cells.append(f"{values.mean():.3g}{spread}")
+    lines.append(f"| {name} | " + " | ".join(cells) + " |")
+  return "\n".join(lines) + "\n"
+
+
+def main(settings: Settings) -> None:
+  """Runs the comparison and prints the table."""
+  count = round(settings.seconds / _STEP)
+  actions = {"sway": sway_actions(count, settings.seed), "walk": walk_actions(count)}
+  simulation = Simulation(settings)
+  simulated = {name: simulation.run(motion, settings) for name, motion in actions.items()}
+  results: dict[str, list[dict[str, float]]] = {name: [] for name in actions}
+  for seed in settings.robots:
+    virtual = run_virtual(simulation, actions, settings, seed=seed)
+    for name, trace in virtual.items():
+      results[name].append(compare(simulated[name], trace))
+  text = table(results, settings)
+  print(text)
+  if settings.out is not None:
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    settings.out.write_text(text)
+
+
+if __name__ == "__main__":
+  main(tyro.cli(Settings, description=__doc__))

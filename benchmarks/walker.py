@@ -1,0 +1,160 @@
+"""Does the scripted walker walk? A metre straight ahead, then five goals, on every plant.
+
+Straight ahead only the gait acts, without being told where it is. The goals are reached one after
+another, steered by the true pose. Simulation: episodes as in training, without pushes. Virtual
+robots: what is hidden in each is drawn from its seed; "data sheet" has nothing hidden.
+
+python benchmarks/walker.py --out benchmarks/results/walker.md
+"""
+
+# ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
+
+import dataclasses
+import itertools
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+  os.environ.setdefault(_name, "1")
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import numpy as np
+import tyro
+
+import real
+import suite
+from real.virtual.robot import VirtualRobot
+from suite.gaits.floor import EmptyFloor
+from suite.gaits.walk import Command, Gait
+from suite.gaits.walker import Pose, Walker
+from suite.randomisation import RandomisationSettings
+from suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT, Start
+
+GOALS = ((0.6, 0.0), (0.6, 0.5), (0.0, 0.5), (-0.3, 0.0), (0.2, -0.3))  # m, ours
+_REACHED = 0.15  # m
+_STRAIGHT_LIMIT, _GOALS_LIMIT = 15.0, 60.0  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """Settings of the benchmark."""
+
+  episodes: int = 10
+  """Episodes in simulation, of different draws."""
+  robots: int = 10
+  """Virtual robots."""
+  out: Path | None = None
+  """Where to write the table (Markdown)."""
+
+
+class Seen(NamedTuple):
+  """What an observer sees."""
+
+  pose: Pose
+  fallen: bool
+
+
+class Result(NamedTuple):
+  """One walk."""
+
+  fell: bool
+  metre: float  # s to the first metre; NaN if it was not reached
+  sideways: float  # m at that moment
+  goals: int  # reached of five
+  goals_fell: bool
+
+
+Run = tuple[Any, Callable[[], Seen]]  # environment and observer
+
+
+def walk(environment: Any, see: Callable[[], Seen]) -> Result:
+  """Walks a metre and, in another episode, to five goals."""
+  timestep, gait = environment.reset(), Gait()
+  start, metre, sideways, step = see().pose, float("nan"), float("nan"), 0
+  seen = see()
+  while not (timestep.last() or seen.fallen) and step * 0.025 < _STRAIGHT_LIMIT:
+    observation = timestep.observation
+    timestep = environment.step(
+      gait.act(
+        Command(1.0), gyroscope=observation["gyroscope"][-1], gravity=observation["gravity"][-1]
+      )
+    )
+    seen, step = see(), step + 1
+    offset = seen.pose.xy - start.xy
+    if np.linalg.norm(offset) >= 1.0:
+      metre = step * 0.025
+      sideways = float(abs(np.cos(start.yaw) * offset[1] - np.sin(start.yaw) * offset[0]))
+      break
+  fell = seen.fallen
+  timestep, walker = environment.reset(), Walker(EmptyFloor())
+  seen = see()
+  origin = seen.pose
+  walker.reset(origin)
+  reached, step = 0, 0
+  while reached < len(GOALS) and not (timestep.last() or seen.fallen):
+    if step * 0.025 >= _GOALS_LIMIT:
+      break
+    goal = origin.xy + np.array(GOALS[reached])
+    timestep = environment.step(walker.act(timestep.observation, goal=goal, pose=seen.pose))
+    seen, step = see(), step + 1
+    reached += bool(np.linalg.norm(seen.pose.xy - goal) < _REACHED)
+  return Result(fell, metre, sideways, reached, seen.fallen)
+
+
+def simulated(count: int) -> Iterator[tuple[str, Result]]:
+  """Walks in simulation."""
+  environment = suite.load(
+    "nerf_nav", scene=EmptyFloor(), image_size=None, random=0, time_limit=_GOALS_LIMIT + 5,
+    randomisation=RandomisationSettings(pushes=False), privileged=False,
+  )  # fmt: skip
+  task = environment.task
+  task.set_start(Start((0.0, 0.0), 0.0))
+
+  def see() -> Seen:
+    x, y = (float(value) for value in task.state.position[:2])
+    return Seen(Pose(x, y, task.state.yaw), bool(task.fallen))
+
+  for episode in range(count):
+    yield f"simulation, episode {episode}", walk(environment, see)
+
+
+def rehearsed(count: int) -> Iterator[tuple[str, Result]]:
+  """Walks on virtual robots."""
+  for seed in [None, *range(count)]:
+    with VirtualRobot(world="floor", seed=seed, stepped=True) as robot:
+      environment = real.load(
+        "nerf_nav", robot=robot.connection(), image_size=None, scene=EmptyFloor(),
+        time_limit=_GOALS_LIMIT + 5,
+      )  # fmt: skip
+
+      def see(robot: VirtualRobot = robot) -> Seen:
+        truth = robot.truth()
+        low = truth.rotation[2, 2] < MIN_UPRIGHT or truth.position[2] < MIN_HEIGHT
+        pose = Pose(float(truth.position[0]), float(truth.position[1]), truth.yaw)
+        return Seen(pose, bool(truth.touches_floor or low))
+
+      with environment:
+        name = "data sheet" if seed is None else f"seed {seed}"
+        yield f"virtual robot, {name}", walk(environment, see)
+
+
+def main(settings: Settings) -> None:
+  """Walks everywhere and prints the table."""
+  lines = ["| plant | first metre [s] | sideways [m] | fell | goals of 5 | fell on the way |",
+           "| --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+  for line in lines:
+    print(line)
+  for name, result in itertools.chain(simulated(settings.episodes), rehearsed(settings.robots)):
+    fell = ["no", "yes"]
+    lines.append(f"| {name} | {result.metre:.1f} | {result.sideways:.2f} | {fell[result.fell]} | "
+                 f"{result.goals} | {fell[result.goals_fell]} |")  # fmt: skip
+    print(lines[-1], flush=True)
+  if settings.out is not None:
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    settings.out.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+  main(tyro.cli(Settings, description=__doc__))
