@@ -4,6 +4,8 @@ Bounds are wide of the kinds' plausible ranges (`suite.effects`), so that a fit 
 a sign of a wrong kind. Starts are several where the error has several valleys.
 """
 
+import dataclasses
+
 import numpy as np
 
 from sysid.kernel import INDEX
@@ -22,7 +24,7 @@ _INF = float("inf")
 def calibration(plant: JointPlant, *, prior: float = 0.06) -> Term:
   """Returns the null model: declared constants off by factors, and small latencies.
 
-  The logarithms of the factors are fitted: within about 10-15 % constants are mis-declared, beyond
+  Relative errors are fitted: within about 10-15 % constants are mis-declared, beyond
   that something is missing.
   """
   p = plant.declared
@@ -77,7 +79,13 @@ def library(plant: JointPlant) -> list[Term]:
       (0.5 * torque, 0.5 * speed), (0.05 * torque, 0.03 * speed),
       ((0.05 * torque, 0.02 * speed), (0.05 * torque, 0.15 * speed)),
     ),
-    _one("load_friction", joint, "coefficient", 0.0, 0.8, 0.1, (0.1,)),
+    *(
+      dataclasses.replace(
+        _one("load_friction", joint, "coefficient", 0.0, 0.8, 0.1, (0.1, 0.3)),
+        fixed=(("load_kind", float(kind)),),
+      )
+      for kind in (0, 1, 2)  # the actuator's torque, less its damping, what the link takes
+    ),
     Term(
       "asymmetric_friction", joint, ("positive", "negative"), (0.0, 0.0),
       (torque, torque), (0.1 * torque, 0.1 * torque),

@@ -69,9 +69,10 @@ def climb(
   declared: Entry,
   null: Entry,
   *,
-  effort: Effort = Effort(),
+  effort: Effort | None = None,
 ) -> Ladder:
   """Races single effects, then pairs where the best single one leaves something."""
+  effort = effort or Effort()
   library = kinds_for(problem, null)
   start = null.fit.x
   singles = race.run(problem, [calibration], library, start=start, finalists=effort.finalists)

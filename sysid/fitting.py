@@ -12,13 +12,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sysid.plant import JointPlant, quantum
+from sysid.plant import JointPlant, Output, quantum
 from sysid.terms import Term, compose
 
 Array = np.ndarray
 
-_DIFFERENCE = 0.02  # of a value's scale; ours: wide, as stick and slip make the error rough
-_DAMPINGS = (1e-6, 1e-3, 0.1, 3.0)
+_DIFFERENCE = 0.004  # of a value's scale; ours
+_DAMPINGS = ((1e-6, 1.0), (1e-6, 0.3), (1e-6, 0.08), (1e-3, 1.0), (0.1, 1.0), (3.0, 1.0))
+"""Dampings and shares of the step that are tried side by side."""
 _CONVERGED = 1e-4  # relative gain of a step at which a fit ends
 _SOFT = 4.0  # noise units; larger residuals count linearly
 _PRIOR_COUNT = 25.0  # residuals that one independent observation is spread over; ours
@@ -104,37 +105,37 @@ class Problem:
     assert values is not None
     return values
 
-  def simulate(self, terms: Sequence[Term], xs: Array) -> list[list[tuple[Array, Array, Array]]]:
+  def simulate(self, terms: Sequence[Term], xs: Array) -> list[list[Output]]:
     """Returns the motion of each set of values [B, n]."""
     composed = [compose(self.plant, terms, x) for x in np.atleast_2d(xs)]
     return self.plant.simulate(
       np.array([p for p, _ in composed]), surroundings=[s for _, s in composed]
     )
 
-  def effort_scale(self, outputs: Sequence[tuple[Array, Array, Array]]) -> float:
+  def effort_scale(self, outputs: Sequence[Output]) -> float:
     """Returns measured effort over simulated torque, by least squares over all logs."""
     if self.channel == "none":
       return 1.0
     above, below = 0.0, 1e-12
-    for index, (_, _, torque) in enumerate(outputs):
-      chosen = self.masks[index]
+    for index, output in enumerate(outputs):
+      torque = output.torque
+      chosen = self.masks[index] & (output.jump < 10 * self.effort_noise)
       above += float(self.effort(index)[chosen] @ torque[chosen])
       below += float(torque[chosen] @ torque[chosen])
     scale = above / below
     return float(np.clip(scale, 0.3, 3.0)) if self.channel == "effort" else float(scale)
 
-  def errors(
-    self, outputs: Sequence[tuple[Array, Array, Array]]
-  ) -> list[tuple[Array, Array | None]]:
+  def errors(self, outputs: Sequence[Output]) -> list[tuple[Array, Array | None]]:
     """Returns measured minus simulated position and effort of each log, in noise units."""
     scale = self.effort_scale(outputs)
     result: list[tuple[Array, Array | None]] = []
-    for index, (position, _, torque) in enumerate(outputs):
+    for index, output in enumerate(outputs):
       log = self.plant.logs[index]
-      along = (log.position - position) / self.position_noise
+      along = (log.position - output.position) / self.position_noise
       effort = None
       if self.channel != "none":
-        effort = (self.effort(index) - scale * torque) / self.effort_noise
+        noise = np.hypot(self.effort_noise, abs(scale) * output.jump)
+        effort = (self.effort(index) - scale * output.torque) / noise
       result.append((along, effort))
     return result
 
@@ -195,10 +196,10 @@ class Problem:
       normal += 1e-12 * np.trace(normal) * np.eye(len(x))
       free = ~(((x <= low + 1e-9 * scale) & (gradient > 0)) | ((x >= high) & (gradient < 0)))
       tried = np.repeat(x[None], len(_DAMPINGS), axis=0)
-      for row, damping in zip(tried, _DAMPINGS, strict=True):
+      for row, (damping, share) in zip(tried, _DAMPINGS, strict=True):
         block = normal[np.ix_(free, free)]
         damped = block + damping * np.diag(np.diag(block))
-        row[free] -= np.linalg.solve(damped, gradient[free]) * scale[free]
+        row[free] -= share * np.linalg.solve(damped, gradient[free]) * scale[free]
         np.clip(row, low, high, out=row)
       values = self.residuals(terms, tried)
       costs = 0.5 * np.sum(np.square(values), axis=1)

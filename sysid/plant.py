@@ -7,6 +7,7 @@ import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,12 +15,12 @@ import numpy as np
 from suite.effects.passive import rotation_matrix
 from sysid import kernel
 from sysid.logs import Log
-from sysid.reduction import Motion, Reduction, Surroundings
+from sysid.reduction import Motion, Reduction, Surroundings, start_velocity
 
 Array = np.ndarray
 
-STEP = 5e-4
-"""s; ours: at second order its error stays under 0.1 mrad, a tenth of an encoder count."""
+LONGEST_STEP = 2e-3
+"""s; ours: a model with a longer step than this is simulated in parts of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +59,19 @@ class Windows:
   velocity: Array
 
 
+class Output(NamedTuple):
+  """A simulated log at its samples."""
+
+  position: Array
+  """[N]."""
+  velocity: Array
+  """[N]."""
+  torque: Array
+  """[N] the actuator's."""
+  jump: Array
+  """[N] how much the torque jumps within two steps of the sample."""
+
+
 def holds_position(model: mujoco.MjModel, actuator: int) -> bool:
   """Tells whether an actuator has a position loop, so that errors do not accumulate."""
   return float(model.actuator_biasprm[actuator, 1]) < 0.0
@@ -85,6 +99,9 @@ def declared_parameters(model: mujoco.MjModel, joint: str) -> Array:
   values["drag"] = float(poly[0]) if poly.size else 0.0
   values["stiffness"] = float(model.jnt_stiffness[index])
   values["reference"] = float(model.qpos_spring[model.jnt_qposadr[index]])
+  impedance, rate = float(model.dof_solimp[dof, 0]), friction_rate(model, dof)
+  values["softness"] = (1.0 - impedance) / impedance * float(model.dof_invweight0[dof])
+  values["stopping_rate"] = rate
   values["lowest"], values["highest"] = -np.inf, np.inf
   u = actuator_of(model, joint)
   if u >= 0:
@@ -98,6 +115,19 @@ def declared_parameters(model: mujoco.MjModel, joint: str) -> Array:
       low, high = sorted(gear * model.actuator_forcerange[u])
       values["lowest"], values["highest"] = float(low), float(high)
   return np.array([values[name] for name in kernel.NAMES])
+
+
+def friction_rate(model: mujoco.MjModel, dof: int) -> float:
+  """Returns the rate [1/s] at which MuJoCo's friction constraint takes speed away.
+
+  From solref, as in MuJoCo's documentation, "Solver parameters": b = 2 / (dmax timeconst), or the
+  damping itself where solref is negative; a time constant is at least two steps.
+  """
+  time_constant, ratio = model.dof_solref[dof]
+  limit = float(model.dof_solimp[dof, 1])
+  if time_constant <= 0:
+    return float(-ratio / limit)
+  return float(2.0 / (limit * max(time_constant, 2 * model.opt.timestep)))
 
 
 def measured(log: Log, motion: Motion, joint: str) -> Measured:
@@ -164,7 +194,6 @@ class JointPlant:
     *,
     reductions: Sequence[Reduction] | None = None,
     window_s: float = 0.5,
-    step: float = STEP,
   ):
     """Reduces the model along every log.
 
@@ -175,40 +204,41 @@ class JointPlant:
       reductions: of the same logs, to share their work between joints.
       window_s: length of the windows that restart from the measured state where the actuator does
         not hold position.
-      step: s.
     """
-    self.model, self.joint, self.step = model, joint, step
+    self.model, self.joint = model, joint
+    own = float(model.opt.timestep)
+    self.step = own / np.ceil(own / LONGEST_STEP)
     self.reductions = list(reductions or [Reduction(model, log) for log in logs])
     self.declared = declared_parameters(model, joint)
     self.holds = holds_position(model, actuator_of(model, joint))
     index = model.joint(joint).id
+    self.inverse_weight = float(model.dof_invweight0[model.jnt_dofadr[index]])
     self.hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
     self.logs = [
       measured(log, reduction.motion, joint)
       for log, reduction in zip(logs, self.reductions, strict=True)
     ]
     self.surroundings = [reduction.of_joint(joint) for reduction in self.reductions]
-    self.windows = [self._windows(log, window_s) for log in self.logs]
-    self._grids = [np.arange(0.0, log.time[-1] + 0.05, step) for log in self.logs]
+    self.windows = [
+      self._windows(log, window_s, float(start_velocity(source)[source.states.column(joint)]))
+      for log, source in zip(self.logs, logs, strict=True)
+    ]
+    self._grids = [np.arange(0.0, log.time[-1] + 0.05, self.step) for log in self.logs]
     self._loads = [
       np.interp(grid, log.time, _other_load(source, joint, log.time))
       for grid, log, source in zip(self._grids, self.logs, logs, strict=True)
     ]
     self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
-    self._moments: list[list[Surroundings]] | None = None
+    self._moments: dict[str, list[list[Surroundings]]] = {}
     self._gravity: list[list[Surroundings]] | None = None
     self._pool = ThreadPoolExecutor(max_workers=len(os.sched_getaffinity(0)))
 
-  def _windows(self, log: Measured, window_s: float) -> Windows:
+  def _windows(self, log: Measured, window_s: float, first_velocity: float) -> Windows:
     if self.holds:
-      start = np.array([0])
-    else:
-      _, start = np.unique(np.floor((log.time - log.time[0]) / window_s), return_index=True)
-      start = np.array([0, *[s for s in start[1:] if len(log.time) - s > 3]])
-    return Windows(start.astype(np.int64), self._start_position(log, start), log.velocity[start])
-
-  def _start_position(self, log: Measured, start: Array) -> Array:
-    return log.position[start].astype(float)
+      return Windows(np.array([0]), log.position[:1].astype(float), np.array([first_velocity]))
+    _, start = np.unique(np.floor((log.time - log.time[0]) / window_s), return_index=True)
+    start = np.array([0, *[s for s in start[1:] if len(log.time) - s > 3]], np.int64)
+    return Windows(start, log.position[start].astype(float), log.velocity[start])
 
   def _on_grid(self, index: int, s: Surroundings) -> tuple[Array, ...]:
     grid, time = self._grids[index], self.logs[index].time
@@ -221,17 +251,22 @@ class JointPlant:
       return self._nominal
     return [self._on_grid(i, s) for i, s in enumerate(surroundings)]
 
-  def payload(self, mass: float, x: float, y: float, z: float) -> list[Surroundings]:
-    """Returns what a point mass on the joint's body adds, one a log.
+  def payload(self, body: str, mass: float, x: float, y: float, z: float) -> list[Surroundings]:
+    """Returns what a point mass on a body adds, one a log.
 
     Everything is linear in the mass, its first and its second moments: ten passes with a unit mass
     at ten places give the coefficients.
     """
-    if self._moments is None:
-      body = int(self.model.jnt_bodyid[self.model.joint(self.joint).id])
-      self._moments = [r.moments(self.joint, body) for r in self.reductions]
+    if body not in self._moments:
+      index = self._body(body)
+      self._moments[body] = [r.moments(self.joint, index) for r in self.reductions]
     factors = mass * np.array([1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z])
-    return [_combine(parts, factors) for parts in self._moments]
+    return [_combine(parts, factors) for parts in self._moments[body]]
+
+  def _body(self, name: str) -> int:
+    """Returns a body by its name, or by that of its joint."""
+    index = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
+    return index if index >= 0 else int(self.model.jnt_bodyid[self.model.joint(name).id])
 
   def tilt(self, x: float, y: float) -> list[Surroundings]:
     """Returns what turning gravity by the rotation vector (x, y, 0) adds, one a log."""
@@ -253,7 +288,7 @@ class JointPlant:
     surroundings: Sequence[Sequence[Surroundings] | None] | None = None,
     table: tuple[Array, Array] | None = None,
     logs: Sequence[int] | None = None,
-  ) -> list[list[tuple[Array, Array, Array]]]:
+  ) -> list[list[Output]]:
     """Simulates parameter sets along logs.
 
     Args:
@@ -263,7 +298,7 @@ class JointPlant:
       logs: indices of the logs, all for None.
 
     Returns:
-      [B][logs] of (position [N], velocity [N], torque [N]).
+      [B][logs] of outputs.
     """
     chosen = range(len(self.logs)) if logs is None else logs
     parameters = np.atleast_2d(parameters)
@@ -281,16 +316,16 @@ class JointPlant:
 
   def _run(
     self, p: Array, index: int, grid: tuple[Array, ...], table: tuple[Array, Array] | None
-  ) -> tuple[Array, Array, Array]:
+  ) -> Output:
     log, windows = self.logs[index], self.windows[index]
-    out = np.zeros((3, len(log.time)))
+    out = np.zeros((4, len(log.time)))
     weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
     kernel.simulate(  # type: ignore[call-arg]
       np.ascontiguousarray(p, float), self.step, log.command_time, log.command, log.time,
       *grid, self._loads[index], self.hinge, windows.start, windows.position,  # type: ignore
-      windows.velocity, weights, bounds, out[0], out[1], out[2],
+      windows.velocity, weights, bounds, out[0], out[1], out[2], out[3],
     )  # fmt: skip
-    return out[0], out[1], out[2]
+    return Output(out[0], out[1], out[2], out[3])
 
 
 def _combine(parts: Sequence[Surroundings], factors: Array) -> Surroundings:

@@ -5,8 +5,8 @@ The other joints are prescribed: they move as they were measured. What remains f
     (I(t) + armature) dv/dt + g(t, q) + c(t) = actuator, friction, spring
 
 with I = M_jj, gravity's torque g (a sine and cosine of a hinge's position, constant for a slide)
-and c, what the other joints' velocities and accelerations demand. All of it is linear in the masses and
-in gravity, so payloads and tilts are added as linear combinations without another pass.
+and c, what the other joints' velocities and accelerations demand. All of it is linear in the masses
+and in gravity, so payloads and tilts are added as linear combinations without another pass.
 
 Geared servos carry most of their inertia in their own rotors, which is why one joint at a time is a
 good approximation; the figures of a report are simulated by the whole model.
@@ -25,7 +25,7 @@ from sysid.logs import Log
 Array = np.ndarray
 
 _EVERY = 3  # samples between poses at which a model is evaluated (30 ms at 100 Hz); ours
-_SMOOTHING = 0.06  # s, half width of the local polynomial that differentiates positions; ours
+_SMOOTHING = 0.035  # s, half width of the local polynomial that differentiates positions; ours
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +86,21 @@ def smooth_motion(log: Log, *, half_width: float = _SMOOTHING) -> Motion:
   right = np.einsum("nkp,nk,nkj->npj", powers, weight, position[index])
   fit = np.linalg.solve(normal, right)
   return Motion(time, fit[:, 0], fit[:, 1] / half_width, 2.0 * fit[:, 2] / half_width**2)
+
+
+def start_velocity(log: Log) -> Array:
+  """Returns the joints' velocity [J] at a log's first sample: 0 where they start from rest.
+
+  A one-sided derivative at the start of a motion is wrong by the acceleration; logs begin at rest
+  unless the first readings say otherwise.
+  """
+  position = log.states.position
+  assert position is not None
+  first = position[:4]
+  slope = (first[1] - first[0]) / max(float(log.states.stamp[1] - log.states.stamp[0]), 1e-9)
+  spread = np.ptp(position, axis=0) / max(log.duration, 1e-9)
+  moving = np.abs(slope) > 2.0 * spread
+  return np.where(moving, slope, 0.0)
 
 
 class Reduction:
@@ -161,8 +176,8 @@ class Reduction:
   def moments(self, joint: str, body: int) -> list[Surroundings]:
     """Returns what mass and its moments on a body add, per unit.
 
-    In the order 1, x, y, z, xx, yy, zz, xy, xz, yz, each is what a joint's surroundings gain per unit of mass times that monomial of its place in
-    the body's frame.
+    In the order 1, x, y, z, xx, yy, zz, xy, xz, yz: each is what a joint's surroundings gain per
+    unit of mass times that monomial of its place in the body's frame.
     """
     base = self.of_joint(joint)
     reach, added = 0.1, 0.2

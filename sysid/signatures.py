@@ -17,7 +17,7 @@ from sysid.terms import compose
 
 Array = np.ndarray
 
-_SMOOTH_EDGES = 10  # samples at either end whose derivatives are one-sided
+EDGES = 10  # samples at either end whose derivatives are one-sided
 
 
 class TorqueResidual(NamedTuple):
@@ -56,7 +56,7 @@ def torque_residual(problem: Problem, fit: Fit, index: int) -> TorqueResidual:
   demand = (around.inertia + value["armature"]) * log.acceleration
   demand = demand + value["damping"] * log.velocity + gravity + around.bias
   demand = demand + value["stiffness"] * (q - value["reference"]) - value["offset_force"]
-  inner = slice(_SMOOTH_EDGES, -_SMOOTH_EDGES)
+  inner = slice(EDGES, -EDGES)
   fields = (log.time, log.position, log.velocity, torque, torque - demand)
   return TorqueResidual(*(f[inner] for f in fields))
 

@@ -46,24 +46,22 @@ class Term:
   def surroundings(self, plant: JointPlant, x: Array) -> list[Surroundings] | None:
     """Returns what is added to the surroundings, one a log; None for nothing."""
     if self.kind == "payload":
-      return plant.payload(*x)
+      return plant.payload(str(self.target), *map(float, x))
     if self.kind == "gravity_tilt":
-      return plant.tilt(*x)
+      return plant.tilt(float(x[0]), float(x[1]))
     if self.kind == "calibration" and "mass" in self.names:
-      return plant.scaled(float(np.expm1(x[self.names.index("mass")])))
+      return plant.scaled(float(x[self.names.index("mass")]))
     return None
 
   def effect(self, x: Array, intervals: Mapping[str, tuple[float, float]] | None = None) -> Effect:
     """Returns the fitted effect."""
     values = {n: float(v) for n, v in zip(self.names, x, strict=True)} | dict(self.fixed)
     if self.kind == "calibration":
-      factors = {n: float(np.exp(values[n])) for n in values if n not in ("skew", "latency")}
-      bounds = {
-        n: (float(np.exp(a)), float(np.exp(b)))
-        for n, (a, b) in (intervals or {}).items()
-        if n in factors
-      }
+      factors = {n: 1.0 + values[n] for n in values if n not in ("skew", "latency")}
+      bounds = {n: (1.0 + a, 1.0 + b) for n, (a, b) in (intervals or {}).items() if n in factors}
       return Effect("parameter_error", self.target, factors, bounds)
+    known = {p.name for p in kind_of(self.kind).parameters}
+    values = {n: v for n, v in values.items() if n in known}
     return Effect(self.kind, self.target, values, dict(intervals or {}))
 
   def unit(self, name: str, *, slide: bool = False) -> str:
@@ -74,15 +72,23 @@ class Term:
     return units[-1] if slide else units[0]
 
 
+_STIFF = 1e-3 / 0.999  # as suite.effects.friction: impedance 0.999 where an effect adds friction
+
+
+def _stick(plant: JointPlant, p: Array) -> None:
+  """Makes a joint with added dry friction stick, as `suite.effects` does."""
+  p[I["softness"]] = _STIFF * plant.inverse_weight
+
+
 def _nothing(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   """Terms that act on the surroundings alone."""
 
 
 def _calibration(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
-  p[I["damping"]] *= np.exp(v.get("damping", 0.0))
-  p[I["armature"]] *= np.exp(v.get("armature", 0.0))
-  p[I["friction"]] *= np.exp(v.get("friction", 0.0))
-  p[I["gain"]] *= np.exp(v.get("gain", 0.0))
+  p[I["damping"]] *= 1.0 + v.get("damping", 0.0)
+  p[I["armature"]] *= 1.0 + v.get("armature", 0.0)
+  p[I["friction"]] *= 1.0 + v.get("friction", 0.0)
+  p[I["gain"]] *= 1.0 + v.get("gain", 0.0)
   p[I["measurement_delay"]] += v.get("skew", 0.0)
   p[I["effort_delay"]] += v.get("skew", 0.0)
   p[I["command_delay"]] += v.get("latency", 0.0)
@@ -105,6 +111,7 @@ def _setter(*pairs: tuple[str, str]):
 
 
 def _asymmetric(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
   p[I["friction"]] += 0.5 * (v["positive"] + v["negative"])
   p[I["offset_force"]] += 0.5 * (v["negative"] - v["positive"])
 
@@ -126,6 +133,29 @@ def _limit(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["highest"]] = min(p[I["highest"]], v["limit"])
 
 
+def _coulomb(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+  p[I["friction"]] += v["torque"]
+
+
+def _stribeck(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+  p[I["breakaway"]] = v["breakaway"]
+  p[I["stribeck_velocity"]] = v["velocity"]
+
+
+def _load(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+  p[I["load_coefficient"]] = v["coefficient"]
+  p[I["load_kind"]] = v.get("load_kind", 0.0)
+
+
+def _backlash(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["gap"]] = v["gap"]
+  p[I["encoder_on_motor"]] = v["encoder_on_motor"]
+  p[I["friction_on_motor"]] = v.get("friction_on_motor", 0.0)
+
+
 def _late(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["measurement_delay"]] += v["delay"]
 
@@ -135,13 +165,13 @@ _APPLY = {
   "command_delay": _adder(("delay", "command_delay")),
   "measurement_delay": _late,
   "clock_drift": _setter(("rate", "clock_rate")),
-  "coulomb_friction": _adder(("torque", "friction")),
+  "coulomb_friction": _coulomb,
   "viscous_friction": _adder(("coefficient", "damping")),
-  "stribeck_friction": _setter(("breakaway", "breakaway"), ("velocity", "stribeck_velocity")),
-  "load_friction": _setter(("coefficient", "load_coefficient")),
+  "stribeck_friction": _stribeck,
+  "load_friction": _load,
   "asymmetric_friction": _asymmetric,
   "quadratic_drag": _adder(("coefficient", "drag")),
-  "backlash": _setter(("gap", "gap"), ("encoder_on_motor", "encoder_on_motor")),
+  "backlash": _backlash,
   "encoder_offset": _setter(("offset", "encoder_offset")),
   "motor_gain": _gain,
   "torque_limit": _limit,

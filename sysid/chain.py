@@ -1,0 +1,85 @@
+"""One effect felt by several joints: a payload on a body bends every joint on the way to it.
+
+Each joint keeps the calibration that it had; the shared term is fitted to all of them at once.
+"""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from sysid import race
+from sysid.fitting import Fit, Problem
+from sysid.terms import Term
+
+Array = np.ndarray
+
+
+def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
+  """Returns the joints that carry a body, the nearest first."""
+  result = []
+  while body > 0:
+    first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    result += [model.joint(first + i).name for i in range(count)][::-1]
+    body = int(model.body_parentid[body])
+  return result
+
+
+class SharedProblem(Problem):
+  """Several joints with one shared term, each with a calibration of its own.
+
+  Values are those of the shared term, then each joint's calibration.
+  """
+
+  def __init__(self, parts: Sequence[tuple[Problem, Term]]):
+    """Takes each joint's problem and calibration."""
+    self.parts = list(parts)
+    self.plant = parts[0][0].plant
+
+  def residuals(self, terms: Sequence[Term], xs: Array) -> Array:
+    """Returns all joints' residuals [B, R]; the shared term is the first."""
+    xs = np.atleast_2d(xs)
+    count = len(terms[0].names)
+    rows, at = [], count
+    for (problem, _), calibration in zip(self.parts, terms[1:], strict=True):
+      own = xs[:, at : at + len(calibration.names)]
+      at += len(calibration.names)
+      rows.append(problem.residuals((calibration, terms[0]), np.hstack([own, xs[:, :count]])))
+    return np.hstack(rows)
+
+  def simulate(self, terms: Sequence[Term], xs: Array):
+    """Returns the first joint's motion."""
+    xs = np.atleast_2d(xs)
+    count, own = len(terms[0].names), len(terms[1].names)
+    joined = np.hstack([xs[:, count : count + own], xs[:, :count]])
+    return self.parts[0][0].simulate((terms[1], terms[0]), joined)
+
+  def effort_scale(self, outputs) -> float:
+    """Returns the first joint's scale."""
+    return self.parts[0][0].effort_scale(outputs)
+
+  def entries(self, fit: Fit) -> list[race.Entry]:
+    """Returns each joint's entry under a shared fit."""
+    shared, at = fit.terms[0], len(fit.terms[0].names)
+    result = []
+    for (problem, _), calibration in zip(self.parts, fit.terms[1:], strict=True):
+      own = fit.x[at : at + len(calibration.names)]
+      at += len(calibration.names)
+      x = np.concatenate([own, fit.part(0)])
+      result.append(race.entry(problem, Fit((calibration, shared), x, 0.0, 1.0, 0)))
+    return result
+
+
+def share(parts: Sequence[tuple[Problem, Term]], term: Term, start: Array) -> list[race.Entry]:
+  """Fits a term to several joints at once and returns each one's entry.
+
+  Args:
+    parts: each joint's problem and calibration.
+    term: what they share.
+    start: values of the shared term.
+  """
+  problem = SharedProblem(parts)
+  terms = [term, *[calibration for _, calibration in parts]]
+  zeros = [np.array(c.starts[0], float) for _, c in parts]
+  fit = problem.fit(terms, np.concatenate([start, *zeros]), evaluations=25)
+  return problem.entries(fit)

@@ -1,0 +1,114 @@
+"""Reads a joint's ladder of evidence: nothing, constants off, named effects, or unexplained.
+
+All thresholds are in nats of error (see `race`) and were set on healthy and faulty blind sets of
+the development seeds; none was set on the sets that figures are reported of.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from sysid import race
+from sysid.explanation import Ladder
+from sysid.race import Entry
+
+_FRICTION_SPREAD = 4.0  # dry friction varies that much more than other constants before it counts
+
+
+@dataclasses.dataclass(frozen=True)
+class Thresholds:
+  """When a hypothesis is believed."""
+
+  gain: float = 0.15
+  """nats that an effect must gain over the calibrated model; healthy sets gained up to 0.04."""
+  second: float = 0.2
+  """nats that a second effect must gain over one."""
+  margin: float = 0.12
+  """nats within which a runner-up is as good: then the set is confounded."""
+  adequate: float = 1.0
+  """nats above the noise at which a hypothesis is not believed; healthy sets end up to 0.7."""
+  constant: float = 0.05
+  """Relative error of a declared constant at which it is reported."""
+  constants_gain: float = 0.3
+  """nats that calibrated constants must gain over the declared ones."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+  """What is concluded about one joint."""
+
+  verdict: str
+  """none, effects or unexplained."""
+  chosen: Entry
+  """The hypothesis that is put into the model."""
+  named: bool
+  """Whether the chosen hypothesis has effects beside the constants."""
+  constants: bool
+  """Whether the declared constants are off."""
+  alternatives: list[Entry]
+  """Other hypotheses, the best first, one a kind (or set of kinds)."""
+  confounded: list[Entry]
+  """Those that explain as much."""
+
+
+def names(entry: Entry) -> frozenset[str]:
+  """Returns the kinds of a hypothesis beside the constants."""
+  return frozenset(t.kind for t in entry.fit.terms if t.kind != "calibration")
+
+
+def unique(entries: list[Entry]) -> list[Entry]:
+  """Returns the best entry of every set of kinds, in order."""
+  seen: set[frozenset[str]] = set()
+  result = []
+  for entry in entries:
+    if names(entry) not in seen:
+      seen.add(names(entry))
+      result.append(entry)
+  return result
+
+
+def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresholds) -> bool:
+  """Tells whether the declared constants are off by more than machines of a kind differ."""
+  values = entry.fit.values("calibration")
+  factors = {n: v for n, v in values.items() if n not in ("skew", "latency")}
+  limit = {n: thresholds.constant for n in factors}
+  if "friction" in limit:
+    limit["friction"] *= _FRICTION_SPREAD
+  off = any(abs(v) > limit[n] for n, v in factors.items())
+  return off and declared.score - null.score > thresholds.constants_gain
+
+
+def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
+  """Returns what is concluded about a joint."""
+  thresholds = thresholds or Thresholds()
+  singles, pairs = unique(ladder.singles), unique(ladder.pairs)
+  null = ladder.null
+  best = singles[0]
+  others = singles[1:]
+  if pairs and best.score - pairs[0].score > thresholds.second:
+    best, others = pairs[0], [*pairs[1:], *singles]
+  gained = null.score - best.score
+  chosen = best if gained > thresholds.gain else null
+  named = chosen is best
+  constants = constants_off(chosen, ladder.declared, null, thresholds)
+  left = race.above_floor(chosen)
+  confounded = [e for e in others if named and e.score - best.score < thresholds.margin]
+  size = len(names(best))
+  confounded = [e for e in confounded if len(names(e)) <= size]
+  if left > thresholds.adequate:
+    verdict = "unexplained"
+  elif named or constants:
+    verdict = "effects"
+  else:
+    verdict = "none"
+  alternatives = sorted(others if named else [best, *others], key=lambda e: e.score)
+  return Finding(verdict, chosen, named, constants, alternatives, confounded)
+
+
+def evidence(entry: Entry, ladder: Ladder) -> dict[str, float]:
+  """Returns a hypothesis's evidence as numbers."""
+  return {
+    "gain_over_constants_nats": round(float(ladder.null.score - entry.score), 4),
+    "gain_over_declared_nats": round(float(ladder.declared.score - entry.score), 4),
+    "position_rms_in_noise": round(float(np.sqrt(np.mean(entry.levels[:, 0] ** 2))), 3),
+  }

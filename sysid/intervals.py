@@ -1,0 +1,73 @@
+"""How sure the values of a fit are: a sandwich estimate that allows for correlated residuals.
+
+    covariance = H^-1 (sum over blocks of g g') H^-1,  H = J'J,  g = J_b' r_b
+
+with blocks much longer than the residuals' memory (White 1980; block form as in Liang and Zeger
+1986), widened by a systematic share: a model that is slightly wrong moves its values by more than
+noise does. Shapes: n values, R residuals of a block.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sysid.fitting import Fit, Problem
+
+Array = np.ndarray
+
+BLOCK_S = 1.0  # s
+SYSTEMATIC = 1.6  # factor on standard deviations; ours, set on blind sets to cover 95 %
+_Z = 1.96
+
+
+def covariance(problem: Problem, fit: Fit) -> Array:
+  """Returns the covariance [n, n] of a fit's values."""
+  terms = fit.terms
+  scale = np.concatenate([np.zeros(0), *[t.scale for t in terms]])
+  low = np.concatenate([np.zeros(0), *[t.low for t in terms]])
+  high = np.concatenate([np.zeros(0), *[t.high for t in terms]])
+  steps = np.where(fit.x + 0.02 * scale > high, -0.02, 0.02) * scale
+  rows = problem.residuals(terms, np.vstack([fit.x, fit.x + np.diag(steps)]))
+  residual, jacobian = rows[0], (rows[1:] - rows[0]) / steps[:, None]
+  priors = sum(len(t.prior) for t in terms)
+  normal = jacobian @ jacobian.T
+  fixed = (fit.x <= low + 1e-9 * scale) & (jacobian @ residual > 0)
+  free = ~(fixed | (np.diag(normal) <= 0))
+  meat = np.zeros_like(normal)
+  for block in _blocks(problem, len(residual) - priors):
+    g = jacobian[:, block] @ residual[block]
+    meat += np.outer(g, g)
+  tail = jacobian[:, len(residual) - priors :]  # a prior of standard deviation s has J'J = 1/s^2
+  meat += tail @ tail.T
+  result = np.zeros_like(normal)
+  index = np.ix_(free, free)
+  inverse = np.linalg.pinv(normal[index], rcond=1e-12)
+  result[index] = inverse @ meat[index] @ inverse
+  return result
+
+
+def _blocks(problem: Problem, count: int) -> Sequence[Array]:
+  """Returns index arrays of residuals that belong to the same second of the same log."""
+  labels, offset = [], 0
+  for log, mask in zip(problem.plant.logs, problem.masks, strict=True):
+    block = np.floor((log.time[mask] - log.time[0]) / BLOCK_S).astype(int) + offset
+    offset = int(block.max(initial=offset)) + 1
+    labels += [block] if problem.channel == "none" else [block, block]
+  joined = np.concatenate(labels)
+  assert len(joined) == count
+  order = np.argsort(joined, kind="stable")
+  return np.split(order, np.flatnonzero(np.diff(joined[order])) + 1)
+
+
+def intervals(problem: Problem, fit: Fit, kind: str) -> dict[str, tuple[float, float]]:
+  """Returns 95 % intervals of the values of the term of a kind."""
+  spread = np.sqrt(np.maximum(np.diag(covariance(problem, fit)), 0.0)) * SYSTEMATIC * _Z
+  result, at = {}, 0
+  for term in fit.terms:
+    if term.kind == kind:
+      for i, name in enumerate(term.names):
+        value = float(fit.x[at + i])
+        low, high = value - spread[at + i], value + spread[at + i]
+        result[name] = (float(max(low, term.low[i])), float(high))
+    at += len(term.names)
+  return result
