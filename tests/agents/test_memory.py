@@ -18,7 +18,7 @@ def test_recurrent_policy_remembers_the_cue(tmp_path):
   run = tmp_path / "run"
   process = start(
     run, "--env", "agents:cue", "--preset", "vision_small", "--actors", "1",
-    "--max-env-steps", "40000", "--evaluation-period", "4000", "--evaluation-episodes", "20",
+    "--max-env-steps", "8000", "--evaluation-period", "1000", "--evaluation-episodes", "20",
   )  # fmt: skip
   finish(process, timeout=MINUTES * 60, run=run)
   exported = load_policy(run / "policy" / "best")
