@@ -113,7 +113,7 @@ def draw(
 
   for value in _ticks(low, high):
     cv2.line(picture, place((0, value)), place((right, value)), (225, 225, 225), 1)
-    write(f"{value:g}", (8, place((0, value))[1] + 5), GREY, 0.45)
+    write(f"{value + 0.0:g}", (8, place((0, value))[1] + 5), GREY, 0.45)
   for value in _ticks(0, right):
     column = place((value, low))[0]
     cv2.line(picture, (column, TOP), (column, HEIGHT - BOTTOM), (235, 235, 235), 1)
