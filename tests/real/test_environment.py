@@ -51,7 +51,8 @@ def test_observations_and_actions_are_the_simulations(robot, quick, picture, tas
       assert value.dtype == simulated_step.observation[name].dtype
 
 
-def test_an_episode_of_standing(robot, load):
+def test_an_episode_of_standing(robot, load, caplog):
+  caplog.set_level("INFO", "real.environment")
   environment = load(time_limit=1.0)
   assert not robot.body.motors.enabled.any()  # nothing moves before reset
   timestep = environment.reset()
@@ -63,6 +64,8 @@ def test_an_episode_of_standing(robot, load):
     timestep = environment.step(environment.standing_action)
     steps += 1
   assert steps == 40 and timestep.discount == 1.0
+  for measured in ("time limit", "observation to goal", "imu age", "joint age", "read skew"):
+    assert measured in caplog.text
   assert robot.clock.now() - start == pytest.approx(1.0, abs=0.004)
   truth = robot.truth()
   assert truth.position[2] == pytest.approx(standing_posture()[2], abs=0.005)
