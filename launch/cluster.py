@@ -33,6 +33,7 @@ _REFUSED = 2  # exit status of a process whose arguments are wrong: another star
 _MAX_RESTARTS = 5  # of one process within _RESTART_WINDOW
 _RESTART_WINDOW = 120.0  # s
 _POLL = 2.0  # s
+_JOIN_TIMEOUT = 1800.0  # s; the learner may wait for a free machine, and builds its networks
 _END_TIMEOUT = 90.0  # s for a checkpoint at the end
 _LEARNER, _ACTOR = "learner", "actor"  # the users of a run
 
@@ -134,12 +135,15 @@ class Cluster:
        "resources": resource},
     )  # fmt: skip
     files = files | {"login": f"{_ACTOR}:{passwords[_ACTOR]}\n"}
+    wait = ["--wait", str(_JOIN_TIMEOUT)]
     needs = {"num_cpus": arguments.actor_cpus, "scheduling_strategy": "SPREAD"}
     self.others = [
-      Placed(f"actor-{i}", "actor.py", [*common, "--index", str(i)], files, needs)
+      Placed(f"actor-{i}", "actor.py", [*common, *wait, "--index", str(i)], files, needs)
       for i in range(arguments.actors)
     ]
-    self.others.append(Placed("evaluator", "actor.py", [*common, "--evaluate"], files, needs))
+    self.others.append(
+      Placed("evaluator", "actor.py", [*common, *wait, "--evaluate"], files, needs)
+    )
 
   def place(self, placed: Placed) -> None:
     """Asks Ray for a machine and starts the process there, when one is free."""

@@ -32,6 +32,7 @@ _LAUNCH = Path(__file__).resolve().parent
 _MAX_RESTARTS = 5  # of one process within _RESTART_WINDOW
 _RESTART_WINDOW = 60.0  # s
 _REFUSED = 2  # exit status of a process whose arguments are wrong: another start would not help
+_JOIN_TIMEOUT = 1800.0  # s; on a starved machine the learner takes minutes to build its networks
 _END_TIMEOUT = 60.0  # s for a checkpoint at the end
 
 
@@ -91,7 +92,7 @@ class Supervisor:
     first = [*learner, "--resume"] if arguments.resume else learner
     self.learner = Child("learner", first, run / "logs" / "learner.log")
     actor = [python, str(_LAUNCH / "actor.py"), "--connect", self.endpoint, "--login", str(login),
-             "--seed", str(arguments.seed)]  # fmt: skip
+             "--seed", str(arguments.seed), "--wait", str(_JOIN_TIMEOUT)]  # fmt: skip
     self.others = [
       Child(f"actor-{i}", [*actor, "--index", str(i)], run / "logs" / f"actor-{i}.log")
       for i in range(arguments.actors)
