@@ -35,7 +35,7 @@ class ConvexSettings:
   cell: float = 1.0  # the solid is cut into cubes of this size before anything else
   tolerance: float = 0.035  # a part may reach this far into seen free space
   doubt: float = 0.3  # unseen space this near to seen free space counts as free too
-  max_parts: int = 240  # tolerance grows until the merged parts are this few
+  max_parts: int = 400  # tolerance grows until the merged parts are this few
   method: str = "split"  # "split": cuts along the axes, ours; "coacd": CoACD in each cell
   max_faces: int = 1500  # of a cell's mesh given to CoACD
   max_vertices: int = 48  # of a part; MuJoCo's contact cost grows with it

@@ -73,6 +73,7 @@ class FusedTrainer:
     self._levels = [
       [level for level in range(field.levels) if level % threads == t] for t in range(threads)
     ]
+    self._last_known_step = settings.last_known_step(uneven=views.uneven)
     self._sweep = 0
     self._coarseness = 1 if initial else _COARSEST  # the march's step in units of the field's
 
@@ -100,7 +101,7 @@ class FusedTrainer:
     kernel = engine.kernel._replace(step=np.float32(engine.settings.march_step * self._coarseness))
     if self.steps_done < settings.occupancy_start:
       kernel = kernel._replace(depth_limit=np.float32(1e9))
-    if self.steps_done >= settings.known_steps:
+    if self.steps_done >= self._last_known_step:
       kernel = kernel._replace(anchor_fraction=np.float32(0), empty_samples=0)
     distortion = settings.distortion_weight * settings.distortion_ramp(self.steps_done)
     kernel = kernel._replace(distortion=np.float32(distortion))

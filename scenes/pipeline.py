@@ -229,7 +229,7 @@ class Job:
     seen = photometry.point_colors(model, found.names, pictures)
     gains = photometry.picture_gains(*seen, count=len(images))
     known = anchors.known_points(model, found.names, found.world_from_camera, camera=camera)
-    return Views(camera, pictures, found.world_from_camera, found.names, gains, known)
+    return Views(camera, pictures, found.world_from_camera, found.names, gains, anchors=known)
 
   def train(self) -> None:
     """Trains the field on all views that are not held out."""

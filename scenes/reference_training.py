@@ -186,7 +186,7 @@ def _look_up(level: jax.Array, factor: jax.Array, image, x, y) -> jax.Array:
 
 
 def draw_rays(
-  pictures: Pictures, settings: TrainSettings, key: jax.Array, *, step: jax.Array | int = 0
+  pictures: Pictures, settings: TrainSettings, key: jax.Array, *, known: jax.Array | bool = True
 ) -> Rays:
   """Draws pixels and blurs, and reads the blurred colours by mixing neighbouring levels."""
   keys = jax.random.split(key, 7)
@@ -197,15 +197,15 @@ def draw_rays(
   blurred = jax.random.uniform(keys[3], (count,)) >= settings.blur_sharp_fraction
   blur = settings.blur_max * jax.random.uniform(keys[4], (count,)) ** settings.blur_power
   blur = jnp.where(blurred, blur, 0.0)
-  known = jnp.zeros(count)
+  distances = jnp.zeros(count)
   if len(pictures.anchors):
     chosen = pictures.anchors[jax.random.randint(keys[5], (count,), 0, len(pictures.anchors))]
-    fraction = jnp.where(step < settings.known_steps, settings.anchor_fraction, 0.0)
+    fraction = jnp.where(known, settings.anchor_fraction, 0.0)
     use = jax.random.uniform(keys[6], (count,)) < fraction
     image = jnp.where(use, chosen[:, 0].astype(jnp.int32), image)
     x = jnp.where(use, chosen[:, 1].astype(jnp.int32), x)
     y = jnp.where(use, chosen[:, 2].astype(jnp.int32), y)
-    blur, known = jnp.where(use, 0.0, blur), jnp.where(use, chosen[:, 3], 0.0)
+    blur, distances = jnp.where(use, 0.0, blur), jnp.where(use, chosen[:, 3], 0.0)
   targets = _look_up(pictures.levels[0], pictures.factors[0], image, x, y)
   for k in range(1, len(pictures.levels)):
     low, high = pictures.blurs[k - 1], pictures.blurs[k]
@@ -216,7 +216,7 @@ def draw_rays(
   directions = jnp.einsum("rij,rj->ri", rotation, pictures.directions[y, x])
   directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
   footprints = encoding.blur_footprint(blur, rule=settings.field.footprint_rule)
-  return Rays(pictures.poses[image, :, 3], directions, targets, footprints, known)
+  return Rays(pictures.poses[image, :, 3], directions, targets, footprints, distances)
 
 
 def loss_of_rays(
@@ -267,6 +267,7 @@ class ReferenceTrainer:
     self.samples_done = 0
     self.rays_done = 0
     self._seed = seed
+    self._last_known_step = settings.last_known_step(uneven=views.uneven)
     self._pictures = make_pictures(views, blur_max=settings.blur_max)
     field_key, proposal_key = jax.random.split(jax.random.PRNGKey(seed))
     params: Params = {
@@ -292,11 +293,12 @@ class ReferenceTrainer:
 
   def _make_step(self):
     settings, optimizer, pixel_angle = self.settings, self._optimizer, self.pixel_angle
+    last_known = self._last_known_step
 
     def step(state: State, pictures: Pictures, learning_rate: jax.Array):
       key = jax.random.fold_in(jax.random.PRNGKey(self._seed), state.step)
       draw_key, loss_key = jax.random.split(key)
-      rays = draw_rays(pictures, settings, draw_key, step=state.step)
+      rays = draw_rays(pictures, settings, draw_key, known=state.step < last_known)
       gradient, metrics = jax.grad(loss_of_rays, has_aux=True)(
         state.params, settings, loss_key, rays, pixel_angle=pixel_angle
       )

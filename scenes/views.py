@@ -25,6 +25,7 @@ class Views:
   world_from_camera: np.ndarray  # float64 [N, 4, 4], OpenCV camera axes
   names: tuple[str, ...]
   gains: np.ndarray | None = None  # float64 [N, 3]: exposure of each picture; None: all 1
+  uneven: bool = False  # whether the exposure changed, also where it was evened out since
   anchors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.float32))
   """Known points [A, 4]: picture, pixel x and y, distance along the pixel's ray [unit]."""
 
@@ -60,7 +61,7 @@ class Views:
     anchors = anchors[anchors[:, 0] >= 0]
     poses = self.world_from_camera[indices]
     gains = None if self.gains is None else self.gains[indices]
-    return Views(self.camera, self.images[indices], poses, names, gains, anchors)
+    return Views(self.camera, self.images[indices], poses, names, gains, self.uneven, anchors)
 
   def evened(self) -> "Views":
     """Returns the pictures as they would be with one exposure, see `scenes.photometry`."""
@@ -68,7 +69,8 @@ class Views:
       return self
     pairs = zip(self.images, self.gains, strict=True)
     images = np.stack([photometry.even_out(image, gain) for image, gain in pairs])
-    return dataclasses.replace(self, images=images, gains=None)
+    uneven = bool(np.any(self.gains != 1))
+    return dataclasses.replace(self, images=images, gains=None, uneven=uneven)
 
   def split(self, every: int = 8) -> tuple["Views", "Views"]:
     """Returns (training, held out): one of `every` pictures is held out, as LLFF does."""

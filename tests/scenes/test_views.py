@@ -77,4 +77,4 @@ def test_evening_out_divides_by_the_gain():
   evened = doubled.evened()
   np.testing.assert_array_equal(evened.images[0], views.images[0] // 4)
   np.testing.assert_array_equal(evened.images[1], (views.images[1] // 4) * 2)
-  assert evened.gains is None
+  assert evened.gains is None and evened.uneven and evened.select([0]).uneven
