@@ -157,7 +157,7 @@ def make_intruder(perturbation: str, scene: Any, *, keep_clear: np.ndarray) -> I
   if perturbation == MOVED_OBJECT:
     return Intruder(_STOOL, middle, speed=0.0)
   # The person crosses the room through that place along the longer free direction.
-  free = {tuple(np.round(point, 3)) for point in points}
+  free = {tuple(np.round(point, 3)) for point in points[away > _CLEAR]}
   lines = []
   for direction in ((0.1, 0.0), (0.0, 0.1)):
     ends = []

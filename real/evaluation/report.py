@@ -123,7 +123,7 @@ def _beliefs(found: Sequence[Episode], floor: maps.Map, draw_belief: DrawBelief)
         picture = heat if seen is None else np.concatenate([seen, heat])
         text = f"episode {episode.index + 1} ({episode.outcome}), {moment.time:.1f} s"
         cells.append(parts.picture(picture, text))
-      cells += [""] * (_MOMENTS - len(shown))
+      cells += ["<div></div>"] * (_MOMENTS - len(shown))
     blocks.append(f"<p>{title}</p>" + parts.grid(cells, _MOMENTS))
   if not blocks:
     return ""
