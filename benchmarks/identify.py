@@ -47,6 +47,8 @@ class Settings:
   """Sets analysed at the same time, each on one core."""
   timeout: float = 900.0
   """s that one analysis may take; longer is a failure."""
+  done_only: bool = False
+  """Analyse nothing: score what was analysed so far."""
   redo: bool = False
   """Analyse again what was analysed."""
   name: str = "identify"
@@ -70,6 +72,10 @@ def main(settings: Settings) -> None:
   if unknown:
     raise ValueError(f"Found no sets {unknown} in {settings.sets}, expected some of its answers.")
   names = [name for name in answers if not settings.only or name in settings.only]
+  if settings.done_only:
+    names = [name for name in names if (settings.out / name / "harness.json").is_file()]
+    if not names:
+      raise ValueError(f"Found no analysed set in {settings.out}, run without --done-only first.")
   rows: list[dict[str, Any]] = []
   with concurrent.futures.ThreadPoolExecutor(settings.processes) as pool:
     futures = {pool.submit(_analyse, settings, name): name for name in names}
@@ -143,7 +149,7 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any], settings: Settin
     "# The analyser on blind sets",
     "",
     f"`python benchmarks/identify.py`, {datetime.date.today()}, {platform.machine()}, "
-    f"{os.cpu_count()} cores. {len(rows)} sets of seeds "
+    f"{os.cpu_count()} cores. {len(rows)} of {len(answers)} sets of seeds "
     f"{', '.join(sorted({name.split('_')[0] for name in answers}))}: "
     + ", ".join(f"{n} {mix}" for mix, n in mixes.items())
     + "; "
@@ -160,11 +166,13 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any], settings: Settin
     met = {True: "yes", False: "no", None: "-"}[figure.met]
     lines.append(f"| {figure.question} | {value} | {figure.of} | {figure.target} | {met} |")
   for plant in plants:
-    seconds = sorted(r["used"]["wall_s"] for r in rows if r["plant"] == plant)
-    lines.append(
-      f"| {plant}: seconds a set, median (most {seconds[-1]:.0f}) "
-      f"| {seconds[len(seconds) // 2]:.0f} | {len(seconds)} | - | - |"
-    )
+    for key, words in (("wall_s", "seconds"), ("cpu_s", "processor seconds")):
+      used = sorted(r["used"][key] for r in rows if r["plant"] == plant and key in r["used"])
+      if used:
+        lines.append(
+          f"| {plant}: {words} a set, median (most {used[-1]:.0f}) | {used[len(used) // 2]:.0f} "
+          f"| {len(used)} | - | - |"
+        )
   lines += ["", "## What was said of what", "", "| set | is | said | right |", "|---|---|---|---|"]
   for row in rows:
     s = row["score"]

@@ -154,7 +154,7 @@ def test_the_harness_scores_kept_reports(tmp_path):
   subprocess.run(
     [
       sys.executable, str(root / "benchmarks/identify.py"), "--sets", str(tmp_path / "sets"),
-      "--out", str(tmp_path / "out"), "--results", str(tmp_path),
+      "--out", str(tmp_path / "out"), "--results", str(tmp_path), "--done-only",
     ],
     check=True, capture_output=True, timeout=60,
   )  # fmt: skip
