@@ -173,7 +173,7 @@ class Job:
     return self.stages.results[stage].folder
 
   def _keys(self, *names: str) -> dict[str, str]:
-    return {name: self.stages.results[name].key for name in names}
+    return {name: self.stages.results[name].made for name in names}
 
   def load(self, stage: str, file: str) -> dict[str, Any]:
     return json.loads((self.folder(stage) / file).read_text())

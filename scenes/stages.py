@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,7 @@ class StageResult:
 
   folder: Path  # what the stage wrote
   key: str  # hash of its name, settings and inputs
+  made: str  # drawn when it was made: two runs of equal settings may differ, as training does
   seconds: float  # how long it took, summed over interrupted runs
   cached: bool  # True where an earlier run had done it
 
@@ -107,7 +109,7 @@ class Stages:
       function: Writes the result into the folder given; may find what an interrupted run of the
         same key left there, and may continue from it.
       settings: Whatever the result depends on; a dataclass or plain values.
-      inputs: Keys of the stages or files that the result depends on.
+      inputs: Hashes of the files, and `made` of the stages, that the result depends on.
       version: Raised when the stage's code changes what it writes.
 
     Returns:
@@ -126,7 +128,8 @@ class Stages:
     final = self.folder / name
     record = self._read_record(final)
     if record.get("key") == key:
-      result = StageResult(final, key, float(record["seconds"]), cached=True)
+      made = str(record.get("made", key))
+      result = StageResult(final, key, made, float(record["seconds"]), cached=True)
       self.results[name] = result
       with self._bar(name) as report:
         report(1.0, "done before")
@@ -154,11 +157,12 @@ class Stages:
       seconds = earlier + time.monotonic() - start
       with contextlib.suppress(OSError):  # a full disk must not hide the error that is under way
         self._write_record(work, {"seconds": seconds})
-    self._write_record(work, {"key": key, "seconds": seconds, **description})
+    made = uuid.uuid4().hex
+    self._write_record(work, {"key": key, "made": made, "seconds": seconds, **description})
     if final.exists():
       shutil.rmtree(final)
     work.rename(final)
-    result = StageResult(final, key, seconds, cached=False)
+    result = StageResult(final, key, made, seconds, cached=False)
     self.results[name] = result
     return result
 

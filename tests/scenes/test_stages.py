@@ -1,6 +1,7 @@
 """Stages are cached by what went in, resume, and never leave half of a result."""
 
 import errno
+import shutil
 
 import pytest
 
@@ -95,3 +96,13 @@ def test_atomic_write_keeps_the_old_file_on_failure(tmp_path, monkeypatch):
   with pytest.raises(ZeroDivisionError):
     write_atomically(target, "new")
   assert target.read_text() == "old"
+
+
+def test_a_stage_made_again_is_another_one(tmp_path):
+  """What depends on a stage whose folder was deleted must not be taken for up to date."""
+  first = make(tmp_path).run("a", write_number(1, []), settings=1, inputs={})
+  cached = make(tmp_path).run("a", write_number(1, []), settings=1, inputs={})
+  shutil.rmtree(first.folder)
+  again = make(tmp_path).run("a", write_number(1, []), settings=1, inputs={})
+  assert cached.made == first.made
+  assert again.key == first.key and again.made != first.made
