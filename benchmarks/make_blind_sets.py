@@ -65,7 +65,7 @@ def main(settings: Settings) -> None:
       print(
         f"{name}: {answer['plant']}, {kinds}; "
         f"held-out error {1e3 * answer['held_error']:.1f} mrad, "
-        f"{answer['error_ratio']:.1f} times the healthy machine's; {seconds:.1f} s",
+        f"{answer['error_ratio']:.1f} times the floor; {seconds:.1f} s",
         flush=True,
       )
 
