@@ -20,6 +20,10 @@ LATENCY = 0.006
 
 _INF = float("inf")
 
+_GAIN_SPREAD = 0.3
+"""Of the other constants' spread; ours: a servo's law is set by registers and a data sheet, while
+its friction and inertia are estimates."""
+
 
 def calibration(plant: JointPlant, *, prior: float = 0.06) -> Term:
   """Returns the null model: declared constants off by factors, and small latencies.
@@ -37,7 +41,7 @@ def calibration(plant: JointPlant, *, prior: float = 0.06) -> Term:
     ("armature", p[INDEX["armature"]] > 0.2 * inertia, 0.2, prior),
     ("mass", p[INDEX["armature"]] <= 0.2 * inertia, 0.2, prior),
     ("friction", p[INDEX["friction"]] > 0, 0.4, 2.5 * prior),
-    ("gain", True, 0.15, prior),
+    ("gain", True, 0.15, _GAIN_SPREAD * prior),
   ):
     if present:
       names.append(name)
@@ -82,7 +86,7 @@ def library(plant: JointPlant) -> list[Term]:
     *(
       dataclasses.replace(
         _one("load_friction", joint, "coefficient", 0.0, 0.8, 0.1, (0.1, 0.3)),
-        fixed=(("load_kind", float(kind)),),
+        fixed=(("carried", float(kind)),),
       )
       for kind in (0, 1, 2)  # the actuator's torque, less its damping, what the link takes
     ),

@@ -12,6 +12,13 @@ from sysid import race
 from sysid.explanation import Ladder
 from sysid.race import Entry
 
+_TIE = 0.03  # nats within which the usual kind is named rather than the rare one
+_USUAL = (
+  *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
+  *("gravity_tilt", "encoder_offset", "spring"),
+)
+"""Kinds in the order in which they are named where logs cannot tell them apart; ours: a late command
+is more usual than a late reading."""
 _FRICTION_SPREAD = 4.0  # dry friction varies that much more than other constants before it counts
 
 
@@ -67,6 +74,16 @@ def unique(entries: list[Entry]) -> list[Entry]:
   return result
 
 
+def usual_first(entries: list[Entry]) -> list[Entry]:
+  """Returns entries with the most usual kind of those that tie with the best one first."""
+  ties = [e for e in entries if e.score - entries[0].score < _TIE]
+  order = {kind: index for index, kind in enumerate(_USUAL)}
+  size = min(len(e.fit.x) for e in ties)
+  ties = [e for e in ties if len(e.fit.x) <= size + 1]
+  first = min(ties, key=lambda e: min(order.get(k, len(order)) for k in names(e)))
+  return [first, *[e for e in entries if e is not first]]
+
+
 def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresholds) -> bool:
   """Tells whether the declared constants are off by more than machines of a kind differ."""
   values = entry.fit.values("calibration")
@@ -81,7 +98,7 @@ def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresh
 def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   """Returns what is concluded about a joint."""
   thresholds = thresholds or Thresholds()
-  singles, pairs = unique(ladder.singles), unique(ladder.pairs)
+  singles, pairs = usual_first(unique(ladder.singles)), unique(ladder.pairs)
   null = ladder.null
   best = singles[0]
   others = singles[1:]

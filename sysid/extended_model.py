@@ -14,6 +14,8 @@ import numpy as np
 from suite.effects import Effect
 from suite.effects.passive import rotation_matrix
 
+_POINT = 1e-4  # m, radius of a payload: no inertia of its own
+
 EXPRESSED = (
   *("parameter_error", "coulomb_friction", "viscous_friction", "quadratic_drag", "motor_gain"),
   *("torque_limit", "encoder_offset", "payload", "spring", "gravity_tilt"),
@@ -53,10 +55,14 @@ def _put(spec: mujoco.MjSpec, effect: Effect) -> None:
     return
   if effect.kind == "payload":
     body = spec.body(effect.target) or _joint(spec, effect).parent
-    added = body.add_body(name=f"payload_on_{body.name}", pos=[value[a] for a in "xyz"])
-    added.mass = value["mass"]
-    added.explicitinertial = True
-    added.inertia = np.full(3, 1e-9)
+    carrier = body.add_body(name=f"payload_on_{body.name}", pos=[value[a] for a in "xyz"])
+    carrier.add_geom(
+      type=mujoco.mjtGeom.mjGEOM_SPHERE,
+      size=[_POINT, 0, 0],
+      mass=value["mass"],
+      contype=0,
+      conaffinity=0,
+    )
     return
   joints = [_joint(spec, effect)] if effect.target is not None else list(spec.joints)
   for joint in joints:
@@ -112,7 +118,10 @@ def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float
       own = float(np.ravel(joint.stiffness)[0])
       total = own + value["stiffness"]
       if total > 0:
-        joint.springref = (own * joint.springref + value["stiffness"] * value["reference"]) / total
+        turned = joint.type == mujoco.mjtJoint.mjJNT_HINGE and spec.compiler.degree
+        unit = np.degrees(1.0) if turned else 1.0  # a spec keeps the file's unit of angle
+        added = value["stiffness"] * value["reference"] * unit
+        joint.springref = (own * joint.springref + added) / total
       joint.stiffness = _first_plus(joint.stiffness, value["stiffness"], 0)
 
 

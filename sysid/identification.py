@@ -26,6 +26,12 @@ from sysid.terms import Term
 
 Array = np.ndarray
 
+_RELATIVE = {"friction": 2.5, "gain": 0.3}
+"""Spread of a constant over that of the others, as `candidates.calibration` has it."""
+
+_NO_LATENCY = 2e-4
+"""s; spread of latencies beside a delay, from which they cannot be told."""
+
 COMMON = ("clock_drift", "supply_sag", "gravity_tilt")
 """Kinds that have no target: they concern all joints or none."""
 
@@ -214,9 +220,15 @@ def _polished(item: Found, spread: float) -> Entry:
   terms = list(entry.fit.terms)
   if not terms[0].centre:  # not fixed by reference logs
     prior = tuple(
-      p if n in ("skew", "latency") else (2.5 if n == "friction" else 1.0) * spread
+      p if n in ("skew", "latency") else _RELATIVE.get(n, 1.0) * spread
       for n, p in zip(terms[0].names, terms[0].prior, strict=True)
     )
+    late = {"command_delay", "measurement_delay"} & decision.names(entry)
+    if late:  # a delay takes in what latency there is beside it
+      prior = tuple(
+        _NO_LATENCY if n in ("skew", "latency") else p
+        for n, p in zip(terms[0].names, prior, strict=True)
+      )
     terms[0] = dataclasses.replace(terms[0], prior=prior)
   problem = item.screened.problem
   as_declared = entry.fit.x.copy()

@@ -2,15 +2,16 @@
 
 Naming an effect takes tens of thousands of roll-outs. Stepping `suite.effects.EffectStack` from
 Python costs about 10 us a step, this kernel 20 ns. It is the same physics for one hinge or slide
-joint whose surroundings are prescribed (`reduction`); a test compares the two for every kind. Whatever is reported at the end is simulated by MuJoCo itself.
+joint whose surroundings are prescribed (`reduction`); a test compares the two for every kind.
+Whatever is reported at the end is simulated by MuJoCo itself.
 
     (I(t) + armature) dv/dt = torque - damping v - drag |v| v - k (q - q_ref) - gravity(t, q) - c(t)
                               - friction
 
 The scheme is MuJoCo's `implicitfast`: forces at the old position, damping implicit, then the new
-speed moves the position. A scheme of higher order would be nearer to the machine, but constants that
-are fitted with it would not fit MuJoCo. Dry friction is MuJoCo's constraint, solved in closed form
-for its one row: f = -(a_free + b v) / (1/m + R), at most F.
+speed moves the position. A scheme of higher order would be nearer to the machine, but constants
+that are fitted with it would not fit MuJoCo. Dry friction is MuJoCo's constraint, solved in closed
+form for its one row: f = -(a_free + b v) / (1/m + R), at most F.
 
 Shapes: C commands, S samples, T grid points, W windows.
 """
@@ -183,9 +184,10 @@ def simulate(
       while pointer + 1 < command_time.size and command_time[pointer + 1] <= reach:
         pointer += 1
       u = command[pointer]
+      later, share = u, 0.0
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + step:
         share = (reach + step - command_time[pointer + 1]) / step
-        u += share * (command[pointer + 1] - u)
+        later = command[pointer + 1]
       i = min(n, last)
       seen_v = motor_speed if apart else v
       seen_q = q + encoder
@@ -199,8 +201,11 @@ def simulate(
       if droop > 0.0 or fade != 0.0:
         supply = 1.0 - droop * (abs(before) + load[i]) - fade * time
         strength *= max(supply, _LEAST_STRENGTH)
-      torque = strength * (slope * u + constant + per_q * seen_q + per_v * seen_v)
-      torque = min(max(torque, lowest), highest)
+      rest = constant + per_q * seen_q + per_v * seen_v
+      torque = min(max(strength * (slope * u + rest), lowest), highest)
+      if share > 0.0:  # limits first: a mean of commands would lose the moment of a large jump
+        other = min(max(strength * (slope * later + rest), lowest), highest)
+        torque += share * (other - torque)
       coming = 0.0
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + 3.0 * step:
         coming = abs(strength * slope * (command[pointer + 1] - command[pointer]))
@@ -228,9 +233,9 @@ def simulate(
         ratio = v / stribeck
         limit += breakaway * math.exp(-ratio * ratio)
       if load_share > 0.0:
-        carried = torque
+        carried = before  # of the last step, as suite.effects
         if load_kind == 1:
-          carried = torque - damping * v
+          carried = before - damping * v
         elif load_kind == 2:
           carried = demand + bias[i] + inertia[i] * acceleration
         limit += load_share * abs(carried)
@@ -288,5 +293,5 @@ def simulate(
       v = speed
       time = ahead
       n += 1
-    for rest in range(e, end):
-      out_torque[rest] = torque
+    for index in range(e, end):
+      out_torque[index] = torque

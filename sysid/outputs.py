@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from suite.effects import Effect, read_effects, write_effects
-from sysid import decision, evaluation, excitation, extended_model, report
+from sysid import decision, detection, evaluation, excitation, extended_model, report
 from sysid.evaluation import Clocks
 from sysid.identification import Found, Identified, Settings, analyse, load_model, read_logs
 from sysid.logs import Log
@@ -77,6 +77,11 @@ def identify(
       {"kind": "residual_force", "joint": e.target, "parameters": {}, "evidence": {}}
       for e in found.learned
     ]
+  first = found.found[0]
+  content["tests"] = {
+    "declared": detection.tests(first.screened.problem, first.ladder.declared.fit),
+    "extended": detection.tests(first.screened.problem, first.finding.chosen.fit),
+  }
   content["audit"] = found.audits
   content["model"] = str(Path(model).resolve())
   content["calibration"] = {

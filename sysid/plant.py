@@ -212,6 +212,7 @@ class JointPlant:
     self.declared = declared_parameters(model, joint)
     self.holds = holds_position(model, actuator_of(model, joint))
     index = model.joint(joint).id
+    self.impedance = float(model.dof_solimp[model.jnt_dofadr[index], 1])
     self.inverse_weight = float(model.dof_invweight0[model.jnt_dofadr[index]])
     self.hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
     self.logs = [

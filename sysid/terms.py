@@ -78,6 +78,7 @@ _STIFF = 1e-3 / 0.999  # as suite.effects.friction: impedance 0.999 where an eff
 def _stick(plant: JointPlant, p: Array) -> None:
   """Makes a joint with added dry friction stick, as `suite.effects` does."""
   p[I["softness"]] = _STIFF * plant.inverse_weight
+  p[I["stopping_rate"]] *= plant.impedance / 0.999
 
 
 def _nothing(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
@@ -147,7 +148,7 @@ def _stribeck(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
 def _load(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   _stick(plant, p)
   p[I["load_coefficient"]] = v["coefficient"]
-  p[I["load_kind"]] = v.get("load_kind", 0.0)
+  p[I["load_kind"]] = v.get("carried", 0.0)
 
 
 def _backlash(plant: JointPlant, p: Array, v: dict[str, float]) -> None:

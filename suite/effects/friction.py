@@ -63,15 +63,29 @@ class StribeckFriction(Operator):
 class LoadFriction(Operator):
   """Dry friction in proportion to the torque that the gear transmits: coefficient * |torque|.
 
-  The torque is the actuators', of the last step.
+  The torque is that of the last step; which one loads the gear is `carried`: 0 the actuators', 1
+  that less the joint's damping (back-EMF: what is left is the current's), 2 what the link takes,
+  which is also less what the rotor's own inertia needs.
   """
 
   def bind(self, binding: Binding) -> None:
-    self._coefficient = self.per_joint(binding)["coefficient"]
+    parameters = self.per_joint(binding)
+    self._coefficient = parameters["coefficient"]
+    self._damped = parameters["carried"] == 1
+    self._linked = parameters["carried"] == 2
     _stick(binding, self._coefficient)
 
   def step(self, binding: Binding) -> None:
-    load = np.abs(binding.data.qfrc_actuator[binding.dofs])
+    data, dofs = binding.data, binding.dofs
+    load = data.qfrc_actuator[dofs].copy()
+    if self._damped.any():
+      damping = binding.model.dof_damping[dofs] * binding.velocity
+      load -= np.where(self._damped, damping, 0.0)
+    if self._linked.any():
+      inner = data.qfrc_passive[dofs] + data.qfrc_constraint[dofs] + data.qfrc_applied[dofs]
+      inner -= binding.model.dof_armature[dofs] * data.qacc[dofs]
+      load += np.where(self._linked, inner, 0.0)
+    np.abs(load, out=load)
     load *= self._coefficient
     binding.friction += load
 
@@ -136,7 +150,21 @@ KINDS = (
     "dry friction in proportion to the actuator's torque",
     "joint",
     "force",
-    (Parameter("coefficient", "1", 0.0, 0.0, 0.4, "friction per torque", minimum=0.0),),
+    (
+      Parameter("coefficient", "1", 0.0, 0.0, 0.4, "friction per torque", minimum=0.0),
+      Parameter(
+        "carried",
+        "1",
+        0.0,
+        0.0,
+        2.0,
+        "which torque: 0 the actuator's, 1 less damping, 2 what the link takes",
+        minimum=0.0,
+        maximum=2.0,
+        shape=True,
+        fitted=False,
+      ),
+    ),
     LoadFriction,
   ),
   Kind(
