@@ -12,10 +12,10 @@ from sysid.kernel import INDEX
 from sysid.plant import JointPlant
 from sysid.terms import Term
 
-_SKEW = 0.004
+_SKEW = 0.003
 """s; ours: reading a bus of servos takes up to this, so stamps are off by it."""
 
-LATENCY = 0.006
+LATENCY = 0.004
 """s; ours: a firmware cycle and a bus cycle take up to this, which is no effect."""
 
 _INF = float("inf")
@@ -119,6 +119,8 @@ def library(plant: JointPlant) -> list[Term]:
        (0.1 * torque / reach, -0.7 * reach)),
     ),
   ]  # fmt: skip
+  weaker = {"motor_gain", "supply_sag", "thermal_derating"}
+  terms = [v for t in terms for v in (_weakenings(plant, t) if t.kind in weaker else [t])]
   if plant.holds:
     terms += [
       _one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)),
@@ -166,6 +168,19 @@ def library(plant: JointPlant) -> list[Term]:
     )
   )
   return terms
+
+
+def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
+  """Returns a weakened actuator in its forms: whether its limit falls too, whether efforts tell."""
+  limited = np.isfinite(plant.declared[INDEX["highest"]])
+  told = all(log.effort is not None for log in plant.logs) and term.kind != "motor_gain"
+  return [
+    dataclasses.replace(
+      term, fixed=(*term.fixed, ("scales_limit", float(scales)), ("effort_tells", float(tells)))
+    )
+    for scales in ((0, 1) if limited else (0,))
+    for tells in ((1, 0) if told else (1,))
+  ]
 
 
 def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:

@@ -17,9 +17,9 @@ _USUAL = (
   *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
   *("gravity_tilt", "encoder_offset", "spring"),
 )
-"""Kinds in the order in which they are named where logs cannot tell them apart; ours: a late command
-is more usual than a late reading."""
-_FRICTION_SPREAD = 4.0  # dry friction varies that much more than other constants before it counts
+"""Kinds in the order in which they are named where logs cannot tell them apart; ours: a late
+command is more usual than a late reading."""
+_FRICTION_SPREAD = 7.0  # dry friction varies that much more than other constants before it counts
 
 
 @dataclasses.dataclass(frozen=True)

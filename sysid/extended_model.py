@@ -101,6 +101,8 @@ def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float
     case "motor_gain":
       for actuator in actuators:
         _scale(actuator, value["gain"])
+        if value.get("scales_limit"):
+          actuator.forcerange = np.array(actuator.forcerange) * value["gain"]
     case "torque_limit":
       for actuator in actuators:
         limit = value["limit"] / max(abs(actuator.gear[0]), 1e-9)

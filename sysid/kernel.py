@@ -38,10 +38,18 @@ NAMES = (
   *("load_kind", "friction_on_motor"),
   # MuJoCo's friction constraint: R of its row, and the rate at which it takes speed away
   *("softness", "stopping_rate"),
+  # whether a weakened actuator saturates earlier too, and whether its measured effort tells
+  *("scales_limit", "effort_tells"),
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 
-NEUTRAL = {"gain": 1.0, "stribeck_velocity": 0.1, "time_constant": 300.0, "derating": 0.004}
+NEUTRAL = {
+  "effort_tells": 1.0,
+  "gain": 1.0,
+  "stribeck_velocity": 0.1,
+  "time_constant": 300.0,
+  "derating": 0.004,
+}
 """Values that do nothing, where that is not zero."""
 
 _LEAST_STRENGTH = 0.1  # as suite.effects.actuation
@@ -131,6 +139,7 @@ def simulate(
   amplitude, periods, phase = p[29], p[30], p[31]
   load_kind, on_motor_side = int(p[32]), p[33] > 0.5
   softness, stopping_rate = p[34], p[35]
+  scales_limit, effort_tells = p[36] > 0.5, p[37] > 0.5
   learned = weights.size > 0
   samples = sample_time.size
   windows = window_start.size
@@ -165,6 +174,7 @@ def simulate(
     torque = 0.0
     acceleration = 0.0
     jump = 0.0
+    told = 0.0
     apart = False
     gap_offset = 0.0
     started = False
@@ -202,10 +212,13 @@ def simulate(
         supply = 1.0 - droop * (abs(before) + load[i]) - fade * time
         strength *= max(supply, _LEAST_STRENGTH)
       rest = constant + per_q * seen_q + per_v * seen_v
-      torque = min(max(strength * (slope * u + rest), lowest), highest)
+      inner, outer = (1.0, strength) if scales_limit else (strength, 1.0)
+      torque = outer * min(max(inner * (slope * u + rest), lowest), highest)
       if share > 0.0:  # limits first: a mean of commands would lose the moment of a large jump
-        other = min(max(strength * (slope * later + rest), lowest), highest)
+        other = outer * min(max(inner * (slope * later + rest), lowest), highest)
         torque += share * (other - torque)
+      told_before = told
+      told = torque if effort_tells else torque / strength
       coming = 0.0
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + 3.0 * step:
         coming = abs(strength * slope * (command[pointer + 1] - command[pointer]))
@@ -214,10 +227,10 @@ def simulate(
         x = (sample_time[e] / (1.0 + rate) - late_effort - time) / step + 1.0
         if x > 1.0:
           break
-        out_torque[e] = torque if n == 0 else before + max(x, 0.0) * (torque - before)
-        out_jump[e] = max(jump, abs(torque - before), coming)
+        out_torque[e] = told if n == 0 else told_before + max(x, 0.0) * (told - told_before)
+        out_jump[e] = max(jump, abs(told - told_before), coming)
         e += 1
-      jump = abs(torque - before)
+      jump = abs(told - told_before)
       if hinge:
         turn = q - gravity_at[i]
         demand = gravity_here[i] * math.cos(turn) + gravity_across[i] * math.sin(turn)
@@ -248,7 +261,7 @@ def simulate(
       else:
         mass = link + armature
         resist, slope_v = damping + drag * abs(v), damping + 2.0 * drag * abs(v)
-        if lowest < torque < highest:
+        if lowest < torque < highest or scales_limit:
           slope_v -= strength * per_v
         force = torque + passive
       # A step of velocity: the friction that stops it, then damping implicit.
@@ -294,4 +307,4 @@ def simulate(
       time = ahead
       n += 1
     for index in range(e, end):
-      out_torque[index] = torque
+      out_torque[index] = told

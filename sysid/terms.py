@@ -127,6 +127,23 @@ def _spring(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
 
 def _gain(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["gain"]] *= v["gain"]
+  _weakened(plant, p, v)
+
+
+def _weakened(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["scales_limit"]] = v.get("scales_limit", 0.0)
+  p[I["effort_tells"]] = v.get("effort_tells", 1.0)
+
+
+def _sag(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["droop"]], p[I["fade"]] = v["droop"], v["fade"]
+  _weakened(plant, p, v)
+
+
+def _heat(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["heating"]], p[I["time_constant"]] = v["heating"], v["time_constant"]
+  p[I["derating"]] = v["derating"]
+  _weakened(plant, p, v)
 
 
 def _limit(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
@@ -176,10 +193,8 @@ _APPLY = {
   "encoder_offset": _setter(("offset", "encoder_offset")),
   "motor_gain": _gain,
   "torque_limit": _limit,
-  "supply_sag": _setter(("droop", "droop"), ("fade", "fade")),
-  "thermal_derating": _setter(
-    ("heating", "heating"), ("time_constant", "time_constant"), ("derating", "derating")
-  ),
+  "supply_sag": _sag,
+  "thermal_derating": _heat,
   "spring": _spring,
   "cogging": _setter(("amplitude", "amplitude"), ("periods", "periods"), ("phase", "phase")),
 }

@@ -57,10 +57,13 @@ class CommandDelay(Operator):
 
 
 class MotorGain(Operator):
-  """The actuator's force is `gain` times the declared one, before its limits."""
+  """The actuator's force is `gain` times the declared one, before its limits or with them."""
 
   def bind(self, binding: Binding) -> None:
-    gain = self.per_actuator(binding)["gain"]
+    parameters = self.per_actuator(binding)
+    gain = parameters["gain"]
+    limit = np.where(parameters["scales_limit"] > 0, gain, 1.0)
+    binding.model.actuator_forcerange *= limit[:, None]
     binding.model.actuator_gainprm[:, 0] *= gain
     binding.model.actuator_biasprm[:, :3] *= gain[:, None]
 
@@ -107,6 +110,7 @@ class ThermalDerating(Operator):
     self._heating = parameters["heating"] * step * binding.gear**2
     self._cooling = 1 - step / np.maximum(parameters["time_constant"], step)
     self._derating = parameters["derating"]
+    self._scales_limit = parameters["scales_limit"] > 0
     self.temperature_rise = np.zeros(binding.model.nu)
     """K, [U]."""
 
@@ -118,7 +122,10 @@ class ThermalDerating(Operator):
     heat *= self._heating
     self.temperature_rise *= self._cooling
     self.temperature_rise += heat
-    binding.strength *= np.maximum(1 - self._derating * self.temperature_rise, _LEAST_STRENGTH)
+    strength = np.maximum(1 - self._derating * self.temperature_rise, _LEAST_STRENGTH)
+    binding.strength *= strength
+    if self._scales_limit.any():
+      binding.limit *= np.where(self._scales_limit, strength, 1.0)
 
 
 class SupplySag(Operator):
@@ -133,12 +140,31 @@ class SupplySag(Operator):
       raise ValueError("Found a target, or more than one supply_sag; expected one, with no target.")
     self._droop = self.value(self.effects[0], "droop")
     self._fade = self.value(self.effects[0], "fade")
+    self._scales_limit = self.value(self.effects[0], "scales_limit") > 0
     self._gear = np.abs(binding.gear)
 
   def step(self, binding: Binding) -> None:
     load = float(np.abs(binding.data.actuator_force) @ self._gear)
     strength = 1 - self._droop * load - self._fade * binding.data.time
-    binding.strength *= max(strength, _LEAST_STRENGTH)
+    strength = max(strength, _LEAST_STRENGTH)
+    binding.strength *= strength
+    if self._scales_limit:
+      binding.limit *= strength
+
+
+def _scales_limit() -> Parameter:
+  return Parameter(
+    "scales_limit",
+    "1",
+    0.0,
+    0.0,
+    1.0,
+    "1 if the actuator's limits weaken with it, 0 if they stay",
+    minimum=0.0,
+    maximum=1.0,
+    shape=True,
+    fitted=False,
+  )
 
 
 KINDS = (
@@ -155,7 +181,10 @@ KINDS = (
     "the actuator is stronger or weaker than declared",
     "joint",
     "model",
-    (Parameter("gain", "1", 1.0, 0.4, 1.6, "true over declared force", minimum=0.0),),
+    (
+      Parameter("gain", "1", 1.0, 0.4, 1.6, "true over declared force", minimum=0.0),
+      _scales_limit(),
+    ),
     MotorGain,
   ),
   Kind(
@@ -183,6 +212,7 @@ KINDS = (
       Parameter("heating", "K/(s N^2 m^2)", 0.0, 0.0, 5.0, "heating by torque", minimum=0.0),
       Parameter("time_constant", "s", 300.0, 20.0, 1000.0, "of cooling", minimum=1e-3, shape=True),
       Parameter("derating", "1/K", 0.004, 0.001, 0.02, "loss per kelvin", minimum=0.0, shape=True),
+      _scales_limit(),
     ),
     ThermalDerating,
   ),
@@ -194,6 +224,7 @@ KINDS = (
     (
       Parameter("droop", "1/(N m)", 0.0, 0.0, 0.1, "loss per total torque", minimum=0.0),
       Parameter("fade", "1/s", 0.0, 0.0, 0.01, "loss per second", minimum=0.0),
+      _scales_limit(),
     ),
     SupplySag,
   ),

@@ -92,6 +92,8 @@ class Binding:
     """What the encoder reads beyond the joint's position, rad."""
     self.strength = np.ones(num_actuators)
     """Factor on the actuators' force at this step."""
+    self.limit = np.ones(num_actuators)
+    """Factor on the actuators' limits at this step."""
     self.ctrl = np.zeros(num_actuators)
     self.data: Any = None
     """mujoco.MjData of the step."""
@@ -167,12 +169,15 @@ class Binding:
     self._uses_velocity = bool(self._per_velocity.any())
     self._ctrl_low, self._ctrl_high = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
     self._low, self._high = _limits(model.actuator_forcelimited, model.actuator_forcerange)
+    self._forcerange = model.actuator_forcerange.copy()
     self._work = np.zeros(model.nu)
 
   def write_actuators(self, *, shifted: bool) -> None:
     """Writes strength, and encoder shift if `shifted`, into the model's actuator constants."""
     strength = self.strength
     np.multiply(self._gain, strength, out=self._gain_view)
+    if self.limit.min(initial=1.0) < 1.0:
+      np.multiply(self._forcerange, self.limit[:, None], out=self.model.actuator_forcerange)
     np.multiply(self._bias, strength[:, None], out=self._bias_view)
     if shifted and len(self.joints):
       shift = self._per_position * self.encoder_shift[self._of_joint]

@@ -123,6 +123,7 @@ class EffectStack:
     binding.friction.fill(0.0)
     binding.encoder_shift.fill(0.0)
     binding.strength.fill(1.0)
+    binding.limit.fill(1.0)
     for operator in self._steps:
       operator.step(binding)
     if self._adds_friction:

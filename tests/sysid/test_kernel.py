@@ -25,6 +25,13 @@ CASES = [
   ("quadratic_drag", {"coefficient": 0.1}, 1e-6),
   ("encoder_offset", {"offset": 0.05}, 1e-6),
   ("motor_gain", {"gain": 0.7}, 1e-6),
+  ("motor_gain", {"gain": 0.7, "scales_limit": 1.0}, 1e-6),
+  ("supply_sag", {"droop": 0.05, "fade": 0.01, "scales_limit": 1.0}, 3e-4),
+  (
+    "thermal_derating",
+    {"heating": 2.0, "time_constant": 20.0, "derating": 0.004, "scales_limit": 1.0},
+    3e-4,
+  ),
   ("torque_limit", {"limit": 1.2}, 1e-6),
   ("supply_sag", {"droop": 0.05, "fade": 0.01}, 3e-4),
   ("thermal_derating", {"heating": 2.0, "time_constant": 20.0, "derating": 0.004}, 3e-4),
