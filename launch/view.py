@@ -72,12 +72,13 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
         color=(213, 94, 0), thickness=0.004,
       )
     )  # fmt: skip
+    frusta[-1].visible = False  # the view starts among them
   grid = server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
 
   for label, handles, on in (
     ("surface mesh", [shown], False),
     ("convex parts", parts, False),
-    ("cameras", frusta, True),
+    ("cameras", frusta, False),
     ("floor grid", [grid], True),
   ):
     switch = server.gui.add_checkbox(label, on)
@@ -93,14 +94,26 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
     server.gui.add_markdown("\n".join(["| figure | value |", "| --- | --- |", *figures]))
 
 
+def _overlooking_camera(bundle: Bundle) -> tuple[np.ndarray, np.ndarray]:
+  """Position and direction [3] of the capture's camera that had most of the room before it.
+
+  From where nothing was filmed the field is fog.
+  """
+  poses = localise.load(bundle.folder / "sfm").world_from_camera
+  world = bundle.world_from_unit.apply_pose(poses)
+  eyes, forward = world[:, :3, 3], world[:, :3, 2]
+  depth = np.einsum("ni,ni->n", 0.5 * sum(bundle.extent) - eyes, forward)
+  best = int(np.argmax(depth))
+  return eyes[best], forward[best]
+
+
 def view_bundle(bundle: Bundle, *, host: str, port: int) -> viser.ViserServer:
   """Serves a bundle's viewer; returns the running server."""
   server = viser.ViserServer(host=host, port=port, label=f"scene {bundle.name}", verbose=False)
   server.scene.set_up_direction("+z")
-  lower, upper = bundle.extent
-  centre = 0.5 * (lower + upper)
-  server.initial_camera.position = (centre[0] - 0.35 * (upper - lower)[0], centre[1], 1.2)
-  server.initial_camera.look_at = (centre[0], centre[1], 0.8)
+  eye, forward = _overlooking_camera(bundle)
+  server.initial_camera.position = tuple(eye)
+  server.initial_camera.look_at = tuple(eye + forward)
   renderer = Renderer(Field.load(bundle.field_path), threads=os.cpu_count() or 1)
   field_view.serve_field(server, field_view.FieldView(renderer, bundle.world_from_unit))
   _add_scene(server, bundle)
