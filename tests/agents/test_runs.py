@@ -169,7 +169,7 @@ def test_pictures_lstm_state_and_belief_go_through(tmp_path):
   )  # fmt: skip
   output = finish(process, timeout=240, run=run)
   assert process.returncode == 0, output
-  assert read_info(run)["updates"] == 100
+  assert read_info(run)["updates"] == 1600 / 8
 
 
 def test_wrong_arguments_are_one_line(tmp_path):
