@@ -105,7 +105,7 @@ def library(plant: JointPlant) -> list[Term]:
     ),
     _one("motor_gain", joint, "gain", 0.15, 3.0, 0.1, (0.75, 1.25)),
     Term(
-      "supply_sag", None, ("droop", "fade"), (0.0, -0.01), (0.5 / torque, 0.04),
+      "supply_sag", None, ("droop", "fade"), (0.0, 0.0), (0.5 / torque, 0.04),
       (0.03 / torque, 0.003), ((0.05 / torque, 0.001), (0.01 / torque, 0.01)),
     ),
     Term(
@@ -173,7 +173,8 @@ def library(plant: JointPlant) -> list[Term]:
 def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   """Returns a weakened actuator in its forms: whether its limit falls too, whether efforts tell."""
   limited = np.isfinite(plant.declared[INDEX["highest"]])
-  told = all(log.effort is not None for log in plant.logs) and term.kind != "motor_gain"
+  told = all(log.effort is not None or log.duty is not None for log in plant.logs)
+  told = told and term.kind != "motor_gain"
   return [
     dataclasses.replace(
       term, fixed=(*term.fixed, ("scales_limit", float(scales)), ("effort_tells", float(tells)))

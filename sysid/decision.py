@@ -12,6 +12,7 @@ from sysid import race
 from sysid.explanation import Ladder
 from sysid.race import Entry
 
+_BELIEVED = 2  # effects of one joint that are claimed; more can imitate what no library has
 _TIE = 0.03  # nats within which the usual kind is named rather than the rare one
 _USUAL = (
   *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
@@ -102,8 +103,10 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   null = ladder.null
   best = singles[0]
   others = singles[1:]
-  if pairs and best.score - pairs[0].score > thresholds.second:
-    best, others = pairs[0], [*pairs[1:], *singles]
+  for size in sorted({len(names(e)) for e in pairs}):
+    longer = next(e for e in pairs if len(names(e)) == size)
+    if best.score - longer.score > thresholds.second:
+      best, others = longer, [*(e for e in pairs if e is not longer), *singles]
   gained = null.score - best.score
   chosen = best if gained > thresholds.gain else null
   named = chosen is best
@@ -112,7 +115,7 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   confounded = [e for e in others if named and e.score - best.score < thresholds.margin]
   size = len(names(best))
   confounded = [e for e in confounded if len(names(e)) <= size]
-  if left > thresholds.adequate:
+  if left > thresholds.adequate or len(names(chosen)) > _BELIEVED:
     verdict = "unexplained"
   elif named or constants:
     verdict = "effects"

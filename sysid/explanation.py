@@ -10,6 +10,8 @@ from sysid.fitting import Problem
 from sysid.race import Entry
 from sysid.terms import Term
 
+_STEP = 0.2  # nats that a chain's next effect must gain; as decision.Thresholds.second
+
 
 @dataclasses.dataclass(frozen=True)
 class Effort:
@@ -21,6 +23,10 @@ class Effort:
   """Single effects on top of which a second one is raced."""
   parent_margin: float = 1.2
   """nats; single effects further behind are no parents."""
+  longest: int = 4
+  """Effects in a chain that is grown where two leave much; three or more are used, not claimed."""
+  growing: float = 0.9
+  """nats above the noise at which a chain grows further."""
   adequate: float = 0.35
   """nats above the noise floor at which a hypothesis leaves nothing for a second effect."""
 
@@ -35,6 +41,7 @@ class Ladder:
   null: Entry
   singles: list[Entry]
   pairs: list[Entry]
+  """Two effects, or longer chains."""
 
   @property
   def best_single(self) -> Entry:
@@ -79,7 +86,25 @@ def climb(
   ladder = Ladder(problem, calibration, declared, null, singles, [])
   if race.above_floor(singles[0]) > effort.adequate:
     ladder.pairs = pairs(ladder, effort=effort)
+    grow(ladder, effort=effort)
   return ladder
+
+
+def grow(ladder: Ladder, *, effort: Effort) -> None:
+  """Adds effects to the best pair one by one while they help and much is left."""
+  problem = ladder.problem
+  for size in range(3, effort.longest + 1):
+    best = ladder.best()
+    if race.above_floor(best) < effort.growing or len(best.fit.terms) != size:
+      return
+    present = {t.kind for t in best.fit.terms}
+    waves = signatures.waves(problem, best.fit)
+    library = [*candidates.library(problem.plant), candidates.cogging(problem.plant, waves)]
+    others = [c for c in library if c.kind not in present]
+    found = race.run(problem, best.fit.terms, others, start=best.fit.x, finalists=2)
+    if best.score - found[0].score < _STEP:
+      return
+    ladder.pairs = sorted([*ladder.pairs, *found[:3]], key=lambda e: e.score)
 
 
 def pairs(ladder: Ladder, *, effort: Effort) -> list[Entry]:

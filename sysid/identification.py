@@ -122,6 +122,7 @@ def analyse(
   chosen = _suspects(screened, settings)
   found = [_race(s, settings) for s in chosen]
   found = _without_contradictions(found, settings)
+  found += _others(found, screened, settings)
   result = Identified(
     model, logs, screened, found, "none", [], [], [], {}, [], [audit(log) for log in logs]
   )
@@ -167,6 +168,37 @@ def _without_contradictions(found: list[Found], settings: Settings) -> list[Foun
         ladder.pairs = [e for e in ladder.pairs if kind not in decision.names(e)]
         item.finding = decision.decide(ladder, settings.thresholds)
   return found
+
+
+def _others(found: list[Found], screened: list[Screened], settings: Settings) -> list[Found]:
+  """Looks for what several raced joints have in the joints that were not raced.
+
+  A machine's servos are of one kind: what two of them have, the others are asked for too.
+  """
+  shared: dict[str, Entry] = {}
+  for item in found:
+    for kind in decision.names(item.finding.chosen) if item.finding.named else ():
+      same = [f for f in found if f.finding.named and kind in decision.names(f.finding.chosen)]
+      single = [e for e in item.ladder.singles if decision.names(e) == {kind}]
+      if len(same) > 1 and kind not in (*COMMON, "payload") and single:
+        shared.setdefault(kind, single[0])
+  raced = {f.screened.joint for f in found}
+  result = []
+  for s in screened:
+    if s.joint in raced or not shared:
+      continue
+    entries = []
+    for entry in shared.values():
+      term = dataclasses.replace(entry.fit.terms[-1], target=s.joint)
+      start = np.concatenate([s.null.fit.x, entry.fit.part(len(entry.fit.terms) - 1)])
+      entries.append(race.entry(s.problem, s.problem.fit([s.calibration, term], start)))
+    entries.sort(key=lambda e: e.score)
+    ladder = Ladder(s.problem, s.calibration, s.declared, s.null, entries, [])
+    finding = decision.decide(ladder, settings.thresholds)
+    if finding.named:
+      chance = detection.chance_gain(s.problem, s.null, entries, seed=settings.seed)
+      result.append(Found(s, ladder, finding, chance))
+  return result
 
 
 def _conclude(result: Identified, settings: Settings) -> None:

@@ -23,6 +23,10 @@ LONGEST_STEP = 2e-3
 """s; ours: a model with a longer step than this is simulated in parts of it."""
 
 
+_SAME = 1e-6
+"""Share of a range below which two readings differ by rounding of floating point alone."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Measured:
   """What one log says about one joint."""
@@ -179,7 +183,7 @@ def fresh(time: Array, position: Array, velocity: Array) -> Array:
 def quantum(values: Array) -> float:
   """Returns the smallest step between different readings: the resolution of a sensor."""
   steps = np.diff(np.unique(values))
-  steps = steps[steps > 1e-12]
+  steps = steps[steps > _SAME * max(float(np.ptp(values)), 1e-12)]
   return float(steps.min()) if len(steps) else 0.0
 
 
