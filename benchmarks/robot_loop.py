@@ -10,6 +10,8 @@ what the wire alone costs, with time that jumps from event to event.
   python benchmarks/robot_loop.py --stepped --loss 0.05      # the machine's speed does not matter
 """
 
+# ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
+
 import contextlib
 import dataclasses
 import json
@@ -21,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # idle OpenBLAS threads spin on a core
+  os.environ.setdefault(_name, "1")
 
 import numpy as np
 import tyro

@@ -139,7 +139,8 @@ class Bus:
         raw: list[int] = []
         if result == sdk.COMM_SUCCESS:
           self._expect(_INSTRUCTION_SIZE + count + size, delay=self._return_delay)
-          raw, result, _ = self._handler.fastSyncReadRx(port, sdk.BROADCAST_ID, size - _FAST_HEAD)
+          while result == sdk.COMM_SUCCESS and not raw:  # the board's late answer is not this one
+            raw, result, _ = self._handler.fastSyncReadRx(port, sdk.BROADCAST_ID, size - _FAST_HEAD)
       except (serial.SerialException, OSError):
         result, raw = sdk.COMM_RX_FAIL, []
       finally:

@@ -71,6 +71,10 @@ class Port(dynamixel_sdk.PortHandler):
       wait = min(wait, self.deadline - self._clock.now())
     self.setPacketTimeoutMillis(1000 * max(wait, 0.0))
 
+  def isPacketTimeout(self) -> bool:
+    # An answer that lies here is not late, whatever kept this thread from taking it.
+    return self.ser.in_waiting == 0 and super().isPacketTimeout()
+
   def readPort(self, length: int):
     left = self.packet_timeout / 1000 - (self._clock.now() - self.packet_start_time / 1000)
     if length > 0 and self.ser.in_waiting < length:

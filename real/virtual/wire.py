@@ -11,13 +11,13 @@ import select
 import threading
 import tty
 
-from real.clock import Clock, SteppedClock
+from real.clock import Clock, SteppedClock, prefer_this_thread
 from real.virtual.devices import BYTE_TIME, Answer, Devices
 from real.virtual.protocol import Parser
 
 _CHUNK = 4096
 _MAX_LAG = 0.2  # s that the body may be behind the clock
-_IDLE = 0.004  # s after which the body is brought up to date when nothing is asked
+_IDLE = 0.001  # s after which the body is brought up to date when nothing is asked
 
 
 class Wire:
@@ -60,6 +60,7 @@ class Wire:
 
   def _run(self) -> None:
     clock = self._clock
+    prefer_this_thread()  # servos do not wait for the host's programs
     while not self._stop.is_set():
       ready, _, _ = select.select((self._master,), (), (), _IDLE)
       # A machine too slow for the body must not fall behind for ever.
