@@ -21,6 +21,12 @@ Array = np.ndarray
 
 CHIP_BANDWIDTH_HZ = 41.0  # OpenCR firmware, gyroscope and accelerometer of the MPU-9250
 CHIP_DELAY = 0.002  # s, data-sheet delay minus that of a first-order low-pass; see above
+# OpenCR firmware, `init` of both chips (FSR_2G, 2000DPS), and the scales of ROBOTIS-OP3's
+# open_cr_module: 16-bit readings end at 2 g and, at 16.4 counts per degree/s, at 1998 degrees/s. A
+# walking OP3 exceeds 2 g at every step.
+CHIP_ACCELERATION = 2 * 9.80665  # m/s^2
+CHIP_TURNING_RATE = 32767 / 16.4 * np.pi / 180  # rad/s
+_CHIP_RANGE = np.repeat([CHIP_TURNING_RATE, CHIP_ACCELERATION], 3)
 ACTION_FILTER_STRENGTH = 0.8  # paper, "an exponential filter with strength 0.8"
 MIN_DELAY, MAX_DELAY = 0.010, 0.050  # s, paper, constant over an episode
 JITTER = 0.005  # s, paper
@@ -93,6 +99,11 @@ class LowPass:
       self._state1 = b1 * x - a1 * y + self._state2
       self._state2 = b2 * x - a2 * y
     return y
+
+
+def saturate(imu: Array) -> Array:
+  """Returns turning rates and specific force [6] [rad/s, m/s^2] as far as the chip's range goes."""
+  return np.clip(imu, -_CHIP_RANGE, _CHIP_RANGE)
 
 
 class ExponentialFilter:

@@ -1,9 +1,9 @@
 """The path from the robot's true motion to what its policy is told about it.
 
-Gyroscope and accelerometer pass the IMU chip's low-pass, are sampled with the encoders at 125 Hz,
-feed Madgwick's filter, and reach the policy late (a delay drawn for each episode, and jitter). Each
-reading has a history of five control steps, oldest first. Shapes: J joints, S physics steps in a
-control step, H history.
+Gyroscope and accelerometer pass the IMU chip's low-pass, end at its range, are sampled with the
+encoders at 125 Hz, feed Madgwick's filter, and reach the policy late (a delay drawn for each
+episode, and jitter). Each reading has a history of five control steps, oldest first. Shapes: J
+joints, S physics steps in a control step, H history.
 """
 
 from collections.abc import Callable
@@ -120,6 +120,7 @@ class Proprioception:
       joints = self.observe("joint_positions", joints, time)
       gyroscope = self.observe("gyroscope", imu[:3], time)
       imu = np.concatenate([gyroscope, self.observe("accelerometer", imu[3:], time)])
+    imu = filters.saturate(imu)
     gravity = self._madgwick.update(imu[:3], imu[3:])
     self._imu_line.push(time, np.concatenate([imu, gravity]))
     self._joint_line.push(time, np.rint(joints / constants.ENCODER_STEP) * constants.ENCODER_STEP)

@@ -2,7 +2,8 @@
 
 Sources: ROBOTIS-GIT/OpenCR, OP3 example (`dxl_node_op3.cpp`: instructions, table, ids; the chip's
 values are given as they are); ROBOTIS-GIT/ROBOTIS-OP3, `open_cr_module` (16.4 counts per degree/s,
-2 g full scale, x and y of the chip point against the robot's). The IMU is read at 200 Hz.
+2 g full scale, x and y of the chip point against the robot's). The IMU is read at 200 Hz. A step of
+a walking OP3 is felt as 3 g: such readings end at the full scale, as in `suite.filters.saturate`.
 """
 
 import struct

@@ -67,6 +67,19 @@ def test_jitter_spreads_the_age_and_never_reaches_into_the_future():
   assert age.max() <= 0.025 + 0.008 + constants.ENCODER_STEP
 
 
+def test_imu_ends_at_the_chips_range():
+  def truth(time):
+    hard = time > 0.3
+    return np.array([40.0 * hard, -1.0, 0.0, 0.0, -30.0 * hard, 9.81 + 20.0 * hard])
+
+  _, found = _run(truth, lambda t: np.zeros(20), 20)
+  np.testing.assert_allclose(found["gyroscope"][5], [0, -1, 0], atol=1e-6)
+  np.testing.assert_allclose(found["gyroscope"][-1], [np.deg2rad(1998), -1, 0], rtol=1e-4)
+  np.testing.assert_allclose(found["accelerometer"][5], [0, 0, 9.81], atol=1e-6)
+  two_g = 19.6133  # m/s^2
+  np.testing.assert_allclose(found["accelerometer"][-1], [0, -two_g, two_g], rtol=1e-6)
+
+
 def test_imu_passes_the_chips_low_pass():
   frequency = 41.0  # Hz: the chip's bandwidth, where a first-order filter passes 1/sqrt(2)
 
