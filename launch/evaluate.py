@@ -6,7 +6,7 @@ short goes on where it stopped.
 
 python launch/evaluate.py --policy gait --plant sim --protocol navigation --out out/evaluation
 python launch/evaluate.py --policy runs/nav/policy/best --plant virtual --protocol navigation
-python launch/evaluate.py --policy gait --plant robot --robot /dev/ttyUSB0 --camera 0
+python launch/evaluate.py --policy gait --plant robot --robot /dev/ttyUSB0 --camera 0 --dry-run
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
@@ -15,6 +15,7 @@ import dataclasses
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -74,6 +75,8 @@ class Arguments:
   """Records runs on the virtual robot and the robot as MCAP beside the report."""
   time_limit: float | None = None
   """Length of an episode [s]; the task's own if not given."""
+  dry_run: bool = False
+  """Robot only: reads and asks everything, moves and keeps nothing; one trial without --trials."""
 
 
 class LearnedPolicy:
@@ -168,7 +171,7 @@ def make_plant(arguments: Arguments, scene: Any, image_size: tuple[int, int] | N
   return OperatedPlant(
     scene, arguments.protocol, arguments.perturb, robot=arguments.robot, camera=camera,
     image_size=image_size, time_limit=arguments.time_limit, record=record,
-    offsets=arguments.offsets,
+    offsets=arguments.offsets, dry_run=arguments.dry_run,
   )  # fmt: skip
 
 
@@ -211,21 +214,21 @@ def _say(episode: episodes.Episode, number: int, count: int) -> None:
   print(f"{number:3d}/{count} {episode.group}: {episode.outcome} {took}{detail}{lost}", flush=True)
 
 
-def run(arguments: Arguments) -> Path:
-  """Runs what is missing, writes the report and returns its path."""
+def run(arguments: Arguments) -> Path | None:
+  """Runs what is missing, writes the report and returns its path; None after a dry run.
+
+  Raises:
+    ValueError: A dry run of a plant that is no robot.
+  """
+  if arguments.dry_run:
+    _dry_run(arguments)
+    return None
   scene = loading.open_scene(arguments.scene)
   store = episodes.Store(arguments.out)
-  policy = load_policy(arguments, scene)
-  image_size = policy.image_size or arguments.camera_size
-  plant = make_plant(arguments, scene, image_size)
   path = arguments.out / "report.html"
   try:
-    runner.run_all(
-      plant, policy, choose(plants.trials(arguments.protocol), arguments.trials), store=store,
-      report=_say,
-    )  # fmt: skip
+    _run_trials(arguments, scene, store, arguments.trials)
   finally:
-    plant.close()
     if store.episodes:
       report.write(path, store.episodes, scene=scene, draw_belief=draw_belief,
                    settings=dataclasses.asdict(arguments))  # fmt: skip
@@ -234,11 +237,36 @@ def run(arguments: Arguments) -> Path:
   return path
 
 
+def _dry_run(arguments: Arguments) -> None:
+  """Goes through trials on the robot without moving it; nothing of it is counted or kept."""
+  if arguments.plant != "robot":
+    raise ValueError(
+      f"--dry-run with --plant {arguments.plant}: expected --plant robot; the others move nothing "
+      "that could break."
+    )
+  scene = loading.open_scene(arguments.scene)
+  with tempfile.TemporaryDirectory() as folder:
+    _run_trials(arguments, scene, episodes.Store(Path(folder)), arguments.trials or 1)
+
+
+def _run_trials(arguments: Arguments, scene: Any, store: episodes.Store, count: int | None) -> None:
+  policy = load_policy(arguments, scene)
+  image_size = policy.image_size or arguments.camera_size
+  plant = make_plant(arguments, scene, image_size)
+  try:
+    runner.run_all(
+      plant, policy, choose(plants.trials(arguments.protocol), count), store=store, report=_say
+    )
+  finally:
+    plant.close()
+
+
 def main() -> None:
   """Parses the command line and evaluates."""
   arguments = tyro.cli(Arguments, description=__doc__)
   try:
-    print(f"wrote {run(arguments)}")
+    path = run(arguments)
+    print("dry run: nothing moved, nothing kept" if path is None else f"wrote {path}")
   except (ValueError, OSError, RuntimeError) as error:
     sys.exit(f"error: {error}")
   except KeyboardInterrupt:

@@ -7,9 +7,8 @@ then. The time a policy needs is therefore part of the robot's delay, as everyth
 
 import collections
 import logging
-from typing import Any, Protocol
+from typing import Any
 
-import cv2
 import dm_env
 import numpy as np
 from dm_env import specs
@@ -18,6 +17,7 @@ from real.bus import Bus
 from real.cycle import Cycle
 from real.motion import SUPPORTED_POSE, Motion, RobotSettings
 from real.operator import Operator
+from real.pictures import CameraSource, Pictures
 from real.safety import Limiter, Monitor, Stop
 from real.sensing import Sensing
 from real.servos import Servos
@@ -27,16 +27,6 @@ from suite import specs as policy_specs
 from suite.op3 import constants
 
 _log = logging.getLogger(__name__)
-
-
-class CameraSource(Protocol):
-  """Where pictures come from, such as `real.camera.Camera`."""
-
-  def read(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture, RGB uint8 [H, W, 3], and its age [s]; never waits."""
-
-  def close(self) -> None:
-    """Frees the camera."""
 
 
 class RobotEnvironment(dm_env.Environment):
@@ -76,8 +66,7 @@ class RobotEnvironment(dm_env.Environment):
     self.timing = Timing()
     self.dry_run = dry_run
     self._bus, self._clock = bus, bus.clock
-    self._camera, self._operator, self._recorder = camera, operator, recorder
-    self._image_size = image_size
+    self._operator = operator
     self._time_limit = time_limit
     self._goal_bounds = goal_bounds
     self._lower, self._upper = constants.joint_limits(head_pan=head_pan_limit)
@@ -89,6 +78,12 @@ class RobotEnvironment(dm_env.Environment):
     self._limiter = Limiter(self._lower, self._upper, max_speed=safety.max_speed)
     self._action_filter = filters.ExponentialFilter(constants.ACTION_FILTER)
     self._monitor = Monitor(safety, camera=camera is not None)
+    self._pictures: Pictures | None = None
+    if camera is not None and image_size is not None:
+      self._pictures = Pictures(
+        camera, image_size, clock=self._clock, monitor=self._monitor, timing=self.timing,
+        recorder=recorder,
+      )  # fmt: skip
     self._action_spec = policy_specs.action_spec()
     self._observation_spec = policy_specs.policy_observation_spec(
       goal_lower=goal_bounds[0], goal_upper=goal_bounds[1],
@@ -97,7 +92,6 @@ class RobotEnvironment(dm_env.Environment):
     self.set_goal(self.goals[0])
     self._control = self._normalised(SUPPORTED_POSE)
     self._running = False  # an episode is
-    self._last_picture = float("-inf")  # s, when the picture recorded last was taken
     self._closed = False
     self.servos = Servos(bus)
     self.servos.power_on()
@@ -188,8 +182,8 @@ class RobotEnvironment(dm_env.Environment):
         _log.error("not every servo confirmed that its torque is off: switch the robot off")
       self._bus.close()
       self._operator.close()
-      if self._camera is not None:
-        self._camera.close()
+      if self._pictures is not None:
+        self._pictures.close()
 
   # ---- beyond dm_env ----
 
@@ -231,6 +225,11 @@ class RobotEnvironment(dm_env.Environment):
     """The bus."""
     return self._bus
 
+  @property
+  def camera(self) -> CameraSource | None:
+    """Where the pictures come from; None without a camera."""
+    return None if self._pictures is None else self._pictures.camera
+
   # ---- acting ----
 
   def _act(self, action: np.ndarray, asked: float) -> None:
@@ -262,38 +261,11 @@ class RobotEnvironment(dm_env.Environment):
       (name, sensing.read(name)) for name in policy_specs.PROPRIOCEPTION
     )
     found["goal"] = self._goal.astype(np.float32)
-    if self._image_size is not None:
-      found["camera"] = self._picture()
-    return found
-
-  def _picture(self) -> np.ndarray:
-    """Returns the newest picture in the policy's size; notes its age."""
-    assert self._camera is not None and self._image_size is not None
-    height, width = self._image_size
-    age: float | None = None
-    picture: np.ndarray = np.zeros((height, width, 3), np.uint8)
-    try:
-      picture, age = self._camera.read()
-    except Exception as error:  # whatever a driver raises, it is a lost picture
-      _log.warning("no picture: %s: %s", type(error).__name__, error)
-    now = self._clock.now()
-    if age is not None:
-      self.timing.add("camera age", age)
-      self._record_picture(picture, now - age)
-    if self._running:
-      stop = self._monitor.camera(now, age)
+    if self._pictures is not None:
+      found["camera"], stop = self._pictures.read(watched=self._running)
       if stop is not None:
         self._cycle.halt(stop)
-    if picture.shape[:2] != (height, width):
-      picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
-    return picture
-
-  def _record_picture(self, picture: np.ndarray, taken: float) -> None:
-    if self._recorder is None or taken < self._last_picture + 0.002:
-      return  # the age of one picture is measured a little differently each time
-    self._last_picture = taken
-    full = getattr(self._camera, "read_full", None)
-    self._recorder.image(self._clock.wall(taken), picture if full is None else full()[0])
+    return found
 
   def _end(self, timestep: dm_env.TimeStep) -> dm_env.TimeStep:
     self._running = False

@@ -9,9 +9,10 @@ import numpy as np
 from real import op3
 from real.bus import Bus
 from real.clock import Clock
-from real.environment import CameraSource, RobotEnvironment
+from real.environment import RobotEnvironment
 from real.motion import RobotSettings
 from real.operator import Operator, Terminal
+from real.pictures import CameraSource
 from suite import errors, loading
 from suite.op3 import constants
 from suite.tasks import ball_push, nerf_nav

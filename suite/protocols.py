@@ -3,12 +3,12 @@
 Paper, sections "Navigation and obstacle avoidance results" and "Ball pushing results", and the
 appendix table on the camera's gain. A protocol is a tuple of trials; a trial says where everything
 starts. The paper gives the numbers of positions and orientations but not the positions themselves:
-navigation trials name them by index, and `navigation_starts` draws positions of a scene from its
-free space with a fixed seed, so that they are the same for every policy.
+navigation trials name them by index, and `scene_starts` draws positions of a scene from its free
+space with a fixed seed, so that they are the same for every policy.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,10 @@ TARGET_CELL = (1, 1)  # the corner, in cells from the centre cell: +x, +y
 BALL_TIME_LIMIT = 60.0  # s, paper
 WALL_SPREAD = 0.1  # m, ours: the paper says "near the center" of the cell
 START_SEED = 20221010  # ours
+START_ROOM = 0.15  # m around a start beyond what the robot needs to stand: as at the scene's goals
+MIN_GOAL_DISTANCE = 1.0  # m between a start and every goal, where the scene has such places: ours
+_START_GRID = 0.1  # m between the places among which starts are chosen: ours
+_START_ROOM_STEP = 0.05  # m by which less room is taken where the scene has no better: ours
 
 
 class NavigationTrial(NamedTuple):
@@ -117,10 +121,10 @@ def navigation_starts(
   goals: np.ndarray,
   *,
   count: int = NUM_POSITIONS,
-  min_goal_distance: float = 1.0,
+  min_goal_distance: float = MIN_GOAL_DISTANCE,
   seed: int = START_SEED,
 ) -> np.ndarray:
-  """Chooses start positions for a scene, far from each other and from the goals.
+  """Chooses start positions among places, far from each other and from the goals.
 
   Greedy farthest points: deterministic for a scene, and spread over it as the paper's three "unique
   initial positions" are.
@@ -148,3 +152,36 @@ def navigation_starts(
     distance = np.linalg.norm(free[:, None] - free[chosen], axis=-1).min(axis=1)
     chosen.append(int(np.argmax(distance)))
   return free[chosen]
+
+
+def scene_starts(scene: Any) -> np.ndarray:
+  """Returns the start positions of navigation in a scene [3, 2] [m].
+
+  They are chosen where the robot has room to turn and sway, not just where it fits: `START_ROOM`
+  around it, or the most that the scene offers.
+
+  Args:
+    scene: A bundle: its extent, goals and free space are used.
+
+  Raises:
+    ValueError: The robot fits nowhere.
+  """
+  lower, upper = (np.asarray(corner, np.float64)[:2] for corner in scene.extent)
+  x, y = (np.arange(lower[i] + _START_GRID / 2, upper[i], _START_GRID) for i in range(2))
+  points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+  free = points[np.asarray(scene.free_space.is_reachable(points), bool)]
+  goals = np.asarray(scene.goals, np.float64).reshape(-1, 2)
+  for room in np.arange(START_ROOM, 0.0, -_START_ROOM_STEP):
+    wide = free[_has_room(scene.free_space, free, room)]
+    far = np.linalg.norm(wide[:, None] - goals, axis=-1).min(axis=1, initial=np.inf)
+    if np.count_nonzero(far >= MIN_GOAL_DISTANCE) >= NUM_POSITIONS:
+      return navigation_starts(wide, goals)
+  return navigation_starts(free, goals)
+
+
+def _has_room(free_space: Any, places: np.ndarray, room: float) -> np.ndarray:
+  """Returns whether the robot fits at places [N, 2] and all around them up to a distance [m]."""
+  angles = 2 * np.pi * np.arange(16) / 16
+  ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+  around = np.concatenate([room * ring, room / 2 * ring])
+  return np.asarray(free_space.is_reachable(places[:, None] + around), bool).all(axis=1)

@@ -14,7 +14,9 @@ from real.evaluation import episodes, perturbations, starts
 from real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
 from real.recorder import Recorder
 from real.safety import Reason
+from suite import protocols
 from suite.gaits.walker import Pose
+from suite.op3 import constants
 from suite.protocols import DEFAULT_GAIN, BallTrial
 from suite.tasks.workspace import find_workspace
 
@@ -44,6 +46,7 @@ class OperatedPlant(Plant):
     time_limit: float | None = None,
     record: Path | None = None,
     offsets: Path | None = None,
+    dry_run: bool = False,
     observer: Callable[[], Sight] | None = None,
     ask: Callable[[str], str] = input,
     say: Callable[[str], None] = print,
@@ -61,6 +64,7 @@ class OperatedPlant(Plant):
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
       offsets: The robot's `offset.yaml`.
+      dry_run: Everything is read, asked and computed, and nothing moves; no verdict is asked for.
       observer: Motion capture, if there is any.
       ask: Puts a question to the operator and returns the answer.
       say: Tells the operator something.
@@ -68,14 +72,14 @@ class OperatedPlant(Plant):
     super().__init__(scene, protocol, perturbation)
     self.plant_id = robot_name
     self._observer, self._ask, self._say = observer, ask, say
-    self._starts = starts.navigation_starts(scene)
+    self._starts = protocols.scene_starts(scene)
     self._workspace = find_workspace(scene) if protocol == BALL else None
     self._recorder = None if record is None else Recorder(record)
     self._environment = real.load(
       TASKS[protocol], robot=robot, camera=camera, scene=scene, image_size=image_size,
-      time_limit=time_limit, recorder=self._recorder, offsets=offsets,
+      time_limit=time_limit, recorder=self._recorder, offsets=offsets, dry_run=dry_run,
     )  # fmt: skip
-    self._goal_index = 0
+    self._dry_run = dry_run
     self._steps = 0
 
   @property
@@ -88,7 +92,7 @@ class OperatedPlant(Plant):
 
   @property
   def time_limit(self) -> float:
-    return float(self._environment._time_limit)
+    return float(self._environment.time_limit)
 
   def start(self, trial: Trial) -> dm_env.TimeStep:
     if isinstance(trial, BallTrial):
@@ -112,8 +116,8 @@ class OperatedPlant(Plant):
     return self._environment.reset()
 
   def _set_gain(self, gain: float) -> None:
-    camera = getattr(self._environment, "_camera", None)
-    if camera is None or not hasattr(camera, "set_controls"):
+    camera: Any = self._environment.camera
+    if not hasattr(camera, "set_controls"):
       return
     found = camera.set_controls(Controls(gain=gain))["gain"]
     if not found.holds:
@@ -136,9 +140,11 @@ class OperatedPlant(Plant):
     return "" if stop is None else f"{stop.reason}: {stop.detail}"
 
   def judge(self) -> tuple[str, float | None, str] | None:
+    if self._dry_run:
+      return episodes.STOPPED, None, f"dry run; {self._environment.timing.line()}"
     if self._observer is not None:
       return None
-    time = self._steps * 0.025
+    time = self._steps * constants.CONTROL_TIMESTEP
     while True:
       answer = self._ask(_QUESTION).strip().lower()[:1]
       if answer == "r":

@@ -13,6 +13,7 @@ from real.loading import Connection
 from real.recorder import Recorder
 from real.safety import Reason
 from real.virtual.robot import VirtualRobot
+from suite import protocols
 from suite.gaits.walker import Pose
 from suite.protocols import BallTrial, NavigationTrial
 from suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT
@@ -67,7 +68,7 @@ class RehearsedPlant(Plant):
     """
     super().__init__(scene, protocol, perturbation)
     self.plant_id = "data sheet" if robot_seed is None else f"robot {robot_seed}"
-    self._starts = starts.navigation_starts(scene)
+    self._starts = protocols.scene_starts(scene)
     self._workspace = find_workspace(scene) if protocol == BALL else None
     self._intruder = make_intruder(self, self._starts)
     self.robot = VirtualRobot(
@@ -108,7 +109,7 @@ class RehearsedPlant(Plant):
 
   @property
   def time_limit(self) -> float:
-    return float(self._environment._time_limit)
+    return float(self._environment.time_limit)
 
   def start(self, trial: Trial) -> dm_env.TimeStep:
     self._begin = self.robot.clock.now()

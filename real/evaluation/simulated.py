@@ -9,7 +9,7 @@ import numpy as np
 import suite
 from real.evaluation import perturbations
 from real.evaluation.plants import TASKS, Plant, Sight, Trial, make_intruder
-from real.evaluation.starts import navigation_starts
+from suite import protocols
 from suite.gaits.walker import Pose
 from suite.randomisation import RandomisationSettings
 from suite.tasks import nerf_nav
@@ -45,7 +45,7 @@ class SimulatedPlant(Plant):
     super().__init__(scene, protocol, perturbation)
     self.plant_id = f"seed {seed}" + ("" if effects is None else ", effects")
     self._seed = seed
-    self._intruder = make_intruder(self, navigation_starts(scene))
+    self._intruder = make_intruder(self, protocols.scene_starts(scene))
     self._environment = suite.load(
       TASKS[protocol], scene=scene, effects=effects, image_size=image_size, random=seed,
       randomisation=dataclasses.replace(RandomisationSettings(), pushes=False),

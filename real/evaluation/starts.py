@@ -1,6 +1,6 @@
-"""Where the trials of a protocol start in a scene: as the simulation's tasks have it, without them.
+"""Where the trials of ball pushing start in a scene: as the simulation's task has it, without it.
 
-A test compares the two.
+A test compares the two. Navigation starts where `suite.protocols.scene_starts` says.
 """
 
 from typing import Any
@@ -11,18 +11,7 @@ from suite import protocols
 from suite.gaits.walker import Pose
 from suite.tasks.workspace import Workspace
 
-_GRID = 0.1  # m, as suite.tasks.nerf_nav has it
 _BALL_GRID = 0.05  # m, as suite.tasks.ball_push has it
-
-
-def navigation_starts(scene: Any) -> np.ndarray:
-  """Returns the start positions of navigation [3, 2] [m]."""
-  lower, upper = (np.asarray(corner, np.float64)[:2] for corner in scene.extent)
-  x, y = (np.arange(lower[i] + _GRID / 2, upper[i], _GRID) for i in range(2))
-  points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-  free = points[np.asarray(scene.free_space.is_reachable(points), bool)]
-  goals = np.asarray(scene.goals, np.float64).reshape(-1, 2)
-  return protocols.navigation_starts(free, goals)
 
 
 def ball_start(

@@ -19,7 +19,6 @@ from suite.tasks.state import Start
 NAME = "nerf_nav"
 # s: ours, the paper names no limit for navigation; three times its median time to a goal (10.3 s).
 TIME_LIMIT = 30.0
-_START_GRID = 0.1  # m between the places among which an evaluation's start positions are chosen
 FALL, COLLISION = "fall", "collision"
 
 
@@ -67,11 +66,7 @@ class NerfNav(RobotTask):
   @functools.cached_property
   def evaluation_starts(self) -> np.ndarray:
     """The start positions of the evaluation protocols [3, 2] in the world [m]."""
-    lower, upper = self._arena.extent
-    x, y = (np.arange(lower[i] + _START_GRID / 2, upper[i], _START_GRID) for i in range(2))
-    points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    free = points[np.asarray(self.scene.free_space.is_reachable(points), bool)]
-    return protocols.navigation_starts(free, self._goals)
+    return protocols.scene_starts(self.scene)
 
   def _place(self, random_state: np.random.RandomState) -> None:
     drawn = random_state.randint(len(self._goals))

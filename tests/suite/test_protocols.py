@@ -1,6 +1,7 @@
 """The paper's counts, and starts that are the same for every policy."""
 
 import collections
+import types
 
 import numpy as np
 import pytest
@@ -50,3 +51,33 @@ def test_navigation_starts_are_spread_and_fixed():
   # A scene with no place far from the goals still gets starts: the farthest there are.
   near = protocols.navigation_starts(grid[np.linalg.norm(grid - goals[0], axis=1) < 0.3], goals)
   assert near.shape == (3, 2)
+
+
+def _room(half_width, *, goals):
+  """A floor 6 m long whose narrow bays at both ends hold the places farthest apart."""
+
+  def is_reachable(xy):
+    x, y = np.moveaxis(np.asarray(xy), -1, 0)
+    bay = (np.abs(y - 1.0) < 0.06) & (np.abs(x) < 3.0)
+    return bay | ((np.abs(x) < half_width) & (np.abs(y) < half_width))
+
+  return types.SimpleNamespace(
+    extent=(np.full(2, -3.0), np.full(2, 3.0)), goals=np.array(goals),
+    free_space=types.SimpleNamespace(is_reachable=is_reachable),
+  )  # fmt: skip
+
+
+def test_starts_have_room_to_turn():
+  scene = _room(2.0, goals=[[0.0, 0.0]])
+  starts = protocols.scene_starts(scene)
+  np.testing.assert_array_equal(starts, protocols.scene_starts(scene))
+  assert (np.abs(starts) <= 2.0 - protocols.START_ROOM).all()  # none in a bay, none at a wall
+  gaps = np.linalg.norm(starts[:, None] - starts, axis=-1)[np.triu_indices(3, 1)]
+  assert gaps.min() > 2.0
+  assert np.linalg.norm(starts, axis=1).min() >= protocols.MIN_GOAL_DISTANCE
+
+
+def test_starts_in_a_cramped_scene_have_what_there_is():
+  scene = _room(0.1, goals=[[0.0, 0.0]])  # only the bays are far from the goal
+  starts = protocols.scene_starts(scene)
+  assert starts.shape == (3, 2) and (np.linalg.norm(starts, axis=1) >= 1.0).all()

@@ -13,7 +13,7 @@ from real.virtual.robot import VirtualRobot
 from suite import loading, protocols
 from suite.tasks.workspace import find_workspace
 
-NEAREST = 50  # a trial of navigation that starts 1.3 m from its goal
+NEAREST = 46  # a trial of navigation that starts 1.3 m from its goal
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,14 @@ def simulated(scene):
 
 
 def test_trials_start_where_the_simulations_tasks_have_them(scene, simulated):
-  assert starts.navigation_starts(scene) == pytest.approx(simulated.task.evaluation_starts)
+  xy = protocols.scene_starts(scene)
+  for index in (0, 46):
+    trial = protocols.navigation()[index]
+    simulated.task.set_trial(trial)
+    assert simulated.task.start.xy == pytest.approx(xy[trial.position])
+  # At least as much room as at the scene's goals: the robot's radius and 15 cm.
+  cells = scene.free_space.cell_of(xy)
+  assert (scene.free_space.clearance[cells[:, 0], cells[:, 1]] >= 0.33).all()
   ball = suite.load("ball_push", scene=scene, image_size=None, random=0)
   workspace = find_workspace(scene)
   assert workspace.center == pytest.approx(ball.task.workspace.center)
@@ -46,7 +53,7 @@ def test_the_gait_reaches_a_goal_in_simulation(scene, simulated):
   found = runner.run_trial(simulated, policy, trial, group=group, index=NEAREST)
   assert found.outcome == "success" and 3 < found.time < 30
   assert found.goal == pytest.approx(scene.goals[2]) and found.setting.plant == "sim"
-  start = starts.navigation_starts(scene)[trial.position]
+  start = protocols.scene_starts(scene)[trial.position]
   assert found.path[0][1:3] == pytest.approx(start, abs=0.02)
   distance = np.linalg.norm(np.array(found.path[-1][1:3]) - scene.goals[2])
   assert distance < 0.35  # a point every 0.2 s
@@ -63,7 +70,7 @@ def test_the_gait_reaches_a_goal_on_the_virtual_robot(scene):
   finally:
     plant.close()
   assert found.outcome == "success" and found.setting.plant_id == "robot 2"
-  start = starts.navigation_starts(scene)[trial.position]
+  start = protocols.scene_starts(scene)[trial.position]
   assert found.path[0][1:3] == pytest.approx(start, abs=0.06)
 
 
@@ -80,7 +87,7 @@ def _standing_in(intruder, time):
 
 @pytest.mark.parametrize("name", ["moved_object", "person"])
 def test_intruders_stand_in_free_space_away_from_starts_and_goals(scene, name):
-  clear = plants.keep_clear(scene, starts.navigation_starts(scene))
+  clear = plants.keep_clear(scene, protocols.scene_starts(scene))
   intruder = perturbations.make_intruder(name, scene, keep_clear=clear)
   places = np.array([_standing_in(intruder, time) for time in (0.0, 2.0, 5.0)])
   assert scene.free_space.is_reachable(places).all()
@@ -144,7 +151,29 @@ def test_robot_prompts_for_placement_and_verdict(scene):
       found = runner.run_trial(plant, policy, trial, group=group, index=NEAREST)
     finally:
       plant.close()
-  start = starts.navigation_starts(scene)[trial.position]
+  start = protocols.scene_starts(scene)[trial.position]
   assert f"x = {start[0]:.2f} m" in asked[0] and "Goal 3" in said[0]
   assert "Walk slowly around" in said[1] and "Expected one of" in said[2]
   assert len(asked) == 3 and found.outcome == "lost" and found.setting.plant == "robot"
+
+
+def test_a_dry_run_moves_nothing_and_asks_for_no_verdict(scene):
+  asked = []
+  with VirtualRobot(world="floor", seed=1, stepped=True) as robot:
+    servos = robot.devices.servos.values()
+    before = [servo.table["goal_position"] for servo in servos]
+    plant = operated.OperatedPlant(
+      scene, "navigation", robot=robot.connection(), camera=None, image_size=None, time_limit=0.5,
+      dry_run=True, ask=lambda question: asked.append(question) or "", say=lambda text: None,
+    )  # fmt: skip
+    try:
+      group, trial = plants.trials("navigation")[NEAREST]
+      policy = GaitPolicy(scene, "navigation")
+      found = runner.run_trial(plant, policy, trial, group=group, index=NEAREST)
+    finally:
+      plant.close()
+    assert not any(servo.table["torque_enable"] for servo in servos)
+    assert [servo.table["goal_position"] for servo in servos] == before
+  assert len(asked) == 1 and "Place the robot" in asked[0]
+  assert found.outcome == "stopped" and found.detail.startswith("dry run; ")
+  assert "observation to goal" in found.detail  # what it would have taken
