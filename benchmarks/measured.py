@@ -41,10 +41,10 @@ def main(settings: Settings) -> None:
       held=sorted(folder.glob("held*.mcap")),
       out=settings.out / folder.name,
     )
-    rows[folder.name] = {
-      name: content[name]
-      for name in ("verdict", "effects", "alternatives", "error", "calibration", "seconds")
-    }
+    kept = ("verdict", "effects", "alternatives", "residual_at", "error", "seconds")
+    details = json.loads((settings.out / folder.name / "details.json").read_text())
+    rows[folder.name] = {name: content[name] for name in kept}
+    rows[folder.name] |= {name: details[name] for name in ("calibration", "clocks")}
     held = content["error"]["held"]
     print(
       f"{folder.name}: {content['verdict']}"

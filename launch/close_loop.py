@@ -34,6 +34,7 @@ VIRTUAL = "virtual"
 _STEP = constants.CONTROL_TIMESTEP
 _TRAIN = ("sweep", "slow", "steps")
 _HELD = ("mixed",)
+_LIFTING = 2.0  # s until a robot that was taken by its torso hangs still
 _NOMINAL = RandomisationSettings(
   pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
 )
@@ -61,7 +62,7 @@ def main() -> int:
   try:
     run(arguments)
   except (OSError, RuntimeError, ValueError) as error:
-    print(f"close_loop: {error}", file=sys.stderr)
+    print(f"error: {error}", file=sys.stderr)
     return 2
   return 0
 
@@ -142,38 +143,71 @@ def _excite(arguments: Arguments) -> dict[str, np.ndarray]:
     return _on(robot.connection(), arguments, robot)
 
 
+class Gate:
+  """A recorder that notes nothing until it is opened: what happens before is no part of a log."""
+
+  def __init__(self, recorder: Recorder):
+    """Takes the recorder, closed."""
+    self._recorder = recorder
+    self.open = False
+
+  def __getattr__(self, name: str) -> Any:
+    """Returns the recorder's method, or one that does nothing."""
+    return getattr(self._recorder, name) if self.open else _ignore
+
+
+def _ignore(*_: Any, **__: Any) -> None:
+  """Notes nothing."""
+
+
 def _on(connection: Connection, arguments: Arguments, robot: Any) -> dict[str, np.ndarray]:
   count = round(arguments.seconds / _STEP)
   for name in (*_TRAIN, *_HELD):
     with Recorder(arguments.out / f"{name}.mcap") as recorder:
-      _play(connection, motion(name, count), robot, recorder=recorder, held=True)
+      _play(connection, motion(name, count), robot, recorder=Gate(recorder), held=True)
+    if recorder.dropped:
+      raise RuntimeError(
+        f"Found {recorder.dropped} messages missing in {name}.mcap, expected none: the recorder did"
+        " not keep up; run again on a machine with less load."
+      )
   actions = motion("sway", count)
   return {"actions": actions, "positions": _play(connection, actions, robot, held=False)}
 
 
 def _play(
-  connection: Connection, actions: np.ndarray, robot: Any, *, held: bool, recorder: Any = None
+  connection: Connection,
+  actions: np.ndarray,
+  robot: Any,
+  *,
+  held: bool,
+  recorder: Gate | None = None,
 ) -> np.ndarray:
   """Plays actions [T, 20] and returns the joint positions [T, 20] that were observed."""
   rows = []
+  lifting = round(_LIFTING / _STEP) if held else 0
   with real.load(
-    "nerf_nav", robot=connection, image_size=None, time_limit=len(actions) * _STEP + 1.0,
-    recorder=recorder,
+    "nerf_nav", robot=connection, image_size=None,
+    time_limit=(lifting + len(actions)) * _STEP + 1.0, recorder=recorder,
   ) as environment:  # fmt: skip
     environment.reset()
     if held:
       if robot is not None:
         robot.hold(True)
       else:
-        input("Lift the robot by its torso, then press Enter. ")
-    for action in actions:
+        print(f"Lift the robot by its torso, feet off the ground, within {_LIFTING:g} s.")
+    for index, action in enumerate([*np.repeat(actions[:1], lifting, axis=0), *actions]):
+      if index == lifting and recorder is not None:
+        recorder.open = True
       timestep = environment.step(action)
-      rows.append(timestep.observation["joint_positions"][-1].copy())
+      if index >= lifting:
+        rows.append(timestep.observation["joint_positions"][-1].copy())
       if timestep.last():
         raise RuntimeError(
           f"Found the episode ended after {len(rows)} steps ({environment.stop}), expected"
           f" {len(actions)}: look at the robot."
         )
+    if recorder is not None:
+      recorder.open = False
   return np.array(rows)
 
 

@@ -42,8 +42,8 @@ def main() -> int:
     if arguments.evaluate is not None:
       return _evaluate(arguments)
     return _identify(arguments)
-  except (FileNotFoundError, ValueError) as error:
-    print(f"identify: {error}", file=sys.stderr)
+  except (OSError, ValueError) as error:
+    print(f"error: {error}", file=sys.stderr)
     return 2
 
 

@@ -42,8 +42,17 @@ def write(source: Path, target: Path, effects: Sequence[Effect]) -> list[Effect]
       continue
     _put(spec, effect)
   spec.compile()
+  _absolute(spec, source.resolve().parent)
   target.write_text(spec.to_xml())
   return left
+
+
+def _absolute(spec: mujoco.MjSpec, folder: Path) -> None:
+  """Lets a model find its meshes and textures from any folder."""
+  if spec.meshes or spec.hfields or spec.skins:
+    spec.meshdir = str(folder / spec.meshdir)
+  if spec.textures:
+    spec.texturedir = str(folder / spec.texturedir)
 
 
 def _put(spec: mujoco.MjSpec, effect: Effect) -> None:

@@ -1,4 +1,8 @@
-"""Writes what an identification found, and reads it back to evaluate it on other logs."""
+"""Writes what an identification found, and reads it back to evaluate it on other logs.
+
+report.json holds the findings, details.json what they rest on and all that `evaluate` needs: the
+declared model's path, the extended model as effects, the joints' latencies.
+"""
 
 import json
 import time
@@ -8,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from suite.effects import Effect, read_effects, write_effects
+from suite.effects import Effect, write_effects
+from suite.effects.files import from_list, to_list
 from sysid import decision, detection, evaluation, excitation, extended_model, report
 from sysid.evaluation import Clocks
 from sysid.identification import Found, Identified, Settings, analyse, load_model, read_logs
-from sysid.logs import Log
+from sysid.logs import COMMANDS, Log, LogError
 
 _LISTED = 6  # alternatives in the report
 
@@ -28,7 +33,7 @@ def identify(
 ) -> dict[str, Any]:
   """Finds the effect that a model lacks and writes down what it found.
 
-  Written are report.json, effects.json, calibration.json, model_extended.xml and report.html.
+  Written are report.json, details.json, effects.json, model_extended.xml and report.html.
 
   Args:
     model: declared MuJoCo model.
@@ -43,7 +48,8 @@ def identify(
 
   Raises:
     FileNotFoundError: a file is missing.
-    LogError: a log cannot be used.
+    OSError: the folder cannot be written.
+    LogError: a log cannot be used, or the held or reference logs lack a joint of the others.
     ValueError: the model cannot be read, or there is no log.
   """
   began = time.perf_counter()
@@ -52,9 +58,11 @@ def identify(
     raise ValueError("Found no log to identify from, expected at least one --logs file.")
   compiled = load_model(Path(model))
   logs, others = read_logs(train, compiled), read_logs(held, compiled)
-  found = analyse(compiled, logs, reference=read_logs(reference, compiled), settings=settings)
+  healthy = read_logs(reference, compiled)
+  _check_joints(logs, [*others, *healthy])
   out = Path(out)
   out.mkdir(parents=True, exist_ok=True)
+  found = analyse(compiled, logs, reference=healthy, settings=settings)
   whole = [*found.calibration, *found.objects, *found.learned]
   content: dict[str, Any] = {
     "verdict": found.verdict,
@@ -77,30 +85,51 @@ def identify(
       {"kind": "residual_force", "joint": e.target, "parameters": {}, "evidence": {}}
       for e in found.learned
     ]
-  first = found.found[0]
-  content["tests"] = {
-    "declared": detection.tests(first.screened.problem, first.ladder.declared.fit),
-    "extended": detection.tests(first.screened.problem, first.finding.chosen.fit),
-  }
-  content["audit"] = found.audits
-  content["model"] = str(Path(model).resolve())
-  content["calibration"] = {
-    e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
-    for e in found.calibration
-  }
   write_effects(out / "effects.json", _claimed(found))
-  write_effects(out / "calibration.json", [*found.calibration])
-  (out / "clocks.json").write_text(
-    json.dumps({j: [c.skew, c.latency] for j, c in found.clocks.items()}, indent=2) + "\n"
-  )
   extended_model.write(
     Path(model), out / "model_extended.xml", [*found.calibration, *found.objects]
   )
+  details = _details(found, Path(model), whole)
+  (out / "details.json").write_text(json.dumps(details, indent=2, allow_nan=False) + "\n")
   content["seconds"] = round(time.perf_counter() - began, 1)
-  (out / "report.html").write_text(report.page(found, content, others, whole, settings.window_s))
+  (out / "report.html").write_text(
+    report.page(found, content, details, others, whole, settings.window_s)
+  )
   content["seconds"] = round(time.perf_counter() - began, 1)
   (out / "report.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
   return content
+
+
+def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
+  """Raises a LogError where a held or reference log lacks a joint of the logs that are fitted."""
+  wanted = [j for j in logs[0].commands.joints if all(j in log.commands.joints for log in logs)]
+  for log in others:
+    missing = [j for j in wanted if j not in log.commands.joints]
+    if missing:
+      raise LogError(
+        f"{log.name} has no commands for {missing}: found {list(log.commands.joints)} in "
+        f"{COMMANDS}, expected the joints of the logs to identify from; record the same joints."
+      )
+
+
+def _details(found: Identified, model: Path, extended: Sequence[Effect]) -> dict[str, Any]:
+  """Returns what the findings rest on, and what `evaluate` needs."""
+  first = found.found[0]
+  return {
+    "model": str(model.resolve()),
+    "extended": to_list(extended),
+    "clocks": {j: {"skew": c.skew, "latency": c.latency} for j, c in found.clocks.items()},
+    "calibration": {
+      e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
+      for e in found.calibration
+    },
+    "tests": {
+      "joint": first.screened.joint,
+      "declared": detection.tests(first.screened.problem, first.ladder.declared.fit),
+      "extended": detection.tests(first.screened.problem, first.finding.chosen.fit),
+    },
+    "audit": found.audits,
+  }
 
 
 def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
@@ -111,17 +140,16 @@ def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
     held: logs.
   """
   folder = Path(folder)
-  if not (folder / "report.json").is_file():
-    raise FileNotFoundError(
-      f"Found no {folder / 'report.json'}, expected a folder that identify.py wrote."
-    )
+  for name in ("report.json", "details.json"):
+    if not (folder / name).is_file():
+      raise FileNotFoundError(
+        f"Found no {folder / name}, expected a folder that identify.py wrote."
+      )
   content = json.loads((folder / "report.json").read_text())
-  model = load_model(Path(content["model"]))
-  effects = [
-    *read_effects(folder / "calibration.json"), *read_effects(folder / "effects.json")
-  ]  # fmt: skip
-  raw = json.loads((folder / "clocks.json").read_text())
-  clocks = {joint: Clocks(*values) for joint, values in raw.items()}
+  details = json.loads((folder / "details.json").read_text())
+  model = load_model(Path(details["model"]))
+  effects = from_list(details["extended"])
+  clocks = {joint: Clocks(**values) for joint, values in details["clocks"].items()}
   rows = []
   for log in read_logs(held, model):
     window = content["window_s"] or 0.5
@@ -136,12 +164,16 @@ def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def _claimed(found: Identified) -> list[Effect]:
-  """Returns the effects that go into effects.json."""
+  """Returns the effects that go into effects.json.
+
+  The constants of a joint go with its effects, which were fitted beside them.
+  """
   if found.verdict == "none":
     return []
-  if found.verdict == "unexplained":
-    return [*found.objects, *found.learned]
-  return list(found.objects)
+  joints = {f.screened.joint for f in found.found if f.finding.named}
+  joints |= {e["joint"] for e in found.effects}
+  constants = [c for c in found.calibration if c.target in joints]
+  return [*constants, *found.objects, *found.learned]
 
 
 def _errors(

@@ -1,0 +1,125 @@
+"""`launch/identify.py`: bad input is one line that says what was found and what to do."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sysid import log_writer
+from tests.sysid.synthetic import ARM, PENDULUM
+
+_LAUNCH = Path(__file__).parents[2] / "launch"
+START = 1_700_000_000_000_000_000
+NO_ACTUATOR = PENDULUM.replace(
+  '<position name="joint" joint="joint" kp="21" forcerange="-4 4"/>', ""
+)
+
+
+@pytest.fixture
+def identify(monkeypatch, capsys):
+  """Runs the command line; returns exit code, stdout and stderr."""
+  spec = importlib.util.spec_from_file_location("identify", _LAUNCH / "identify.py")
+  module = importlib.util.module_from_spec(spec)
+  monkeypatch.setitem(sys.modules, "identify", module)
+  spec.loader.exec_module(module)
+
+  def run(*arguments):
+    monkeypatch.setattr(sys, "argv", ["identify.py", *map(str, arguments)])
+    code = module.main()
+    return code, *capsys.readouterr()
+
+  return run
+
+
+def _log(path, *, duration=2.0, commands=True, joints=("joint",), spoil=None, cut=None):
+  """Writes a log of joints that move; `spoil(index, fields)` changes states."""
+  with log_writer.open_log(path, joints) as log:
+    for index in range(round(duration * 100)):
+      t = START + index * 10_000_000
+      if commands and index % 2 == 0:
+        log.command(t, position=[0.1] * len(joints))
+      fields = {"stamp_ns": t, "position": [np.sin(0.1 * index)] * len(joints)}
+      log.state(**(spoil(index, fields) if spoil else fields))
+  if cut is not None:
+    path.write_bytes(path.read_bytes()[:cut])
+  return path
+
+
+def _at(which, **changes):
+  return lambda index, fields: {**fields, **changes} if index == which else fields
+
+
+@pytest.mark.parametrize(
+  ("options", "words"),
+  [
+    ({"commands": False}, "has no commands"),
+    ({"joints": ("elbow",)}, "['elbow'] that the model lacks"),
+    ({"spoil": _at(50, position=[np.nan])}, "NaN or infinite positions"),
+    ({"spoil": _at(50, stamp_ns=START)}, "time runs backwards"),
+    ({"duration": 0.1}, "expected at least 1 s"),
+    ({"cut": 2000}, "truncated or damaged"),
+    ({"cut": 0}, "is empty"),
+  ],
+)
+def test_a_bad_log_is_one_line(options, words, identify, tmp_path):
+  (tmp_path / "model.xml").write_text(PENDULUM)
+  log = _log(tmp_path / "bad.mcap", **options)
+  code, out, err = identify(
+    "--model", tmp_path / "model.xml", "--logs", log, "--out", tmp_path / "out"
+  )
+  assert code != 0 and out == ""
+  assert err.startswith("error: bad.mcap") and err.count("\n") == 1
+  assert words in err
+
+
+@pytest.mark.parametrize(
+  ("model", "words"),
+  [
+    (None, "Found no file"),
+    ("<mujoco><nonsense/></mujoco>", "is not a MuJoCo model"),
+    ("not xml", "is not a MuJoCo model"),
+    (NO_ACTUATOR, "no actuator of the model drives that joint"),
+  ],
+)
+def test_a_bad_model_is_one_line(model, words, identify, tmp_path):
+  if model is not None:
+    (tmp_path / "model.xml").write_text(model)
+  log = _log(tmp_path / "a.mcap")
+  code, _, err = identify(
+    "--model", tmp_path / "model.xml", "--logs", log, "--out", tmp_path / "out"
+  )
+  assert code != 0
+  assert err.startswith("error: ") and err.count("\n") == 1 and words in err
+
+
+def test_missing_files_and_options_are_one_line(identify, tmp_path):
+  (tmp_path / "model.xml").write_text(PENDULUM)
+  log = _log(tmp_path / "a.mcap")
+  model = ("--model", tmp_path / "model.xml")
+  out = ("--out", tmp_path / "out")
+  (tmp_path / "file").write_text("")
+  for arguments, words in (
+    ((*model, *out), "Found no --model, --logs or --out"),
+    ((*model, "--logs", tmp_path / "none.mcap", *out), "Found no file"),
+    ((*model, "--logs", log, "--held", tmp_path / "none.mcap", *out), "Found no file"),
+    ((*model, "--logs", log, "--out", tmp_path / "file"), "File exists"),
+    (("--evaluate", tmp_path, "--held", log), "expected a folder that identify.py wrote"),
+    (("--evaluate", tmp_path), "Found no --held log"),
+  ):
+    code, _, err = identify(*arguments)
+    assert code != 0
+    assert err.startswith("error: ") and err.count("\n") == 1 and words in err
+
+
+@pytest.mark.parametrize("option", ["--held", "--reference"])
+def test_held_logs_of_other_joints_are_one_line(option, identify, tmp_path):
+  (tmp_path / "model.xml").write_text(ARM)
+  log = _log(tmp_path / "a.mcap", joints=("shoulder", "elbow"))
+  other = _log(tmp_path / "b.mcap", joints=("elbow",))
+  code, _, err = identify(
+    "--model", tmp_path / "model.xml", "--logs", log, option, other, "--out", tmp_path / "out"
+  )
+  assert code != 0
+  assert err.startswith("error: b.mcap has no commands for ['shoulder']") and err.count("\n") == 1
