@@ -184,4 +184,5 @@ def _has_room(free_space: Any, places: np.ndarray, room: float) -> np.ndarray:
   angles = 2 * np.pi * np.arange(16) / 16
   ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
   around = np.concatenate([room * ring, room / 2 * ring])
-  return np.asarray(free_space.is_reachable(places[:, None] + around), bool).all(axis=1)
+  fits = np.asarray(free_space.is_reachable(places[:, None] + around), bool)
+  return np.all(fits, axis=1)
