@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from mcap_ros2.writer import Writer
 
-from real import messages
 from real.recorder import LENGTH
+from sysid import messages
 
 _CHUNK = 1 << 20  # bytes: chunks end by time before they are so large
 _FLUSH_PERIOD = 0.25  # s between chunks: what a killed recorder loses; ours

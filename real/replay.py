@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import plotly.offline
 
-from real import messages, recording
+from real import recording
+from sysid import messages
 
 _MAX_POINTS = 4000  # of a plotted line: more than a screen has pixels
 _JOINT_TOPICS = {

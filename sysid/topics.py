@@ -13,13 +13,21 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 
-COMMANDS = "/joint_commands"
-STATES = "/joint_states"
-PWM = "/joint_pwm"
-IMU = "/imu/data_raw"
-BATTERY = "/battery_state"
-TEMPERATURE_TYPE = "sensor_msgs/msg/Temperature"
-"""Temperatures are found by type: the topic's name is free, frame_id names the joint."""
+from sysid.messages import BATTERY, COMMANDS, IMU, PWM, STATES, TEMPERATURE_TYPE
+
+__all__ = [
+  "BATTERY",
+  "COMMANDS",
+  "IMU",
+  "NANO",
+  "PWM",
+  "STATES",
+  "TEMPERATURE_TYPE",
+  "LogError",
+  "Topic",
+  "check_time",
+  "read_topics",
+]
 
 NANO = 1e-9
 
@@ -47,6 +55,8 @@ class Topic:
 
 def read_topics(path: pathlib.Path, recover: bool) -> tuple[dict[str, Topic], bool]:
   """Reads the topics that measured logs are made of.
+
+  Temperatures are found by type: the topic's name is free, frame_id names the joint.
 
   Args:
     path: an MCAP file.

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from mcap_ros2.reader import read_ros2_messages
 
-from real import messages, recording
+from real import recording
 from real.recorder import Recorder
 from scenes.cameras import Camera
-from sysid import logs
+from sysid import logs, messages
 
 NAMES = ("head_pan", "l_knee", "r_knee")
 START = 1_700_000_000.25

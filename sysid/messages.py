@@ -1,7 +1,8 @@
 """The ROS 2 messages of a measured log, built without ROS: definitions, topics and dictionaries.
 
 Definitions are those of ROS 2's sensor_msgs, std_msgs, geometry_msgs and builtin_interfaces, field
-by field. Times are nanoseconds since 1970. Every function returns (topic, type, fields).
+by field. Times are nanoseconds since 1970. Every function returns (topic, type, fields). The
+robot's recorder and whoever makes logs up write the same messages.
 """
 
 import math
@@ -33,7 +34,7 @@ Message = tuple[str, str, dict[str, Any]]
 
 def _definition(fields: str, *parts: str) -> str:
   separator = "=" * 80
-  return "\n".join([fields.strip(), *(f"{separator}\n{part.strip()}" for part in parts), ""])
+  return "\n".join([fields.strip(), *(f"{separator}\n{part}" for part in parts), ""])
 
 
 _TIME = """MSG: builtin_interfaces/Time
@@ -74,11 +75,11 @@ float64[9] orientation_covariance
 geometry_msgs/Vector3 angular_velocity
 float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance""", _HEADER, _TIME, _QUATERNION, _VECTOR3),
+float64[9] linear_acceleration_covariance""", _VECTOR3, _QUATERNION, _HEADER, _TIME),
   VECTOR_STAMPED: _definition(
     """
 std_msgs/Header header
-geometry_msgs/Vector3 vector""", _HEADER, _TIME, _VECTOR3),
+geometry_msgs/Vector3 vector""", _VECTOR3, _HEADER, _TIME),
   COMPRESSED_IMAGE: _definition(
     """
 std_msgs/Header header
@@ -158,11 +159,17 @@ def _vector(values: Sequence[float]) -> dict[str, float]:
   return {"x": x, "y": y, "z": z}
 
 
-def imu(time_ns: int, gyroscope: Sequence[float], accelerometer: Sequence[float]) -> Message:
+def imu(
+  time_ns: int,
+  gyroscope: Sequence[float],
+  accelerometer: Sequence[float],
+  *,
+  frame: str = IMU_FRAME,
+) -> Message:
   """Returns turning rates [3] [rad/s] and specific force [3] [m/s^2]; there is no orientation."""
   unknown = [-1.0] + 8 * [0.0]  # sensor_msgs: -1 first says that there is none
   fields = {
-    "header": header(time_ns, IMU_FRAME),
+    "header": header(time_ns, frame),
     "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
     "orientation_covariance": unknown,
     "angular_velocity": _vector(gyroscope),
