@@ -13,7 +13,16 @@ import mujoco
 import numpy as np
 
 from suite.effects import Effect
-from sysid import decision, detection, explanation, intervals, learned, race, screening
+from sysid import (
+  decision,
+  detection,
+  elaboration,
+  explanation,
+  intervals,
+  learned,
+  race,
+  screening,
+)
 from sysid.audit import audit
 from sysid.chain import ancestors, share
 from sysid.decision import Finding, Thresholds
@@ -211,7 +220,11 @@ def _conclude(result: Identified, settings: Settings) -> None:
   entries: list[tuple[Found, Entry]] = []
   for item in result.found:
     entry = item.finding.chosen
-    if item.finding.named:
+    if item.finding.verdict == "unexplained":
+      entry = elaboration.elaborate(item.ladder, entry)
+    if entry is not item.finding.chosen:
+      item.finding = dataclasses.replace(item.finding, chosen=entry, named=True)
+    elif item.finding.named:
       entry = _polished(item, spread)
     entries.append((item, entry))
   by_joint = {item.screened.joint: entry for item, entry in entries}

@@ -40,6 +40,8 @@ NAMES = (
   *("softness", "stopping_rate"),
   # whether a weakened actuator saturates earlier too, and whether its measured effort tells
   *("scales_limit", "effort_tells"),
+  # load friction: its square, and how much larger it is at rest
+  *("load_square", "load_at_rest", "load_velocity"),
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 
@@ -47,6 +49,7 @@ NEUTRAL = {
   "effort_tells": 1.0,
   "gain": 1.0,
   "stribeck_velocity": 0.1,
+  "load_velocity": 0.1,
   "time_constant": 300.0,
   "derating": 0.004,
 }
@@ -140,6 +143,7 @@ def simulate(
   load_kind, on_motor_side = int(p[32]), p[33] > 0.5
   softness, stopping_rate = p[34], p[35]
   scales_limit, effort_tells = p[36] > 0.5, p[37] > 0.5
+  load_square, load_at_rest, load_velocity = p[38], p[39], max(p[40], 1e-6)
   learned = weights.size > 0
   samples = sample_time.size
   windows = window_start.size
@@ -245,13 +249,17 @@ def simulate(
       if breakaway > 0.0:
         ratio = v / stribeck
         limit += breakaway * math.exp(-ratio * ratio)
-      if load_share > 0.0:
+      if load_share > 0.0 or load_square > 0.0:
         carried = before  # of the last step, as suite.effects
         if load_kind == 1:
           carried = before - damping * v
         elif load_kind == 2:
           carried = demand + bias[i] + inertia[i] * acceleration
-        limit += load_share * abs(carried)
+        rubbing = (load_share + load_square * abs(carried)) * abs(carried)
+        if load_at_rest > 0.0:
+          ratio = v / load_velocity
+          rubbing *= 1.0 + load_at_rest * math.exp(-ratio * ratio)
+        limit += rubbing
       link = inertia[i]
       motor = rotor if rotor > 0.0 else _ROTOR_WITHOUT_ARMATURE * link
       if apart:

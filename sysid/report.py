@@ -201,7 +201,7 @@ def _ladder(found: Identified) -> str:
   blocks = []
   for item in found.found:
     ladder = item.ladder
-    rows = [
+    rows: list[list[Any]] = [
       ["declared model", ladder.declared.score, 0.0, ""],
       ["constants calibrated", ladder.null.score, ladder.declared.score - ladder.null.score, ""],
     ]

@@ -166,6 +166,9 @@ def _load(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   _stick(plant, p)
   p[I["load_coefficient"]] = v["coefficient"]
   p[I["load_kind"]] = v.get("carried", 0.0)
+  p[I["load_square"]] = v.get("quadratic", 0.0)
+  p[I["load_at_rest"]] = v.get("rest", 0.0)
+  p[I["load_velocity"]] = v.get("velocity", kernel.NEUTRAL["load_velocity"])
 
 
 def _backlash(plant: JointPlant, p: Array, v: dict[str, float]) -> None:

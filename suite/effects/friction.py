@@ -61,8 +61,12 @@ class StribeckFriction(Operator):
 
 
 class LoadFriction(Operator):
-  """Dry friction in proportion to the torque that the gear transmits: coefficient * |torque|.
+  """Dry friction that grows with the torque that the gear transmits.
 
+    (coefficient |torque| + quadratic torque^2) (1 + rest exp(-(v / velocity)^2))
+
+  The last factor is a Stribeck fall of it: gears under load hold at rest what they pass in motion
+  (Duclusaud, Passault, Padois and Ly 2024 measure both on small servos).
   The torque is that of the last step; which one loads the gear is `carried`: 0 the actuators', 1
   that less the joint's damping (back-EMF: what is left is the current's), 2 what the link takes,
   which is also less what the rotor's own inertia needs.
@@ -71,9 +75,13 @@ class LoadFriction(Operator):
   def bind(self, binding: Binding) -> None:
     parameters = self.per_joint(binding)
     self._coefficient = parameters["coefficient"]
+    self._quadratic = parameters["quadratic"]
+    self._at_rest = parameters["rest"]
+    self._rate = 1 / np.maximum(parameters["velocity"], _VELOCITY_FLOOR)
+    self._falls = bool(self._at_rest.any())
     self._damped = parameters["carried"] == 1
     self._linked = parameters["carried"] == 2
-    _stick(binding, self._coefficient)
+    _stick(binding, self._coefficient + self._quadratic)
 
   def step(self, binding: Binding) -> None:
     data, dofs = binding.data, binding.dofs
@@ -86,7 +94,9 @@ class LoadFriction(Operator):
       inner -= binding.model.dof_armature[dofs] * data.qacc[dofs]
       load += np.where(self._linked, inner, 0.0)
     np.abs(load, out=load)
-    load *= self._coefficient
+    load *= self._coefficient + self._quadratic * load
+    if self._falls:
+      load *= 1 + self._at_rest * np.exp(-np.square(binding.velocity * self._rate))
     binding.friction += load
 
 
@@ -147,11 +157,44 @@ KINDS = (
   ),
   Kind(
     "load_friction",
-    "dry friction in proportion to the actuator's torque",
+    "dry friction that grows with the torque through the gear",
     "joint",
     "force",
     (
       Parameter("coefficient", "1", 0.0, 0.0, 0.4, "friction per torque", minimum=0.0),
+      Parameter(
+        "quadratic",
+        "1/(N m)",
+        0.0,
+        0.0,
+        2.0,
+        "friction per squared torque",
+        minimum=0.0,
+        shape=True,
+        fitted=False,
+      ),
+      Parameter(
+        "rest",
+        "1",
+        0.0,
+        0.0,
+        1.0,
+        "share that it is larger at rest",
+        minimum=0.0,
+        shape=True,
+        fitted=False,
+      ),
+      Parameter(
+        "velocity",
+        "rad/s",
+        0.1,
+        0.01,
+        1.0,
+        "speed of the fall to 1/e",
+        minimum=0.0,
+        shape=True,
+        fitted=False,
+      ),
       Parameter(
         "carried",
         "1",

@@ -102,6 +102,21 @@ def test_load_friction_takes_its_share_of_the_torque():
     assert acceleration == pytest.approx(0.7 * torque / _INERTIA, rel=1e-3)
 
 
+def test_load_friction_may_grow_with_the_square_and_fall_with_speed():
+  shape = {"coefficient": 0.1, "quadratic": 2.0, "rest": 0.5, "velocity": 0.5}
+  for torque in (0.1, -0.2):
+    _, v, _, _ = _run(_hinge(), [Effect("load_friction", "hinge", shape)], np.full(300, torque))
+
+    def accelerate(_, v, torque=torque):
+      friction = (0.1 + 2.0 * abs(torque)) * (1 + 0.5 * np.exp(-((v / 0.5) ** 2)))
+      return torque * (1 - friction) / _INERTIA
+
+    times = _times(300)
+    want = scipy.integrate.solve_ivp(accelerate, (0, 0.3), [0.0], t_eval=times, rtol=1e-9).y[0]
+    # In the first step there is no torque yet that rubs.
+    np.testing.assert_allclose(v, want, atol=0.02 * abs(want[-1]))
+
+
 def test_asymmetric_friction():
   effect = [Effect("asymmetric_friction", "hinge", {"positive": 0.06, "negative": 0.02})]
   for velocity, friction in ((2.0, 0.06), (-2.0, 0.02)):

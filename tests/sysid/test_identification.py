@@ -9,7 +9,7 @@ import pytest
 
 import sysid
 from suite.effects import Effect, EffectStack, read_effects
-from sysid import decision, evaluation, extended_model, learned
+from sysid import decision, elaboration, evaluation, explanation, extended_model, learned
 from sysid.audit import audit
 from sysid.candidates import calibration
 from sysid.chain import ancestors
@@ -99,6 +99,28 @@ def test_learned_force_lowers_the_error_of_what_has_no_name() -> None:
   force, before, after = learned.learn(problem, null)
   assert force is not None
   assert after < 0.6 * before
+
+
+def test_rich_friction_is_found_where_the_library_has_none() -> None:
+  shape = {"coefficient": 0.05, "quadratic": 0.3, "rest": 0.6, "velocity": 0.3, "carried": 2.0}
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  logs = logs_of(PENDULUM, [Effect("load_friction", "joint", shape)])
+  problem = Problem(JointPlant(model, "joint", logs))
+  term, declared, null = explanation.bare(problem)
+  ladder = explanation.Ladder(problem, term, declared, null, [], [])
+  found = elaboration.elaborate(ladder, null)
+  assert decision.names(found) == {"load_friction"}
+  assert found.levels[:, 0].max() < 1.3  # of the readings' noise
+  assert null.levels[:, 0].max() > 3
+  assert found.fit.values("load_friction")["quadratic"] == pytest.approx(0.3, rel=0.15)
+
+
+def test_a_simple_machine_gets_no_rich_friction() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  problem = Problem(JointPlant(model, "joint", logs_of(PENDULUM)))
+  term, declared, null = explanation.bare(problem)
+  ladder = explanation.Ladder(problem, term, declared, null, [], [])
+  assert elaboration.elaborate(ladder, null) is null
 
 
 @pytest.mark.parametrize(

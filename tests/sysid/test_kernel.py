@@ -21,6 +21,11 @@ CASES = [
   ("load_friction", {"coefficient": 0.15, "carried": 0.0}, 3e-4),
   ("load_friction", {"coefficient": 0.4, "carried": 1.0}, 3e-4),
   ("load_friction", {"coefficient": 0.4, "carried": 2.0}, 3e-4),
+  (
+    "load_friction",
+    {"coefficient": 0.05, "quadratic": 0.1, "rest": 0.5, "velocity": 0.4, "carried": 2.0},
+    3e-4,
+  ),
   ("asymmetric_friction", {"positive": 0.2, "negative": 0.05}, 1e-6),
   ("quadratic_drag", {"coefficient": 0.1}, 1e-6),
   ("encoder_offset", {"offset": 0.05}, 1e-6),

@@ -1,0 +1,85 @@
+"""A richer friction where nothing in the library fits: used in the model, not a ground for a name.
+
+Gears under load rub more than in proportion to it, and hold at rest more than they take in motion.
+Such a friction has four values and can imitate much, so it does not take part in the race: it is
+fitted where a joint stays unexplained, on top of the hypotheses that came nearest, and kept if it
+lowers the error on blocks that it was not fitted to.
+
+Source: Duclusaud, Passault, Padois and Ly 2024, "Extended friction models for the physics
+simulation of servo actuators", whose models of load, square and Stribeck this joins in one factor.
+"""
+
+import numpy as np
+
+from sysid import decision, race
+from sysid.explanation import Ladder
+from sysid.fitting import Problem
+from sysid.race import Entry
+from sysid.terms import Term
+
+_BASES = 4  # hypotheses on top of which it is tried
+_FINALISTS = 3  # fitted to the end
+_LONGEST = 3  # effects beside it
+_LEAST = 0.2  # nats that it must gain on held-out blocks; as decision.Thresholds.second
+_REPLACED = ("load_friction", "stribeck_friction", "supply_sag")
+"""Kinds that imitate parts of it: strength that falls with torque is friction that grows with it."""
+
+
+def rich_friction(problem: Problem, carried: int) -> Term:
+  """Returns load friction with its square and its fall from rest to motion.
+
+  Args:
+    problem: the joint.
+    carried: which torque loads the gear, as `suite.effects.friction.LoadFriction` has it.
+  """
+  logs = problem.plant.logs
+  fast = max(float(np.quantile(np.abs(np.concatenate([g.velocity for g in logs])), 0.98)), 1e-6)
+  torques = np.concatenate([o.torque for o in problem.plant.simulate(problem.plant.declared)[0]])
+  large = max(float(np.quantile(np.abs(torques), 0.95)), 1e-6)
+  return Term(
+    "load_friction",
+    problem.plant.joint,
+    ("coefficient", "quadratic", "rest", "velocity"),
+    (0.0, 0.0, 0.0, 0.002 * fast),
+    (0.8, 3.0 / large, 3.0, fast),
+    (0.1, 0.2 / large, 0.2, 0.05 * fast),
+    ((0.1, 0.3 / large, 0.4, 0.1 * fast), (0.05, 1.0 / large, 0.4, 0.3 * fast)),
+    fixed=(("carried", float(carried)),),
+  )
+
+
+def elaborate(ladder: Ladder, chosen: Entry) -> Entry:
+  """Returns the chosen hypothesis, or a better one with rich friction.
+
+  Args:
+    ladder: the evidence about a joint that stayed unexplained.
+    chosen: its hypothesis so far.
+  """
+  problem = ladder.problem
+  entries = []
+  for terms, start in _bases(ladder, chosen):
+    for carried in (0, 1, 2):
+      term = rich_friction(problem, carried)
+      for begin in term.starts:
+        fit = problem.fit([*terms, term], np.concatenate([start, begin]), evaluations=8)
+        entries.append(race.entry(problem, fit))
+  entries.sort(key=lambda e: e.score)
+  fits = [problem.fit(e.fit.terms, e.fit.x, evaluations=60) for e in entries[:_FINALISTS]]
+  best = min((race.entry(problem, f) for f in fits), key=lambda e: e.score)
+  before, after = (race.held_out(problem, e, evaluations=15).score for e in (chosen, best))
+  return best if before - after > _LEAST else chosen
+
+
+def _bases(ladder: Ladder, chosen: Entry) -> list[tuple[list[Term], np.ndarray]]:
+  """Returns the nearest hypotheses without what rich friction replaces, as terms and values."""
+  nearest = sorted([*ladder.singles, *ladder.pairs], key=lambda e: e.score)
+  found: dict[frozenset[str], tuple[list[Term], np.ndarray]] = {}
+  for entry in [chosen, *decision.unique(nearest), ladder.null]:
+    kept = [i for i, t in enumerate(entry.fit.terms) if t.kind not in _REPLACED]
+    terms = [entry.fit.terms[i] for i in kept]
+    names = frozenset(t.kind for t in terms)
+    if len(names) <= _LONGEST + 1:
+      found.setdefault(names, (terms, np.concatenate([entry.fit.part(i) for i in kept])))
+  last = list(found.values())[: _BASES - 1]
+  null = found[frozenset(t.kind for t in ladder.null.fit.terms)]
+  return [*last, null] if all(null is not base for base in last) else last
