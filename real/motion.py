@@ -1,6 +1,7 @@
 """Slow moves with the robot held: up to its pose before an episode, and to rest at the end."""
 
 import dataclasses
+import logging
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from suite.op3 import constants
 SUPPORTED_POSE = constants.standing_targets()  # [J] rad, where the robot starts and ends, held
 _LEVEL_TIME = 0.1  # s in which at least one of a dozen IMU readings arrives
 _FIRST_READING = 2.0  # s to wait for the first reading of everything
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,6 +27,7 @@ class RobotSettings:
   safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
   chip_low_pass: bool = True  # the IMU chip filters by itself; False: filtered here
   settle_time: float = 2.5  # s between being let go and the start of an episode
+  rest_time: float = 1.0  # s at the end of it in which the gyroscope's zero is measured; ours
   grip_time: float = 1.0  # s between being taken hold of and the first move
 
 
@@ -57,7 +60,7 @@ class Motion:
     if not self._dry_run:  # without torque it could not stand
       self._monitor.held = False
       self._operator.support(False)
-      self._pause(self._settings.settle_time)
+      self._stand_still()
       self._level()
 
   def rest(self) -> bool:
@@ -72,6 +75,16 @@ class Motion:
       self.standing = False
       return self._cycle.relax()
     return self._dry_run or self._cycle.torque_off or self._servos.torque(False)
+
+  def _stand_still(self) -> None:
+    """Lets the robot settle on its feet, and measures the gyroscope's zero when it has."""
+    settle = self._settings.settle_time
+    rest = min(self._settings.rest_time, settle / 2)
+    self._pause(settle - rest)
+    self._cycle.sensing.begin_rest()
+    self._pause(rest)
+    if not self._cycle.sensing.end_rest():
+      _log.warning("the robot did not stand still: the gyroscope's old zero is kept")
 
   def _take_hold(self) -> None:
     self._operator.support(True)
