@@ -23,7 +23,7 @@ _JOINT_TOPICS = {
   messages.CURRENTS: ("effort", "current", "A"),
   messages.VOLTAGES: ("effort", "voltage", "V"),
   messages.PWM: ("effort", "duty", ""),
-  messages.STAMPS: ("effort", "read after the first", "s"),
+  messages.STAMPS: ("effort", "time of reading after the stamp", "s"),
 }
 
 
