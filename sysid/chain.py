@@ -3,13 +3,17 @@
 Each joint keeps the calibration that it had; the shared term is fitted to all of them at once.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-from sysid import race
+from sysid import decision, race
+from sysid.decision import Thresholds
 from sysid.fitting import Fit, Problem
+from sysid.joint import Found
+from sysid.race import Entry
 from sysid.terms import Term
 
 Array = np.ndarray
@@ -83,3 +87,49 @@ def share(parts: Sequence[tuple[Problem, Term]], term: Term, start: Array) -> li
   zeros = [np.array(c.starts[0], float) for _, c in parts]
   fit = problem.fit(terms, np.concatenate([start, *zeros]), evaluations=25)
   return problem.entries(fit)
+
+
+def merge_payloads(model: mujoco.MjModel, found: Sequence[Found], thresholds: Thresholds) -> None:
+  """Replaces payloads on several joints of one chain by one payload that all of them feel.
+
+  A payload shows in every joint between it and the base. Each carrying body is tried with all
+  raced joints that carry it; the one that explains most over all of them is kept.
+  """
+  carriers = [f for f in found if f.finding.named and _payload_entry(f) is not None]
+  if not carriers or model.njnt < 2:
+    return
+  by_joint = {f.joint: f for f in found}
+  best: tuple[float, list[tuple[Found, Entry]]] | None = None
+  for carrier in carriers:
+    entry = _payload_entry(carrier)
+    assert entry is not None
+    term = next(t for t in entry.fit.terms if t.kind == "payload")
+    joint = model.joint(carrier.joint).id
+    chain = ancestors(model, int(model.jnt_bodyid[joint]))
+    items = [by_joint[j] for j in chain if j in by_joint]
+    values = entry.fit.values("payload")
+    start = np.array([values[n] for n in term.names])
+    parts = [(f.screened.problem, f.screened.calibration) for f in items]
+    entries = share(parts, term, start)
+    gain = sum(f.ladder.null.score - e.score for f, e in zip(items, entries, strict=True))
+    if best is None or gain > best[0]:
+      best = gain, list(zip(items, entries, strict=True))
+  assert best is not None
+  for rank, (item, entry) in enumerate(best[1]):
+    own = item.finding.chosen
+    if rank == 0 or entry.score - own.score < thresholds.second:
+      left = race.above_floor(entry) > thresholds.adequate
+      item.finding = dataclasses.replace(
+        item.finding,
+        chosen=entry,
+        named=rank == 0,
+        verdict="unexplained" if left else ("effects" if rank == 0 else "none"),
+      )
+
+
+def _payload_entry(item: Found) -> Entry | None:
+  """Returns a joint's best hypothesis of a payload alone if it is nearly as good as the chosen."""
+  entries = [e for e in item.ladder.singles if decision.names(e) == {"payload"}]
+  if not entries or entries[0].score - item.finding.chosen.score > 0.5:
+    return None
+  return entries[0]

@@ -5,6 +5,7 @@ the development seeds; none was set on the sets that figures are reported of.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -125,10 +126,11 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   return Finding(verdict, chosen, named, constants, alternatives, confounded)
 
 
-def evidence(entry: Entry, ladder: Ladder) -> dict[str, float]:
+def evidence(entry: Entry, ladder: Ladder) -> dict[str, Any]:
   """Returns a hypothesis's evidence as numbers."""
   return {
     "gain_over_constants_nats": round(float(ladder.null.score - entry.score), 4),
     "gain_over_declared_nats": round(float(ladder.declared.score - entry.score), 4),
     "position_rms_in_noise": round(float(np.sqrt(np.mean(entry.levels[:, 0] ** 2))), 3),
+    "position_rms_in_noise_by_log": [round(float(v), 2) for v in entry.levels[:, 0]],
   }

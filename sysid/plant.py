@@ -234,6 +234,7 @@ class JointPlant:
       for grid, log, source in zip(self._grids, self.logs, logs, strict=True)
     ]
     self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
+    self.absorbed: set[str] = set()
     self._moments: dict[str, list[list[Surroundings]]] = {}
     self._gravity: list[list[Surroundings]] | None = None
     self._pool = ThreadPoolExecutor(max_workers=len(os.sched_getaffinity(0)))
@@ -281,6 +282,22 @@ class JointPlant:
     turn = rotation_matrix([x, y, 0.0])
     after = before if turn is None else turn @ before
     return [_combine(parts, after - before) for parts in self._gravity]
+
+  def absorb(
+    self, kind: str, parameters: Array, surroundings: Sequence[Surroundings] | None
+  ) -> None:
+    """Declares what was found to hold for all joints, so that what is left can be looked at.
+
+    Args:
+      kind: of the effect; it is no candidate any more.
+      parameters: the kernel's [P].
+      surroundings: one a log; None where they stay.
+    """
+    self.absorbed.add(kind)
+    self.declared = parameters.copy()
+    if surroundings is not None:
+      self.surroundings = list(surroundings)
+      self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
 
   def scaled(self, factor: float) -> list[Surroundings]:
     """Returns `factor` times the surroundings: all masses changed by that share."""

@@ -19,6 +19,8 @@ Array = np.ndarray
 FLOOR = 0.3  # noise variances added to a mean square before the logarithm; ours
 EFFORT_SHARE = 0.3  # of the score, where efforts are measured; ours
 PER_PARAMETER = 0.01  # nats that a parameter must earn; ours
+PER_DEVIATION = 0.006  # nats a squared standard deviation of a declared constant's error; ours
+CLOCKS = ("skew", "latency")  # values of a calibration that are no constants of the model
 TRIMMED = 0.01  # share of the largest errors that a score leaves out: stale reads, command edges
 BLOCK_S = 1.0  # s; blocks of cross-validation: several times the memory of a servo
 
@@ -75,7 +77,18 @@ def entry(problem: Problem, fit: Fit) -> Entry:
   """Scores a fit on the samples that it was fitted to."""
   table = levels(problem, fit)
   count = sum(len(t.names) for t in fit.terms if t.kind != "calibration")
-  return Entry(fit, score_of(table, count), table)
+  return Entry(fit, score_of(table, count) + deviation(fit), table)
+
+
+def deviation(fit: Fit) -> float:
+  """Returns what a fit pays for constants that are far from where they are expected, nats."""
+  total = 0.0
+  for index, term in enumerate(fit.terms):
+    if term.kind == "calibration" and term.prior:
+      centre = np.array(term.centre) if term.centre else 0.0
+      off = (fit.part(index) - centre) / np.array(term.prior)
+      total += float(sum(o**2 for o, n in zip(off, term.names, strict=True) if n not in CLOCKS))
+  return PER_DEVIATION * total
 
 
 def folds(problem: Problem, *, count: int = 2) -> list[tuple[list[Array], list[Array]]]:
@@ -99,7 +112,7 @@ def held_out(problem: Problem, found: Entry, *, evaluations: int = 5) -> Entry:
     tables.append(levels(problem, fit, held))
   table = np.sqrt(np.mean(np.square(tables), axis=0))
   count = sum(len(t.names) for t in found.fit.terms if t.kind != "calibration")
-  return Entry(found.fit, score_of(table, count), table)
+  return Entry(found.fit, score_of(table, count) + deviation(found.fit), table)
 
 
 def run(

@@ -45,13 +45,22 @@ class Term:
 
   def surroundings(self, plant: JointPlant, x: Array) -> list[Surroundings] | None:
     """Returns what is added to the surroundings, one a log; None for nothing."""
+    value = dict(zip(self.names, map(float, x), strict=True)) | dict(self.fixed)
     if self.kind == "payload":
-      return plant.payload(str(self.target), *map(float, x))
+      return plant.payload(str(self.target), *(value[n] for n in ("mass", "x", "y", "z")))
     if self.kind == "gravity_tilt":
-      return plant.tilt(float(x[0]), float(x[1]))
-    if self.kind == "calibration" and "mass" in self.names:
-      return plant.scaled(float(x[self.names.index("mass")]))
+      return plant.tilt(value["x"], value["y"])
+    if self.kind == "calibration" and "mass" in value:
+      return plant.scaled(value["mass"])
     return None
+
+  def held_at(self, x: Array) -> "Term":
+    """Returns a term with these values, of which none is fitted."""
+    values = tuple(zip(self.names, map(float, x), strict=True))
+    return dataclasses.replace(
+      self, names=(), low=(), high=(), scale=(), starts=((),), prior=(), centre=(),
+      fixed=(*self.fixed, *values),
+    )  # fmt: skip
 
   def effect(self, x: Array, intervals: Mapping[str, tuple[float, float]] | None = None) -> Effect:
     """Returns the fitted effect."""

@@ -1,0 +1,89 @@
+"""What is claimed: findings as entries of a report, and as effects that can be simulated."""
+
+from typing import Any
+
+import numpy as np
+
+from suite.effects import Effect
+from sysid import decision, intervals
+from sysid.common import WHOLE, Shared
+from sysid.joint import Found
+from sysid.race import Entry
+from sysid.screening import Screened
+from sysid.terms import Term
+
+Claim = tuple[Effect, dict[str, Any]]
+"""An effect and its entry in the report."""
+
+
+def effect(item: Found, entry: Entry, term: Term) -> Claim:
+  """Returns a joint's effect, with intervals."""
+  problem = item.screened.problem
+  bounds = intervals.intervals(problem, entry.fit, term.kind)
+  found = term.effect(entry.fit.part(entry.fit.terms.index(term)), bounds)
+  row = {
+    "kind": term.kind,
+    "joint": None if term.kind in WHOLE else item.joint,
+    **({"body": term.target} if term.kind == "payload" else {}),
+    "parameters": _parameters(found, bounds, term, slide=not problem.plant.hinge),
+    "evidence": {
+      **decision.evidence(entry, item.ladder),
+      "runner_up_behind_nats": _runner_up(item),
+      "chance_gain_q95_nats": round(item.chance["q95"], 4),
+    },
+  }
+  return found, row
+
+
+def whole(shared: Shared) -> Claim:
+  """Returns an effect of the whole machine."""
+  found = shared.term.effect(shared.x, shared.bounds)
+  row = {
+    "kind": found.kind,
+    "joint": None,
+    "parameters": _parameters(found, shared.bounds, shared.term, slide=False),
+    "evidence": {**shared.evidence, "other_joints_gain_nats": round(shared.gain, 4)},
+  }
+  return found, row
+
+
+def constants(s: Screened, entry: Entry) -> dict[str, Any]:
+  """Returns the report's entry of declared constants that are off."""
+  term = entry.fit.terms[0]
+  found = term.effect(entry.fit.part(0), intervals.intervals(s.problem, entry.fit, "calibration"))
+  return {
+    "kind": "parameter_error",
+    "joint": s.joint,
+    "parameters": _parameters(found, found.intervals, term, slide=False),
+    "evidence": {"gain_over_declared_nats": round(float(s.declared.score - s.null.score), 4)},
+  }
+
+
+def _parameters(
+  found: Effect, bounds: Any, term: Term, *, slide: bool
+) -> dict[str, dict[str, Any]]:
+  return {
+    name: {
+      "value": _plain(value),
+      "low": _plain(bounds.get(name, (np.nan, np.nan))[0]),
+      "high": _plain(bounds.get(name, (np.nan, np.nan))[1]),
+      "unit": term.unit(name, slide=slide),
+    }
+    for name, value in found.parameters.items()
+  }
+
+
+def _runner_up(item: Found) -> float | None:
+  size = len(decision.names(item.finding.chosen))
+  behind = [
+    e.score - item.finding.chosen.score
+    for e in item.finding.alternatives
+    if len(decision.names(e)) <= size
+  ]
+  return round(float(min(behind)), 4) if behind else None
+
+
+def _plain(value: Any) -> Any:
+  if isinstance(value, (list, tuple)):
+    return list(value)
+  return float(value) if np.isfinite(value) else None
