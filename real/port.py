@@ -15,6 +15,7 @@ from real.clock import Clock
 
 _PATIENCE = 0.1  # s that an answer may be late outside the cycle
 _TICK = 1e-6  # s beyond a time-out: the SDK ends a wait only when it has passed
+serial.protocol_handler_packages.append("real.virtual")  # for rehearsals, which have a URL
 _LATENCY_LIMIT = 1  # ms; the adapter's own default of 16 ms is a hidden delay
 
 
@@ -29,7 +30,7 @@ class Port(dynamixel_sdk.PortHandler):
     """Opens the port.
 
     Args:
-      path: Such as /dev/ttyUSB0.
+      path: Such as /dev/ttyUSB0, or a URL that pyserial knows.
       baud: Bit/s.
       clock: Time for time-outs.
 
@@ -42,7 +43,7 @@ class Port(dynamixel_sdk.PortHandler):
     self.byte_time = 10 / baud  # s
     try:
       opened = self.setBaudRate(baud)
-    except (serial.SerialException, OSError) as error:
+    except (serial.SerialException, OSError, ValueError) as error:
       raise PortError(
         f"The serial port {path} cannot be opened ({error}): check the cable, the path, and that "
         "this user is in the group of the port (often `dialout`)."
@@ -50,6 +51,14 @@ class Port(dynamixel_sdk.PortHandler):
     if not opened:
       raise PortError(f"The DYNAMIXEL SDK knows no {baud} bit/s: use 2000000, as the OP3 does.")
     _check_latency(path)
+
+  def setupPort(self, cflag_baud: int) -> bool:
+    # The SDK's own knows paths alone; pyserial's function opens URLs, too.
+    self.ser = serial.serial_for_url(self.port_name, baudrate=self.baudrate, timeout=0)
+    self.is_open = True
+    self.ser.reset_input_buffer()
+    self.tx_time_per_byte = 1000 * self.byte_time
+    return True
 
   def getCurrentTime(self) -> float:
     return 1000 * self._clock.now()

@@ -22,6 +22,7 @@ from real.virtual.devices import Devices
 from real.virtual.eye import Eye
 from real.virtual.faults import Faults
 from real.virtual.hidden import Hidden
+from real.virtual.protocol_rehearsal import Cable
 from real.virtual.stream import CameraStream, Sensor
 from real.virtual.wire import Wire
 from scenes.cameras import Camera
@@ -132,7 +133,11 @@ class VirtualRobot:
     self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish)
     self.body.time = self.clock.now()
     devices = Devices(self.body, faults=self.faults, seed=seed or 0)
-    self._wire = Wire(devices, self.clock)
+    self._wire: Wire | Cable
+    if isinstance(self.clock, SteppedClock):
+      self._wire = Cable(devices, self.clock)
+    else:
+      self._wire = Wire(devices, self.clock)
     self.devices = devices
     self.operator = Hand(self.hold)
     self.eyes = Eyes(self.body, lens) if camera else None
@@ -149,7 +154,7 @@ class VirtualRobot:
 
   @property
   def port(self) -> str:
-    """Path of the serial port."""
+    """Name of the serial port: a path, or a URL in stepped time."""
     return self._wire.port
 
   def connection(self) -> Connection:

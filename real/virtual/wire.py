@@ -2,7 +2,7 @@
 
 The host opens `port` like any serial port. In real time a thread answers when the last bit of an
 answer would be through the wire; with a `SteppedClock` the answer is there when a write returns,
-and the clock stands at the time at which it would have come.
+and the clock stands at the time at which it would have come; `protocol_rehearsal` does that faster.
 """
 
 import contextlib
@@ -12,8 +12,8 @@ import threading
 import tty
 
 from real.clock import Clock, SteppedClock, prefer_this_thread
-from real.virtual.devices import BYTE_TIME, Answer, Devices
-from real.virtual.protocol import Parser
+from real.virtual.devices import Devices
+from real.virtual.line import Line
 
 _CHUNK = 4096
 _MAX_LAG = 0.2  # s that the body may be behind the clock
@@ -36,8 +36,7 @@ class Wire:
       tty.setraw(end)
     self.port = os.ttyname(self._slave)
     """Path of the serial port."""
-    self._parser = Parser()
-    self._free = clock.now()  # s, when the wire has carried everything sent to it
+    self._line = Line(devices, clock)
     self._stop = threading.Event()
     self._thread: threading.Thread | None = None
     if isinstance(clock, SteppedClock):
@@ -68,7 +67,7 @@ class Wire:
       if not ready:
         self._devices.body.advance(clock.now())
         continue
-      for answer in self._receive(os.read(self._master, _CHUNK)):
+      for answer in self._line.receive(os.read(self._master, _CHUNK)):
         clock.sleep_until(answer.time)
         os.write(self._master, answer.data)
 
@@ -78,18 +77,7 @@ class Wire:
       data = os.read(self._master, _CHUNK)
     except BlockingIOError:
       return
-    for answer in self._receive(data):
+    for answer in self._line.receive(data):
       os.write(self._master, answer.data)
       self._clock.advance(answer.time)
-    self._clock.advance(self._free)
-
-  def _receive(self, data: bytes):
-    """Yields the answers to bytes that the host wrote just now."""
-    start = max(self._free, self._clock.now())
-    self._free = start + len(data) * BYTE_TIME
-    for packet in self._parser.feed(self._devices.hears(data)):
-      start += packet.size * BYTE_TIME
-      answers: list[Answer] = self._devices.handle(packet, start)
-      if answers:
-        self._free = max(self._free, answers[-1].time)
-      yield from answers
+    self._clock.advance(self._line.free)

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from real.clock import SteppedClock
-from real.port import Port
+from real.port import Port, PortError
 from real.virtual import protocol
 from real.virtual.body import Body
 from real.virtual.devices import BYTE_TIME, IDS, Devices
 from real.virtual.faults import Faults
 from real.virtual.protocol import Error, Instruction
+from real.virtual.protocol_rehearsal import Cable
 from real.virtual.servo import INPUT_VOLTAGE, OVERHEATING
 from real.virtual.wire import Wire
 
@@ -18,12 +19,12 @@ from real.virtual.wire import Wire
 class Bench:
   """A body, its devices and an SDK port on a stepped clock."""
 
-  def __init__(self):
+  def __init__(self, cable=Wire):
     self.clock = SteppedClock()
     self.faults = Faults()
     self.body = Body()
     self.devices = Devices(self.body, faults=self.faults)
-    self.wire = Wire(self.devices, self.clock)
+    self.wire = cable(self.devices, self.clock)
     self.port = Port(self.wire.port, baud=2_000_000, clock=self.clock)
     self.sdk = sdk.Protocol2PacketHandler()
 
@@ -50,9 +51,9 @@ class Bench:
     return group
 
 
-@pytest.fixture
-def bench():
-  found = Bench()
+@pytest.fixture(params=[Wire, Cable], ids=["terminal", "rehearsal"])
+def bench(request):
+  found = Bench(request.param)
   yield found
   found.port.close()
   found.wire.close()
@@ -293,3 +294,25 @@ def test_a_cut_cable_carries_nothing(powered):
   assert powered.sdk.ping(powered.port, 200)[1] == sdk.COMM_RX_TIMEOUT
   powered.faults.cut = False
   assert powered.sdk.ping(powered.port, 200)[1] == sdk.COMM_SUCCESS
+
+
+def test_a_rehearsal_takes_the_same_time_as_a_pseudo_terminal():
+  """Byte for byte and to the microsecond, lost packets included."""
+  found = []
+  for cable in (Wire, Cable):
+    bench = Bench(cable)
+    try:
+      bench.power()
+      bench.faults.loss = 0.2
+      reads = [bench.read(1 + index % 20, 132, 4) for index in range(40)]
+      found.append((reads, bench.clock.now()))
+    finally:
+      bench.port.close()
+      bench.wire.close()
+  assert found[0] == found[1]
+  assert any(result != sdk.COMM_SUCCESS for _, result, _ in found[0][0])
+
+
+def test_an_unplugged_rehearsal_is_said():
+  with pytest.raises(PortError, match="no rehearsal is plugged in as rehearsal://0"):
+    Port("rehearsal://0", baud=2_000_000, clock=SteppedClock())
