@@ -57,20 +57,22 @@ class Body:
   """The plant: call `advance`, set motor goals, read sensors; threads may call it."""
 
   def __init__(
-    self, *, world: str = "floor", hidden: Hidden | None = None, ball: bool = False, furnish=None
-  ):
+    self, *, world: str = "floor", hidden: Hidden | None = None, ball: bool = False, furnish=None,
+    looks: bool = True,
+  ):  # fmt: skip
     """Builds the world and hangs the robot at its origin.
 
     Args:
-      world: "floor", or "room" for the built-in room with its looks (takes 10 s to paint).
+      world: "floor", or "room" for the built-in room (its looks take 10 s to paint).
       hidden: The robot's own physics; as in the data sheets if None.
       ball: Whether there is a ball.
       furnish: Called with the world's `mujoco.MjSpec` before the robot is put in, to change it.
+      looks: Whether the room can be seen.
     """
     if world not in WORLDS:
       raise ValueError(f"Unknown world {world!r}: expected one of {WORLDS}.")
     self.hidden = hidden or Hidden.none(len(constants.JOINT_NAMES))
-    self.model = _build(world, self.hidden, ball, furnish)
+    self.model = _build(world, self.hidden, ball, furnish, looks)
     self.data = mujoco.MjData(self.model)
     self.motors = Motors(self.hidden.motors)
     self.lock = threading.RLock()
@@ -230,12 +232,12 @@ class Body:
       return self._trace[row].copy() if np.isfinite(past[row]) else self.data.qpos.copy()
 
 
-def _build(world: str, hidden: Hidden, ball: bool, furnish) -> mujoco.MjModel:
+def _build(world: str, hidden: Hidden, ball: bool, furnish, looks: bool) -> mujoco.MjModel:
   """Returns the compiled world with the robot in it."""
   if world == "room":
     from real.virtual import room
 
-    spec = room.build_room()
+    spec = room.build_room(looks=looks)
   else:
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(

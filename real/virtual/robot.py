@@ -130,7 +130,7 @@ class VirtualRobot:
       hidden = Hidden.none(count) if seed is None else Hidden.draw(seed, count)
     self.clock: RealClock | SteppedClock = SteppedClock() if stepped else RealClock()
     self.faults = Faults()
-    self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish)
+    self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish, looks=camera)
     self.body.time = self.clock.now()
     devices = Devices(self.body, faults=self.faults, seed=seed or 0)
     self._wire: Wire | Cable
