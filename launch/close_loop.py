@@ -34,12 +34,17 @@ VIRTUAL = "virtual"
 _STEP = constants.CONTROL_TIMESTEP
 _TRAIN = ("sweep", "slow", "steps")
 _HELD = ("mixed",)
+_RAMP = 1.5  # s from the standing pose to a motion
 _LIFTING = 2.0  # s until a robot that was taken by its torso hangs still
 _NOMINAL = RandomisationSettings(
   pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
 )
-_REACH = {"head": 0.35, "sho": 0.35, "el": 0.35, "hip": 0.16, "knee": 0.2, "ank": 0.16}
-"""rad about the standing pose, by a part of the joint's name: no limb meets another."""
+_REACH = {
+  "head": 0.35, "sho_pitch": 0.6, "sho_roll": 0.3, "el": 0.35, "hip_yaw": 0.15, "hip_roll": 0.1,
+  "hip_pitch": 0.4, "knee": 0.4, "ank_pitch": 0.4, "ank_roll": 0.25,
+}  # fmt: skip
+"""rad to both sides, by a part of the joint's name: gravity loads joints, no limb meets another."""
+_SWAY = 0.1  # of the reach, standing on the floor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,6 +57,8 @@ class Arguments:
   """Of the virtual robot's hidden properties."""
   seconds: float = 12.0
   """Length of a recorded motion."""
+  reuse: bool = False
+  """Take the logs that an earlier run left in the folder instead of moving the robot."""
   out: Path = Path("out/loop")
   """Folder for logs, model, report and table."""
 
@@ -72,7 +79,9 @@ def run(arguments: Arguments) -> dict[str, Any]:
   arguments.out.mkdir(parents=True, exist_ok=True)
   model = arguments.out / "declared.xml"
   model.write_text(declared_model())
-  standing = _excite(arguments)
+  if not arguments.reuse:
+    np.savez(arguments.out / "standing.npz", **_excite(arguments))
+  standing = np.load(arguments.out / "standing.npz")
   logs = {name: arguments.out / f"{name}.mcap" for name in (*_TRAIN, *_HELD)}
   content = sysid.identify(
     model,
@@ -110,9 +119,9 @@ def motion(kind: str, count: int) -> np.ndarray:
   """
   rng = np.random.default_rng([3, ("sweep", "slow", "steps", "mixed", "sway").index(kind)])
   lower, upper = constants.joint_limits()
-  middle, half = (lower + upper) / 2, (upper - lower) / 2
   reach = np.array([next(r for part, r in _REACH.items() if part in name)
                     for name in constants.JOINT_NAMES])  # fmt: skip
+  standing = constants.standing_targets()
   time = _STEP * np.arange(count)[:, None]
   phase = rng.uniform(0, 2 * np.pi, 20)
   duration = count * _STEP
@@ -126,10 +135,14 @@ def motion(kind: str, count: int) -> np.ndarray:
   elif kind == "mixed":
     rates = rng.uniform(0.2, 1.4, (3, 20))
     wave = sum(np.sin(2 * np.pi * r * time + p) for r, p in zip(rates, (0, 1, 2), strict=True)) / 3
-  else:  # standing on the floor: small
-    wave = 0.25 * np.sin(2 * np.pi * rng.uniform(0.3, 1.0, 20) * time + phase)
-  standing = constants.standing_targets()
-  targets = standing + np.minimum(time, 1.0) * reach * wave
+  else:
+    wave = _SWAY * np.sin(2 * np.pi * rng.uniform(0.3, 1.0, 20) * time + phase)
+  away = np.minimum(time / _RAMP, 1.0)
+  centre = standing
+  if kind != "sway":  # all of the reach lies within the limits
+    centre = np.clip(standing, lower + reach, np.maximum(upper - reach, lower + reach))
+  targets = standing + away * (centre - standing + reach * wave)
+  middle, half = (lower + upper) / 2, (upper - lower) / 2
   return np.clip((targets - middle) / half, -1, 1).astype(np.float32)
 
 

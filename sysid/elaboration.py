@@ -9,6 +9,8 @@ Source: Duclusaud, Passault, Padois and Ly 2024, "Extended friction models for t
 simulation of servo actuators", whose models of load, square and Stribeck this joins in one factor.
 """
 
+import dataclasses
+
 import numpy as np
 
 from sysid import decision, race
@@ -22,7 +24,7 @@ _FINALISTS = 3  # fitted to the end
 _LONGEST = 3  # effects beside it
 _LEAST = 0.2  # nats that it must gain on held-out blocks; as decision.Thresholds.second
 _REPLACED = ("load_friction", "stribeck_friction", "supply_sag")
-"""Kinds that imitate parts of it: strength that falls with torque is friction that grows with it."""
+"""Kinds that imitate parts of it: strength that falls with torque is like friction that grows."""
 
 
 def rich_friction(problem: Problem, carried: int) -> Term:
@@ -70,13 +72,23 @@ def elaborate(ladder: Ladder, chosen: Entry) -> Entry:
   return best if before - after > _LEAST else chosen
 
 
+def _duty_tells(term: Term, problem: Problem) -> Term:
+  """Returns a term that leaves the limit where duties are logged: those saturate at 1 as declared."""
+  if problem.channel != "duty":
+    return term
+  fixed = tuple((n, 0.0 if n == "scales_limit" else v) for n, v in term.fixed)
+  return dataclasses.replace(term, fixed=fixed)
+
+
 def _bases(ladder: Ladder, chosen: Entry) -> list[tuple[list[Term], np.ndarray]]:
   """Returns the nearest hypotheses without what rich friction replaces, as terms and values."""
+  problem = ladder.problem
   nearest = sorted([*ladder.singles, *ladder.pairs], key=lambda e: e.score)
   found: dict[frozenset[str], tuple[list[Term], np.ndarray]] = {}
-  for entry in [chosen, *decision.unique(nearest), ladder.null]:
+  strength = [e for e in nearest if decision.names(e) == {"motor_gain"}][:1]
+  for entry in [chosen, *strength, *decision.unique(nearest), ladder.null]:
     kept = [i for i, t in enumerate(entry.fit.terms) if t.kind not in _REPLACED]
-    terms = [entry.fit.terms[i] for i in kept]
+    terms = [_duty_tells(entry.fit.terms[i], problem) for i in kept]
     names = frozenset(t.kind for t in terms)
     if len(names) <= _LONGEST + 1:
       found.setdefault(names, (terms, np.concatenate([entry.fit.part(i) for i in kept])))
