@@ -73,7 +73,7 @@ def elaborate(ladder: Ladder, chosen: Entry) -> Entry:
 
 
 def _duty_tells(term: Term, problem: Problem) -> Term:
-  """Returns a term that leaves the limit where duties are logged: those saturate at 1 as declared."""
+  """Returns a term that leaves the limit where duties are logged: those saturate as declared."""
   if problem.channel != "duty":
     return term
   fixed = tuple((n, 0.0 if n == "scales_limit" else v) for n, v in term.fixed)
