@@ -14,7 +14,7 @@ Array = np.ndarray
 BEFORE, AFTER, MEASURED = "#D55E00", "#0072B2", "#1d2330"
 """Colours of the declared model, the extended one and the machine (Okabe and Ito)."""
 
-_POINTS = 1500  # a curve is thinned to this many points: a page of a few MB
+_POINTS = 1200  # a curve is thinned to this many points: a page of a few MB
 _BINS = 24
 _DIGITS = 6
 
@@ -27,7 +27,7 @@ def lines(
   for name, color, along, values in curves:
     keep = slice(None, None, max(1, len(along) // _POINTS))
     figure.add_trace(
-      go.Scattergl(
+      go.Scatter(
         x=np.round(along[keep], _DIGITS), y=np.round(values[keep], _DIGITS), name=name,
         mode="lines", line={"color": color, "width": 1.4},
       )
@@ -108,14 +108,16 @@ def intervals(title: str, rows: Sequence[tuple[str, float, float, float]]) -> st
 
 def _html(figure: go.Figure, title: str, x: str, y: str, height: int) -> str:
   layout: dict[str, Any] = {
-    "title": {"text": title, "font": {"size": 14}, "x": 0.01},
+    "title": {"text": title, "font": {"size": 14}, "x": 0.01, "y": 0.97, "yanchor": "top"},
     "template": "plotly_white",
     "height": height,
-    "margin": {"l": 60, "r": 16, "t": 40, "b": 44},
+    "margin": {"l": 60, "r": 16, "t": 56, "b": 44},
     "xaxis_title": x,
     "yaxis_title": y,
-    "legend": {"orientation": "h", "y": 1.14, "x": 1, "xanchor": "right"},
+    "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 1, "xanchor": "right"},
     "font": {"size": 12},
   }
   figure.update_layout(layout)
-  return figure.to_html(full_html=False, include_plotlyjs=False, config={"responsive": True})
+  return figure.to_html(
+    full_html=False, include_plotlyjs=False, config={"responsive": True, "displayModeBar": False}
+  )

@@ -8,7 +8,7 @@ import numpy as np
 
 from scenes import report_parts as parts
 from suite.effects import Effect
-from sysid import charts, decision, evaluation, signatures
+from sysid import balance, charts, decision, evaluation, signatures
 from sysid.fitting import Fit
 from sysid.identification import Found, Identified
 from sysid.logs import Log
@@ -74,35 +74,48 @@ def _unit(item: Found) -> str:
 
 
 def _verdict(content: dict[str, Any]) -> str:
-  rows, bounds = [], []
-  for effect in content["effects"]:
+  rows, bounds = _parameters(content["effects"])
+  notes = [
+    f"As good an explanation of {a['joint']}: {a['kind']}."
+    for a in content["alternatives"]
+    if a.get("confounded")
+  ]
+  # Of what is unexplained, the nearest hypothesis is among the alternatives, with intervals.
+  nearest, _ = _parameters([a for a in content["alternatives"] if "kinds" not in a])
+  blocks = [parts.warnings(notes)]
+  if rows:
+    blocks += [parts.table(_HEADER, rows), charts.intervals("95 % intervals", bounds)]
+  if nearest:
+    blocks += [
+      "<h3>In the extended model, but not claimed</h3>",
+      parts.table(_HEADER, nearest),
+    ]
+  return parts.section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], *blocks)
+
+
+_HEADER = ["effect", "where", "parameter", "value", "95 % interval", "unit", "gain [nats]"]
+
+
+def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], list[tuple]]:
+  """Returns a table's rows, and the intervals that are known as (name, value, low, high)."""
+  rows: list[list[Any]] = []
+  bounds = []
+  for effect in effects:
     where = effect["joint"] or effect.get("body") or "all"
-    gain = effect["evidence"].get("gain_over_constants_nats")
+    gain = effect["evidence"].get("gain_over_constants_nats", "")
     for name, value in effect["parameters"].items():
       if isinstance(value["value"], list):
         continue
       known = None not in (value["value"], value["low"], value["high"])
       interval = f"{value['low']:.4g} to {value['high']:.4g}" if known else ""
       number = _number(value["value"])
-      rows.append([effect["kind"], where, name, number, interval, value["unit"], gain or ""])
+      rows.append([effect["kind"], where, name, number, interval, value["unit"], gain])
       if known and value["high"] > value["low"]:
         label = f"{effect['kind']} {name} ({where})"
         bounds.append((label, value["value"], value["low"], value["high"]))
     if not effect["parameters"]:
       rows.append([effect["kind"], where, "a table over position and speed", "", "", "", ""])
-  notes = [
-    f"As good an explanation of {a['joint']}: {a['kind']}."
-    for a in content["alternatives"]
-    if a.get("confounded")
-  ]
-  header = ["effect", "where", "parameter", "value", "95 % interval", "unit", "gain [nats]"]
-  return parts.section(
-    f"Verdict: {content['verdict']}",
-    _VERDICTS[content["verdict"]],
-    parts.warnings(notes),
-    parts.table(header, rows) if rows else "",
-    charts.intervals("95 % intervals", bounds),
-  )
+  return rows, bounds
 
 
 def _number(value: Any) -> str:
@@ -165,9 +178,9 @@ def _residuals(item: Found) -> str:
   return parts.section(
     f"Residual of {item.screened.joint}, before and after",
     "Against time: measured minus simulated position. Against the others: the torque that the"
-    " model lacks (what the measured motion demands by inverse dynamics, less what the model"
-    " gives), medians and quartiles; friction shows as a step where the velocity changes sign, and"
-    f" a flat line at zero is a model that lacks nothing.{note}",
+    " model lacks (what the measured motion demands by inverse dynamics, less what actuator and"
+    " friction give), medians and quartiles; a flat line at zero is a model that lacks nothing, a"
+    f" step at zero velocity is dry friction, a slope over velocity is damping.{note}",
     parts.grid([f for f in figures if f], 2),
   )
 
@@ -178,14 +191,14 @@ def _against(item: Found, hypotheses, name: str) -> str:
   for fit, label, color in hypotheses:
     x, y = [], []
     for index, log in enumerate(problem.plant.logs):
-      r = signatures.torque_residual(problem, fit, index)
+      r, missing = balance.missing_torque(problem, fit, index)
       if name == "temperature":
         if log.temperature is None:
           return ""
         x.append(log.temperature[signatures.EDGES : -signatures.EDGES])
       else:
         x.append({"position": r.position, "velocity": r.velocity, "load": r.torque}[name])
-      y.append(-r.residual)
+      y.append(missing)
     curves.append((label, color, np.concatenate(x), np.concatenate(y)))
   hinge = problem.plant.hinge
   torque = "N m" if hinge else "N"
@@ -257,7 +270,7 @@ def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> str:
     "Where the rest sits",
     text,
     parts.table(["over", "range", "share of the square"], rows),
-    "<p>Does the residual go with anything? Chance of as large a correlation of the whitened"
+    "<h3>Does it go with anything?</h3><p>Chance of as large a correlation of the whitened"
     " residual, by resampling blocks of a second; small numbers say yes.</p>",
     parts.table(["with", "declared", "extended"], checks),
   )
@@ -329,6 +342,7 @@ def _next(content: dict[str, Any]) -> str:
     "What to record next",
     "The motion under which the remaining hypotheses differ most, in units of the sensor's noise.",
     parts.table(["", ""], rows),
+    "<h3>All motions that were tried</h3>" if designs else "",
     parts.table(["motion", "separation"], [[k, v] for k, v in designs.items()]) if designs else "",
   )
 
@@ -337,6 +351,6 @@ def _audit(details: dict[str, Any]) -> str:
   audits = details["audit"]
   warnings = [w for a in audits for w in a["warnings"]]
   keys = [k for k in audits[0] if k not in ("log", "warnings")]
-  rows = [[a["log"], *[a[k] for k in keys]] for a in audits]
-  header = ["log", *[k.replace("_", " ") for k in keys]]
+  rows = [[k.replace("_", " "), *[a[k] for a in audits]] for k in keys]
+  header = ["", *[a["log"] for a in audits]]
   return parts.section("The logs", "", parts.warnings(warnings), parts.table(header, rows))

@@ -57,6 +57,51 @@ def test_delay_is_named_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPa
   assert row["after"] == pytest.approx(error["after"], rel=1e-3)
 
 
+def test_extended_model_has_the_error_that_is_reported(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  effects = [Effect("coulomb_friction", "joint", {"torque": 0.25})]
+  logs = logs_of(PENDULUM, effects)
+  held = log_of(PENDULUM, "sweep", effects, seed=9)
+  (tmp_path / "model.xml").write_text(PENDULUM)
+  files = {f"{i}.mcap": log for i, log in enumerate([*logs, held])}
+  monkeypatch.setattr("sysid.identification.read_log", lambda path: files[Path(path).name])
+  names = [Path(f"{i}.mcap") for i in range(3)]
+  content = sysid.identify(
+    tmp_path / "model.xml", names, held=[Path("3.mcap")], out=tmp_path / "out"
+  )
+  assert content["effects"][0]["kind"] == "coulomb_friction"
+  extended = mujoco.MjModel.from_xml_path(str(tmp_path / "out/model_extended.xml"))
+  details = json.loads((tmp_path / "out/details.json").read_text())
+  clocks = {joint: evaluation.Clocks(**values) for joint, values in details["clocks"].items()}
+  got = evaluation.error(extended, [held], clocks=clocks)
+  assert got == pytest.approx(content["error"]["held"]["after"], rel=0.01)
+  # What others read; the rest is in details.json.
+  assert set(content) == {
+    "verdict", "effects", "alternatives", "residual_at", "error", "window_s", "seconds",
+    "next_excitation",
+  }  # fmt: skip
+  assert set(content["error"]) == {"train", "held", "floor"}
+  # The constants that were fitted beside the effect go with it.
+  kinds = {e.kind for e in read_effects(tmp_path / "out/effects.json")}
+  assert kinds == {"coulomb_friction", "parameter_error"}
+
+
+def test_extended_model_finds_its_meshes_from_any_folder(tmp_path: Path) -> None:
+  (tmp_path / "meshes").mkdir()
+  corners = ["0 0 0", ".1 0 0", "0 .1 0", "0 0 .1"]
+  faces = ["1 3 2", "1 2 4", "1 4 3", "2 3 4"]
+  text = "".join(f"v {c}\n" for c in corners) + "".join(f"f {f}\n" for f in faces)
+  (tmp_path / "meshes" / "part.obj").write_text(text)
+  model = PENDULUM.replace("<worldbody>", '<asset><mesh file="part.obj"/></asset><worldbody>')
+  model = model.replace("<option", '<compiler meshdir="meshes"/><option')
+  model = model.replace("</body></worldbody>", '<geom type="mesh" mesh="part"/></body></worldbody>')
+  (tmp_path / "model.xml").write_text(model)
+  (tmp_path / "out").mkdir()
+  extended_model.write(tmp_path / "model.xml", tmp_path / "out" / "extended.xml", [])
+  assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "extended.xml")).nmesh == 1
+
+
 def test_wrong_constants_come_out_as_parameter_error() -> None:
   truth = {"damping": 1.12, "armature": 0.88}
   model = mujoco.MjModel.from_xml_string(PENDULUM)

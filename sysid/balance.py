@@ -1,0 +1,54 @@
+"""The torque that a model lacks at every moment of a log, friction included: what the page shows.
+
+    missing = (I + armature) a + damping v + drag |v| v + gravity + c + friction sign(v) - actuator
+
+While a joint hardly moves, dry friction takes whatever it must up to its limit; what is left beyond
+that is missing. Shapes: N samples.
+"""
+
+import numpy as np
+
+from sysid import signatures
+from sysid.fitting import Fit, Problem
+from sysid.kernel import INDEX
+from sysid.signatures import TorqueResidual
+from sysid.terms import compose
+
+Array = np.ndarray
+
+_AT_REST = 0.02  # of the usual highest speed, below which a joint may stick; ours
+
+
+def missing_torque(problem: Problem, fit: Fit, index: int) -> tuple[TorqueResidual, Array]:
+  """Returns a log's regressors and the missing torque [N] at the same samples.
+
+  Args:
+    problem: the joint.
+    fit: a hypothesis.
+    index: of the log.
+  """
+  r = signatures.torque_residual(problem, fit, index)
+  p, _ = compose(problem.plant, fit.terms, fit.x)
+  value = dict(zip(INDEX, p, strict=True))
+  needed = -r.residual + value["drag"] * np.abs(r.velocity) * r.velocity
+  needed -= value["amplitude"] * np.sin(value["periods"] * r.position + value["phase"])
+  limit = _friction(value, r, needed)
+  moving = np.abs(r.velocity) > _AT_REST * np.quantile(np.abs(r.velocity), 0.98)
+  sliding = needed + limit * np.sign(r.velocity)
+  sticking = np.sign(needed) * np.maximum(np.abs(needed) - limit, 0.0)
+  return r, np.where(moving, sliding, sticking)
+
+
+def _friction(value: dict[str, float], r: TorqueResidual, needed: Array) -> Array:
+  """Returns the limit of dry friction [N]."""
+  ratio = r.velocity / max(value["stribeck_velocity"], 1e-6)
+  limit = value["friction"] + value["breakaway"] * np.exp(-(ratio**2))
+  carried = r.torque
+  if value["load_kind"] == 1:
+    carried = r.torque - value["damping"] * r.velocity
+  elif value["load_kind"] == 2:
+    carried = r.torque + needed - value["damping"] * r.velocity
+  size = np.abs(carried)
+  rubbing = (value["load_coefficient"] + value["load_square"] * size) * size
+  fall = r.velocity / max(value["load_velocity"], 1e-6)
+  return limit + rubbing * (1.0 + value["load_at_rest"] * np.exp(-(fall**2)))
