@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from real.evaluation.episodes import COLLISION, FALL, LOST, STOPPED, SUCCESS, Episode
-from suite import rewards
+from suite import protocols, rewards
 
 # RGB, Okabe and Ito's palette.
 COLORS = {
@@ -71,13 +71,21 @@ class Map:
     point = (int(center[0]), int(center[1]))
     cv2.circle(picture, point, size, color, width, cv2.LINE_AA, _FINE)
 
+  def square(self, picture: np.ndarray, xy: np.ndarray, side: float, color: Any) -> None:
+    """Draws the outline of a square of a side [m] about a place [2]."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * side / 2
+    self.line(picture, np.asarray(xy) + corners, color)
+
 
 def draw_paths(floor: Map, found: Sequence[Episode]) -> np.ndarray:
   """Returns the floor with the paths of episodes, coloured by how they ended, uint8 [H, W, 3]."""
   picture = floor.background.copy()
-  for goal in sorted({episode.goal for episode in found}):
-    floor.disc(picture, np.array(goal), rewards.SUCCESS_DISTANCE, COLORS[SUCCESS], width=2)
-  for episode in sorted(found, key=lambda e: e.success):
+  for goal, of_ball in sorted({(e.goal, bool(e.ball_path)) for e in found}):
+    if of_ball:
+      floor.square(picture, np.array(goal), protocols.CELL_SIZE, COLORS[SUCCESS])
+    else:
+      floor.disc(picture, np.array(goal), rewards.SUCCESS_DISTANCE, COLORS[SUCCESS], width=2)
+  for episode in sorted(found, key=lambda e: not e.success):  # failures on top: they are few
     path = np.array(episode.path, np.float64).reshape(-1, 4)
     if not len(path):
       continue

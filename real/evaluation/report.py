@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from scenes import report_parts as parts
 
 _MOMENTS = 5  # shown of an episode's belief
 _BELIEF_EPISODES = 4  # shown of a setting
-_PICTURE_WIDTH = 224  # pixels of what the robot saw
+_WIDE = 8  # columns of a table that is set smaller
 
 # Draws a belief: (moment, goal, map) -> picture uint8 [H, W, 3].
 DrawBelief = Callable[[Moment, tuple[float, float], maps.Map], np.ndarray]
@@ -68,8 +69,13 @@ _OUTCOME_TEXT = (
 
 
 def _table(table: tables.Table, text: str = "") -> str:
-  rows = [(row.name, *row.cells) for row in table.rows]
-  return parts.section(table.title, text, parts.table(table.header, rows))
+  # No line break between a figure and its unit.
+  rows = [(row.name, *(re.sub(r"(?<=\d) (?=sec|m$)", "\u00a0", cell) for cell in row.cells))
+          for row in table.rows]  # fmt: skip
+  found = parts.table(table.header, rows)
+  if len(table.header) > _WIDE:
+    found = f"<div style='font-size:13px'>{found}</div>"
+  return parts.section(table.title, text, found)
 
 
 def _title(episode: Episode) -> str:
@@ -100,7 +106,8 @@ def _paths(found: Sequence[Episode], floor: maps.Map) -> str:
   return parts.section(
     "Where the robot went",
     "Seen from above: light is floor where the robot fits, dark is matter. Black dots are starts, "
-    "circles are goals, a coloured dot is where a failure ended, a thin orange line is the ball.",
+    "circles and squares are goals, a coloured dot is where a failure ended, a thin orange line is "
+    "the ball.",
     f"<p>{legend}</p>",
     parts.grid(pictures, 2),
   )
@@ -124,7 +131,7 @@ def _beliefs(found: Sequence[Episode], floor: maps.Map, draw_belief: DrawBelief)
         text = f"episode {episode.index + 1} ({episode.outcome}), {moment.time:.1f} s"
         cells.append(parts.picture(picture, text))
       cells += ["<div></div>"] * (_MOMENTS - len(shown))
-    blocks.append(f"<p>{title}</p>" + parts.grid(cells, _MOMENTS))
+    blocks.append(f"<p style='margin-top:14px'>{title}</p>" + parts.grid(cells, _MOMENTS))
   if not blocks:
     return ""
   return parts.section(
