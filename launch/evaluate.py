@@ -75,6 +75,8 @@ class Arguments:
   """Records runs on the virtual robot and the robot as MCAP beside the report."""
   time_limit: float | None = None
   """Length of an episode [s]; the task's own if not given."""
+  markdown: Path | None = None
+  """Writes the tables of everything in the folder to a Markdown file, too."""
   dry_run: bool = False
   """Robot only: reads and asks everything, moves and keeps nothing; one trial without --trials."""
 
@@ -232,8 +234,11 @@ def run(arguments: Arguments) -> Path | None:
     if store.episodes:
       report.write(path, store.episodes, scene=scene, draw_belief=draw_belief,
                    settings=dataclasses.asdict(arguments))  # fmt: skip
-  for table in [*tables.paper_tables(store.episodes), tables.outcome_table(store.episodes)]:
-    print("\n" + tables.as_text(table))
+  said = [*tables.paper_tables(store.episodes), tables.outcome_table(store.episodes)]
+  text = "\n".join(tables.as_text(table) for table in said)
+  print(f"\n{text}")
+  if arguments.markdown is not None:
+    arguments.markdown.write_text(text)
   return path
 
 

@@ -1,0 +1,116 @@
+"""How well the direction of gravity is known while the robot walks, and what spoils it.
+
+The gait walks straight ahead on virtual robots and in simulation; the policy's newest `gravity` is
+compared with the truth. On the virtual robots three ways: as it is, without the gyroscope's zero
+that is measured while the robot stands, and with an accelerometer whose range never ends.
+
+python benchmarks/gravity.py
+"""
+
+# ruff: noqa: E402  (threads are chosen before numpy is imported)
+
+import dataclasses
+import os
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+  os.environ.setdefault(_name, "1")
+
+import numpy as np
+import tyro
+
+import real
+import suite
+from real.motion import RobotSettings
+from real.virtual.robot import VirtualRobot
+from suite.gaits.floor import EmptyFloor
+from suite.gaits.walk import Command, Gait
+from suite.randomisation import RandomisationSettings
+from suite.tasks.base import Start
+
+_STANDARD_GRAVITY = 9.80665  # m/s^2
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """How well the direction of gravity is known while the robot walks."""
+
+  seconds: float = 20.0
+  """Length of a walk."""
+  robots: tuple[int, ...] = (1, 2, 3)
+  """Seeds of the virtual robots."""
+  episodes: int = 3
+  """Walks in simulation."""
+
+
+class Errors:
+  """Angles between estimate and truth."""
+
+  def __init__(self) -> None:
+    self.degrees: list[float] = []
+
+  def add(self, estimate: np.ndarray, truth: np.ndarray) -> None:
+    """Notes two unit vectors [3]."""
+    self.degrees.append(float(np.rad2deg(np.arccos(np.clip(estimate @ truth, -1, 1)))))
+
+  def row(self, name: str) -> str:
+    """Returns a line of the table."""
+    return f"| {name} | {np.sqrt(np.mean(np.square(self.degrees))):.1f} | {self.degrees[-1]:.1f} |"
+
+
+def _walk(environment: Any, truth: Any) -> Errors:
+  timestep, gait, errors = environment.reset(), Gait(), Errors()
+  while not timestep.last():
+    gyroscope, gravity = (timestep.observation[name][-1] for name in ("gyroscope", "gravity"))
+    timestep = environment.step(gait.act(Command(1.0), gyroscope=gyroscope, gravity=gravity))
+    errors.add(timestep.observation["gravity"][-1], truth())
+  return errors
+
+
+def rehearsed(seed: int, seconds: float, *, zeroed: bool, endless: bool) -> tuple[Errors, float]:
+  """Walks on a virtual robot; returns the errors and the largest specific force in the chip [g]."""
+  settings = RobotSettings() if zeroed else RobotSettings(rest_time=0.0)
+  with VirtualRobot(seed=seed, stepped=True) as robot:
+    environment = real.load(
+      "nerf_nav", robot=robot.connection(), image_size=None, scene=EmptyFloor(), time_limit=seconds,
+      settings=settings,
+    )  # fmt: skip
+    sensing, line, peak = environment._cycle.sensing, robot.devices.board._line, [0.0]
+    take = sensing.take_imu
+
+    def take_true(reading: Any) -> np.ndarray:
+      felt = line.read(reading.stamp)[3:]
+      if environment._running:  # not while it is set down
+        peak[0] = max(peak[0], float(np.abs(felt).max()))
+      return take(reading._replace(accelerometer=felt) if endless else reading)
+
+    sensing.take_imu = take_true  # type: ignore[method-assign]
+    with environment:
+      errors = _walk(environment, lambda: -robot.truth().rotation[2])
+  return errors, peak[0] / _STANDARD_GRAVITY
+
+
+def main(settings: Settings) -> None:
+  """Walks everywhere and prints the table."""
+  print("| walk | RMS error [degrees] | at its end |\n| --- | --- | --- |")
+  ways = {"": (True, False), ", zero not measured": (False, False), ", endless range": (True, True)}
+  peaks = []
+  for seed in settings.robots:
+    for name, (zeroed, endless) in ways.items():
+      errors, peak = rehearsed(seed, settings.seconds, zeroed=zeroed, endless=endless)
+      print(errors.row(f"virtual robot {seed}{name}"), flush=True)
+      peaks.append(peak)
+  environment = suite.load(
+    "nerf_nav", scene=EmptyFloor(), image_size=None, random=0, time_limit=settings.seconds,
+    randomisation=RandomisationSettings(pushes=False), privileged=False,
+  )  # fmt: skip
+  task = environment.task
+  task.set_start(Start((0.0, 0.0), 0.0))
+  for episode in range(settings.episodes):
+    errors = _walk(environment, lambda: -task.state.rotation[2])
+    print(errors.row(f"simulation, episode {episode}"), flush=True)
+  print(f"\nlargest specific force in the chip of the virtual robots: {max(peaks):.1f} g")
+
+
+if __name__ == "__main__":
+  main(tyro.cli(Settings, description=__doc__))
