@@ -78,7 +78,8 @@ def simulate(
     starts = [int(s) for s in np.unique(window, return_index=True)[1]]
   delays = merge_delays(effects, clocks, model)
   late_by = _delays(delays, model)
-  stack = EffectStack([e for e in delays if e.kind != "command_delay"]).bind(model)
+  moving = [e for e in delays if e.kind != "command_delay" and not e.kind.startswith("imu_")]
+  stack = EffectStack(moving).bind(model)
   try:
     rate = _of_joint(effects, "clock_drift", "rate", None)
     offset = np.array([_offset(effects, name) for name in log.joints])

@@ -14,7 +14,7 @@ import numpy as np
 
 from suite.effects import Effect, write_effects
 from suite.effects.files import from_list, to_list
-from sysid import decision, detection, evaluation, excitation, extended_model, report
+from sysid import decision, detection, evaluation, excitation, extended_model, inertial, report
 from sysid.evaluation import Clocks
 from sysid.identification import Found, Identified, Settings, analyse, load_model, read_logs
 from sysid.logs import COMMANDS, Log, LogError
@@ -63,6 +63,11 @@ def identify(
   out = Path(out)
   out.mkdir(parents=True, exist_ok=True)
   found = analyse(compiled, logs, reference=healthy, settings=settings)
+  sensed = inertial.find(compiled, logs)
+  if sensed is not None and sensed.effects:
+    found.objects += sensed.effects
+    found.effects += sensed.rows
+    found.verdict = "effects" if found.verdict == "none" else found.verdict
   whole = [*found.calibration, *found.objects, *found.learned]
   content: dict[str, Any] = {
     "verdict": found.verdict,
@@ -85,11 +90,16 @@ def identify(
       {"kind": "residual_force", "joint": e.target, "parameters": {}, "evidence": {}}
       for e in found.learned
     ]
+    if sensed is not None:  # what the IMU shows is explained all the same
+      content["effects"] += sensed.rows
+      content["alternatives"] = [a for a in content["alternatives"] if a not in sensed.rows]
+  if sensed is not None:
+    content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(
     Path(model), out / "model_extended.xml", [*found.calibration, *found.objects]
   )
-  details = _details(found, Path(model), whole)
+  details = _details(found, Path(model), whole, sensed)
   (out / "details.json").write_text(json.dumps(details, indent=2, allow_nan=False) + "\n")
   content["seconds"] = round(time.perf_counter() - began, 1)
   (out / "report.html").write_text(
@@ -112,7 +122,9 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
       )
 
 
-def _details(found: Identified, model: Path, extended: Sequence[Effect]) -> dict[str, Any]:
+def _details(
+  found: Identified, model: Path, extended: Sequence[Effect], sensed: inertial.Inertial | None
+) -> dict[str, Any]:
   """Returns what the findings rest on, and what `evaluate` needs."""
   first = found.found[0]
   return {
@@ -129,6 +141,9 @@ def _details(found: Identified, model: Path, extended: Sequence[Effect]) -> dict
       "extended": detection.tests(first.screened.problem, first.finding.chosen.fit),
     },
     "audit": found.audits,
+    "imu_rms_in_noise": None
+    if sensed is None
+    else {"before": round(sensed.before, 3), "after": round(sensed.after, 3)},
   }
 
 
