@@ -15,18 +15,22 @@ from collections.abc import Callable
 from typing import Protocol
 
 _SWITCH_INTERVAL = 0.0001  # s that a thread may keep others from running; Python's own is 5 ms
-_PRIORITY = 20  # of SCHED_FIFO, 1 to 99; ours: above ordinary programs, below the kernel's own work
+_WATCHING, _ACTING = 20, 10  # of SCHED_FIFO, 1 to 99; ours: above ordinary programs
 _log = logging.getLogger(__name__)
 
 
-def prefer_this_thread() -> bool:
+def prefer_this_thread(*, acting: bool = False) -> bool:
   """Asks Linux to run this thread before ordinary programs, as motion control does.
+
+  Args:
+    acting: Whether it computes actions; threads that watch the robot come before it.
 
   Returns:
     Whether it does. It needs root, CAP_SYS_NICE or an `rtprio` limit (limits.conf).
   """
   try:
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    priority = os.sched_param(_ACTING if acting else _WATCHING)
+    os.sched_setscheduler(0, os.SCHED_FIFO, priority)
   except OSError:
     _log.info("no real-time priority for %s: readings may be late", threading.current_thread().name)
     return False

@@ -10,6 +10,7 @@ import numpy as np
 
 import real
 from real.camera import Controls
+from real.clock import prefer_this_thread
 from real.evaluation import episodes, perturbations, starts
 from real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
 from real.recorder import Recorder
@@ -79,6 +80,7 @@ class OperatedPlant(Plant):
       TASKS[protocol], robot=robot, camera=camera, scene=scene, image_size=image_size,
       time_limit=time_limit, recorder=self._recorder, offsets=offsets, dry_run=dry_run,
     )  # fmt: skip
+    prefer_this_thread(acting=True)
     self._dry_run = dry_run
     self._steps = 0
 
