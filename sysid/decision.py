@@ -36,6 +36,8 @@ class Thresholds:
   """nats within which a runner-up is as good: then the set is confounded."""
   adequate: float = 1.0
   """nats above the noise at which a hypothesis is not believed; healthy sets end up to 0.7."""
+  adequate_log: float = 1.6
+  """The same for the log that is explained least: what shows in slow motion only is an effect."""
   constant: float = 0.05
   """Relative error of a declared constant at which it is reported."""
   constants_gain: float = 0.3
@@ -112,11 +114,12 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   chosen = best if gained > thresholds.gain else null
   named = chosen is best
   constants = constants_off(chosen, ladder.declared, null, thresholds)
-  left = race.above_floor(chosen)
+  enough = race.above_floor(chosen) <= thresholds.adequate
+  enough = enough and race.worst_log(chosen) <= thresholds.adequate_log
   confounded = [e for e in others if named and e.score - best.score < thresholds.margin]
   size = len(names(best))
   confounded = [e for e in confounded if len(names(e)) <= size]
-  if left > thresholds.adequate or len(names(chosen)) > _BELIEVED:
+  if not enough or len(names(chosen)) > _BELIEVED:
     verdict = "unexplained"
   elif named or constants:
     verdict = "effects"
