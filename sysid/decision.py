@@ -21,7 +21,7 @@ _USUAL = (
 )
 """Kinds in the order in which they are named where logs cannot tell them apart; ours: a late
 command is more usual than a late reading."""
-_FRICTION_SPREAD = 7.0  # dry friction varies that much more than other constants before it counts
+_FRICTION_SPREAD = 10.0  # dry friction varies that much more than other constants before it counts
 
 
 @dataclasses.dataclass(frozen=True)

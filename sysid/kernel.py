@@ -203,7 +203,7 @@ def simulate(
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + step:
         share = (reach + step - command_time[pointer + 1]) / step
         later = command[pointer + 1]
-      i = min(n, last)
+      i = min(int(time * (1.0 + rate) / step), last)  # surroundings were measured: stamped time
       seen_v = motor_speed if apart else v
       seen_q = q + encoder
       if half > 0.0 and on_motor > 0.0:
