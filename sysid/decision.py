@@ -99,6 +99,12 @@ def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresh
   return off and declared.score - null.score > thresholds.constants_gain
 
 
+def adequate(entry: Entry, thresholds: Thresholds) -> bool:
+  """Tells whether a hypothesis leaves no more than healthy joints do, over all logs and in each."""
+  in_all = race.above_floor(entry) <= thresholds.adequate
+  return in_all and race.worst_log(entry) <= thresholds.adequate_log
+
+
 def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   """Returns what is concluded about a joint."""
   thresholds = thresholds or Thresholds()
@@ -114,12 +120,10 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   chosen = best if gained > thresholds.gain else null
   named = chosen is best
   constants = constants_off(chosen, ladder.declared, null, thresholds)
-  enough = race.above_floor(chosen) <= thresholds.adequate
-  enough = enough and race.worst_log(chosen) <= thresholds.adequate_log
   confounded = [e for e in others if named and e.score - best.score < thresholds.margin]
   size = len(names(best))
   confounded = [e for e in confounded if len(names(e)) <= size]
-  if not enough or len(names(chosen)) > _BELIEVED:
+  if not adequate(chosen, thresholds) or len(names(chosen)) > _BELIEVED:
     verdict = "unexplained"
   elif named or constants:
     verdict = "effects"

@@ -124,6 +124,7 @@ def analyse(
     shared.append(effect)
     common.declare(effect, screened)
     found = _race(screened, settings)
+  chain.without_refuted(model, found, screened, settings.thresholds)
   found = _without_contradictions(found, settings)
   found += _others(found, screened, settings)
   result = Identified(model, logs, screened, found, audits=[audit(log) for log in logs])
