@@ -14,9 +14,12 @@ from sysid.decision import Thresholds
 from sysid.fitting import Fit, Problem
 from sysid.joint import Found
 from sysid.race import Entry
+from sysid.screening import Screened
 from sysid.terms import Term
 
 Array = np.ndarray
+
+_REFUTED = 0.1  # nats by which a joint that carries a payload may get worse; ours
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
@@ -89,19 +92,54 @@ def share(parts: Sequence[tuple[Problem, Term]], term: Term, start: Array) -> li
   return problem.entries(fit)
 
 
+def without_refuted(
+  model: mujoco.MjModel,
+  found: Sequence[Found],
+  screened: Sequence[Screened],
+  thresholds: Thresholds,
+) -> None:
+  """Drops payloads that make a joint which carries them worse, and decides anew."""
+  for item in found:
+    chosen = item.finding.chosen
+    if not item.finding.named or "payload" not in decision.names(chosen):
+      continue
+    index = [t.kind for t in chosen.fit.terms].index("payload")
+    term, x = chosen.fit.terms[index], chosen.fit.part(index)
+    others = [s for s in screened if s.joint != item.joint]
+    if _worse_with(model, item.joint, term.held_at(x), others):
+      item.ladder.singles = [e for e in item.ladder.singles if "payload" not in decision.names(e)]
+      item.ladder.pairs = [e for e in item.ladder.pairs if "payload" not in decision.names(e)]
+      item.finding = decision.decide(item.ladder, thresholds)
+
+
+def _worse_with(
+  model: mujoco.MjModel, joint: str, payload: Term, others: Sequence[Screened]
+) -> list[str]:
+  """Returns the joints that carry a payload on a joint's body and are explained worse with it."""
+  carriers = ancestors(model, int(model.jnt_bodyid[model.joint(joint).id]))
+  result = []
+  for s in others:
+    if s.joint in carriers:
+      fit = s.problem.fit([s.calibration, payload], s.null.fit.x, evaluations=6)
+      if race.entry(s.problem, fit).score - s.null.score > _REFUTED:
+        result.append(s.joint)
+  return result
+
+
 def merge_payloads(model: mujoco.MjModel, found: Sequence[Found], thresholds: Thresholds) -> None:
   """Replaces payloads on several joints of one chain by one payload that all of them feel.
 
   A payload shows in every joint between it and the base. Each carrying body is tried with all
-  raced joints that carry it; the one that explains most over all of them is kept.
+  raced joints that carry it; the one that explains most over all of them is kept. A joint keeps
+  what was concluded of it alone unless the shared payload explains it as well.
   """
-  carriers = [f for f in found if f.finding.named and _payload_entry(f) is not None]
+  carriers = [f for f in found if f.finding.named and _payload_entry(f, thresholds) is not None]
   if not carriers or model.njnt < 2:
     return
   by_joint = {f.joint: f for f in found}
   best: tuple[float, list[tuple[Found, Entry]]] | None = None
   for carrier in carriers:
-    entry = _payload_entry(carrier)
+    entry = _payload_entry(carrier, thresholds)
     assert entry is not None
     term = next(t for t in entry.fit.terms if t.kind == "payload")
     joint = model.joint(carrier.joint).id
@@ -112,13 +150,15 @@ def merge_payloads(model: mujoco.MjModel, found: Sequence[Found], thresholds: Th
     parts = [(f.screened.problem, f.screened.calibration) for f in items]
     entries = share(parts, term, start)
     gain = sum(f.ladder.null.score - e.score for f, e in zip(items, entries, strict=True))
-    if best is None or gain > best[0]:
+    first, own = entries[0], items[0]
+    enough = own.ladder.null.score - first.score > thresholds.gain
+    as_good = first.score - own.finding.chosen.score < thresholds.second
+    if enough and as_good and (best is None or gain > best[0]):
       best = gain, list(zip(items, entries, strict=True))
-  assert best is not None
-  for rank, (item, entry) in enumerate(best[1]):
-    own = item.finding.chosen
-    if rank == 0 or entry.score - own.score < thresholds.second:
-      left = race.above_floor(entry) > thresholds.adequate
+  for rank, (item, entry) in enumerate(best[1] if best is not None else ()):
+    own_entry = item.finding.chosen
+    if rank == 0 or entry.score - own_entry.score < thresholds.second:
+      left = not decision.adequate(entry, thresholds)
       item.finding = dataclasses.replace(
         item.finding,
         chosen=entry,
@@ -127,9 +167,9 @@ def merge_payloads(model: mujoco.MjModel, found: Sequence[Found], thresholds: Th
       )
 
 
-def _payload_entry(item: Found) -> Entry | None:
+def _payload_entry(item: Found, thresholds: Thresholds) -> Entry | None:
   """Returns a joint's best hypothesis of a payload alone if it is nearly as good as the chosen."""
   entries = [e for e in item.ladder.singles if decision.names(e) == {"payload"}]
-  if not entries or entries[0].score - item.finding.chosen.score > 0.5:
+  if not entries or entries[0].score - item.finding.chosen.score > 2.5 * thresholds.second:
     return None
   return entries[0]

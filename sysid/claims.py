@@ -59,6 +59,36 @@ def constants(s: Screened, entry: Entry) -> dict[str, Any]:
   }
 
 
+def constants_of_all(claimed: list[dict[str, Any]]) -> dict[str, Any]:
+  """Returns one entry for constants that are off alike in (nearly) all joints: their medians.
+
+  Args:
+    claimed: the joints' entries.
+  """
+  names = set.intersection(*(set(row["parameters"]) for row in claimed))
+  parameters = {}
+  for name in claimed[0]["parameters"]:
+    if name not in names:
+      continue
+    values = np.array([row["parameters"][name]["value"] for row in claimed])
+    widths = [row["parameters"][name]["high"] - row["parameters"][name]["low"] for row in claimed]
+    middle = float(np.median(values))
+    scatter = 1.4826 * float(np.median(np.abs(values - middle))) / np.sqrt(len(values))
+    # Of a median: 1.25 times the deviation of a mean.
+    reach = float(np.hypot(1.96 * 1.25 * scatter, 0.5 * np.median(widths)))
+    parameters[name] = {"value": middle, "low": middle - reach, "high": middle + reach, "unit": "1"}
+  gains = [row["evidence"]["gain_over_declared_nats"] for row in claimed]
+  return {
+    "kind": "parameter_error",
+    "joint": None,
+    "parameters": parameters,
+    "evidence": {
+      "gain_over_declared_nats": round(float(np.median(gains)), 4),
+      "joints": [row["joint"] for row in claimed],
+    },
+  }
+
+
 def _parameters(
   found: Effect, bounds: Any, term: Term, *, slide: bool
 ) -> dict[str, dict[str, Any]]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid import decision, explanation, intervals, race
+from sysid import decision, intervals, race
 from sysid.joint import Found
 from sysid.race import CLOCKS
 from sysid.screening import Screened
@@ -24,11 +24,12 @@ WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
 """Kinds that have no target: they concern all joints or none."""
 _LATE = ("command_delay", "measurement_delay")
 """Kinds that can be a joint's or the bus's."""
-_FEWEST = 4  # joints from which a spread of constants is told
+_FEWEST = 2  # joints of which one tells the latencies of the other; constants take three
 _NARROWEST = 0.5  # of the prior's own spread; a joint may differ from its like
 _TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution, to its standard deviation
 _GAIN = 0.05  # nats that the other joints must gain in the mean; ours
 _LOSS = 0.15  # nats that a joint may lose; ours
+_ASKED = 5  # joints that an effect's values are asked of, those that show it most
 _SHARE = 0.8  # of joints that a late bus must show in; ours
 
 
@@ -48,26 +49,23 @@ class Shared:
 
 
 def expect_like_the_others(screened: Sequence[Screened]) -> None:
-  """Centres every joint's constants on what the other joints have, and fits the null anew."""
-  if len(screened) < _FEWEST or any(s.calibration.centre for s in screened):
-    return
+  """Centres every joint's constants and latencies on what the others have; fits the nulls anew."""
+  if len(screened) < _FEWEST or any(s.calibration.centre and s.alone is None for s in screened):
+    return  # too few, or reference logs have told already
   values = {s.joint: s.null.fit.values("calibration") for s in screened}
   for s in screened:
+    s.alone = s.alone or s.calibration
     centre, prior = [], []
-    for name, spread in zip(s.calibration.names, s.calibration.prior, strict=True):
+    for name, spread in zip(s.alone.names, s.alone.prior, strict=True):
       others = [v[name] for joint, v in values.items() if joint != s.joint and name in v]
-      if name in CLOCKS or len(others) < _FEWEST - 1:
-        centre.append(0.0)
-        prior.append(spread)
-        continue
-      middle = float(np.median(others))
+      middle = float(np.median(others)) if others else 0.0
       width = 1.5 * _TO_SIGMA * float(np.median(np.abs(np.array(others) - middle)))
-      centre.append(middle)
-      prior.append(float(np.clip(width, _NARROWEST * spread, spread)))
+      narrow = name not in CLOCKS and len(others) > 1
+      centre.append(middle if narrow or name in CLOCKS else 0.0)
+      prior.append(float(np.clip(width, _NARROWEST * spread, spread)) if narrow else spread)
     s.calibration = dataclasses.replace(
-      s.calibration, centre=tuple(centre), prior=tuple(prior),
-      starts=(tuple(centre), *s.calibration.starts),
-    )  # fmt: skip
+      s.alone, centre=tuple(centre), prior=tuple(prior), starts=(tuple(centre), *s.alone.starts)
+    )
     s.null = race.entry(s.problem, s.problem.fit([s.calibration]))
 
 
@@ -86,18 +84,43 @@ def shared_effect(found: Sequence[Found], screened: Sequence[Screened]) -> Share
     for kind in decision.names(chosen) & {*WHOLE, *_LATE}:
       index = [t.kind for t in chosen.fit.terms].index(kind)
       term, x = chosen.fit.terms[index], chosen.fit.part(index)
-      gains = [_gain(s, term, x) for s in screened if s.joint != item.joint]
-      if not gains or np.mean(gains) < _GAIN or np.quantile(gains, 0.1) < -_LOSS:
+      gains = {s.joint: _gain(s, term, x) for s in screened if s.joint != item.joint}
+      values = np.array(list(gains.values()))
+      if not gains or values.mean() < _GAIN or np.quantile(values, 0.1) < -_LOSS:
         continue
-      if kind in _LATE and np.mean(np.array(gains) > _GAIN) < _SHARE:
+      if kind in _LATE and np.mean(values > _GAIN) < _SHARE:
         continue
-      if best is None or np.mean(gains) > best.gain:
+      if best is None or values.mean() > best.gain:
+        most = sorted(gains, key=lambda joint: -gains[joint])[: _ASKED - 1]
+        asked = [s for s in screened if s.joint in (item.joint, *most)]
+        whole = dataclasses.replace(term, target=None)
+        x, spread = _agreed(asked, whole, x)
         best = Shared(
-          dataclasses.replace(term, target=None), x.copy(), float(np.mean(gains)),
-          intervals.intervals(item.screened.problem, chosen.fit, kind),
+          whole, x, float(values.mean()), intervals.around(whole, x, spread),
           decision.evidence(chosen, item.ladder),
         )  # fmt: skip
   return best
+
+
+def _agreed(asked: Sequence[Screened], term: Term, start: Array) -> tuple[Array, Array]:
+  """Returns the values [n] that joints agree on and their standard deviations [n].
+
+  The joints' own fits are weighted by their information; where they differ by more than their
+  covariances say (Birge's ratio), the deviations grow.
+  """
+  fits = []
+  for s in asked:
+    x = np.concatenate([s.null.fit.x, start])
+    fit = s.problem.fit([s.calibration, term], x, evaluations=20)
+    own = slice(len(s.null.fit.x), None)
+    fits.append((fit.part(1), intervals.covariance(s.problem, fit)[own, own]))
+  informations = [np.linalg.pinv(c + 1e-18 * np.eye(len(start))) for _, c in fits]
+  together = np.linalg.pinv(sum(informations, np.zeros_like(informations[0])))
+  x = together @ sum((i @ v for i, (v, _) in zip(informations, fits, strict=True)), 0 * start)
+  off = [(v - x) @ i @ (v - x) for i, (v, _) in zip(informations, fits, strict=True)]
+  birge = max(1.0, float(np.sum(off)) / max(len(start) * (len(fits) - 1), 1))
+  x = np.clip(x, term.low, term.high)
+  return x, np.sqrt(np.maximum(np.diag(together), 0.0) * birge)
 
 
 def _gain(s: Screened, term: Term, x: Array) -> float:
@@ -113,4 +136,6 @@ def declare(shared: Shared, screened: Sequence[Screened]) -> None:
     plant = s.problem.plant
     parameters, surroundings = compose(plant, [shared.term], shared.x)
     plant.absorb(shared.term.kind, parameters, surroundings)
-    _, _, s.null = explanation.bare(s.problem, s.calibration)
+    s.calibration = s.alone or s.calibration
+    s.null = race.entry(s.problem, s.problem.fit([s.calibration]))
+  expect_like_the_others(screened)

@@ -21,7 +21,7 @@ _USUAL = (
 )
 """Kinds in the order in which they are named where logs cannot tell them apart; ours: a late
 command is more usual than a late reading."""
-_FRICTION_SPREAD = 7.0  # dry friction varies that much more than other constants before it counts
+_FRICTION_SPREAD = 10.0  # dry friction varies that much more than other constants before it counts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Thresholds:
   """nats within which a runner-up is as good: then the set is confounded."""
   adequate: float = 1.0
   """nats above the noise at which a hypothesis is not believed; healthy sets end up to 0.7."""
+  adequate_log: float = 1.6
+  """The same for the log that is explained least: what shows in slow motion only is an effect."""
   constant: float = 0.05
   """Relative error of a declared constant at which it is reported."""
   constants_gain: float = 0.3
@@ -97,6 +99,12 @@ def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresh
   return off and declared.score - null.score > thresholds.constants_gain
 
 
+def adequate(entry: Entry, thresholds: Thresholds) -> bool:
+  """Tells whether a hypothesis leaves no more than healthy joints do, over all logs and in each."""
+  in_all = race.above_floor(entry) <= thresholds.adequate
+  return in_all and race.worst_log(entry) <= thresholds.adequate_log
+
+
 def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   """Returns what is concluded about a joint."""
   thresholds = thresholds or Thresholds()
@@ -112,11 +120,10 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   chosen = best if gained > thresholds.gain else null
   named = chosen is best
   constants = constants_off(chosen, ladder.declared, null, thresholds)
-  left = race.above_floor(chosen)
   confounded = [e for e in others if named and e.score - best.score < thresholds.margin]
   size = len(names(best))
   confounded = [e for e in confounded if len(names(e)) <= size]
-  if left > thresholds.adequate or len(names(chosen)) > _BELIEVED:
+  if not adequate(chosen, thresholds) or len(names(chosen)) > _BELIEVED:
     verdict = "unexplained"
   elif named or constants:
     verdict = "effects"

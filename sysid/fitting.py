@@ -117,14 +117,12 @@ class Problem:
   def effort_scale(self, outputs: Sequence[Output]) -> float:
     """Returns measured effort over simulated torque.
 
-    Efforts are scaled by least squares over all logs, as their torque constant is a guess. A duty
-    is absolute: full duty is the actuator's limit, where the model has one.
+    Both are scaled by least squares over all logs: an effort's torque constant is a guess, and full
+    duty is the torque limit of the model only about, where it has one.
     """
     if self.channel == "none":
       return 1.0
     full = float(self.plant.declared[INDEX["highest"]])
-    if self.channel == "duty" and np.isfinite(full):
-      return 1.0 / full
     above, below = 0.0, 1e-12
     for index, output in enumerate(outputs):
       torque = output.torque
@@ -132,7 +130,9 @@ class Problem:
       above += float(self.effort(index)[chosen] @ torque[chosen])
       below += float(torque[chosen] @ torque[chosen])
     scale = above / below
-    return float(np.clip(scale, 0.3, 3.0)) if self.channel == "effort" else float(scale)
+    if self.channel == "effort":
+      return float(np.clip(scale, 0.3, 3.0))
+    return float(np.clip(scale, 0.3 / full, 3.0 / full)) if np.isfinite(full) else float(scale)
 
   def errors(self, outputs: Sequence[Output]) -> list[tuple[Array, Array | None]]:
     """Returns measured minus simulated position and effort of each log, in noise units."""

@@ -37,6 +37,7 @@ from sysid.screening import Screened
 Array = np.ndarray
 
 _FEW = 5  # joints of which half may have something
+_ALL_OFF = 0.6  # share of joints with constants that are off that stands for all
 _MOST_SHARED = 2  # effects of the whole machine that are looked for
 
 
@@ -123,6 +124,7 @@ def analyse(
     shared.append(effect)
     common.declare(effect, screened)
     found = _race(screened, settings)
+  chain.without_refuted(model, found, screened, settings.thresholds)
   found = _without_contradictions(found, settings)
   found += _others(found, screened, settings)
   result = Identified(model, logs, screened, found, audits=[audit(log) for log in logs])
@@ -217,6 +219,7 @@ def _conclude(result: Identified, settings: Settings) -> None:
     for term in chosen[item.joint].fit.terms if item.finding.named else ():
       if term.kind != "calibration":
         _claim(result, claims.effect(item, chosen[item.joint], term))
+  off: list[dict[str, Any]] = []
   for s in result.screened:
     fit = chosen[s.joint].fit
     values = fit.values("calibration")
@@ -224,7 +227,9 @@ def _conclude(result: Identified, settings: Settings) -> None:
     calibration = fit.terms[0].effect(fit.part(0))
     result.calibration.append(dataclasses.replace(calibration, target=s.joint))
     if decision.constants_off(chosen[s.joint], s.declared, s.null, settings.thresholds):
-      result.effects.append(claims.constants(s, chosen[s.joint]))
+      off.append(claims.constants(s, chosen[s.joint]))
+  alike = len(off) > _ALL_OFF * len(result.screened) and len(off) > 1
+  result.effects += [claims.constants_of_all(off)] if alike else off
   unexplained = [f for f in result.found if f.finding.verdict == "unexplained"]
   if unexplained:
     result.verdict = "unexplained"

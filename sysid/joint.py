@@ -48,17 +48,13 @@ def polished(item: Found, spread: float) -> Entry:
   """Fits the chosen hypothesis to the end, constants held as near to declared as their like."""
   entry = item.finding.chosen
   terms = list(entry.fit.terms)
-  if not terms[0].centre:  # not fixed by reference logs
-    prior = tuple(
-      p if n in CLOCKS else _RELATIVE.get(n, 1.0) * spread
-      for n, p in zip(terms[0].names, terms[0].prior, strict=True)
-    )
-    late = {"command_delay", "measurement_delay"} & decision.names(entry)
-    if late:  # a delay takes in what latency there is beside it
-      prior = tuple(
-        _NO_LATENCY if n in CLOCKS else p for n, p in zip(terms[0].names, prior, strict=True)
-      )
-    terms[0] = dataclasses.replace(terms[0], prior=prior)
+  prior = dict(zip(terms[0].names, terms[0].prior, strict=True))
+  if not terms[0].centre:  # neither reference logs nor other joints tell
+    prior = {n: p if n in CLOCKS else _RELATIVE.get(n, 1.0) * spread for n, p in prior.items()}
+  if {"command_delay", "measurement_delay"} & decision.names(entry):
+    # A delay takes in what latency there is beside it.
+    prior = {n: min(p, _NO_LATENCY) if n in CLOCKS else p for n, p in prior.items()}
+  terms[0] = dataclasses.replace(terms[0], prior=tuple(prior.values()))
   problem = item.screened.problem
   as_declared = entry.fit.x.copy()
   as_declared[: len(terms[0].names)] = terms[0].starts[0]

@@ -180,6 +180,7 @@ def simulate(
     jump = 0.0
     told = 0.0
     apart = False
+    was_apart = False
     gap_offset = 0.0
     started = False
     motor_speed = v
@@ -202,12 +203,13 @@ def simulate(
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + step:
         share = (reach + step - command_time[pointer + 1]) / step
         later = command[pointer + 1]
-      i = min(n, last)
+      i = min(int(time * (1.0 + rate) / step), last)  # surroundings were measured: stamped time
       seen_v = motor_speed if apart else v
       seen_q = q + encoder
       if half > 0.0 and on_motor > 0.0:
         seen_q += on_motor * gap_offset
-      before = torque
+      before = 0.0 if was_apart else torque  # what the joint felt in the last step
+      was_apart = apart
       strength = gain
       if heating > 0.0:
         heat = heat * keep_cool + heating * step * before * before
@@ -251,7 +253,7 @@ def simulate(
         limit += breakaway * math.exp(-ratio * ratio)
       if load_share > 0.0 or load_square > 0.0:
         carried = before  # of the last step, as suite.effects
-        if load_kind == 1:
+        if load_kind == 1 and not apart:
           carried = before - damping * v
         elif load_kind == 2:
           carried = demand + bias[i] + inertia[i] * acceleration

@@ -77,7 +77,7 @@ def identify(
     "error": {
       "train": _errors(found, logs, whole, settings),
       "held": _errors(found, others, whole, settings) if others else None,
-      "floor": _floor(found),
+      "floor": _floor(others or logs, [s.joint for s in found.screened]),
     },
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
@@ -202,10 +202,21 @@ def _errors(
   }
 
 
-def _floor(found: Identified) -> float:
-  """Returns the noise of the position readings, rad: what no model can explain."""
-  noise = [s.problem.position_noise for s in found.screened]
-  return float(np.sqrt(np.mean(np.square(noise))))
+def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:
+  """Returns what no smooth model can explain, rad (or m) rms over joints.
+
+  Readings scatter about any smooth motion by rounding, noise and stamps that are off while the
+  joint moves: that is what their differences of fourth order keep (70 times its variance). The
+  largest hundredth, stale readings, is left out.
+  """
+  squares = []
+  for log in logs:
+    position = log.states.position
+    assert position is not None
+    columns = [log.states.column(joint) for joint in joints]
+    fourth = np.sort(np.square(np.diff(position[:, columns], n=4, axis=0)), axis=0)
+    squares.append(fourth[: max(1, int(0.99 * len(fourth)))].mean(axis=0) / 70.0)
+  return float(np.sqrt(np.mean(squares)))
 
 
 def _holds(found: Identified) -> bool:

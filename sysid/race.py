@@ -162,3 +162,9 @@ def _with_start(base: Sequence[Term], start: Array) -> list[Term]:
 def above_floor(found: Entry) -> float:
   """Returns by how much an entry's positions lie above the noise: mean log rms over logs, nats."""
   return float(np.mean(0.5 * np.log(FLOOR + found.levels[:, 0] ** 2)) - 0.5 * np.log(FLOOR + 1.0))
+
+
+def worst_log(found: Entry) -> float:
+  """Returns by how much an entry's positions lie above the noise in the log it fits least, nats."""
+  worst = float(np.max(found.levels[:, 0]))
+  return float(0.5 * np.log((FLOOR + worst**2) / (FLOOR + 1.0)))

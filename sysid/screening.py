@@ -30,6 +30,8 @@ class Screened:
   null: Entry
   background: float = 0.0
   """nats above the noise that the same joint leaves on reference logs."""
+  alone: Term | None = None
+  """The calibration before it was centred on what the other joints have."""
 
   @property
   def excess(self) -> float:

@@ -200,8 +200,8 @@ class Binding:
       force += np.multiply(self._per_velocity, velocity[self._of_joint], out=self._work)
     force *= self.strength
     if self._low is not None and self._high is not None:
-      np.maximum(force, self._low, out=force)
-      np.minimum(force, self._high, out=force)
+      np.maximum(force, self._low * self.limit, out=force)
+      np.minimum(force, self._high * self.limit, out=force)
     return force
 
   def restore(self) -> None:

@@ -1,5 +1,7 @@
 """The compiled joint against MuJoCo with `suite.effects`, kind by kind."""
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -117,3 +119,34 @@ def test_surroundings_of_a_payload_are_those_of_a_heavier_model() -> None:
     np.testing.assert_allclose(
       getattr(added, name), getattr(want, name) - getattr(base, name), atol=2e-7, err_msg=name
     )
+
+
+def test_pairs_move_the_joint_as_mujoco_does() -> None:
+  # A kind may use what another one changes: the torque that acts, the friction, the strength.
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=3.0)
+  plant = JointPlant(model, "joint", [log])
+  cases = [*{case[0]: case for case in reversed(CASES)}.values()]  # the first of a kind
+  cases.append(("backlash", {"gap": 0.01, "encoder_on_motor": 1.0}, 2e-3))
+  weaker = {"motor_gain", "supply_sag", "thermal_derating"}  # one flag tells what their limits do
+  wrong = []
+  for first, second in itertools.combinations(cases, 2):
+    kinds = {first[0], second[0]}
+    if len(kinds) == 1 or kinds <= weaker:
+      continue
+    values = [*first[1].values(), *second[1].values()]
+    terms, effects = zip(*(_case(kind, v) for kind, v, _ in (first, second)), strict=True)
+    p, changed = compose(plant, terms, np.array(values))
+    got = plant.simulate(p, surroundings=[changed])[0][0].position
+    want = evaluation.simulate(model, log, list(effects))[:, 0]
+    if float(np.sqrt(np.mean((got - want) ** 2))) > 4e-3:
+      wrong.append(kinds)
+  assert not wrong
+
+
+def _case(kind: str, values: dict) -> tuple[Term, Effect]:
+  target = "arm" if kind == "payload" else (None if kind in _COMMON else "joint")
+  zeros = (0.0,) * len(values)
+  return Term(kind, target, tuple(values), zeros, zeros, zeros, (zeros,)), Effect(
+    kind, target, values
+  )
