@@ -5,8 +5,10 @@
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 
 import mujoco
+import numpy as np
 
 from sysid.series import (
   ImuSeries,
@@ -45,6 +47,13 @@ __all__ = [
 
 MINIMUM_DURATION = 1.0
 """s; ours: a shorter log holds not one period of the slowest excitation of a servo joint."""
+
+
+MINIMUM_RATE = 20.0
+"""Hz; ours: servo joints answer within a tenth of a second, which two readings must show."""
+
+MINIMUM_MOTION = 1e-4
+"""rad or m; ours: less is rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +95,7 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
   Raises:
     FileNotFoundError: no such file.
     LogError: not an MCAP, damaged, without commands or states, with NaNs, with time running
-      backwards, or shorter than `MINIMUM_DURATION`.
+      backwards, shorter than `MINIMUM_DURATION` or slower than `MINIMUM_RATE`.
   """
   path = pathlib.Path(path)
   if not path.is_file():
@@ -126,7 +135,27 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
       f"{path.name} lasts {max(log.duration, 0.0):.3g} s with commands and states, expected at "
       f"least {MINIMUM_DURATION:g} s: record a longer log."
     )
+  span = states.stamp[-1] - states.stamp[0]
+  if len(states.stamp) < MINIMUM_RATE * span:
+    raise LogError(
+      f"{path.name} has {len(states.stamp)} readings of {STATES} in {span:.3g} s, expected at "
+      f"least {MINIMUM_RATE:g} a second: record faster."
+    )
   return log
+
+
+def check_motion(logs: Sequence[Log]) -> None:
+  """Raises a LogError where no joint that is commanded moves in any of the logs."""
+  for log in logs:
+    assert log.states.position is not None
+    columns = [log.states.column(joint) for joint in log.commands.joints]
+    if np.ptp(log.states.position[:, columns], axis=0).max() > MINIMUM_MOTION:
+      return
+  names = ", ".join(log.name for log in logs)
+  raise LogError(
+    f"Found no commanded joint that moves in {names}, expected some motion: record a sweep, a slow "
+    "motion and steps."
+  )
 
 
 def check_against_model(log: Log, model: mujoco.MjModel) -> None:

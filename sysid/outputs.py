@@ -17,7 +17,7 @@ from suite.effects.files import from_list, to_list
 from sysid import decision, detection, evaluation, excitation, extended_model, inertial, report
 from sysid.evaluation import Clocks
 from sysid.identification import Found, Identified, Settings, analyse, load_model, read_logs
-from sysid.logs import COMMANDS, Log, LogError
+from sysid.logs import COMMANDS, Log, LogError, check_motion
 
 _LISTED = 6  # alternatives in the report
 
@@ -59,6 +59,7 @@ def identify(
   compiled = load_model(Path(model))
   logs, others = read_logs(train, compiled), read_logs(held, compiled)
   healthy = read_logs(reference, compiled)
+  check_motion(logs)
   _check_joints(logs, [*others, *healthy])
   out = Path(out)
   out.mkdir(parents=True, exist_ok=True)

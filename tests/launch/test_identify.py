@@ -59,6 +59,7 @@ def _at(which, **changes):
     ({"spoil": _at(50, position=[np.nan])}, "NaN or infinite positions"),
     ({"spoil": _at(50, stamp_ns=START)}, "time runs backwards"),
     ({"duration": 0.1}, "expected at least 1 s"),
+    ({"spoil": lambda index, fields: {**fields, "stamp_ns": START + index * 10**9}}, "a second"),
     ({"cut": 2000}, "truncated or damaged"),
     ({"cut": 0}, "is empty"),
   ],
@@ -111,6 +112,17 @@ def test_missing_files_and_options_are_one_line(identify, tmp_path):
     code, _, err = identify(*arguments)
     assert code != 0
     assert err.startswith("error: ") and err.count("\n") == 1 and words in err
+
+
+def test_logs_without_motion_are_one_line(identify, tmp_path):
+  (tmp_path / "model.xml").write_text(PENDULUM)
+  log = _log(tmp_path / "a.mcap", spoil=lambda index, fields: {**fields, "position": [0.5]})
+  code, _, err = identify(
+    "--model", tmp_path / "model.xml", "--logs", log, "--out", tmp_path / "out"
+  )
+  assert code != 0
+  assert err.startswith("error: Found no commanded joint that moves in a.mcap")
+  assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize("option", ["--held", "--reference"])

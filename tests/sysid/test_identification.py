@@ -1,5 +1,6 @@
 """The whole tool: verdicts, files, bad input."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,15 @@ import pytest
 
 import sysid
 from suite.effects import Effect, EffectStack, read_effects
-from sysid import decision, elaboration, evaluation, explanation, extended_model, learned
+from sysid import (
+  decision,
+  elaboration,
+  evaluation,
+  explanation,
+  extended_model,
+  learned,
+  signatures,
+)
 from sysid.audit import audit
 from sysid.candidates import calibration
 from sysid.chain import ancestors
@@ -100,6 +109,15 @@ def test_extended_model_finds_its_meshes_from_any_folder(tmp_path: Path) -> None
   (tmp_path / "out").mkdir()
   extended_model.write(tmp_path / "model.xml", tmp_path / "out" / "extended.xml", [])
   assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "extended.xml")).nmesh == 1
+
+
+def test_a_joint_that_holds_still_is_looked_at_without_harm() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "slow", duration=3.0)
+  still = dataclasses.replace(log.states, position=np.full_like(log.states.position, 0.3))
+  plant = JointPlant(model, "joint", [dataclasses.replace(log, states=still)])
+  waves = signatures.waves(Problem(plant), Problem(plant).fit([]))
+  assert all(np.isfinite(waves).ravel())
 
 
 def test_wrong_constants_come_out_as_parameter_error() -> None:
