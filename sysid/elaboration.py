@@ -10,12 +10,15 @@ simulation of servo actuators", whose models of load, square and Stribeck this j
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from sysid import decision, race
 from sysid.explanation import Ladder
 from sysid.fitting import Problem
+from sysid.kernel import INDEX
+from sysid.plant import Output
 from sysid.race import Entry
 from sysid.terms import Term
 
@@ -57,9 +60,18 @@ def elaborate(ladder: Ladder, chosen: Entry) -> Entry:
     ladder: the evidence about a joint that stayed unexplained.
     chosen: its hypothesis so far.
   """
-  problem = ladder.problem
+  for problem in _readings(ladder.problem):
+    best = _best(problem, _bases(ladder, chosen))
+    scores = (race.held_out(ladder.problem, e, evaluations=15).score for e in (chosen, best))
+    before, after = scores
+    if before - after > _LEAST:
+      return race.entry(ladder.problem, best.fit)
+  return chosen
+
+
+def _best(problem: Problem, bases: Sequence[tuple[list[Term], np.ndarray]]) -> Entry:
   entries = []
-  for terms, start in _bases(ladder, chosen):
+  for terms, start in bases:
     for carried in (0, 1, 2):
       term = rich_friction(problem, carried)
       for begin in term.starts:
@@ -67,9 +79,22 @@ def elaborate(ladder: Ladder, chosen: Entry) -> Entry:
         entries.append(race.entry(problem, fit))
   entries.sort(key=lambda e: e.score)
   fits = [problem.fit(e.fit.terms, e.fit.x, evaluations=60) for e in entries[:_FINALISTS]]
-  best = min((race.entry(problem, f) for f in fits), key=lambda e: e.score)
-  before, after = (race.held_out(problem, e, evaluations=15).score for e in (chosen, best))
-  return best if before - after > _LEAST else chosen
+  return min((race.entry(problem, f) for f in fits), key=lambda e: e.score)
+
+
+class AbsoluteDuty(Problem):
+  """A joint whose logged duty is taken at its word: full duty is the actuator's limit."""
+
+  def effort_scale(self, outputs: Sequence[Output]) -> float:
+    """Returns duty over torque."""
+    return 1.0 / float(self.plant.declared[INDEX["highest"]])
+
+
+def _readings(problem: Problem) -> list[Problem]:
+  """Returns the ways to read a joint's logs, the more telling first."""
+  if problem.channel != "duty" or not np.isfinite(problem.plant.declared[INDEX["highest"]]):
+    return [problem]
+  return [AbsoluteDuty(problem.plant, masks=problem.masks), problem]
 
 
 def _duty_tells(term: Term, problem: Problem) -> Term:
