@@ -13,7 +13,7 @@ from mujoco import rollout
 
 from suite.effects import Effect, EffectStack
 from sysid.logs import Log
-from sysid.plant import actuator_of, holds_position
+from sysid.plant import actuator_of, fresh, holds_position
 from sysid.reduction import smooth_motion, start_velocity
 
 Array = np.ndarray
@@ -130,15 +130,20 @@ def _roll(stack: EffectStack, data: mujoco.MjData, ctrl: Array, qpos: Array) -> 
 
 
 def _held(stamp: Array, command: Array, times: Array, delay: float, step: float) -> Array:
-  """Returns the command [T] at step times, held and late; parts of a step are mixed, as
-  `suite.effects` does."""
-  whole = np.floor(delay / step + 1e-9) * step
-  share = max(delay - whole, 0.0) / step
-  newer, older = (
-    command[np.clip(np.searchsorted(stamp, t + 1e-9, side="right") - 1, 0, len(command) - 1)]
-    for t in (times - whole, times - whole - step)
-  )
-  return newer + share * (older - newer)
+  """Returns the mean command [T] of every step, each held until the next comes, and late.
+
+  A command that comes within a step acts for the rest of it: used from the next step on it would be
+  half a step late in the mean, which a moving joint shows.
+  """
+  spans = np.diff(stamp, append=stamp[-1])
+  total = np.concatenate([[0.0], np.cumsum(command * spans)[:-1]])
+
+  def integral(at: Array) -> Array:
+    index = np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, len(stamp) - 1)
+    return total[index] + command[index] * (at - stamp[index])
+
+  begin = times - delay
+  return (integral(begin + step) - integral(begin)) / step
 
 
 def _delays(effects: Sequence[Effect], model: mujoco.MjModel) -> Array:
@@ -186,11 +191,15 @@ def error(
   window_s: float = 0.5,
   joints: Sequence[str] | None = None,
 ) -> float:
-  """Returns the RMSE of positions over logs and joints, rad (or m)."""
+  """Returns the RMSE of positions over logs and joints, rad (or m); readings that were repeated
+  while the joint moved are left out: they measure nothing."""
   squares = []
   for log in logs:
     assert log.states.position is not None
     positions = simulate(model, log, effects, clocks=clocks, window_s=window_s)
     columns = [log.states.column(j) for j in (joints or log.joints)]
-    squares.append(np.square(log.states.position - positions)[:, columns].ravel())
+    measured, speeds = log.states.position, smooth_motion(log).velocity
+    for column in columns:
+      kept = fresh(log.states.stamp, measured[:, column], speeds[:, column])
+      squares.append(np.square((measured - positions)[kept, column]))
   return float(np.sqrt(np.mean(np.concatenate(squares))))

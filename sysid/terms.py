@@ -98,7 +98,8 @@ def _calibration(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["damping"]] *= 1.0 + v.get("damping", 0.0)
   p[I["armature"]] *= 1.0 + v.get("armature", 0.0)
   p[I["friction"]] *= 1.0 + v.get("friction", 0.0)
-  p[I["gain"]] *= 1.0 + v.get("gain", 0.0)
+  for name in ("input", "constant", "position", "velocity"):  # limits stay
+    p[I[name]] *= 1.0 + v.get("gain", 0.0)
   p[I["measurement_delay"]] += v.get("skew", 0.0)
   p[I["effort_delay"]] += v.get("skew", 0.0)
   p[I["command_delay"]] += v.get("latency", 0.0)
