@@ -272,7 +272,7 @@ def main() -> None:
   try:
     path = run(arguments)
     print("dry run: nothing moved, nothing kept" if path is None else f"wrote {path}")
-  except (ValueError, OSError, RuntimeError) as error:
+  except (ValueError, OSError, RuntimeError, EOFError) as error:
     sys.exit(f"error: {error}")
   except KeyboardInterrupt:
     sys.exit("\nstopped: the same command goes on from here")

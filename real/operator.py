@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 _LOOK_PERIOD = 0.02  # s between looks for the answer to a question
+_ESCAPE, _ERASE, _ENTER = 0x1B, b"\x08\x7f", b"\r\n"  # keys
 
 
 class Operator(Protocol):
@@ -30,7 +31,8 @@ class Operator(Protocol):
 class Terminal:
   """A person at a terminal: any key stops the robot, Enter confirms what is asked.
 
-  The bus's thread looks for keys all the time, also while a question waits for its Enter.
+  The bus's thread looks for keys all the time, also while a question waits. So whoever asks at this
+  terminal must ask with `ask`: `input` would compete for the keys, and an answer would be a stop.
   """
 
   def __init__(self, descriptor: int | None = None):
@@ -40,6 +42,7 @@ class Terminal:
     self._settings = termios.tcgetattr(self._descriptor) if self._open else None
     self._lock = threading.Lock()
     self._asking = self._confirmed = self._stopped = False
+    self._answer: bytearray | None = None  # to a question, as far as it has been typed
     if self._open:
       tty.setcbreak(self._descriptor, termios.TCSANOW)
 
@@ -61,6 +64,38 @@ class Terminal:
       time.sleep(_LOOK_PERIOD)
     self._asking = False
 
+  def ask(self, question: str) -> str:
+    """Asks and returns the line that is typed; meanwhile Escape stops the robot, no other key."""
+    if not self._open:
+      return input(question)
+    print(question, end="", flush=True)
+    answer = bytearray()
+    with self._lock:
+      self._answer = answer
+    while self._open and not answer.endswith(b"\n"):
+      self._take()
+      time.sleep(_LOOK_PERIOD)
+    with self._lock:
+      self._answer = None
+    if not self._open:
+      raise RuntimeError("The terminal is gone: nobody answers.")
+    print(flush=True)
+    return answer.decode(errors="replace").strip()
+
+  def _type(self, answer: bytearray, keys: bytes) -> None:
+    """Adds keys to an answer, up to the end of its line."""
+    for key in keys:
+      if key == _ESCAPE:
+        self._stopped = True
+      elif key in _ERASE:
+        del answer[-1:]
+      elif key in _ENTER:
+        answer += b"\n"
+        return
+      else:
+        answer.append(key)
+        print(chr(key), end="", flush=True)  # the terminal does not echo
+
   def _take(self) -> None:
     """Takes the keys that were pressed."""
     with self._lock:
@@ -72,6 +107,8 @@ class Terminal:
         keys = b""
       if not keys:  # the terminal is gone, and with it who could stop the robot
         self._open, self._stopped = False, True
+      elif self._answer is not None:
+        self._type(self._answer, keys)
       elif self._asking and set(keys) <= set(b"\r\n"):
         self._confirmed = True
       else:

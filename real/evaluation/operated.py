@@ -1,6 +1,7 @@
 """A robot as a plant: a person places it, one episode after another, and says how it went."""
 
 import contextlib
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from real.camera import Controls
 from real.clock import prefer_this_thread
 from real.evaluation import episodes, perturbations, starts
 from real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
+from real.loading import Connection
+from real.operator import Terminal
 from real.recorder import Recorder
 from real.safety import Reason
 from suite import protocols
@@ -49,7 +52,7 @@ class OperatedPlant(Plant):
     offsets: Path | None = None,
     dry_run: bool = False,
     observer: Callable[[], Sight] | None = None,
-    ask: Callable[[str], str] = input,
+    ask: Callable[[str], str] | None = None,
     say: Callable[[str], None] = print,
   ):
     """Connects to the robot; nothing moves yet.
@@ -67,17 +70,22 @@ class OperatedPlant(Plant):
       offsets: The robot's `offset.yaml`.
       dry_run: Everything is read, asked and computed, and nothing moves; no verdict is asked for.
       observer: Motion capture, if there is any.
-      ask: Puts a question to the operator and returns the answer.
+      ask: Puts a question to the operator and returns the answer; None: at this terminal.
       say: Tells the operator something.
     """
     super().__init__(scene, protocol, perturbation)
     self.plant_id = robot_name
+    connection = Connection(port=robot) if isinstance(robot, str) else robot
+    if ask is None:  # through the terminal that the stop key is read from, never beside it
+      terminal = Terminal()
+      connection = dataclasses.replace(connection, operator=terminal)
+      ask = terminal.ask
     self._observer, self._ask, self._say = observer, ask, say
     self._starts = protocols.scene_starts(scene)
     self._workspace = find_workspace(scene) if protocol == BALL else None
     self._recorder = None if record is None else Recorder(record)
     self._environment = real.load(
-      TASKS[protocol], robot=robot, camera=camera, scene=scene, image_size=image_size,
+      TASKS[protocol], robot=connection, camera=camera, scene=scene, image_size=image_size,
       time_limit=time_limit, recorder=self._recorder, offsets=offsets, dry_run=dry_run,
     )  # fmt: skip
     prefer_this_thread(acting=True)

@@ -266,6 +266,42 @@ def test_enter_answers_a_question_and_any_other_key_stops():
     os.close(slave)
 
 
+def test_a_typed_answer_is_no_stop_though_the_bus_looks_for_keys():
+  master, slave = pty.openpty()
+  stops, ended, answers = [], threading.Event(), []
+  terminal = Terminal(slave)
+
+  def bus():
+    while not ended.is_set():
+      stops.append(terminal.pressed())
+
+  thief = threading.Thread(target=bus, daemon=True)
+  thief.start()
+  try:
+    for typed, expected in ((b"s\r", "s"), (b"lx\x7f\n", "l"), (b"\n", "")):
+      asked = threading.Thread(target=lambda: answers.append(terminal.ask("What? ")), daemon=True)
+      asked.start()
+      assert _soon(lambda: terminal._answer is not None)
+      for key in typed:
+        os.write(master, bytes((key,)))
+      assert _soon(lambda asked=asked: not asked.is_alive())
+      assert answers[-1] == expected
+    assert not any(stops)
+    asked = threading.Thread(target=lambda: answers.append(terminal.ask("What? ")), daemon=True)
+    asked.start()
+    assert _soon(lambda: terminal._answer is not None)
+    os.write(master, b"\x1b")  # Escape stops even then
+    assert _soon(lambda: any(stops)) and asked.is_alive()
+    os.write(master, b"\n")
+    assert _soon(lambda: not asked.is_alive())
+  finally:
+    ended.set()
+    thief.join()
+    terminal.close()
+    os.close(master)
+    os.close(slave)
+
+
 def test_without_a_terminal_nobody_can_be_asked():
   read, write = os.pipe()
   try:
