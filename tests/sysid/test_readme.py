@@ -1,0 +1,26 @@
+"""The example in the README writes a log that can be read."""
+
+import pathlib
+import re
+
+import numpy as np
+
+import sysid
+from sysid.logs import read_log
+
+
+def test_the_example_writes_a_log(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  text = pathlib.Path(sysid.__file__).with_name("README.md").read_text()
+  (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+  exec(compile(code, "README.md", "exec"), {})
+  log = read_log(tmp_path / "train_1.mcap")
+  assert log.joints == ("elbow",)
+  assert log.duration > 11 and np.ptp(log.states.position) > 0.9
+
+
+def test_every_file_is_in_the_table():
+  folder = pathlib.Path(sysid.__file__).parent
+  text = (folder / "README.md").read_text()
+  files = {path.name for path in folder.glob("*.py")} - {"__init__.py"}
+  assert {name for name in files if f"`{name}`" not in text} == set()
