@@ -235,6 +235,10 @@ def table(results: dict[str, list[dict[str, float]]], settings: Settings) -> str
   motions = list(results)
   robots = ", ".join(str(seed) for seed in settings.robots)
   lines = [
+    "# The gap between simulation and virtual robot",
+    "",
+    "`python benchmarks/gap.py --out benchmarks/results/gap.md`",
+    "",
     f"Simulation against virtual robots {robots}, {settings.seconds:g} s of each motion; RMS over "
     "control steps, mean over the robots (smallest to largest).",
     "",
