@@ -27,16 +27,19 @@ from sysid.reduction import smooth_motion
 Array = np.ndarray
 
 _AXES = "xyz"
+_CHANNELS = ("gyroscope", "accelerometer")
 _LAYOUT = {
   "imu_tilt": tuple(_AXES),
-  "imu_scale": ("gyroscope", "accelerometer"),
-  "imu_bias": tuple(f"{c}_{a}" for c in ("gyroscope", "accelerometer") for a in _AXES),
+  "imu_scale/gyroscope": ("gyroscope",),
+  "imu_scale/accelerometer": ("accelerometer",),
+  "imu_bias/gyroscope": tuple(f"gyroscope_{a}" for a in _AXES),
+  "imu_bias/accelerometer": tuple(f"accelerometer_{a}" for a in _AXES),
   "imu_lag": ("delay",),
 }
-"""Kinds and the parameters that are fitted of each."""
+"""Parts of kinds that are told apart, and the parameters that are fitted of each."""
 _USUAL = {
-  "imu_tilt": 0.01, "gyroscope": 0.02, "accelerometer": 0.02, "gyroscope_bias": 0.005,
-  "accelerometer_bias": 0.15, "imu_lag": 0.005,
+  "imu_tilt": 0.01, "imu_scale/gyroscope": 0.02, "imu_scale/accelerometer": 0.02,
+  "imu_bias/gyroscope": 0.005, "imu_bias/accelerometer": 0.15, "imu_lag": 0.005,
 }  # fmt: skip
 """rad, 1, 1, rad/s, m/s^2, s; ours: what a data sheet, soldering and a bus cycle allow."""
 _GAIN = 0.05  # nats on held-out seconds that a kind must gain
@@ -90,29 +93,45 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Inertial | None:
   without = {n: _score(parts, noise, tuple(m for m in names if m != n))[0] for n in names}
   bounds = _intervals(parts, noise, names, fitted)
   where = model.sensor(sensors[0]).name
-  effects, rows = [], []
+  rows: dict[str, dict[str, Any]] = {}
   for name in names:
     values, sure = _claimed(name, names, fitted, bounds)
     gain = without[name] - full
     if sure and gain > _GAIN:
-      effects.append(Effect(name, None, values, {n: bounds[name][n] for n in values}))
-      rows.append(_row(name, values, bounds[name], where, gain, bare - full))
+      row = _row(name, values, bounds[name], where, gain, bare - full)
+      known = rows.setdefault(row["kind"], row)
+      known["parameters"] |= row["parameters"]
   alternatives = []
-  for name in names if not effects and bare - full > _GAIN else ():
+  for name in names if not rows and bare - full > _GAIN else ():
     alone, x = _score(parts, noise, (name,))
     if alone - full < _GAIN:  # explains as much by itself as all together
       own = _intervals(parts, noise, (name,), x)
       values, _ = _claimed(name, (name,), x, own)
       alternatives.append(_row(name, values, own[name], where, bare - alone, bare - full))
-  kept = _score(parts, noise, tuple(e.kind for e in effects))[0]
-  return Inertial(effects, rows, alternatives, float(np.exp(bare)), float(np.exp(kept)))
+  effects = [_effect(row) for row in rows.values()]
+  kept = tuple(n for n in names if n.split("/")[0] in rows)
+  after = _score(parts, noise, kept)[0]
+  return Inertial(
+    effects, list(rows.values()), alternatives, float(np.exp(bare)), float(np.exp(after))
+  )
+
+
+def _effect(row: dict[str, Any]) -> Effect:
+  found = row["parameters"].items()
+  return Effect(
+    row["kind"],
+    None,
+    {name: p["value"] for name, p in found},
+    {name: (p["low"], p["high"]) for name, p in found},
+  )
 
 
 def _row(
-  kind: str, values: dict[str, float], bounds: dict[str, tuple[float, float]], sensor: str,
+  part: str, values: dict[str, float], bounds: dict[str, tuple[float, float]], sensor: str,
   gain: float, most: float,
 ) -> dict[str, Any]:  # fmt: skip
-  """Returns a kind's entry in the report."""
+  """Returns a part's entry in the report."""
+  kind = part.split("/")[0]
   return {
     "kind": kind,
     "joint": None,
@@ -150,6 +169,9 @@ def _readings(model: mujoco.MjModel, log: Log, sensors: tuple[int, int]) -> _Rea
   ids = [model.joint(name).id for name in log.joints]
   qpos, dofs = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
   at = np.concatenate([model.sensor_adr[s] + np.arange(3) for s in sensors])
+  site = int(model.sensor_objid[sensors[1]])
+  fixed = model.body_weldid[model.site_bodyid[site]] == 0
+  gravity = np.array(model.opt.gravity)
   truth = np.empty((len(motion.time), 6))
   for n in range(len(motion.time)):
     data.qpos[qpos] = motion.position[n]
@@ -157,6 +179,8 @@ def _readings(model: mujoco.MjModel, log: Log, sensors: tuple[int, int]) -> _Rea
     data.qacc[dofs] = motion.acceleration[n]
     mujoco.mj_inverse(model, data)
     truth[n] = data.sensordata[at]
+    if fixed:  # of a body that cannot move MuJoCo computes no acceleration
+      truth[n] = np.concatenate([np.zeros(3), -data.site_xmat[site].reshape(3, 3).T @ gravity])
   imu = log.imu
   assert imu is not None
   inner = (imu.stamp > motion.time[0] + _LATEST) & (imu.stamp < motion.time[-1] - _LATEST)
@@ -174,14 +198,15 @@ def _noise(read: Array) -> Array:
 
 def _predict(part: _Readings, kinds: Sequence[str], x: Array) -> Array:
   """Returns what an IMU with effects reads [N, 6]."""
-  value = _unpack(kinds, x)
-  tilt = rotation_matrix(list(value.get("imu_tilt", np.zeros(3))))
-  delay = float(value.get("imu_lag", np.zeros(1))[0])
+  value = {n: v for k, v in _unpack(kinds, x).items() for n, v in zip(_LAYOUT[k], v, strict=True)}
+  tilt = rotation_matrix([value.get(a, 0.0) for a in _AXES])
+  delay = value.get("delay", 0.0)
   seen = np.stack([np.interp(part.stamp - delay, part.time, c) for c in part.truth.T], axis=1)
-  scale = np.repeat(value.get("imu_scale", np.ones(2)), 3)
+  scale = np.repeat([value.get(c, 1.0) for c in _CHANNELS], 3)
+  bias = np.array([value.get(f"{c}_{a}", 0.0) for c in _CHANNELS for a in _AXES])
   if tilt is not None:
     seen = np.hstack([seen[:, :3] @ tilt, seen[:, 3:] @ tilt])
-  return seen * scale + value.get("imu_bias", np.zeros(6))
+  return seen * scale + bias
 
 
 def _unpack(kinds: Sequence[str], x: Array) -> dict[str, Array]:
@@ -194,7 +219,7 @@ def _unpack(kinds: Sequence[str], x: Array) -> dict[str, Array]:
 
 
 def _nominal(kinds: Sequence[str]) -> Array:
-  return np.array([1.0 if k == "imu_scale" else 0.0 for k in kinds for _ in _LAYOUT[k]])
+  return np.array([1.0 if k.startswith("imu_scale") else 0.0 for k in kinds for _ in _LAYOUT[k]])
 
 
 def _residuals(parts: Sequence[_Readings], noise: Array, kinds: Sequence[str], x: Array) -> Array:
@@ -291,10 +316,9 @@ def _claimed(
 ) -> tuple[dict[str, float], bool]:
   """Returns a kind's values, and whether one of them is surely none and larger than usual."""
   values = dict(zip(_LAYOUT[kind], map(float, _unpack(kinds, x)[kind]), strict=True))
-  nominal = 1.0 if kind == "imu_scale" else 0.0
+  nominal = float(_nominal((kind,))[0])
   sure = False
   for name, value in values.items():
-    usual = {"imu_scale": name, "imu_bias": f"{name[:-2]}_bias"}.get(kind, kind)
     low, high = bounds[kind][name]
-    sure |= not low <= nominal <= high and abs(value - nominal) > _USUAL[usual]
+    sure |= not low <= nominal <= high and abs(value - nominal) > _USUAL[kind]
   return values, sure and values.get("delay", 0.0) >= 0.0

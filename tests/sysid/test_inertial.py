@@ -68,8 +68,8 @@ def _found(tmp_path, **effects):
     ({"bias": (0.02, 0, -0.01, 0, 0, 0)}, "imu_bias", {"gyroscope_x": 0.02, "gyroscope_z": -0.01}),
     ({"bias": (0, 0, 0, 0, 0.5, 0)}, "imu_bias", {"accelerometer_y": 0.5}),
     ({"tilt": (0.06, 0.0, -0.04)}, "imu_tilt", {"x": 0.06, "y": 0.0, "z": -0.04}),
-    ({"scale": (1.06, 1.0)}, "imu_scale", {"gyroscope": 1.06, "accelerometer": 1.0}),
-    ({"scale": (1.0, 0.95)}, "imu_scale", {"gyroscope": 1.0, "accelerometer": 0.95}),
+    ({"scale": (1.06, 1.0)}, "imu_scale", {"gyroscope": 1.06}),
+    ({"scale": (1.0, 0.95)}, "imu_scale", {"accelerometer": 0.95}),
     ({"late": 0.03}, "imu_lag", {"delay": 0.03}),
   ],
 )
@@ -96,6 +96,20 @@ def test_of_an_imu_at_rest_tilt_and_bias_are_not_told_apart(tmp_path):
   found = _found(tmp_path, still=True, bias=(0, 0, 0, 0.6, 0, 0))
   assert found.effects == []
   assert {a["kind"] for a in found.alternatives} >= {"imu_tilt", "imu_bias"}
+
+
+def test_an_imu_on_a_body_that_stands_still_has_a_zero_of_its_gyroscope(tmp_path):
+  base = '<body><geom size=".1" mass="1"/><site name="imu"/><body>'
+  fixed = MODEL.replace('<site name="imu" pos="0 0 -0.3"/>', "").replace(
+    "<worldbody><body>", f"<worldbody>{base}"
+  )
+  fixed = fixed.replace("</body></body></worldbody>", "</body></body></body></worldbody>")
+  bias = (0.02, 0, 0, 0, 0, 0)
+  log = _log(tmp_path / "a.mcap", still=True, bias=bias)
+  found = inertial.find(mujoco.MjModel.from_xml_string(fixed), [log])
+  assert [e.kind for e in found.effects] == ["imu_bias"]
+  assert set(found.effects[0].parameters) == {"gyroscope_x", "gyroscope_y", "gyroscope_z"}
+  assert found.effects[0].parameters["gyroscope_x"] == pytest.approx(0.02, abs=1e-3)
 
 
 def test_without_an_imu_nothing_is_said(tmp_path):
