@@ -9,6 +9,7 @@ that were not fitted: standing on the floor and in the air, without and with the
 """
 
 import dataclasses
+import json
 import os
 import sys
 from pathlib import Path
@@ -92,6 +93,8 @@ def run(arguments: Arguments) -> dict[str, Any]:
   before = _suite_motion(None, standing["actions"])
   after = _suite_motion(arguments.out / "identified" / "effects.json", standing["actions"])
   table = gap_table(standing["positions"], before, after, content)
+  if arguments.robot == VIRTUAL:
+    table += hidden_table(arguments.seed, content, arguments.out / "identified" / "details.json")
   (arguments.out / "gap.md").write_text(table)
   print(table)
   print(f"report: {arguments.out / 'identified' / 'report.html'}")
@@ -268,6 +271,50 @@ def gap_table(
     "",
     f"Verdict: {content['verdict']}: "
     + (", ".join(f"{e['kind']} ({e['joint'] or 'all'})" for e in content["effects"]) or "nothing"),
+  ]
+  return "\n".join(lines) + "\n"
+
+
+def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:
+  """Returns what the virtual robot hides beside what was found, in Markdown."""
+  from real.virtual import motors
+  from real.virtual.hidden import Hidden
+
+  hidden = Hidden.draw(seed)
+  duty = 800 / 128 * motors.COUNTS / (2 * np.pi) / motors.FULL_PWM  # per rad at a P gain of 800
+  stall = motors.SPEED_CONSTANT * hidden.motors.battery_voltage / motors.RESISTANCE
+  strength = duty * stall * hidden.motors.strength / constants.POSITION_GAIN
+  constants_of = json.loads(details.read_text())["calibration"]
+  lines = [
+    "",
+    "Share of the torque that the gear takes, and strength over the declared one (voltage law and",
+    "battery included). Without a load strength cannot be told from all constants being smaller.",
+    "",
+    "| joint | gear's share | found | strength | found | also named |",
+    "| --- | --- | --- | --- | --- | --- |",
+  ]
+  for index, name in enumerate(constants.JOINT_NAMES):
+    own = {e["kind"]: e["parameters"] for e in content["effects"] if e["joint"] == name}
+    share = own.pop("load_friction", {}).get("coefficient", {}).get("value")
+    gain = own.pop("motor_gain", {}).get("gain", {}).get("value", 1.0)
+    gain *= constants_of[name].get("gain", 1.0)
+    found = "not named" if share is None else f"{share:.2f}"
+    lines.append(
+      f"| {name} | {hidden.motors.gear_share[index]:.2f} | {found} | {strength[index]:.2f} |"
+      f" {gain:.2f} | {', '.join(own) or '-'} |"
+    )
+  whole = [e for e in content["effects"] if e["joint"] is None]
+  for effect in whole:
+    values = ", ".join(
+      f"{n} {p['value']:.4g}" for n, p in effect["parameters"].items() if p["value"] is not None
+    )
+    lines += ["", f"Of the whole robot: {effect['kind']} ({values})."]
+  bias = ", ".join(f"{value:.4f}" for value in hidden.gyroscope_bias)
+  late = 1e3 * hidden.motors.goal_delay
+  lines += [
+    "",
+    f"Hidden besides: gyroscope's zero {bias} rad/s, goals {late:.1f} ms late, encoders off by up to"
+    " half a degree.",
   ]
   return "\n".join(lines) + "\n"
 

@@ -188,7 +188,8 @@ def _claimed(found: Identified) -> list[Effect]:
     return []
   joints = {f.screened.joint for f in found.found if f.finding.named}
   joints |= {e["joint"] for e in found.effects}
-  constants = [c for c in found.calibration if c.target in joints]
+  all_off = any(e["kind"] == "parameter_error" and e["joint"] is None for e in found.effects)
+  constants = [c for c in found.calibration if all_off or c.target in joints]
   return [*constants, *found.objects, *found.learned]
 
 
