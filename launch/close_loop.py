@@ -81,7 +81,8 @@ def run(arguments: Arguments) -> dict[str, Any]:
   model = arguments.out / "declared.xml"
   model.write_text(declared_model())
   if not arguments.reuse:
-    np.savez(arguments.out / "standing.npz", **_excite(arguments))
+    moved = _excite(arguments)
+    np.savez(arguments.out / "standing.npz", actions=moved["actions"], positions=moved["positions"])
   standing = np.load(arguments.out / "standing.npz")
   logs = {name: arguments.out / f"{name}.mcap" for name in (*_TRAIN, *_HELD)}
   content = sysid.identify(
@@ -313,8 +314,8 @@ def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:
   late = 1e3 * hidden.motors.goal_delay
   lines += [
     "",
-    f"Hidden besides: gyroscope's zero {bias} rad/s, goals {late:.1f} ms late, encoders off by up to"
-    " half a degree.",
+    f"Hidden besides: gyroscope's zero {bias} rad/s, goals {late:.1f} ms late, encoders off by up"
+    " to half a degree.",
   ]
   return "\n".join(lines) + "\n"
 
