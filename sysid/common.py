@@ -30,6 +30,7 @@ _TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution, to its
 _GAIN = 0.05  # nats that the other joints must gain in the mean; ours
 _LOSS = 0.15  # nats that a joint may lose; ours
 _ASKED = 5  # joints that an effect's values are asked of, those that show it most
+_SUREST = 0.003  # of a value's typical size, that a joint's fit can be sure of at most; ours
 _SHARE = 0.8  # of joints that a late bus must show in; ours
 
 
@@ -114,7 +115,8 @@ def _agreed(asked: Sequence[Screened], term: Term, start: Array) -> tuple[Array,
     fit = s.problem.fit([s.calibration, term], x, evaluations=20)
     own = slice(len(s.null.fit.x), None)
     fits.append((fit.part(1), intervals.covariance(s.problem, fit)[own, own]))
-  informations = [np.linalg.pinv(c + 1e-18 * np.eye(len(start))) for _, c in fits]
+  least = np.diag(np.square(_SUREST * np.array(term.scale)))  # a value on its bound varies by 0
+  informations = [np.linalg.inv(c + least) for _, c in fits]
   together = np.linalg.pinv(sum(informations, np.zeros_like(informations[0])))
   x = together @ sum((i @ v for i, (v, _) in zip(informations, fits, strict=True)), 0 * start)
   off = [(v - x) @ i @ (v - x) for i, (v, _) in zip(informations, fits, strict=True)]
