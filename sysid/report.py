@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenes import report_parts as parts
-from suite.effects import Effect
+from suite.effects import Effect, kind_of
 from sysid import balance, charts, decision, evaluation, signatures
 from sysid.fitting import Fit
 from sysid.identification import Found, Identified
@@ -57,9 +57,7 @@ def page(
   if held:
     sections.append(_held(found, held, effects, items[:_SHOWN], window_s))
   sections += [_joints(found), _next(content), _audit(details)]
-  names = ", ".join(
-    f"{e['kind']} ({e['joint'] or e.get('body') or 'all'})" for e in content["effects"]
-  )
+  names = _summary(content["effects"])
   return parts.page(
     "What the model lacks",
     f"Verdict: {content['verdict']}{': ' + names if names else ''}. Model:"
@@ -67,6 +65,21 @@ def page(
     sections,
     with_plots=True,
   )
+
+
+def _summary(effects: Sequence[dict[str, Any]]) -> str:
+  """Returns kinds with where they are; many joints are counted."""
+  where: dict[str, list[str]] = {}
+  for effect in effects:
+    where.setdefault(effect["kind"], []).append(_place(effect))
+  return ", ".join(
+    f"{kind} ({', '.join(places) if len(places) <= _SHOWN else f'{len(places)} joints'})"
+    for kind, places in where.items()
+  )
+
+
+def _place(effect: dict[str, Any]) -> str:
+  return effect["joint"] or effect.get("body") or effect.get("sensor") or "all"
 
 
 def _unit(item: Found) -> str:
@@ -101,10 +114,12 @@ def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
   rows: list[list[Any]] = []
   bounds = []
   for effect in effects:
-    where = effect["joint"] or effect.get("body") or "all"
-    gain = effect["evidence"].get("gain_over_constants_nats", "")
+    where = _place(effect)
+    evidence = effect["evidence"]
+    gain = evidence.get("gain_over_constants_nats", evidence.get("gain_nats", ""))
     for name, value in effect["parameters"].items():
-      if isinstance(value["value"], list):
+      choice = value["low"] is None and not kind_of(effect["kind"]).parameter(name).fitted
+      if choice or isinstance(value["value"], list):
         continue
       known = None not in (value["value"], value["low"], value["high"])
       interval = f"{value['low']:.4g} to {value['high']:.4g}" if known else ""
@@ -211,9 +226,17 @@ def _against(item: Found, hypotheses, name: str) -> str:
 
 
 def _ladder(found: Identified) -> str:
-  blocks = []
-  for item in found.found:
+  blocks, brief = [], []
+  for rank, item in enumerate(found.found):
     ladder = item.ladder
+    if rank >= _SHOWN:
+      chosen = item.finding.chosen
+      gain = ladder.null.score - chosen.score
+      others = [e.score for e in item.finding.alternatives]
+      behind = round(min(others) - chosen.score, 3) if others else ""
+      named = " + ".join(sorted(decision.names(chosen))) or "constants calibrated"
+      brief.append([item.screened.joint, named, gain, behind])
+      continue
     rows: list[list[Any]] = [
       ["declared model", ladder.declared.score, 0.0, ""],
       ["constants calibrated", ladder.null.score, ladder.declared.score - ladder.null.score, ""],
@@ -235,6 +258,10 @@ def _ladder(found: Identified) -> str:
     blocks.append(parts.table(["hypothesis", "score [nats]", "gain [nats]", ""], rows))
     series = [("gain", charts.AFTER, [row[2] for row in rows])]
     blocks.append(charts.bars("gain over the declared model", "nats", series, [r[0] for r in rows]))
+  if brief:
+    blocks.append("<h3>The other joints that were looked at closely</h3>")
+    header = ["joint", "chosen", "gain over the constants [nats]", "runner-up behind [nats]"]
+    blocks.append(parts.table(header, brief))
   return parts.section(
     "Evidence ladder",
     "Score: the logarithm of the error in units of the noise, averaged over the logs; 0.69 nats"
