@@ -20,7 +20,8 @@ _USUAL = (
   *("gravity_tilt", "encoder_offset", "spring"),
 )
 """Kinds in the order in which they are named where logs cannot tell them apart; ours: a late
-command is more usual than a late reading."""
+command is more usual than a late reading. Of a joint alone, a shifted zero is more usual than a
+leaning mount, which several joints can tell from it."""
 _FRICTION_SPREAD = 10.0  # dry friction varies that much more than other constants before it counts
 
 
@@ -78,10 +79,17 @@ def unique(entries: list[Entry]) -> list[Entry]:
   return result
 
 
-def usual_first(entries: list[Entry]) -> list[Entry]:
-  """Returns entries with the most usual kind of those that tie with the best one first."""
+def usual_first(entries: list[Entry], *, alone: bool = False) -> list[Entry]:
+  """Returns entries with the most usual kind of those that tie with the best one first.
+
+  Args:
+    entries: the best first.
+    alone: whether the machine has one joint.
+  """
   ties = [e for e in entries if e.score - entries[0].score < _TIE]
   order = {kind: index for index, kind in enumerate(_USUAL)}
+  if alone:
+    order["gravity_tilt"] = len(order)
   size = min(len(e.fit.x) for e in ties)
   ties = [e for e in ties if len(e.fit.x) <= size + 1]
   first = min(ties, key=lambda e: min(order.get(k, len(order)) for k in names(e)))
@@ -108,7 +116,8 @@ def adequate(entry: Entry, thresholds: Thresholds) -> bool:
 def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   """Returns what is concluded about a joint."""
   thresholds = thresholds or Thresholds()
-  singles, pairs = usual_first(unique(ladder.singles)), unique(ladder.pairs)
+  singles, pairs = unique(ladder.singles), unique(ladder.pairs)
+  singles = usual_first(singles, alone=ladder.problem.plant.model.nu == 1)
   null = ladder.null
   best = singles[0]
   others = singles[1:]
