@@ -73,7 +73,8 @@ def _identify(arguments: Arguments) -> int:
   for name in ("train", "held"):
     error = content["error"][name]
     if error:
-      rich.print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE")
+      worse = " (worse: do not use it)" if error["after"] > error["before"] else ""
+      rich.print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE{worse}")
   rich.print(f"floor: {content['error']['floor']:.5f}; report: {arguments.out / 'report.html'}")
   return 0
 

@@ -149,6 +149,9 @@ def _errors(found: Identified, content: dict[str, Any]) -> str:
   how = "whole logs" if window is None else f"windows of {window} s from the measured state"
   units = sorted({_unit(f) for f in found.found})
   text = f"RMSE of position in {' or '.join(units)}, simulated by MuJoCo over {how}."
+  worse = [label for label, *values in rows[:-1] if values[1] > values[0]]
+  if worse:
+    text += f" On {' and '.join(worse)} the extended model is worse: do not use it."
   blocks = [parts.table(["logs", "declared", "extended", "lower by"], rows)]
   if len(found.screened) > 1:
     blocks.append(_by_joint(found))
