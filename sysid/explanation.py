@@ -7,6 +7,7 @@ import dataclasses
 
 from sysid import candidates, race, signatures
 from sysid.fitting import Problem
+from sysid.plant import JointPlant
 from sysid.race import Entry
 from sysid.terms import Term
 
@@ -90,6 +91,23 @@ def climb(
   return ladder
 
 
+def beside(problem: Problem, hypothesis: Entry) -> list[Term]:
+  """Returns the candidates for one more effect beside those of a hypothesis."""
+  plant = problem.plant
+  waves = signatures.waves(problem, hypothesis.fit)
+  present = {t.kind for t in hypothesis.fit.terms} | _doubles(plant)
+  library = [*candidates.library(plant), candidates.cogging(plant, waves)]
+  return [c for c in library if c.kind not in present]
+
+
+def _doubles(plant: JointPlant) -> set[str]:
+  """Returns kinds that a joint's logs cannot tell from another one: raced alone only.
+
+  Of a machine with one joint a leaning mount is a shifted zero.
+  """
+  return {"gravity_tilt"} if plant.holds and plant.model.nu == 1 else set()
+
+
 def grow(ladder: Ladder, *, effort: Effort) -> None:
   """Adds effects to the best pair one by one while they help and much is left."""
   problem = ladder.problem
@@ -97,10 +115,7 @@ def grow(ladder: Ladder, *, effort: Effort) -> None:
     best = ladder.best()
     if race.above_floor(best) < effort.growing or len(best.fit.terms) != size:
       return
-    present = {t.kind for t in best.fit.terms}
-    waves = signatures.waves(problem, best.fit)
-    library = [*candidates.library(problem.plant), candidates.cogging(problem.plant, waves)]
-    others = [c for c in library if c.kind not in present]
+    others = beside(problem, best)
     found = race.run(problem, best.fit.terms, others, start=best.fit.x, finalists=2)
     if best.score - found[0].score < _STEP:
       return
@@ -112,18 +127,12 @@ def pairs(ladder: Ladder, *, effort: Effort) -> list[Entry]:
   best = ladder.singles[0].score
   found: list[Entry] = []
   seen: set[frozenset[str]] = set()
-  for parent in ladder.singles[: effort.parents]:
+  parents = [e for e in ladder.singles if e.kind not in _doubles(ladder.problem.plant)]
+  for parent in parents[: effort.parents]:
     if parent.score > best + effort.parent_margin:
       continue
     problem = ladder.problem
-    waves = signatures.waves(problem, parent.fit)
-    library = [
-      *candidates.library(problem.plant),
-      candidates.cogging(problem.plant, waves),
-    ]
-    others = [
-      c for c in library if c.kind != parent.kind and frozenset((c.kind, parent.kind)) not in seen
-    ]
+    others = [c for c in beside(problem, parent) if frozenset((c.kind, parent.kind)) not in seen]
     seen |= {frozenset((c.kind, parent.kind)) for c in others}
     base = parent.fit.terms
     found += race.run(problem, base, others, start=parent.fit.x, finalists=4)
