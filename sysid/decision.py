@@ -96,6 +96,12 @@ def usual_first(entries: list[Entry], *, alone: bool = False) -> list[Entry]:
   return [first, *[e for e in entries if e is not first]]
 
 
+def simplest(entries: list[Entry]) -> Entry:
+  """Returns the entry with the fewest values of those that tie with the best, which is first."""
+  ties = [e for e in entries if e.score - entries[0].score < _TIE]
+  return min(ties, key=lambda e: len(e.fit.x))
+
+
 def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresholds) -> bool:
   """Tells whether the declared constants are off by more than machines of a kind differ."""
   values = entry.fit.values("calibration")
@@ -122,7 +128,7 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   best = singles[0]
   others = singles[1:]
   for size in sorted({len(names(e)) for e in pairs}):
-    longer = next(e for e in pairs if len(names(e)) == size)
+    longer = simplest([e for e in pairs if len(names(e)) == size])
     if best.score - longer.score > thresholds.second:
       best, others = longer, [*(e for e in pairs if e is not longer), *singles]
   gained = null.score - best.score

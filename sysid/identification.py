@@ -19,7 +19,6 @@ from sysid import (
   common,
   decision,
   detection,
-  elaboration,
   learned,
   race,
   screening,
@@ -29,7 +28,7 @@ from sysid.common import WHOLE
 from sysid.decision import Thresholds
 from sysid.evaluation import Clocks
 from sysid.explanation import Effort, Ladder
-from sysid.joint import Found, polished, race_joint
+from sysid.joint import Found, look_again, polished, race_joint
 from sysid.logs import Log, check_against_model, read_log
 from sysid.race import Entry
 from sysid.screening import Screened
@@ -194,7 +193,7 @@ def _others(found: list[Found], screened: list[Screened], settings: Settings) ->
     finding = decision.decide(ladder, settings.thresholds)
     if finding.named:
       chance = detection.chance_gain(s.problem, s.null, entries, seed=settings.seed)
-      result.append(Found(s, ladder, finding, chance))
+      result.append(Found(s, ladder, finding, chance, settings.thresholds))
   return result
 
 
@@ -207,14 +206,9 @@ def _conclude(result: Identified, settings: Settings) -> None:
   )
   chosen = {s.joint: s.null for s in result.screened}
   for item in result.found:
-    entry = item.finding.chosen
-    if item.finding.verdict == "unexplained":
-      entry = elaboration.elaborate(item.ladder, entry)
-    if entry is not item.finding.chosen:
-      item.finding = dataclasses.replace(item.finding, chosen=entry, named=True)
-    elif item.finding.named:
-      entry = polished(item, spread)
-    chosen[item.joint] = entry
+    done = item.finding.verdict == "unexplained" and look_again(item)
+    fit_on = item.finding.named and not done
+    chosen[item.joint] = polished(item, spread) if fit_on else item.finding.chosen
   for item in result.found:
     for term in chosen[item.joint].fit.terms if item.finding.named else ():
       if term.kind != "calibration":

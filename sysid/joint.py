@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from sysid import decision, detection, explanation, race
+from sysid import decision, detection, elaboration, explanation, race
 from sysid.decision import Finding, Thresholds
 from sysid.explanation import Effort, Ladder
 from sysid.race import CLOCKS, Entry
@@ -23,6 +23,8 @@ class Found:
   ladder: Ladder
   finding: Finding
   chance: dict[str, float]
+  thresholds: Thresholds
+  """This joint's."""
 
   @property
   def joint(self) -> str:
@@ -41,7 +43,7 @@ def race_joint(screened: Screened, thresholds: Thresholds, effort: Effort, *, se
     gain=max(thresholds.gain, 2.0 * chance["q95"]),
     adequate=thresholds.adequate + screened.background,
   )
-  return Found(screened, ladder, decision.decide(ladder, own), chance)
+  return Found(screened, ladder, decision.decide(ladder, own), chance, own)
 
 
 def polished(item: Found, spread: float) -> Entry:
@@ -60,3 +62,31 @@ def polished(item: Found, spread: float) -> Entry:
   as_declared[: len(terms[0].names)] = terms[0].starts[0]
   fits = [problem.fit(terms, x, evaluations=40) for x in (entry.fit.x, as_declared)]
   return race.entry(problem, min(fits, key=lambda f: f.cost))
+
+
+def look_again(item: Found) -> bool:
+  """Fits richer friction where a joint stays unexplained, and what led to it by itself.
+
+  A hypothesis that a race gave up too early may be enough once it is fitted to the end: then it is
+  decided anew. Richer friction goes into the model and is no ground for a name.
+
+  Returns:
+    Whether the model takes richer friction; it is fitted to the end.
+  """
+  problem, ladder = item.screened.problem, item.ladder
+  richer = elaboration.elaborate(ladder, item.finding.chosen)
+  if richer is item.finding.chosen:
+    return False
+  *terms, last = richer.fit.terms
+  x = richer.fit.x[: len(richer.fit.x) - len(last.names)]
+  plain = race.entry(problem, problem.fit(terms, x, evaluations=60))
+  if decision.names(plain):
+    entries = ladder.singles if len(decision.names(plain)) == 1 else ladder.pairs
+    entries.append(plain)
+    entries.sort(key=lambda e: e.score)
+    again = decision.decide(ladder, item.thresholds)
+    if again.verdict == "effects":
+      item.finding = again
+      return False
+  item.finding = dataclasses.replace(item.finding, chosen=richer, named=True)
+  return True
