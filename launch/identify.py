@@ -68,12 +68,14 @@ def _identify(arguments: Arguments) -> int:
         effect["kind"], effect["joint"] or "all", name, _number(value["value"]), interval,
         value["unit"],
       )  # fmt: skip
+  from sysid import evaluation  # after the work: its import takes seconds that --help can spare
+
   if table.rows:
     rich.print(table)
   for name in ("train", "held"):
     error = content["error"][name]
     if error:
-      worse = " (worse: do not use it)" if error["after"] > error["before"] else ""
+      worse = " (worse: do not use it)" if evaluation.is_worse(error) else ""
       rich.print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE{worse}")
   rich.print(f"floor: {content['error']['floor']:.5f}; report: {arguments.out / 'report.html'}")
   return 0

@@ -5,7 +5,7 @@ state. Shapes: N samples, J joints of the log, U actuators.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -17,6 +17,14 @@ from sysid.plant import actuator_of, fresh, holds_position
 from sysid.reduction import smooth_motion, start_velocity
 
 Array = np.ndarray
+
+
+_SPOILT = 1.02  # times the declared model's error: beyond rounding and the scatter of a fit; ours
+
+
+def is_worse(error: Mapping[str, float]) -> bool:
+  """Tells whether errors {"before", "after"} say that an extended model is worse."""
+  return error["after"] > _SPOILT * error["before"]
 
 
 @dataclasses.dataclass(frozen=True)

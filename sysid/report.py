@@ -138,9 +138,10 @@ def _number(value: Any) -> str:
 
 
 def _errors(found: Identified, content: dict[str, Any]) -> str:
+  names = (("train", "fitted logs"), ("held", "logs that were not fitted"))
+  errors = [(label, content["error"][name]) for name, label in names]
   rows = []
-  for name, label in (("train", "fitted logs"), ("held", "logs that were not fitted")):
-    error = content["error"][name]
+  for label, error in errors:
     if error:
       ratio = error["before"] / max(error["after"], _FEW)
       rows.append([label, 1e3 * error["before"], 1e3 * error["after"], f"{ratio:.1f} times"])
@@ -149,7 +150,7 @@ def _errors(found: Identified, content: dict[str, Any]) -> str:
   how = "whole logs" if window is None else f"windows of {window} s from the measured state"
   units = sorted({_unit(f) for f in found.found})
   text = f"RMSE of position in {' or '.join(units)}, simulated by MuJoCo over {how}."
-  worse = [label for label, *values in rows[:-1] if values[1] > values[0]]
+  worse = [label for label, error in errors if error and evaluation.is_worse(error)]
   if worse:
     text += f" On {' and '.join(worse)} the extended model is worse: do not use it."
   blocks = [parts.table(["logs", "declared", "extended", "lower by"], rows)]
