@@ -29,6 +29,7 @@ _ROW = np.dtype(
 _PRESENT_LENGTH = _ROW.itemsize - 4
 _FAST_HEAD, _STATUS_SIZE, _INSTRUCTION_SIZE = 8, 11, 14  # bytes of packets without their data
 _ALERT = 0x80
+_FOREIGN = 3  # packets that are taken for an answer at most: two late ones, and it
 _ATTEMPTS, _PINGS = 5, 4  # of a transaction outside the cycle, of a ping
 
 
@@ -139,8 +140,10 @@ class Bus:
         raw: list[int] = []
         if result == sdk.COMM_SUCCESS:
           self._expect(_INSTRUCTION_SIZE + count + size, delay=self._return_delay)
-          while result == sdk.COMM_SUCCESS and not raw:  # the board's late answer is not this one
+          for _ in range(_FOREIGN):  # the board's late answer is not this one
             raw, result, _ = self._handler.fastSyncReadRx(port, sdk.BROADCAST_ID, size - _FAST_HEAD)
+            if raw or result != sdk.COMM_SUCCESS:
+              break
       except (serial.SerialException, OSError):
         result, raw = sdk.COMM_RX_FAIL, []
       finally:

@@ -22,6 +22,8 @@ _log = logging.getLogger(__name__)
 def prefer_this_thread(*, acting: bool = False) -> bool:
   """Asks Linux to run this thread before ordinary programs, as motion control does.
 
+  Threads and processes that it starts are ordinary ones.
+
   Args:
     acting: Whether it computes actions; threads that watch the robot come before it.
 
@@ -30,7 +32,7 @@ def prefer_this_thread(*, acting: bool = False) -> bool:
   """
   try:
     priority = os.sched_param(_ACTING if acting else _WATCHING)
-    os.sched_setscheduler(0, os.SCHED_FIFO, priority)
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, priority)
   except OSError:
     _log.info("no real-time priority for %s: readings may be late", threading.current_thread().name)
     return False

@@ -14,6 +14,7 @@ import serial
 from real.clock import Clock
 
 _PATIENCE = 0.1  # s that an answer may be late outside the cycle
+_GRACE = 0.005  # s after a time-out in which bytes that lie here are still taken
 _TICK = 1e-6  # s beyond a time-out: the SDK ends a wait only when it has passed
 serial.protocol_handler_packages.append("real.virtual")  # for rehearsals, which have a URL
 _LATENCY_LIMIT = 1  # ms; the adapter's own default of 16 ms is a hidden delay
@@ -41,6 +42,7 @@ class Port(dynamixel_sdk.PortHandler):
     self._clock = clock
     self.deadline: float | None = None  # s, no wait goes on after it
     self.byte_time = 10 / baud  # s
+    self._last = float("-inf")  # s, when a wait ends whatever still comes
     try:
       opened = self.setBaudRate(baud)
     except (serial.SerialException, OSError, ValueError) as error:
@@ -82,9 +84,20 @@ class Port(dynamixel_sdk.PortHandler):
 
   def isPacketTimeout(self) -> bool:
     # An answer that lies here is not late, whatever kept this thread from taking it.
-    return self.ser.in_waiting == 0 and super().isPacketTimeout()
+    if not super().isPacketTimeout():
+      return False
+    return self.ser.in_waiting == 0 or self._clock.now() >= self._last
+
+  def setPacketTimeoutMillis(self, msec: float) -> None:
+    super().setPacketTimeoutMillis(msec)
+    last = self._clock.now() + msec / 1000 + _GRACE
+    self._last = last if self.deadline is None else min(last, self.deadline)
 
   def readPort(self, length: int):
+    # A line that never falls silent must not hold the thread that watches the robot: the SDK looks
+    # at the time only when bytes are missing.
+    if self._clock.now() >= self._last:
+      return b""
     left = self.packet_timeout / 1000 - (self._clock.now() - self.packet_start_time / 1000)
     if length > 0 and self.ser.in_waiting < length:
       self._clock.wait_readable(self.ser.fd, max(left, 0.0) + _TICK)

@@ -11,7 +11,7 @@ import numpy as np
 
 import real
 from real.camera import Controls
-from real.clock import prefer_this_thread
+from real.clock import RealClock, prefer_this_thread
 from real.evaluation import episodes, perturbations, starts
 from real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
 from real.loading import Connection
@@ -88,7 +88,8 @@ class OperatedPlant(Plant):
       TASKS[protocol], robot=connection, camera=camera, scene=scene, image_size=image_size,
       time_limit=time_limit, recorder=self._recorder, offsets=offsets, dry_run=dry_run,
     )  # fmt: skip
-    prefer_this_thread(acting=True)
+    if isinstance(self._environment.bus.clock, RealClock):
+      prefer_this_thread(acting=True)
     self._dry_run = dry_run
     self._steps = 0
 

@@ -1,5 +1,11 @@
 """Tests of the bus on the virtual robot."""
 
+import contextlib
+import os
+import threading
+import time
+import tty
+
 import numpy as np
 import pytest
 
@@ -201,3 +207,35 @@ def test_servos_stop_by_themselves_when_the_host_is_gone(robot, ready, servos):
   _wait(robot, 0.15)
   watchdogs = {s.table["bus_watchdog"] for s in robot.devices.servos.values()}
   assert watchdogs == {-1}
+
+
+@pytest.mark.parametrize("noise", [b"\xaa" * 64, b"\xff\xff\xfd\x00\x01\xff\x00\x55"])
+def test_a_line_that_never_falls_silent_does_not_hold_the_reader(noise):
+  # The thread that reads is the one that switches the torque off.
+  master, slave = os.openpty()
+  tty.setraw(slave)
+  tty.setraw(master)
+  os.set_blocking(master, False)
+  stop = threading.Event()
+
+  def babble():
+    while not stop.is_set():
+      with contextlib.suppress(BlockingIOError):
+        os.write(master, noise)
+        os.read(master, 4096)
+
+  thread = threading.Thread(target=babble, daemon=True)
+  thread.start()
+  bus = Bus(os.ttyname(slave))
+  try:
+    began = time.monotonic()
+    assert bus.read_joints(deadline=began + 0.02) is None
+    assert bus.read_imu(deadline=began + 0.04) is None
+    took = time.monotonic() - began
+  finally:
+    stop.set()
+    thread.join()
+    bus.close()
+    os.close(master)
+    os.close(slave)
+  assert took < 0.5  # a few hundredths on an idle machine; it was endless
