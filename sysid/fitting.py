@@ -24,7 +24,7 @@ _DAMPINGS = ((1e-6, 1.0), (1e-6, 0.3), (1e-6, 0.08), (1e-3, 1.0), (0.1, 1.0), (3
 _CONVERGED = 1e-4  # relative gain of a step at which a fit ends
 _NINE_TENTHS = 0.79  # rms of the inner 90 % of a normal distribution over its own
 _SOFT = 4.0  # noise units; larger residuals count linearly
-_PRIOR_COUNT = 25.0  # residuals that one independent observation is spread over; ours
+PRIOR_COUNT = 25.0  # residuals that one independent observation is spread over; ours
 _TRIMMED = (
   0.01  # share of the largest residuals that a score leaves out: stale reads, command edges
 )
@@ -239,7 +239,7 @@ def _prior(terms: Sequence[Term], x: Array) -> Array:
     at += len(term.names)
     if term.prior:
       centre = np.array(term.centre) if term.centre else 0.0
-      rows.append((part - centre) / np.array(term.prior) * np.sqrt(_PRIOR_COUNT))
+      rows.append((part - centre) / np.array(term.prior) * np.sqrt(PRIOR_COUNT))
   return np.concatenate(rows) if rows else np.zeros(0)
 
 

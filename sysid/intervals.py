@@ -4,14 +4,15 @@
 
 with blocks much longer than the residuals' memory (White 1980; block form as in Liang and Zeger
 1986), widened by a systematic share: a model that is slightly wrong moves its values by more than
-noise does. Shapes: n values, R residuals of a block.
+noise does. Priors count with the spread that they state: a friction that was added cannot be known
+better than the damping that was declared. Shapes: n values, R residuals of a block.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from sysid.fitting import Fit, Problem
+from sysid.fitting import PRIOR_COUNT, Fit, Problem
 from sysid.terms import Term
 
 Array = np.ndarray
@@ -20,11 +21,12 @@ BLOCK_S = 1.0  # s
 SYSTEMATIC = 2.0  # factor on standard deviations; ours, set on blind sets to cover 95 %
 RELATIVE = 0.006  # of a value; what no model of a joint holds: elastic gears, uneven teeth; ours
 LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; ours
+OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
 _Z = 1.96
 
 
 def covariance(problem: Problem, fit: Fit) -> Array:
-  """Returns the covariance [n, n] of a fit's values."""
+  """Returns the covariance [n, n] of a fit's values, systematic share included."""
   terms = fit.terms
   scale = np.concatenate([np.zeros(0), *[t.scale for t in terms]])
   low = np.concatenate([np.zeros(0), *[t.low for t in terms]])
@@ -39,9 +41,9 @@ def covariance(problem: Problem, fit: Fit) -> Array:
   meat = np.zeros_like(normal)
   for block in _blocks(problem, len(residual) - priors):
     g = jacobian[:, block] @ residual[block]
-    meat += np.outer(g, g)
-  tail = jacobian[:, len(residual) - priors :]  # a prior of standard deviation s has J'J = 1/s^2
-  meat += tail @ tail.T
+    meat += SYSTEMATIC**2 * np.outer(g, g)
+  tail = jacobian[:, len(residual) - priors :]  # weighted by that count; see `fitting`
+  meat += PRIOR_COUNT * tail @ tail.T
   result = np.zeros_like(normal)
   index = np.ix_(free, free)
   inverse = np.linalg.pinv(normal[index], rcond=1e-12)
@@ -69,17 +71,28 @@ def intervals(problem: Problem, fit: Fit, kind: str) -> dict[str, tuple[float, f
   for term in fit.terms:
     if term.kind == kind:
       part = slice(at, at + len(term.names))
-      result = around(term, fit.x[part], spread[part])
+      result = around(term, fit.x[part], spread[part], own_latency=not fit.terms[0].centre)
     at += len(term.names)
   return result
 
 
-def around(term: Term, x: Array, spread: Array) -> dict[str, tuple[float, float]]:
-  """Returns 95 % intervals about values [n] of a term with standard deviations [n]."""
+def around(
+  term: Term, x: Array, spread: Array, *, own_latency: bool = False
+) -> dict[str, tuple[float, float]]:
+  """Returns 95 % intervals about values of a term.
+
+  Args:
+    term: the effect.
+    x: its values [n].
+    spread: their standard deviations [n].
+    own_latency: whether nothing tells what latency the machine had before: then a delay is all
+      that it has now, and its interval reaches down by what healthy machines have.
+  """
   result = {}
   for name, value, sigma, lowest in zip(term.names, x, spread, term.low, strict=True):
     own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
     known = LATE if name == "delay" else 0.0
-    reach = _Z * float(np.sqrt((SYSTEMATIC * sigma) ** 2 + (RELATIVE * own) ** 2 + known**2))
-    result[name] = (float(max(value - reach, lowest)), float(value + reach))
+    reach = _Z * float(np.sqrt(sigma**2 + (RELATIVE * own) ** 2 + known**2))
+    below = OWN_LATENCY if name == "delay" and own_latency else 0.0
+    result[name] = (float(max(value - reach - below, lowest)), float(value + reach))
   return result
