@@ -5,6 +5,8 @@ Nothing is decided here; `decision` reads the ladder.
 
 import dataclasses
 
+import numpy as np
+
 from sysid import candidates, race, signatures
 from sysid.fitting import Problem
 from sysid.plant import JointPlant
@@ -88,6 +90,7 @@ def climb(
   if race.above_floor(singles[0]) > effort.adequate:
     ladder.pairs = pairs(ladder, effort=effort)
     grow(ladder, effort=effort)
+    prune(ladder)
   return ladder
 
 
@@ -120,6 +123,32 @@ def grow(ladder: Ladder, *, effort: Effort) -> None:
     if best.score - found[0].score < _STEP:
       return
     ladder.pairs = sorted([*ladder.pairs, *found[:3]], key=lambda e: e.score)
+
+
+def prune(ladder: Ladder) -> None:
+  """Takes out of the best hypothesis, one by one, the effects that it does without.
+
+  An effect that explained something alone may be idle once others stand beside it.
+  """
+  best = ladder.best()
+  while len(best.fit.terms) > 2:
+    shorter = min(
+      (_without(ladder.problem, best, i) for i in range(1, len(best.fit.terms))),
+      key=lambda e: e.score,
+    )
+    if shorter.score - best.score > _STEP:
+      return
+    entries = ladder.singles if len(shorter.fit.terms) == 2 else ladder.pairs
+    entries.append(shorter)
+    entries.sort(key=lambda e: e.score)
+    best = shorter
+
+
+def _without(problem: Problem, found: Entry, index: int) -> Entry:
+  """Returns a hypothesis without one of its terms, fitted to the end."""
+  terms = [t for i, t in enumerate(found.fit.terms) if i != index]
+  x = np.concatenate([found.fit.part(i) for i in range(len(found.fit.terms)) if i != index])
+  return race.entry(problem, problem.fit(terms, x, evaluations=30))
 
 
 def pairs(ladder: Ladder, *, effort: Effort) -> list[Entry]:

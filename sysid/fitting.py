@@ -22,6 +22,11 @@ _DIFFERENCE = 0.004  # of a value's scale; ours
 _DAMPINGS = ((1e-6, 1.0), (1e-6, 0.3), (1e-6, 0.08), (1e-3, 1.0), (0.1, 1.0), (3.0, 1.0))
 """Dampings and shares of the step that are tried side by side."""
 _CONVERGED = 1e-4  # relative gain of a step at which a fit ends
+_COARSE = 6.0  # times the step of differences, where fine ones lead nowhere: friction is rough
+_THOROUGH = 20  # evaluations from which a fit that ended looks about before it stays
+_LOOKS = 3  # times it does so
+_SIZES = (0.4, 0.7, 1.4, 2.5)  # times a size that is looked at
+_MOVES = (-3.0, -1.0, 1.0, 3.0)  # scales about a value that may be negative
 _NINE_TENTHS = 0.79  # rms of the inner 90 % of a normal distribution over its own
 _SOFT = 4.0  # noise units; larger residuals count linearly
 PRIOR_COUNT = 25.0  # residuals that one independent observation is spread over; ours
@@ -173,13 +178,38 @@ class Problem:
     if len(starts) > 2:  # look at all, descend from the best two
       costs = np.sum(self.residuals(terms, np.array(starts)) ** 2, axis=1)
       starts = [starts[i] for i in np.argsort(costs)[:2]]
-    best: Fit | None = None
-    for begin in starts:
+    fits = [self._descend(terms, begin, low, high, scale, evaluations) for begin in starts]
+    best = min(fits, key=lambda fit: fit.cost)
+    for _ in range(_LOOKS if evaluations >= _THOROUGH else 0):
+      begin = self._look_about(best, low, high, scale)
+      if begin is None:
+        break
       fit = self._descend(terms, begin, low, high, scale, evaluations)
-      if best is None or fit.cost < best.cost:
-        best = fit
-    assert best is not None
+      best = fit if fit.cost < best.cost else best
     return best
+
+  def _look_about(self, fit: Fit, low: Array, high: Array, scale: Array) -> Array | None:
+    """Returns values with one effect's value moved far that cost less, None if there are none.
+
+    Sticking and play make valleys in which a descent ends early.
+    """
+    tried, at = [], 0
+    for term in fit.terms:
+      for j in range(at, at + len(term.names)):
+        if term.kind == "calibration":
+          continue
+        moved = (
+          fit.x[j] * np.array(_SIZES) if low[j] >= 0 else fit.x[j] + scale[j] * np.array(_MOVES)
+        )
+        for value in np.clip(moved, low[j], high[j]):
+          tried.append(fit.x.copy())
+          tried[-1][j] = value
+      at += len(term.names)
+    if not tried:
+      return None
+    costs = 0.5 * np.sum(np.square(self.residuals(fit.terms, np.array(tried))), axis=1)
+    best = int(np.argmin(costs))
+    return tried[best] if costs[best] < (1.0 - _CONVERGED) * fit.cost else None
 
   def _starts(self, terms: Sequence[Term]) -> list[Array]:
     starts = [np.zeros(0)]
@@ -192,7 +222,7 @@ class Problem:
   ) -> Fit:
     """Levenberg-Marquardt with bounds; several dampings are tried side by side."""
     x, count, cost = start, 0, float("inf")
-    steps = _DIFFERENCE * scale
+    steps, coarse = _DIFFERENCE * scale, False
     while count < limit:
       signed = np.where(x + steps > high, -steps, steps)
       rows = self.residuals(terms, np.vstack([x, x + np.diag(signed)]))
@@ -217,7 +247,9 @@ class Problem:
       if gained > 0:
         x, cost = tried[best], float(costs[best])
       if gained < _CONVERGED * cost:
-        break
+        if coarse:
+          break
+        steps, coarse = _COARSE * steps, True
     outputs = self.simulate(terms, x)[0]
     return Fit(tuple(terms), x, cost, self.effort_scale(outputs), count)
 

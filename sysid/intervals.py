@@ -19,7 +19,7 @@ Array = np.ndarray
 
 BLOCK_S = 1.0  # s
 SYSTEMATIC = 2.0  # factor on standard deviations; ours, set on blind sets to cover 95 %
-RELATIVE = 0.006  # of a value; what no model of a joint holds: elastic gears, uneven teeth; ours
+RELATIVE = 0.009  # of a value; what no model of a joint holds: elastic gears, uneven teeth; ours
 LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; ours
 OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
 _Z = 1.96
