@@ -20,6 +20,9 @@ LATENCY = 0.004
 
 _INF = float("inf")
 
+_FEWEST_WAVES = 3.0
+"""1/rad; ours: teeth and magnets repeat twenty times a turn or more."""
+
 _GAIN_SPREAD = 0.3
 """Of the other constants' spread; ours: a servo's law is set by registers and a data sheet, while
 its friction and inertia are estimates."""
@@ -188,14 +191,14 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
   """Returns the candidate of a torque that repeats with position, from (amplitude, periods, phase).
 
   Its error has a valley every fraction of a wave: the starts come from the residual torque's
-  spectrum over position (`signatures.waves`).
+  spectrum over position (`signatures.waves`). Waves as long as a turn are gravity's or a spring's.
   """
   torque = _typical_torque(plant)
   return Term(
     "cogging",
     plant.joint,
     ("amplitude", "periods", "phase"),
-    (0.0, 1.0, -10.0),
+    (0.0, _FEWEST_WAVES, -10.0),
     (0.5 * torque, 300.0, 10.0),
     (0.03 * torque, 0.05, 0.3),
     tuple(waves),

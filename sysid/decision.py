@@ -99,7 +99,16 @@ def usual_first(entries: list[Entry], *, alone: bool = False) -> list[Entry]:
 def simplest(entries: list[Entry]) -> Entry:
   """Returns the entry with the fewest values of those that tie with the best, which is first."""
   ties = [e for e in entries if e.score - entries[0].score < _TIE]
-  return min(ties, key=lambda e: len(e.fit.x))
+  return min(ties, key=_values_that_show)
+
+
+def _values_that_show(entry: Entry) -> int:
+  """Returns how many values of a hypothesis logs can tell.
+
+  Of a payload one joint shows its moment along two directions; its inertia, hardly.
+  """
+  hidden = sum(len(t.names) - 2 for t in entry.fit.terms if t.kind == "payload")
+  return len(entry.fit.x) - hidden
 
 
 def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresholds) -> bool:

@@ -22,9 +22,9 @@ class Effort:
 
   finalists: int = 6
   """Candidates of a race that are fitted to the end."""
-  parents: int = 3
-  """Single effects on top of which a second one is raced."""
-  parent_margin: float = 1.2
+  parents: int = 6
+  """Single effects on top of which a second one is raced; one of a pair alone may rank low."""
+  parent_margin: float = 1.5
   """nats; single effects further behind are no parents."""
   longest: int = 4
   """Effects in a chain that is grown where two leave much; three or more are used, not claimed."""
@@ -156,8 +156,11 @@ def pairs(ladder: Ladder, *, effort: Effort) -> list[Entry]:
   best = ladder.singles[0].score
   found: list[Entry] = []
   seen: set[frozenset[str]] = set()
-  parents = [e for e in ladder.singles if e.kind not in _doubles(ladder.problem.plant)]
-  for parent in parents[: effort.parents]:
+  parents: dict[str, Entry] = {}
+  for entry in ladder.singles:
+    if entry.kind not in _doubles(ladder.problem.plant):
+      parents.setdefault(entry.kind, entry)
+  for parent in list(parents.values())[: effort.parents]:
     if parent.score > best + effort.parent_margin:
       continue
     problem = ladder.problem
