@@ -9,6 +9,7 @@ Writes report.json, report.html, effects.json (for suite.load), model_extended.x
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
 import rich
 import tyro
@@ -28,7 +29,8 @@ class Arguments:
   held: tuple[Path, ...] = ()
   """Logs on which only errors are reported."""
   reference: tuple[Path, ...] = ()
-  """Logs of the same apparatus without the effect: they calibrate the declared constants first."""
+  """Logs of the same apparatus without the effect: they calibrate the declared constants first, and
+  say how bright the place is."""
   out: Path | None = None
   """Folder to write."""
   evaluate: Path | None = None
@@ -58,20 +60,22 @@ def _identify(arguments: Arguments) -> int:
     out=arguments.out,
   )
   rich.print(f"[bold]{content['verdict']}[/bold] in {content['seconds']:.0f} s")
-  table = Table("effect", "joint", "parameter", "value", "95 %", "unit")
+  table = Table("effect", "where", "parameter", "value", "95 %", "unit")
   for effect in content["effects"]:
     for name, value in effect["parameters"].items():
       if isinstance(value["value"], list):
         continue
       interval = "" if value["low"] is None else f"{value['low']:.4g} .. {value['high']:.4g}"
       table.add_row(
-        effect["kind"], effect["joint"] or "all", name, _number(value["value"]), interval,
+        effect["kind"], _place(effect), name, _number(value["value"]), interval,
         value["unit"],
       )  # fmt: skip
   from sysid import evaluation  # after the work: its import takes seconds that --help can spare
 
   if table.rows:
     rich.print(table)
+  for note in content["notes"]:
+    rich.print(f"note: {note}")
   for name in ("train", "held"):
     error = content["error"][name]
     if error:
@@ -79,6 +83,10 @@ def _identify(arguments: Arguments) -> int:
       rich.print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE{worse}")
   rich.print(f"floor: {content['error']['floor']:.5f}; report: {arguments.out / 'report.html'}")
   return 0
+
+
+def _place(effect: dict[str, Any]) -> str:
+  return effect["joint"] or effect.get("geom") or effect.get("sensor") or "all"
 
 
 def _number(value: float | None) -> str:

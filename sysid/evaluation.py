@@ -19,6 +19,7 @@ from sysid.reduction import smooth_motion, start_velocity
 Array = np.ndarray
 
 
+_SENSORS = ("imu_", "camera_")  # kinds that move no joint
 _SPOILT = 1.02  # times the declared model's error: beyond rounding and the scatter of a fit; ours
 
 
@@ -86,7 +87,7 @@ def simulate(
     starts = [int(s) for s in np.unique(window, return_index=True)[1]]
   delays = merge_delays(effects, clocks, model)
   late_by = _delays(delays, model)
-  moving = [e for e in delays if e.kind != "command_delay" and not e.kind.startswith("imu_")]
+  moving = [e for e in delays if e.kind != "command_delay" and not e.kind.startswith(_SENSORS)]
   stack = EffectStack(moving).bind(model)
   try:
     rate = _of_joint(effects, "clock_drift", "rate", None)

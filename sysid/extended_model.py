@@ -1,8 +1,8 @@
 """model_extended.xml: the declared model with what MuJoCo itself can express put in.
 
 Constants are corrected; friction, drag, springs, gains, limits, offsets, payloads and tilts are
-written as attributes. Delays, Stribeck and load friction, play, cogging and learned forces have no
-MJCF: those stay in effects.json.
+written as attributes, a sloping floor is turned. Delays, Stribeck and load friction, play, cogging,
+learned forces and what is wrong with sensors have no MJCF: those stay in effects.json.
 """
 
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from suite.effects import Effect
 from suite.effects.passive import rotation_matrix
@@ -19,6 +20,7 @@ _POINT = 1e-4  # m, radius of a payload: no inertia of its own
 EXPRESSED = (
   *("parameter_error", "coulomb_friction", "viscous_friction", "quadratic_drag", "motor_gain"),
   *("torque_limit", "encoder_offset", "payload", "spring", "gravity_tilt"),
+  "floor_slope",
 )
 """Kinds that MJCF can hold."""
 
@@ -62,6 +64,13 @@ def _put(spec: mujoco.MjSpec, effect: Effect) -> None:
     if turn is not None:
       spec.option.gravity = turn @ np.array(spec.option.gravity)
     return
+  if effect.kind == "floor_slope":
+    turn = Rotation.from_rotvec([value["x"], value["y"], 0.0])
+    for geom in spec.worldbody.geoms:
+      named = geom.name == effect.target
+      if named or (effect.target is None and geom.type == mujoco.mjtGeom.mjGEOM_PLANE):
+        _turn(spec, geom, turn)
+    return
   if effect.kind == "payload":
     body = spec.body(effect.target) or _joint(spec, effect).parent
     carrier = body.add_body(name=f"payload_on_{body.name}", pos=[value[a] for a in "xyz"])
@@ -76,6 +85,14 @@ def _put(spec: mujoco.MjSpec, effect: Effect) -> None:
   joints = [_joint(spec, effect)] if effect.target is not None else list(spec.joints)
   for joint in joints:
     _on_joint(spec, effect, joint, value)
+
+
+def _turn(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, turn: Rotation) -> None:
+  """Turns a geom of the world about its origin, however its orientation is written."""
+  model = spec.compile()
+  before = Rotation.from_quat(model.geom_quat[geom.id], scalar_first=True)
+  geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+  geom.quat = (turn * before).as_quat(scalar_first=True)
 
 
 def _joint(spec: mujoco.MjSpec, effect: Effect):

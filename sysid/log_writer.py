@@ -8,6 +8,7 @@ from typing import Any
 from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 
+from scenes.cameras import Camera
 from sysid import messages
 
 CHUNK_SIZE = 64 * 1024
@@ -88,6 +89,14 @@ class LogWriter:
     """Writes turning rates [rad/s] and accelerations [m/s2] in the sensor's frame."""
     message = messages.imu(stamp_ns, angular_velocity, linear_acceleration, frame=frame)
     self._write(message, stamp_ns, log_ns)
+
+  def picture(self, stamp_ns: int, jpeg: bytes, *, log_ns: int | None = None) -> None:
+    """Writes a JPEG picture; the stamp is when it was taken, as far as the machine knows."""
+    self._write(messages.image(stamp_ns, jpeg), stamp_ns, log_ns)
+
+  def lens(self, stamp_ns: int, camera: Camera, *, log_ns: int | None = None) -> None:
+    """Writes the camera's calibrated lens."""
+    self._write(messages.camera_info(stamp_ns, camera), stamp_ns, log_ns)
 
   def _write(self, message: messages.Message, stamp_ns: int, log_ns: int | None) -> None:
     topic, schema, fields = message

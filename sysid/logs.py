@@ -72,6 +72,8 @@ class Log:
   """By joint."""
   recovered: bool = False
   """The file was damaged and this is what could be read of it."""
+  path: pathlib.Path | None = None
+  """The file, which holds the pictures too; None of a log that was never written."""
 
   @property
   def joints(self) -> tuple[str, ...]:
@@ -129,6 +131,7 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
     battery=battery(topics[BATTERY], start) if BATTERY in topics else None,
     temperatures=temperatures(topics.values(), start),
     recovered=damaged,
+    path=path,
   )
   if log.duration < MINIMUM_DURATION:
     raise LogError(

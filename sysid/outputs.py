@@ -14,7 +14,7 @@ import numpy as np
 
 from suite.effects import Effect, write_effects
 from suite.effects.files import from_list, to_list
-from sysid import decision, detection, evaluation, excitation, extended_model, inertial, report
+from sysid import decision, detection, evaluation, excitation, extended_model, report, sensing
 from sysid.evaluation import Clocks
 from sysid.identification import Found, Identified, Settings, analyse, load_model, read_logs
 from sysid.logs import COMMANDS, Log, LogError, check_motion
@@ -64,8 +64,8 @@ def identify(
   out = Path(out)
   out.mkdir(parents=True, exist_ok=True)
   found = analyse(compiled, logs, reference=healthy, settings=settings)
-  sensed = inertial.find(compiled, logs)
-  if sensed is not None and sensed.effects:
+  sensed = sensing.find(compiled, logs, healthy)
+  if sensed.effects:
     found.objects += sensed.effects
     found.effects += sensed.rows
     found.verdict = "effects" if found.verdict == "none" else found.verdict
@@ -83,6 +83,7 @@ def identify(
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
     "next_excitation": _next(found),
+    "notes": sensed.notes,
   }
   if found.verdict == "unexplained":
     # The best named hypothesis is no explanation: it is listed, not claimed.
@@ -91,11 +92,10 @@ def identify(
       {"kind": "residual_force", "joint": e.target, "parameters": {}, "evidence": {}}
       for e in found.learned
     ]
-    if sensed is not None:  # what the IMU shows is explained all the same
-      content["effects"] += sensed.rows
-      content["alternatives"] = [a for a in content["alternatives"] if a not in sensed.rows]
-  if sensed is not None:
-    content["alternatives"] += sensed.alternatives
+    # What IMU, camera and floor show is explained all the same.
+    content["effects"] += sensed.rows
+    content["alternatives"] = [a for a in content["alternatives"] if a not in sensed.rows]
+  content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(
     Path(model), out / "model_extended.xml", [*found.calibration, *found.objects]
@@ -124,7 +124,7 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
 
 
 def _details(
-  found: Identified, model: Path, extended: Sequence[Effect], sensed: inertial.Inertial | None
+  found: Identified, model: Path, extended: Sequence[Effect], sensed: sensing.Sensed
 ) -> dict[str, Any]:
   """Returns what the findings rest on, and what `evaluate` needs."""
   first = found.found[0]
@@ -142,9 +142,7 @@ def _details(
       "extended": detection.tests(first.screened.problem, first.finding.chosen.fit),
     },
     "audit": found.audits,
-    "imu_rms_in_noise": None
-    if sensed is None
-    else {"before": round(sensed.before, 3), "after": round(sensed.after, 3)},
+    "sensors": sensed.errors(),
   }
 
 

@@ -79,7 +79,8 @@ def _summary(effects: Sequence[dict[str, Any]]) -> str:
 
 
 def _place(effect: dict[str, Any]) -> str:
-  return effect["joint"] or effect.get("body") or effect.get("sensor") or "all"
+  places = (effect["joint"], *(effect.get(noun) for noun in ("body", "geom", "sensor")))
+  return next((place for place in places if place), "all")
 
 
 def _unit(item: Found) -> str:
@@ -94,8 +95,10 @@ def _verdict(content: dict[str, Any]) -> str:
     if a.get("confounded")
   ]
   # Of what is unexplained, the nearest hypothesis is among the alternatives, with intervals.
-  nearest, _ = _parameters([a for a in content["alternatives"] if "kinds" not in a])
-  blocks = [parts.warnings(notes)]
+  listed = [a for a in content["alternatives"] if "kinds" not in a]
+  nearest, _ = _parameters([a for a in listed if "sensor" not in a])
+  alike, _ = _parameters([a for a in listed if "sensor" in a])
+  blocks = [parts.warnings([*notes, *content["notes"]])]
   if rows:
     blocks += [parts.table(_HEADER, rows), charts.intervals("95 % intervals", bounds)]
   if nearest:
@@ -103,6 +106,8 @@ def _verdict(content: dict[str, Any]) -> str:
       "<h3>In the extended model, but not claimed</h3>",
       parts.table(_HEADER, nearest),
     ]
+  if alike:
+    blocks += ["<h3>One of these, the sensors cannot tell which</h3>", parts.table(_HEADER, alike)]
   return parts.section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], *blocks)
 
 

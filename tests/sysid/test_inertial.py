@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from sysid import inertial, log_writer
 from sysid.logs import read_log
+from tests.sysid import imu_machines
 
 START = 1_700_000_000_000_000_000
 LENGTH = 0.3  # m from the hinges' crossing to the IMU
@@ -116,3 +117,22 @@ def test_without_an_imu_nothing_is_said(tmp_path):
   log = _log(tmp_path / "a.mcap")
   bare = MODEL[: MODEL.index("<sensor>")] + "</mujoco>"
   assert inertial.find(mujoco.MjModel.from_xml_string(bare), [log]) is None
+
+
+@pytest.mark.parametrize(
+  "seeds", [range(2), pytest.param(range(40, 80), marks=pytest.mark.slow)], ids=["few", "many"]
+)
+def test_healthy_imus_are_not_accused(seeds):
+  """Machines of `imu_machines`: at most 1 of 20, and no alternatives either for most."""
+  accused = listed = 0
+  for seed in seeds:
+    machine = imu_machines.draw(np.random.default_rng([seed, 3]))
+    logs = [
+      imu_machines.log(machine, kind, 1000 * seed + i, seed)
+      for i, kind in enumerate(("sweep", "slow", "steps"))
+    ]
+    found = inertial.find(mujoco.MjModel.from_xml_string(machine.xml()), logs)
+    accused += bool(found.effects)
+    listed += bool(found.alternatives)
+  assert accused <= len(seeds) // 20
+  assert listed <= max(1, len(seeds) // 10)
