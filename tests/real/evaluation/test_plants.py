@@ -131,6 +131,17 @@ def test_covered_camera_is_black_for_three_seconds(scene):
     perturbations.make_intruder("rain", scene, keep_clear=np.zeros((0, 2)))
 
 
+def _nearest_trial(plant, scene):
+  """Returns what comes of one trial on a plant, which is closed then."""
+  group, trial = plants.trials("navigation")[NEAREST]
+  try:
+    return runner.run_trial(
+      plant, GaitPolicy(scene, "navigation"), trial, group=group, index=NEAREST
+    )
+  finally:
+    plant.close()
+
+
 def test_robot_prompts_for_placement_and_verdict(scene):
   """The robot is a virtual one here; the plant only sees its port and asks a person."""
   asked, said = [], []
@@ -145,12 +156,8 @@ def test_robot_prompts_for_placement_and_verdict(scene):
       scene, "navigation", "person", robot=robot.connection(), camera=None, image_size=None,
       time_limit=0.5, ask=ask, say=said.append,
     )  # fmt: skip
-    try:
-      group, trial = plants.trials("navigation")[NEAREST]
-      policy = GaitPolicy(scene, "navigation")
-      found = runner.run_trial(plant, policy, trial, group=group, index=NEAREST)
-    finally:
-      plant.close()
+    found = _nearest_trial(plant, scene)
+  _, trial = plants.trials("navigation")[NEAREST]
   start = protocols.scene_starts(scene)[trial.position]
   assert f"x = {start[0]:.2f} m" in asked[0] and "Goal 3" in said[0]
   assert "Walk slowly around" in said[1] and "Expected one of" in said[2]
@@ -166,12 +173,7 @@ def test_a_dry_run_moves_nothing_and_asks_for_no_verdict(scene):
       scene, "navigation", robot=robot.connection(), camera=None, image_size=None, time_limit=0.5,
       dry_run=True, ask=lambda question: asked.append(question) or "", say=lambda text: None,
     )  # fmt: skip
-    try:
-      group, trial = plants.trials("navigation")[NEAREST]
-      policy = GaitPolicy(scene, "navigation")
-      found = runner.run_trial(plant, policy, trial, group=group, index=NEAREST)
-    finally:
-      plant.close()
+    found = _nearest_trial(plant, scene)
     assert not any(servo.table["torque_enable"] for servo in servos)
     assert [servo.table["goal_position"] for servo in servos] == before
   assert len(asked) == 1 and "Place the robot" in asked[0]
