@@ -16,7 +16,7 @@ from suite.effects import Effect, write_effects
 from suite.effects.files import from_list, to_list
 from sysid import decision, detection, evaluation, excitation, extended_model, report, sensing
 from sysid.evaluation import Clocks
-from sysid.identification import Found, Identified, Settings, analyse, load_model, read_logs
+from sysid.identification import Identified, Settings, analyse, load_model, read_logs
 from sysid.logs import COMMANDS, Log, LogError, check_motion
 
 _LISTED = 6  # alternatives in the report
@@ -85,16 +85,23 @@ def identify(
     "next_excitation": _next(found),
     "notes": sensed.notes,
   }
+  # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
+  content["alternatives"] = [*found.nearest, *content["alternatives"]]
   if found.verdict == "unexplained":
-    # The best named hypothesis is no explanation: it is listed, not claimed.
-    content["alternatives"] = [*content["effects"], *content["alternatives"]]
-    content["effects"] = [
-      {"kind": "residual_force", "joint": e.target, "parameters": {}, "evidence": {}}
-      for e in found.learned
-    ]
     # What IMU, camera and floor show is explained all the same.
-    content["effects"] += sensed.rows
-    content["alternatives"] = [a for a in content["alternatives"] if a not in sensed.rows]
+    claimed = [row for row in found.effects if row not in sensed.rows]
+    content["alternatives"] = [*claimed, *content["alternatives"]]
+    content["effects"] = list(sensed.rows)
+  content["effects"] = content["effects"] + [
+    {"kind": "residual_force", "joint": e.target, "parameters": {}, "evidence": {}}
+    for e in found.learned
+  ]
+  if found.verdict == "effects" and found.unexplained:
+    joints = ", ".join(item.joint for item in found.unexplained)
+    content["notes"] = [
+      *content["notes"],
+      f"Not explained: {joints}. The effects that are named are those of other joints.",
+    ]
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(
@@ -127,7 +134,7 @@ def _details(
   found: Identified, model: Path, extended: Sequence[Effect], sensed: sensing.Sensed
 ) -> dict[str, Any]:
   """Returns what the findings rest on, and what `evaluate` needs."""
-  first = found.found[0]
+  first = found.least_explained
   return {
     "model": str(model.resolve()),
     "extended": to_list(extended),
@@ -245,7 +252,7 @@ def _alternatives(found: Identified) -> list[dict[str, Any]]:
 
 def residual_at(found: Identified) -> dict[str, Any]:
   """Returns where the residual of the chosen hypothesis sits: joint, position, velocity, time."""
-  item = found.found[0]
+  item = found.least_explained
   problem, fit = item.screened.problem, item.finding.chosen.fit
   errors = problem.errors(problem.simulate(fit.terms, fit.x)[0])
   logs = problem.plant.logs
@@ -278,6 +285,6 @@ def _concentrated(values: np.ndarray, squares: np.ndarray) -> tuple[float, float
 
 
 def _next(found: Identified) -> dict[str, Any]:
-  item: Found = found.found[0]
+  item = found.least_explained
   rivals = item.finding.confounded or item.finding.alternatives[:2]
   return excitation.propose(item.screened.problem, item.finding.chosen, rivals[:3])

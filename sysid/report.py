@@ -52,7 +52,7 @@ def page(
     _errors(found, content),
     *[_residuals(item) for item in items[:_SHOWN]],
     _ladder(found),
-    _where(content, details, _unit(found.found[0])),
+    _where(content, details, _unit(found.least_explained)),
   ]
   if held:
     sections.append(_held(found, held, effects, items[:_SHOWN], window_s))

@@ -87,7 +87,7 @@ def test_extended_model_has_the_error_that_is_reported(
   assert got == pytest.approx(content["error"]["held"]["after"], rel=0.01)
   # What others read; the rest is in details.json.
   assert set(content) == {
-    "verdict", "effects", "alternatives", "residual_at", "error", "window_s", "seconds",
+    "verdict", "effects", "alternatives", "residual_at", "error", "window_s", "seconds", "notes",
     "next_excitation",
   }  # fmt: skip
   assert set(content["error"]) == {"train", "held", "floor"}
