@@ -20,6 +20,9 @@ Array = np.ndarray
 BLOCK_S = 1.0  # s
 SYSTEMATIC = 2.0  # factor on standard deviations; ours, set on blind sets to cover 95 %
 RELATIVE = 0.009  # of a value; what no model of a joint holds: elastic gears, uneven teeth; ours
+PEAK = (
+  0.08  # of the friction that holds at rest; it yields over a way that no rigid model has; ours
+)
 LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; ours
 OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
 _Z = 1.96
@@ -92,7 +95,8 @@ def around(
   for name, value, sigma, lowest in zip(term.names, x, spread, term.low, strict=True):
     own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
     known = LATE if name == "delay" else 0.0
-    reach = _Z * float(np.sqrt(sigma**2 + (RELATIVE * own) ** 2 + known**2))
+    share = PEAK if name == "breakaway" else RELATIVE
+    reach = _Z * float(np.sqrt(sigma**2 + (share * own) ** 2 + known**2))
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     result[name] = (float(max(value - reach - below, lowest)), float(value + reach))
   return result

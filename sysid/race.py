@@ -23,6 +23,9 @@ PER_DEVIATION = 0.006  # nats a squared standard deviation of a declared constan
 CLOCKS = ("skew", "latency")  # values of a calibration that are no constants of the model
 TRIMMED = 0.01  # share of the largest errors that a score leaves out: stale reads, command edges
 BLOCK_S = 1.0  # s; blocks of cross-validation: several times the memory of a servo
+_FIRST, _SECOND, _LAST = 3, 5, 30  # evaluations of a race's rounds
+_PROMISING = 8  # candidates at least in the second round
+_WITHIN = 0.3  # nats of the best in which all are
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +128,8 @@ def run(
 ) -> list[Entry]:
   """Fits every candidate on top of `base` and returns them, the best first.
 
-  All get a few steps; those near the best are fitted to the end.
+  All get a few steps from every start, the better ones some more, those near the best are fitted to
+  the end.
 
   Args:
     problem: the joint.
@@ -137,15 +141,22 @@ def run(
   base = tuple(base)
   if start is not None:
     base = tuple(_with_start(base, start))
-  first = [entry(problem, problem.fit((*base, c), evaluations=7)) for c in candidates]
-  first.sort(key=lambda e: e.score)
-  done = []
-  for rank, found in enumerate(first):
-    if rank < finalists and found.score < first[0].score + 1.0:
-      fit = problem.fit(found.fit.terms, found.fit.x, evaluations=30)
-      found = entry(problem, fit if fit.cost <= found.fit.cost else found.fit)
-    done.append(found)
-  return sorted(done, key=lambda e: e.score)
+  found = [entry(problem, problem.fit((*base, c), evaluations=_FIRST)) for c in candidates]
+  found.sort(key=lambda e: e.score)
+  for rank, e in enumerate(list(found)):
+    if rank < _PROMISING or e.score < found[0].score + _WITHIN:
+      found[rank] = _continued(problem, e, _SECOND)
+  found.sort(key=lambda e: e.score)
+  for rank, e in enumerate(found[:finalists]):
+    if e.score < found[0].score + 1.0:
+      found[rank] = _continued(problem, e, _LAST)
+  return sorted(found, key=lambda e: e.score)
+
+
+def _continued(problem: Problem, found: Entry, evaluations: int) -> Entry:
+  """Returns an entry whose fit goes on from where it is."""
+  fit = problem.fit(found.fit.terms, found.fit.x, evaluations=evaluations)
+  return entry(problem, fit) if fit.cost < found.fit.cost else found
 
 
 def _with_start(base: Sequence[Term], start: Array) -> list[Term]:
