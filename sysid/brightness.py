@@ -65,7 +65,7 @@ def find(
     reference: logs of the same apparatus at the same place.
     camera: name for the report.
   """
-  filmed = [log for log in reference if log.path is not None and pictures.count(log.path)]
+  filmed = optical.with_pictures(reference)
   if not filmed or not seen.sources:
     return Part()
   try:

@@ -76,7 +76,7 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Seen | None:
 
   Where pictures cannot be used the effects are empty and a note says why.
   """
-  filmed = [log for log in logs if log.path is not None and pictures.count(log.path)]
+  filmed = with_pictures(logs)
   if not filmed:
     return None
   try:
@@ -98,6 +98,12 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Seen | None:
   )
   scales = [r["parameters"]["scale"]["value"] for r in part.rows if r["kind"] == "camera_focal"]
   return Seen(part, sources, views, delay, *scales)
+
+
+def with_pictures(logs: Sequence[Log]) -> list[Log]:
+  """Returns the logs whose files hold pictures and are whole."""
+  whole = [log for log in logs if log.path is not None and not log.recovered]
+  return [log for log in whole if pictures.count(log.path)]  # type: ignore[arg-type]
 
 
 def look(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[list[pictures.Source], list[View]]:

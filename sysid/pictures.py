@@ -49,11 +49,12 @@ class Source:
 
 
 def count(path: pathlib.Path) -> int:
-  """Returns the number of pictures in a file, from its index; 0 where it has none."""
+  """Returns the number of pictures in a file: from its index, or by reading where it has none."""
   with path.open("rb") as stream:
-    summary = make_reader(stream).get_summary()
-  if summary is None or summary.statistics is None:
-    return 0
+    reader = make_reader(stream)
+    summary = reader.get_summary()
+    if summary is None or summary.statistics is None:
+      return sum(1 for _ in reader.iter_messages(topics=[IMAGE]))
   numbers = summary.statistics.channel_message_counts
   return sum(numbers.get(i, 0) for i, c in summary.channels.items() if c.topic == IMAGE)
 

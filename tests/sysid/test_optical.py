@@ -6,6 +6,8 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import IndexType, Writer
 
 import sysid
 from suite.effects import EffectStack, read_effects
@@ -128,6 +130,28 @@ def test_the_lens_is_read_as_it_was_written_and_pictures_are_decoded_small(tmp_p
   frames = list(pictures.read(source))
   assert len(frames) == 26 and frames[0][1].shape == (240, 320)
   assert frames[0][0] == pytest.approx(0.1, abs=0.01)
+
+
+def test_pictures_of_a_file_without_an_index_are_found_too(tmp_path):
+  log = film.record(tmp_path / "a.mcap", Film(duration=1.5))
+  with log.path.open("rb") as stream, (tmp_path / "b.mcap").open("wb") as target:
+    writer = Writer(
+      target, use_statistics=False, use_summary_offsets=False, repeat_channels=False,
+      repeat_schemas=False, use_chunking=False, index_types=IndexType.NONE,
+    )  # fmt: skip
+    writer.start()
+    known = {}
+    for schema, channel, message in make_reader(stream).iter_messages():
+      if channel.id not in known:
+        number = writer.register_schema(schema.name, schema.encoding, schema.data)
+        known[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+      writer.add_message(
+        known[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+      )
+    writer.finish()
+  assert pictures.count(tmp_path / "b.mcap") == 26
+  again = pictures.source(tmp_path / "b.mcap", log.start_ns)
+  assert len(list(pictures.read(again))) == 26
 
 
 def test_tracks_follow_a_picture_that_shifts(tmp_path):
