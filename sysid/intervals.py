@@ -25,6 +25,7 @@ PEAK = (
 )
 LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; ours
 OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
+_DIFFERENCE = 0.004  # of a value's scale; ours
 _Z = 1.96
 
 
@@ -34,9 +35,16 @@ def covariance(problem: Problem, fit: Fit) -> Array:
   scale = np.concatenate([np.zeros(0), *[t.scale for t in terms]])
   low = np.concatenate([np.zeros(0), *[t.low for t in terms]])
   high = np.concatenate([np.zeros(0), *[t.high for t in terms]])
-  steps = np.where(fit.x + 0.02 * scale > high, -0.02, 0.02) * scale
-  rows = problem.residuals(terms, np.vstack([fit.x, fit.x + np.diag(steps)]))
-  residual, jacobian = rows[0], (rows[1:] - rows[0]) / steps[:, None]
+  # Small and central: where two values do the same (damping and added friction), their derivatives
+  # must agree to a part in a thousand, or the difference looks like information.
+  above = np.minimum(fit.x + _DIFFERENCE * scale, high)
+  below = np.maximum(fit.x - _DIFFERENCE * scale, low)
+  rows = problem.residuals(
+    terms,
+    np.vstack([fit.x, fit.x + np.diag(above - fit.x), fit.x + np.diag(below - fit.x)]),
+  )
+  residual, count = rows[0], len(fit.x)
+  jacobian = (rows[1 : count + 1] - rows[count + 1 :]) / (above - below)[:, None]
   priors = sum(len(t.prior) for t in terms)
   normal = jacobian @ jacobian.T
   fixed = (fit.x <= low + 1e-9 * scale) & (jacobian @ residual > 0)

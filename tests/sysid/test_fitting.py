@@ -1,5 +1,7 @@
 """Fits recover what was put in; intervals and scores mean what they say."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -38,6 +40,28 @@ def test_fit_recovers_an_effect(kind: str, values: dict, tolerance: dict) -> Non
     low, high = bounds[name]
     assert low - tolerance[name] < value < high + tolerance[name]
     assert high - low < 0.5 * abs(value)
+
+
+def test_friction_is_known_no_better_than_the_damping_that_was_declared() -> None:
+  # Both brake in proportion to speed: only the spread of the declared damping parts them.
+  problem = _problem([Effect("viscous_friction", "joint", {"coefficient": 0.3})])
+  calibration = candidates.calibration(problem.plant, prior=0.06)
+  fit = problem.fit([calibration, _term(problem, "viscous_friction")])
+  low, high = intervals.intervals(problem, fit, "viscous_friction")["coefficient"]
+  declared = 1.0  # N m s/rad, of the model
+  assert (high - low) / 2 == pytest.approx(1.96 * 0.06 * declared, rel=0.2)
+  assert low < 0.3 < high
+
+
+def test_a_delay_may_hold_the_latency_that_a_machine_always_had() -> None:
+  problem = _problem([Effect("command_delay", "joint", {"delay": 0.03})])
+  term = candidates.calibration(problem.plant)
+  sure = [2e-4 if n in race.CLOCKS else p for n, p in zip(term.names, term.prior, strict=True)]
+  calibration = dataclasses.replace(term, prior=tuple(sure))
+  fit = problem.fit([calibration, _term(problem, "command_delay")])
+  delay = fit.values("command_delay")["delay"]
+  low, high = intervals.intervals(problem, fit, "command_delay")["delay"]
+  assert low < delay - intervals.OWN_LATENCY < delay < high < delay + intervals.OWN_LATENCY
 
 
 def test_calibration_recovers_constants_that_are_off() -> None:

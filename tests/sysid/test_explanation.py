@@ -1,0 +1,66 @@
+"""How hypotheses grow and shrink, and what the verdict over several joints is."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from suite.effects import Effect
+from sysid import candidates, decision, explanation, identification, race
+from sysid.fitting import Problem
+from sysid.plant import JointPlant
+from tests.sysid.synthetic import PENDULUM, logs_of
+
+
+def _problem(*effects: Effect) -> Problem:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  return Problem(JointPlant(model, "joint", logs_of(PENDULUM, effects, duration=6.0)))
+
+
+def _terms(problem: Problem, *kinds: str):
+  library = candidates.library(problem.plant)
+  return [next(t for t in library if t.kind == kind) for kind in kinds]
+
+
+def test_effects_that_are_idle_are_taken_out_again() -> None:
+  problem = _problem(
+    Effect("command_delay", "joint", {"delay": 0.04}),
+    Effect("torque_limit", "joint", {"limit": 1.4}),
+  )
+  calibration, declared, null = explanation.bare(problem)
+  terms = [calibration, *_terms(problem, "motor_gain", "command_delay", "torque_limit")]
+  start = np.concatenate([null.fit.x, [1.0, 0.04, 1.4]])
+  grown = race.entry(problem, problem.fit(terms, start))
+  single = race.entry(problem, problem.fit([calibration, terms[1]], evaluations=7))
+  ladder = explanation.Ladder(problem, calibration, declared, null, [single], [grown])
+  explanation.prune(ladder)
+  assert decision.names(ladder.pairs[0]) == {"command_delay", "torque_limit"}
+  assert decision.decide(ladder).verdict == "effects"
+  # Neither of the two is idle.
+  assert len(ladder.singles) == 1
+
+
+def test_a_fit_leaves_a_valley_of_friction() -> None:
+  problem = _problem(Effect("stribeck_friction", "joint", {"breakaway": 0.3, "velocity": 0.12}))
+  calibration, _, null = explanation.bare(problem)
+  (term,) = _terms(problem, "stribeck_friction")
+  far = np.concatenate([null.fit.x, [0.02, term.low[1]]])
+  fit = problem.fit([calibration, term], far, evaluations=30)
+  assert fit.values("stribeck_friction")["velocity"] == pytest.approx(0.12, rel=0.3)
+  assert fit.values("stribeck_friction")["breakaway"] == pytest.approx(0.3, rel=0.2)
+
+
+@pytest.mark.parametrize(
+  ("named", "unexplained", "expected"),
+  [([0.5] * 9, [1.0], True), ([0.4, 0.3], [1.0], False), ([], [1.0], False)],
+)
+def test_a_verdict_is_that_of_what_the_joints_leave(named, unexplained, expected) -> None:
+  found = [
+    SimpleNamespace(
+      finding=SimpleNamespace(verdict=verdict), screened=SimpleNamespace(excess=excess)
+    )
+    for verdict, values in (("effects", named), ("unexplained", unexplained), ("none", [3.0]))
+    for excess in values
+  ]
+  assert identification._mostly_explained(found) is expected
