@@ -204,7 +204,8 @@ def _residuals(item: Found) -> str:
     "Against time: measured minus simulated position. Against the others: the torque that the"
     " model lacks (what the measured motion demands by inverse dynamics, less what actuator and"
     " friction give), medians and quartiles; a flat line at zero is a model that lacks nothing, a"
-    f" step at zero velocity is dry friction, a slope over velocity is damping.{note}",
+    " step at zero velocity is dry friction, a slope over velocity is damping. Against temperature"
+    f" it counts along the actuator's: below zero is an actuator that weakens.{note}",
     parts.grid([f for f in figures if f], 2),
   )
 
@@ -220,6 +221,7 @@ def _against(item: Found, hypotheses, name: str) -> str:
         if log.temperature is None:
           return ""
         x.append(log.temperature[signatures.EDGES : -signatures.EDGES])
+        missing = missing * np.sign(r.torque)
       else:
         x.append({"position": r.position, "velocity": r.velocity, "load": r.torque}[name])
       y.append(missing)
@@ -229,8 +231,9 @@ def _against(item: Found, hypotheses, name: str) -> str:
   length = "rad" if hinge else "m"
   unit = {"position": length, "velocity": f"{length}/s", "load": torque, "temperature": "C"}[name]
   what = "torque" if hinge else "force"
+  along = " along the actuator's" if name == "temperature" else ""
   return charts.binned(
-    f"missing {what} against {name}", f"{name} [{unit}]", f"{what} [{torque}]", curves
+    f"missing {what}{along} against {name}", f"{name} [{unit}]", f"{what} [{torque}]", curves
   )
 
 
