@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from sysid import decision, race
+from sysid import decision, intervals, race
 from sysid.decision import Thresholds
 from sysid.fitting import Fit, Problem
 from sysid.joint import Found
@@ -20,6 +20,7 @@ from sysid.terms import Term
 Array = np.ndarray
 
 _REFUTED = 0.1  # nats by which a joint that carries a payload may get worse; ours
+_SUREST = 0.05  # of a value's typical size, that one joint's fit is sure of at most; ours
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
@@ -103,13 +104,25 @@ def without_refuted(
     chosen = item.finding.chosen
     if not item.finding.named or "payload" not in decision.names(chosen):
       continue
-    index = [t.kind for t in chosen.fit.terms].index("payload")
-    term, x = chosen.fit.terms[index], chosen.fit.part(index)
     others = [s for s in screened if s.joint != item.joint]
-    if _worse_with(model, item.joint, term.held_at(x), others):
+    if _worse_with(model, item.joint, _as_known(item, chosen), others):
       item.ladder.singles = [e for e in item.ladder.singles if "payload" not in decision.names(e)]
       item.ladder.pairs = [e for e in item.ladder.pairs if "payload" not in decision.names(e)]
       item.finding = decision.decide(item.ladder, thresholds)
+
+
+def _as_known(item: Found, chosen: Entry) -> Term:
+  """Returns a joint's payload with a prior as wide as that joint leaves each value open.
+
+  One joint says nothing of how far along its axis a payload sits; those that carry it may.
+  """
+  index = [t.kind for t in chosen.fit.terms].index("payload")
+  before = sum(len(t.names) for t in chosen.fit.terms[:index])
+  term, x = chosen.fit.terms[index], chosen.fit.part(index)
+  spread = np.sqrt(np.diag(intervals.covariance(item.screened.problem, chosen.fit)))
+  prior = np.maximum(spread[before : before + len(x)], _SUREST * np.array(term.scale))
+  values = tuple(map(float, x))
+  return dataclasses.replace(term, prior=tuple(map(float, prior)), centre=values, starts=(values,))
 
 
 def _worse_with(
@@ -120,7 +133,8 @@ def _worse_with(
   result = []
   for s in others:
     if s.joint in carriers:
-      fit = s.problem.fit([s.calibration, payload], s.null.fit.x, evaluations=6)
+      start = np.concatenate([s.null.fit.x, payload.starts[0]])
+      fit = s.problem.fit([s.calibration, payload], start, evaluations=10)
       if race.entry(s.problem, fit).score - s.null.score > _REFUTED:
         result.append(s.joint)
   return result

@@ -19,6 +19,7 @@ Array = np.ndarray
 FLOOR = 0.3  # noise variances added to a mean square before the logarithm; ours
 EFFORT_SHARE = 0.3  # of the score, where efforts are measured; ours
 PER_PARAMETER = 0.01  # nats that a parameter must earn; ours
+PER_BOUND = 0.1  # nats that an effect pays for a value on its bound: a sign of a wrong kind; ours
 PER_DEVIATION = 0.006  # nats a squared standard deviation of a declared constant's error; ours
 CLOCKS = ("skew", "latency")  # values of a calibration that are no constants of the model
 TRIMMED = 0.01  # share of the largest errors that a score leaves out: stale reads, command edges
@@ -80,7 +81,8 @@ def entry(problem: Problem, fit: Fit) -> Entry:
   """Scores a fit on the samples that it was fitted to."""
   table = levels(problem, fit)
   count = sum(len(t.names) for t in fit.terms if t.kind != "calibration")
-  return Entry(fit, score_of(table, count) + deviation(fit), table)
+  bounds = sum(fit.at_bound(t.kind) for t in fit.terms if t.kind != "calibration")
+  return Entry(fit, score_of(table, count) + deviation(fit) + PER_BOUND * bounds, table)
 
 
 def deviation(fit: Fit) -> float:
