@@ -49,6 +49,10 @@ def _friction(value: dict[str, float], r: TorqueResidual, needed: Array) -> Arra
   elif value["load_kind"] == 2:
     carried = r.torque + needed - value["damping"] * r.velocity
   size = np.abs(carried)
+  if value["load_kind"] >= 3:
+    motor = r.torque - value["damping"] * r.velocity
+    sides = np.abs([motor, motor + needed])
+    size = sides.max(axis=0) if value["load_kind"] == 3 else sides.mean(axis=0)
   rubbing = (value["load_coefficient"] + value["load_square"] * size) * size
   fall = r.velocity / max(value["load_velocity"], 1e-6)
   return limit + rubbing * (1.0 + value["load_at_rest"] * np.exp(-(fall**2)))

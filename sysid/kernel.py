@@ -257,6 +257,12 @@ def simulate(
           carried = before - damping * v
         elif load_kind == 2:
           carried = demand + bias[i] + inertia[i] * acceleration
+        elif load_kind >= 3:
+          motor_side = abs(before - damping * v)
+          link_side = abs(demand + bias[i] + inertia[i] * acceleration)
+          carried = max(motor_side, link_side)
+          if load_kind == 4:
+            carried = 0.5 * (motor_side + link_side)
         rubbing = (load_share + load_square * abs(carried)) * abs(carried)
         if load_at_rest > 0.0:
           ratio = v / load_velocity

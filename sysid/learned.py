@@ -2,7 +2,7 @@
 
 The residual torque of the measured motion is regressed on the features of
 `suite.effects.residual_force`; the table is kept only if simulating with it lowers the error on
-blocks that it was not fitted to.
+logs that it was not fitted to (blocks of time where there is one log).
 """
 
 import numpy as np
@@ -10,8 +10,8 @@ import numpy as np
 from suite.effects import Effect
 from suite.effects.residual import features
 from sysid import signatures
+from sysid.elaboration import folds
 from sysid.fitting import Fit, Problem
-from sysid.race import folds
 from sysid.terms import compose
 
 Array = np.ndarray
@@ -25,7 +25,7 @@ def learn(problem: Problem, fit: Fit) -> tuple[Effect | None, float, float]:
   """Fits a residual force beside a hypothesis.
 
   Returns:
-    The effect (None if it does not help), and the rms of positions [m or rad] on held-out blocks
+    The effect (None if it does not help), and the rms of positions [m or rad] on what was left out
     without and with it.
   """
   before: list[float] = []

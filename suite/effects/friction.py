@@ -69,7 +69,8 @@ class LoadFriction(Operator):
   (Duclusaud, Passault, Padois and Ly 2024 measure both on small servos).
   The torque is that of the last step; which one loads the gear is `carried`: 0 the actuators', 1
   that less the joint's damping (back-EMF: what is left is the current's), 2 what the link takes,
-  which is also less what the rotor's own inertia needs.
+  which is also less what the rotor's own inertia needs, 3 the larger of 1 and 2, 4 their mean: a
+  gear is loaded from both sides (the same paper's load is the two together).
   """
 
   def bind(self, binding: Binding) -> None:
@@ -79,25 +80,30 @@ class LoadFriction(Operator):
     self._at_rest = parameters["rest"]
     self._rate = 1 / np.maximum(parameters["velocity"], _VELOCITY_FLOOR)
     self._falls = bool(self._at_rest.any())
-    self._damped = parameters["carried"] == 1
-    self._linked = parameters["carried"] == 2
+    self._carried = parameters["carried"]
+    self._sides = bool((self._carried >= 1).any())
     _stick(binding, self._coefficient + self._quadratic)
 
   def step(self, binding: Binding) -> None:
     data, dofs = binding.data, binding.dofs
     load = data.qfrc_actuator[dofs].copy()
-    if self._damped.any():
-      damping = binding.model.dof_damping[dofs] * binding.velocity
-      load -= np.where(self._damped, damping, 0.0)
-    if self._linked.any():
-      inner = data.qfrc_passive[dofs] + data.qfrc_constraint[dofs] + data.qfrc_applied[dofs]
-      inner -= binding.model.dof_armature[dofs] * data.qacc[dofs]
-      load += np.where(self._linked, inner, 0.0)
+    if self._sides:
+      load = self._of_gear(binding, load)
     np.abs(load, out=load)
     load *= self._coefficient + self._quadratic * load
     if self._falls:
       load *= 1 + self._at_rest * np.exp(-np.square(binding.velocity * self._rate))
     binding.friction += load
+
+  def _of_gear(self, binding: Binding, actuator: Array) -> Array:
+    """Returns the torque that loads each gear [J], from the actuators'."""
+    data, model, dofs = binding.data, binding.model, binding.dofs
+    motor = actuator - model.dof_damping[dofs] * binding.velocity
+    link = actuator + data.qfrc_passive[dofs] + data.qfrc_constraint[dofs]
+    link += data.qfrc_applied[dofs] - model.dof_armature[dofs] * data.qacc[dofs]
+    sides = np.abs([motor, link])
+    forms = (actuator, motor, link, sides.max(axis=0), sides.mean(axis=0))
+    return np.choose(self._carried.astype(int), forms)
 
 
 class AsymmetricFriction(Operator):
@@ -200,10 +206,10 @@ KINDS = (
         "1",
         0.0,
         0.0,
-        2.0,
-        "which torque: 0 the actuator's, 1 less damping, 2 what the link takes",
+        4.0,
+        "which torque: 0 the actuator's, 1 less damping, 2 the link's, 3 larger, 4 mean of 1 and 2",
         minimum=0.0,
-        maximum=2.0,
+        maximum=4.0,
         shape=True,
         fitted=False,
       ),

@@ -23,6 +23,8 @@ CASES = [
   ("load_friction", {"coefficient": 0.15, "carried": 0.0}, 3e-4),
   ("load_friction", {"coefficient": 0.4, "carried": 1.0}, 3e-4),
   ("load_friction", {"coefficient": 0.4, "carried": 2.0}, 3e-4),
+  ("load_friction", {"coefficient": 0.3, "carried": 3.0}, 3e-4),
+  ("load_friction", {"coefficient": 0.3, "carried": 4.0}, 3e-4),
   (
     "load_friction",
     {"coefficient": 0.05, "quadratic": 0.1, "rest": 0.5, "velocity": 0.4, "carried": 2.0},
