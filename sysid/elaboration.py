@@ -34,6 +34,8 @@ _BASES = 4  # hypotheses on top of which it is tried
 _FORMS = (0, 1, 2, 3, 4)  # which torque loads the gear: `suite.effects.friction.LoadFriction`
 _FINALISTS = 10  # fitted without each log in turn
 _HOPELESS = 4.0  # times the least cost at which one is no finalist
+_ROUNDS = 4  # of weighing anew
+_SETTLED = 0.7  # of the error before at which another round is worth while
 _EVALUATIONS = 20  # of a fit that a log was left out of
 _LONGEST = 3  # effects beside it
 _LEAST = 0.2  # nats that it must gain on held-out logs; as decision.Thresholds.second
@@ -83,10 +85,12 @@ def elaborate(ladder: Ladder, chosen: Entry) -> Entry:
   """
   _, before = Weighed.by(ladder.problem, chosen).left_out(chosen.fit)
   for kind in _readings(ladder.problem):
-    problem = kind.by(ladder.problem, chosen)
-    after, fit = _best(problem, _bases(ladder, chosen))
+    found = _nearest(kind.by(ladder.problem, chosen), _bases(ladder, chosen))
+    (_, after), best = min(
+      ((kind.by(ladder.problem, e).left_out(e.fit), e) for e in found), key=lambda j: j[0][0]
+    )
     if before - after > _LEAST:
-      return race.entry(ladder.problem, fit)
+      return _settled(kind, ladder.problem, best)
   return chosen
 
 
@@ -116,7 +120,7 @@ class Weighed(Problem):
     return part._scaled()
 
   def left_out(self, fit: Fit) -> tuple[float, float]:
-    """Returns the error on logs that were not fitted, mean log rms over them, nats.
+    """Returns the error on logs that were not fitted: mean log rms over them in noise units, nats.
 
     Args:
       fit: hypothesis, fitted anew without each log in turn, from these values and from other starts
@@ -131,7 +135,7 @@ class Weighed(Problem):
       fits = [part.fit(fit.terms, x, evaluations=_EVALUATIONS) for x in _starts(fit)]
       best = min(fits, key=lambda f: f.cost)
       rows += self._levels(best, held)
-    logs = 0.5 * np.log(race.FLOOR / self.share**2 + np.square(rows)).mean(axis=0)
+    logs = 0.5 * np.log(race.FLOOR + np.square(self.share * np.array(rows))).mean(axis=0)
     weight = np.array([1.0, race.EFFORT_SHARE])[: len(logs)]
     return float(logs @ weight), float(logs[0])
 
@@ -175,9 +179,8 @@ def folds(problem: Problem) -> list[tuple[Masks, Masks]]:
   return result
 
 
-def _best(problem: Weighed, bases: Sequence[tuple[list[Term], Array]]) -> tuple[float, Fit]:
-  """Returns the best form on the best base: its error of positions on logs that were left out,
-  nats, and its fit to all."""
+def _nearest(problem: Weighed, bases: Sequence[tuple[list[Term], Array]]) -> list[Entry]:
+  """Returns the finalists: forms and bases that fit all logs best after a few steps."""
   fits = []
   for terms, start in bases:
     for carried in _FORMS:
@@ -188,11 +191,19 @@ def _best(problem: Weighed, bases: Sequence[tuple[list[Term], Array]]) -> tuple[
       ]
       fits.append(min(tried, key=lambda f: f.cost))
   fits.sort(key=lambda f: f.cost)
-  near = [f for f in fits[:_FINALISTS] if f.cost < _HOPELESS * fits[0].cost]
-  judged = [(problem.left_out(f), f) for f in near]
-  (_, positions), best = min(judged, key=lambda j: j[0][0])
-  fits = [problem.fit(best.terms, x, evaluations=60) for x in _starts(best)]
-  return positions, min(fits, key=lambda f: f.cost)
+  plain = Problem(problem.plant, masks=problem.masks)
+  return [race.entry(plain, f) for f in fits[:_FINALISTS] if f.cost < _HOPELESS * fits[0].cost]
+
+
+def _settled(kind: type[Weighed], problem: Problem, found: Entry) -> Entry:
+  """Returns a hypothesis fitted to the end, weighed by what it leaves itself."""
+  for _ in range(_ROUNDS):
+    weighed = kind.by(problem, found)
+    fits = [weighed.fit(found.fit.terms, x, evaluations=60) for x in _starts(found.fit)]
+    before, found = found, race.entry(problem, min(fits, key=lambda f: f.cost))
+    if found.levels.max() > _SETTLED * before.levels.max():
+      break
+  return found
 
 
 def _readings(problem: Problem) -> list[type[Weighed]]:

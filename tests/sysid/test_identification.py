@@ -178,6 +178,44 @@ def test_rich_friction_is_found_where_the_library_has_none() -> None:
   assert found.fit.values("load_friction")["quadratic"] == pytest.approx(0.3, rel=0.15)
 
 
+def test_the_side_of_the_gear_that_rubs_is_chosen_by_another_motion() -> None:
+  shape = {"coefficient": 0.05, "quadratic": 0.3, "rest": 0.6, "velocity": 0.3, "carried": 3.0}
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  logs = logs_of(PENDULUM, [Effect("load_friction", "joint", shape)])
+  problem = Problem(JointPlant(model, "joint", logs))
+  term, declared, null = explanation.bare(problem)
+  found = elaboration.elaborate(explanation.Ladder(problem, term, declared, null, [], []), null)
+  assert dict(found.fit.terms[-1].fixed)["carried"] == 3.0
+  assert found.levels[:, 0].max() < 1.3  # of the readings' noise
+
+
+def test_every_log_is_left_out_once() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  logs = logs_of(PENDULUM)
+  problem = Problem(JointPlant(model, "joint", logs))
+  masks = elaboration.folds(problem)
+  assert len(masks) == len(logs) > 1
+  for left, (fitted, held) in enumerate(masks):
+    assert [bool(m.any()) for m in held] == [i == left for i in range(len(logs))]
+    assert [bool(m.any()) for m in fitted] == [i != left for i in range(len(logs))]
+  alone = Problem(JointPlant(model, "joint", logs[:1]))
+  assert all(fitted[0].any() and held[0].any() for fitted, held in elaboration.folds(alone))
+
+
+def test_residuals_are_weighed_by_what_is_unexplained() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  problem = Problem(JointPlant(model, "joint", logs_of(PENDULUM, [
+    Effect("coulomb_friction", "joint", {"torque": 0.3})
+  ])))  # fmt: skip
+  _, declared, _ = explanation.bare(problem)
+  weighed = elaboration.Weighed.by(problem, declared)
+  left = declared.levels[:, 0]
+  assert left.min() < weighed.share < left.max() and weighed.share > 5
+  assert weighed.position_noise == pytest.approx(weighed.share * problem.position_noise)
+  part = weighed.masked(elaboration.folds(weighed)[0][0])
+  assert part.position_noise == weighed.position_noise
+
+
 def test_a_simple_machine_gets_no_rich_friction() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   problem = Problem(JointPlant(model, "joint", logs_of(PENDULUM)))
