@@ -44,6 +44,8 @@ class Arguments:
   """How long the robot stands."""
   offsets: Path | None = None
   """The robot's offset.yaml."""
+  lens: Path | None = None
+  """The camera's camera_info YAML of launch/calibrate_camera.py, for the recording."""
   record: Path | None = None
   """Where to record everything (.mcap)."""
 
@@ -55,8 +57,8 @@ def check(arguments: Arguments, robot: str | Connection, recorder: Any = None) -
     camera = int(camera)
   with real.load(
     "nerf_nav", robot=robot, camera=camera, image_size=None if camera is None else (60, 80),
-    time_limit=arguments.seconds, offsets=arguments.offsets, recorder=recorder,
-    dry_run=arguments.dry_run,
+    time_limit=arguments.seconds, offsets=arguments.offsets, lens=arguments.lens,
+    recorder=recorder, dry_run=arguments.dry_run,
   ) as environment:  # fmt: skip
     timestep = environment.reset()
     while not timestep.last():

@@ -71,6 +71,8 @@ class Arguments:
   """The robot's camera: device number, file or URL."""
   offsets: Path | None = None
   """The robot's offset.yaml."""
+  lens: Path | None = None
+  """The camera's camera_info YAML of launch/calibrate_camera.py, for recordings on the robot."""
   record: bool = False
   """Records runs on the virtual robot and the robot as MCAP beside the report."""
   time_limit: float | None = None
@@ -173,7 +175,7 @@ def make_plant(arguments: Arguments, scene: Any, image_size: tuple[int, int] | N
   return OperatedPlant(
     scene, arguments.protocol, arguments.perturb, robot=arguments.robot, camera=camera,
     image_size=image_size, time_limit=arguments.time_limit, record=record,
-    offsets=arguments.offsets, dry_run=arguments.dry_run,
+    offsets=arguments.offsets, lens=arguments.lens, dry_run=arguments.dry_run,
   )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from real import op3
 from real.bus import Bus
+from real.calibration import read_camera_info
 from real.clock import Clock
 from real.environment import RobotEnvironment
 from real.motion import RobotSettings
@@ -42,6 +43,7 @@ def load(
   time_limit: float | None = None,
   settings: RobotSettings | None = None,
   offsets: Path | str | None = None,
+  lens: Path | str | None = None,
   recorder: Any = None,
   dry_run: bool = False,
 ) -> RobotEnvironment:
@@ -59,6 +61,8 @@ def load(
     time_limit: Length of an episode [s]; the task's own if None.
     settings: Settings of the robot.
     offsets: The robot's `offset.yaml`; none if None.
+    lens: The camera's camera_info YAML (`launch/calibrate_camera.py`), for the recording: what the
+      camera does can be found in it only with its lens.
     recorder: A `real.recorder.Recorder`, which the caller closes.
     dry_run: Reads everything and moves nothing.
 
@@ -80,6 +84,7 @@ def load(
   else:
     goals, head_pan = np.asarray(bundle.goals, np.float64), None
   settings = settings or RobotSettings()
+  seen_through = None if lens is None else read_camera_info(Path(lens))
   wiring = op3.Wiring() if offsets is None else op3.read_offsets(offsets)
   bus = Bus(connection.port, settings=settings.bus, wiring=wiring, clock=connection.clock)
   eye: CameraSource | None = None
@@ -94,6 +99,8 @@ def load(
       time_limit=_TIME_LIMITS[task] if time_limit is None else time_limit, dry_run=dry_run,
     )  # fmt: skip
     environment.set_goal(goal)
+    if recorder is not None and seen_through is not None:
+      recorder.camera_info(bus.clock.wall(bus.clock.now()), seen_through)
   except BaseException:
     bus.close()
     for opened in (eye, operator):

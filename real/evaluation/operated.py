@@ -50,6 +50,7 @@ class OperatedPlant(Plant):
     time_limit: float | None = None,
     record: Path | None = None,
     offsets: Path | None = None,
+    lens: Path | None = None,
     dry_run: bool = False,
     observer: Callable[[], Sight] | None = None,
     ask: Callable[[str], str] | None = None,
@@ -68,6 +69,7 @@ class OperatedPlant(Plant):
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
       offsets: The robot's `offset.yaml`.
+      lens: The camera's camera_info YAML, for the recording.
       dry_run: Everything is read, asked and computed, and nothing moves; no verdict is asked for.
       observer: Motion capture, if there is any.
       ask: Puts a question to the operator and returns the answer; None: at this terminal.
@@ -86,7 +88,7 @@ class OperatedPlant(Plant):
     self._recorder = None if record is None else Recorder(record)
     self._environment = real.load(
       TASKS[protocol], robot=connection, camera=camera, scene=scene, image_size=image_size,
-      time_limit=time_limit, recorder=self._recorder, offsets=offsets, dry_run=dry_run,
+      time_limit=time_limit, recorder=self._recorder, offsets=offsets, lens=lens, dry_run=dry_run,
     )  # fmt: skip
     if isinstance(self._environment.bus.clock, RealClock):
       prefer_this_thread(acting=True)

@@ -222,6 +222,21 @@ def test_everything_is_recorded_at_full_rate(robot, load, picture):
     assert np.shape(values) == (20,)
 
 
+def test_a_recording_holds_the_lens(robot, quick, load, picture, tmp_path):
+  (tmp_path / "lens.yaml").write_text(
+    "image_width: 640\nimage_height: 480\ndistortion_model: plumb_bob\n"
+    "camera_matrix: {data: [600, 0, 320, 0, 601, 240, 0, 0, 1]}\n"
+    "distortion_coefficients: {data: [0.1, -0.2, 0, 0, 0]}\n"
+  )
+  recorder = Recorder()
+  load(pictures=picture, recorder=recorder, lens=tmp_path / "lens.yaml")
+  (((_, lens), _),) = recorder.of("camera_info")
+  assert (lens.width, lens.fx, lens.k2) == (640, 600.0, -0.2)
+  (tmp_path / "lens.yaml").write_text("width: 640")
+  with pytest.raises(ValueError, match="no camera_info YAML"):
+    load(pictures=picture, recorder=recorder, lens=tmp_path / "lens.yaml")
+
+
 def test_wrong_arguments_are_explained(robot, quick, load):
   with pytest.raises(ValueError, match="Unknown task 'walk'"):
     real.load("walk", robot=robot.connection())
