@@ -16,8 +16,15 @@ Claim = tuple[Effect, dict[str, Any]]
 """An effect and its entry in the report."""
 
 
-def effect(item: Found, entry: Entry, term: Term) -> Claim:
-  """Returns a joint's effect, with intervals."""
+def effect(item: Found, entry: Entry, term: Term, held_out: float) -> Claim:
+  """Returns a joint's effect, with intervals.
+
+  Args:
+    item: the joint.
+    entry: its hypothesis, fitted to the end.
+    term: the effect.
+    held_out: nats that the hypothesis gains over the constants alone on left-out blocks.
+  """
   problem = item.screened.problem
   bounds = intervals.intervals(problem, entry.fit, term.kind)
   found = term.effect(entry.fit.part(entry.fit.terms.index(term)), bounds)
@@ -30,6 +37,7 @@ def effect(item: Found, entry: Entry, term: Term) -> Claim:
       **decision.evidence(entry, item.ladder),
       "runner_up_behind_nats": _runner_up(item),
       "chance_gain_q95_nats": round(item.chance["q95"], 4),
+      "held_out_gain_nats": round(held_out, 4),
     },
   }
   return found, row

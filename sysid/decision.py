@@ -157,6 +157,17 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   return Finding(verdict, chosen, named, constants, alternatives, confounded)
 
 
+def unnamed(finding: Finding, ladder: Ladder, thresholds: Thresholds) -> Finding:
+  """Returns a finding whose effects are not claimed: the constants are all that is in the model."""
+  constants = constants_off(ladder.null, ladder.declared, ladder.null, thresholds)
+  if not adequate(ladder.null, thresholds):
+    verdict = "unexplained"
+  else:
+    verdict = "effects" if constants else "none"
+  others = [finding.chosen, *finding.alternatives]
+  return Finding(verdict, ladder.null, False, constants, others, [])
+
+
 def evidence(entry: Entry, ladder: Ladder) -> dict[str, Any]:
   """Returns a hypothesis's evidence as numbers."""
   return {

@@ -53,8 +53,6 @@ less from one passage to the next, and a hypothesis that lets the joint stop at 
 with its exact friction is right by chance; ours."""
 _DRY = [INDEX[n] for n in ("friction", "breakaway", "load_coefficient", "load_square")]
 
-Masks = list[Array]
-
 
 def rich_friction(problem: Problem, carried: int) -> Term:
   """Returns load friction with its square and its fall from rest to motion.
@@ -142,7 +140,7 @@ class Weighed(Problem):
       Of positions and efforts, weighed as in a race; of positions alone.
     """
     rows = []
-    for fitted, held in folds(self):
+    for fitted, held in race.folds_by_log(self):
       part = self.masked(fitted)
       fits = [part.fit(fit.terms, x, evaluations=_EVALUATIONS) for x in _starts(fit)]
       best = min(fits, key=lambda f: f.cost)
@@ -180,20 +178,6 @@ class AbsoluteDuty(Weighed):
   def effort_scale(self, outputs: Sequence[Output]) -> float:
     """Returns duty over torque."""
     return 1.0 / float(self.plant.declared[INDEX["highest"]])
-
-
-def folds(problem: Problem) -> list[tuple[Masks, Masks]]:
-  """Returns (fitted, held) masks: each log left out in turn, blocks of time where there is one."""
-  masks = problem.masks
-  if len(masks) == 1:
-    return race.folds(problem)
-  nothing = [np.zeros_like(m) for m in masks]
-  result = []
-  for left in range(len(masks)):
-    fitted = [n if i == left else m for i, (m, n) in enumerate(zip(masks, nothing, strict=True))]
-    held = [m if i == left else n for i, (m, n) in enumerate(zip(masks, nothing, strict=True))]
-    result.append((fitted, held))
-  return result
 
 
 def _nearest(problem: Weighed, bases: Sequence[tuple[list[Term], Array]]) -> list[Entry]:

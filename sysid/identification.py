@@ -28,7 +28,7 @@ from sysid.common import WHOLE
 from sysid.decision import Thresholds
 from sysid.evaluation import Clocks
 from sysid.explanation import Effort, Ladder
-from sysid.joint import Found, look_again, polished, race_joint
+from sysid.joint import Found, gain_on_left_out, look_again, polished, race_joint
 from sysid.logs import Log, check_against_model, read_log
 from sysid.race import Entry
 from sysid.screening import Screened
@@ -223,10 +223,12 @@ def _conclude(result: Identified, settings: Settings) -> None:
     done = item.finding.verdict == "unexplained" and look_again(item)
     fit_on = item.finding.named and not done
     chosen[item.joint] = polished(item, spread) if fit_on else item.finding.chosen
-  for item in result.found:
-    for term in chosen[item.joint].fit.terms if item.finding.named else ():
+  for item in (f for f in result.found if f.finding.named):
+    entry = chosen[item.joint]
+    held_out = gain_on_left_out(item.ladder, entry)
+    for term in entry.fit.terms:
       if term.kind != "calibration":
-        claim = claims.effect(item, chosen[item.joint], term)
+        claim = claims.effect(item, entry, term, held_out)
         _claim(result, claim, sure=item.finding.verdict != "unexplained")
   off: list[dict[str, Any]] = []
   for s in result.screened:

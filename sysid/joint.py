@@ -43,7 +43,16 @@ def race_joint(screened: Screened, thresholds: Thresholds, effort: Effort, *, se
     gain=max(thresholds.gain, 2.0 * chance["q95"]),
     adequate=thresholds.adequate + screened.background,
   )
-  return Found(screened, ladder, decision.decide(ladder, own), chance, own)
+  finding = decision.decide(ladder, own)
+  if finding.named and gain_on_left_out(ladder, finding.chosen) < own.gain:
+    finding = decision.unnamed(finding, ladder, own)
+  return Found(screened, ladder, finding, chance, own)
+
+
+def gain_on_left_out(ladder: Ladder, entry: Entry) -> float:
+  """Returns what a hypothesis gains over the constants alone on left-out blocks, nats."""
+  null, chosen = (race.held_out(ladder.problem, e) for e in (ladder.null, entry))
+  return null.score - chosen.score
 
 
 def polished(item: Found, spread: float) -> Entry:

@@ -10,8 +10,8 @@ import numpy as np
 from suite.effects import Effect
 from suite.effects.residual import features
 from sysid import signatures
-from sysid.elaboration import folds
 from sysid.fitting import Fit, Problem
+from sysid.race import folds_by_log
 from sysid.terms import compose
 
 Array = np.ndarray
@@ -30,7 +30,7 @@ def learn(problem: Problem, fit: Fit) -> tuple[Effect | None, float, float]:
   """
   before: list[float] = []
   after: dict[float, list[float]] = {share: [] for share in _SHARES}
-  for fitted, held in folds(problem):
+  for fitted, held in folds_by_log(problem):
     effect = _regress(problem, fit, fitted)
     before.append(_rms(problem, fit, None, 0.0, held))
     for share in _SHARES:

@@ -34,6 +34,7 @@ KINDS = {"camera_latency": "delay", "camera_focal": "scale"}
 _USUAL = {"camera_latency": 0.012, "camera_focal": 0.03}
 """s, 1; ours: half a frame's exposure and read-out, jitter; a calibration by hand, focus."""
 _NOMINAL = {"camera_latency": 0.0, "camera_focal": 1.0}
+_STAMPS = 0.002  # s by which the joints' own stamps are off, as a bus cycle takes that; ours
 _MOUNT = 0.05  # rad, standard deviation of a mount's rotation; ours
 _NEARNESS = (0.5, 0.5)  # 1/m, mean and standard deviation of rho: a room, or the open; ours
 _GAIN = 0.05  # nats on held-out seconds that a kind must gain
@@ -309,7 +310,10 @@ def _judge(problem: _Problem, camera: str) -> tuple[Part, float]:
 def _value(kind: str, x: Array, spread: Array) -> tuple[float, float, float]:
   """Returns a kind's value with its interval."""
   index = list(KINDS).index(kind)
-  ends: list[Any] = [x[index] + _SIGMAS * s * spread[index] for s in (0, -1, 1)]
+  reach = _SIGMAS * spread[index]
+  if kind == "camera_latency":
+    reach = np.hypot(reach, _STAMPS)
+  ends: list[Any] = [x[index] + s * reach for s in (0, -1, 1)]
   value, low, high = (float(np.exp(e)) if kind == "camera_focal" else float(e) for e in ends)
   return value, low, high
 

@@ -17,6 +17,7 @@ from sysid import (
   explanation,
   extended_model,
   learned,
+  race,
   signatures,
 )
 from sysid.audit import audit
@@ -193,13 +194,13 @@ def test_every_log_is_left_out_once() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   logs = logs_of(PENDULUM)
   problem = Problem(JointPlant(model, "joint", logs))
-  masks = elaboration.folds(problem)
+  masks = race.folds_by_log(problem)
   assert len(masks) == len(logs) > 1
   for left, (fitted, held) in enumerate(masks):
     assert [bool(m.any()) for m in held] == [i == left for i in range(len(logs))]
     assert [bool(m.any()) for m in fitted] == [i != left for i in range(len(logs))]
   alone = Problem(JointPlant(model, "joint", logs[:1]))
-  assert all(fitted[0].any() and held[0].any() for fitted, held in elaboration.folds(alone))
+  assert all(fitted[0].any() and held[0].any() for fitted, held in race.folds_by_log(alone))
 
 
 def test_residuals_are_weighed_by_what_is_unexplained() -> None:
@@ -212,7 +213,7 @@ def test_residuals_are_weighed_by_what_is_unexplained() -> None:
   left = declared.levels[:, 0]
   assert left.min() < weighed.share < left.max() and weighed.share > 5
   assert weighed.position_noise == pytest.approx(weighed.share * problem.position_noise)
-  part = weighed.masked(elaboration.folds(weighed)[0][0])
+  part = weighed.masked(race.folds_by_log(weighed)[0][0])
   assert part.position_noise == weighed.position_noise
 
 
