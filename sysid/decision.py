@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sysid import race
-from sysid.explanation import Ladder
+from sysid.explanation import Ladder, is_even
 from sysid.race import Entry
 
 _BELIEVED = 2  # effects of one joint that are claimed; more can imitate what no library has
@@ -79,36 +79,46 @@ def unique(entries: list[Entry]) -> list[Entry]:
   return result
 
 
-def usual_first(entries: list[Entry], *, alone: bool = False) -> list[Entry]:
-  """Returns entries with the most usual kind of those that tie with the best one first.
+def usual_first(entries: list[Entry], *, alone: bool) -> list[Entry]:
+  """Returns entries with the most usual of those that tie with the best one first.
 
   Args:
-    entries: the best first.
+    entries: the best first; all of one number of kinds.
     alone: whether the machine has one joint.
   """
   ties = [e for e in entries if e.score - entries[0].score < _TIE]
   order = {kind: index for index, kind in enumerate(_USUAL)}
   if alone:
     order["gravity_tilt"] = len(order)
-  size = min(len(e.fit.x) for e in ties)
-  ties = [e for e in ties if len(e.fit.x) <= size + 1]
-  first = min(ties, key=lambda e: min(order.get(k, len(order)) for k in names(e)))
+  fewest = min(_values_that_show(e) for e in ties)
+  ties = [e for e in ties if _values_that_show(e) <= fewest + 1]
+  first = min(ties, key=lambda e: sorted(order.get(k, len(order)) for k in names(e)))
   return [first, *[e for e in entries if e is not first]]
-
-
-def simplest(entries: list[Entry]) -> Entry:
-  """Returns the entry with the fewest values of those that tie with the best, which is first."""
-  ties = [e for e in entries if e.score - entries[0].score < _TIE]
-  return min(ties, key=_values_that_show)
 
 
 def _values_that_show(entry: Entry) -> int:
   """Returns how many values of a hypothesis logs can tell.
 
-  Of a payload one joint shows its moment along two directions; its inertia, hardly.
+  Of a payload one joint shows its moment along two directions, and its inertia.
   """
-  hidden = sum(len(t.names) - 2 for t in entry.fit.terms if t.kind == "payload")
+  hidden = sum(len(t.names) - 3 for t in entry.fit.terms if t.kind == "payload")
   return len(entry.fit.x) - hidden
+
+
+def without_even(entries: list[Entry], margin: float) -> list[Entry]:
+  """Returns entries without asymmetric frictions that are even, where plain ones do as well.
+
+  Args:
+    entries: one of each set of kinds, the best first.
+    margin: nats within which a plain dry friction does as well.
+  """
+  by_names = {names(e): e for e in entries}
+  result = []
+  for entry in entries:
+    plain = by_names.get(names(entry) - {"asymmetric_friction"} | {"coulomb_friction"})
+    if not is_even(entry) or plain is None or plain.score - entry.score > margin:
+      result.append(entry)
+  return result
 
 
 def constants_off(entry: Entry, declared: Entry, null: Entry, thresholds: Thresholds) -> bool:
@@ -131,13 +141,15 @@ def adequate(entry: Entry, thresholds: Thresholds) -> bool:
 def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   """Returns what is concluded about a joint."""
   thresholds = thresholds or Thresholds()
-  singles, pairs = unique(ladder.singles), unique(ladder.pairs)
-  singles = usual_first(singles, alone=ladder.problem.plant.model.nu == 1)
+  singles = without_even(unique(ladder.singles), thresholds.margin)
+  pairs = without_even(unique(ladder.pairs), thresholds.margin)
+  alone = ladder.problem.plant.model.nu == 1
+  singles = usual_first(singles, alone=alone)
   null = ladder.null
   best = singles[0]
   others = singles[1:]
   for size in sorted({len(names(e)) for e in pairs}):
-    longer = simplest([e for e in pairs if len(names(e)) == size])
+    longer = usual_first([e for e in pairs if len(names(e)) == size], alone=alone)[0]
     if best.score - longer.score > thresholds.second:
       best, others = longer, [*(e for e in pairs if e is not longer), *singles]
   gained = null.score - best.score

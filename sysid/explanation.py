@@ -13,6 +13,7 @@ from sysid.plant import JointPlant
 from sysid.race import Entry
 from sysid.terms import Term
 
+_LOPSIDED = 0.15  # difference over sum of an asymmetric friction from which it is called that
 _STEP = 0.2  # nats that a chain's next effect must gain; as decision.Thresholds.second
 
 
@@ -91,6 +92,7 @@ def climb(
     ladder.pairs = pairs(ladder, effort=effort)
     grow(ladder, effort=effort)
     prune(ladder)
+    even_out(ladder)
   return ladder
 
 
@@ -142,6 +144,32 @@ def prune(ladder: Ladder) -> None:
     entries.append(shorter)
     entries.sort(key=lambda e: e.score)
     best = shorter
+
+
+def is_even(entry: Entry) -> bool:
+  """Tells whether a hypothesis has an asymmetric friction that is the same both ways."""
+  sides = list(entry.fit.values("asymmetric_friction").values())
+  return bool(sides) and abs(sides[0] - sides[1]) < _LOPSIDED * sum(sides)
+
+
+def even_out(ladder: Ladder) -> None:
+  """Adds plain dry frictions for asymmetric ones that are even, in the best hypotheses."""
+  problem = ladder.problem
+  (plain,) = (t for t in candidates.library(problem.plant) if t.kind == "coulomb_friction")
+  best: dict[int, Entry] = {}
+  for entry in [*ladder.singles, *ladder.pairs]:
+    known = best.setdefault(len(entry.fit.terms), entry)
+    best[len(entry.fit.terms)] = min(known, entry, key=lambda e: e.score)
+  for count, entry in best.items():
+    if not is_even(entry):
+      continue
+    at = [t.kind for t in entry.fit.terms].index("asymmetric_friction")
+    terms, parts = list(entry.fit.terms), [entry.fit.part(i) for i in range(count)]
+    terms[at], parts[at] = plain, parts[at].mean(keepdims=True)
+    found = race.entry(problem, problem.fit(terms, np.concatenate(parts), evaluations=30))
+    entries = ladder.singles if count == 2 else ladder.pairs
+    entries.append(found)
+    entries.sort(key=lambda e: e.score)
 
 
 def _without(problem: Problem, found: Entry, index: int) -> Entry:

@@ -35,6 +35,7 @@ from sysid.screening import Screened
 
 Array = np.ndarray
 
+_HEALTHY = 0.7  # nats above the noise that joints without an effect leave at most; ours
 _FEW = 5  # joints of which half may have something
 _ALL_OFF = 0.6  # share of joints with constants that are off that stands for all
 _MOST_SHARED = 2  # effects of the whole machine that are looked for
@@ -161,6 +162,7 @@ def _suspects(screened: list[Screened], settings: Settings) -> list[Screened]:
     return screened[: settings.suspects]
   left = [s.excess for s in screened]
   usual = float(np.median(left) if len(left) > _FEW else np.min(left))
+  usual = min(usual, _HEALTHY)  # what all have is no usual thing
   high = [s for s in screened if s.excess > usual + settings.suspicious]
   return (high or screened[:1])[: settings.suspects]
 

@@ -64,3 +64,39 @@ def test_a_verdict_is_that_of_what_the_joints_leave(named, unexplained, expected
     for excess in values
   ]
   assert identification._mostly_explained(found) is expected
+
+
+def test_an_even_asymmetric_friction_is_a_plain_one() -> None:
+  problem = _problem(Effect("coulomb_friction", "joint", {"torque": 0.2}))
+  calibration, declared, null = explanation.bare(problem)
+  (term,) = _terms(problem, "asymmetric_friction")
+  even = race.entry(problem, problem.fit([calibration, term]))
+  assert explanation.is_even(even)
+  ladder = explanation.Ladder(problem, calibration, declared, null, [even], [])
+  explanation.even_out(ladder)
+  assert decision.names(decision.decide(ladder).chosen) == {"coulomb_friction"}
+  # One that holds more in one direction stays what it is.
+  problem = _problem(Effect("asymmetric_friction", "joint", {"positive": 0.2, "negative": 0.05}))
+  calibration, declared, null = explanation.bare(problem)
+  lopsided = race.entry(problem, problem.fit([calibration, term]))
+  ladder = explanation.Ladder(problem, calibration, declared, null, [lopsided], [])
+  explanation.even_out(ladder)
+  assert ladder.singles == [lopsided]
+
+
+def test_of_equal_explanations_the_usual_one_is_named() -> None:
+  def entry(score: float, *kinds: str):
+    counts = {"payload": 4, "spring": 2, "encoder_offset": 1, "backlash": 1, "command_delay": 1}
+    terms = [SimpleNamespace(kind=k, names=("",) * counts[k]) for k in kinds]
+    x = np.zeros(sum(counts[k] for k in kinds))
+    return SimpleNamespace(score=score, fit=SimpleNamespace(terms=terms, x=x))
+
+  def first(*entries):
+    return {t.kind for t in decision.usual_first(list(entries), alone=True)[0].fit.terms}
+
+  assert first(entry(0.50, "spring"), entry(0.51, "payload")) == {"payload"}
+  assert first(entry(0.50, "spring"), entry(0.60, "payload")) == {"spring"}  # no tie
+  pairs = entry(0.50, "payload", "backlash"), entry(0.51, "encoder_offset", "backlash")
+  assert first(*pairs) == {"encoder_offset", "backlash"}  # two values fewer
+  pairs = entry(0.5, "spring", "command_delay"), entry(0.51, "payload", "command_delay")
+  assert first(*pairs) == {"payload", "command_delay"}
