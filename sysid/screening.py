@@ -35,8 +35,11 @@ class Screened:
 
   @property
   def excess(self) -> float:
-    """What the null model leaves, nats above the noise and the background."""
-    return race.above_floor(self.null) - self.background
+    """What the null model leaves, nats above the noise and the background.
+
+    Constants that are far from where they are expected count: a stronger motor passes for a gain.
+    """
+    return race.above_floor(self.null) + race.deviation(self.null.fit) - self.background
 
 
 def screen(
