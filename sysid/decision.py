@@ -15,6 +15,9 @@ from sysid.race import Entry
 
 _BELIEVED = 2  # effects of one joint that are claimed; more can imitate what no library has
 _TIE = 0.03  # nats within which the usual kind is named rather than the rare one
+_SIMPLER = 0.06
+"""Nats within which fewer values are named rather than more: what three values cost by the Bayesian
+information criterion (Schwarz 1978) with some 200 independent readings; ours."""
 _USUAL = (
   *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
   *("gravity_tilt", "encoder_offset", "spring"),
@@ -86,7 +89,10 @@ def usual_first(entries: list[Entry], *, alone: bool) -> list[Entry]:
     entries: the best first; all of one number of kinds.
     alone: whether the machine has one joint.
   """
-  ties = [e for e in entries if e.score - entries[0].score < _TIE]
+  best, most = entries[0].score, _values_that_show(entries[0])
+  ties = [
+    e for e in entries if e.score - best < (_SIMPLER if _values_that_show(e) < most else _TIE)
+  ]
   order = {kind: index for index, kind in enumerate(_USUAL)}
   if alone:
     order["gravity_tilt"] = len(order)

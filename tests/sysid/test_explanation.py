@@ -96,6 +96,8 @@ def test_of_equal_explanations_the_usual_one_is_named() -> None:
 
   assert first(entry(0.50, "spring"), entry(0.51, "payload")) == {"payload"}
   assert first(entry(0.50, "spring"), entry(0.60, "payload")) == {"spring"}  # no tie
+  assert first(entry(0.50, "payload"), entry(0.55, "encoder_offset")) == {"encoder_offset"}
+  assert first(entry(0.50, "encoder_offset"), entry(0.55, "payload")) == {"encoder_offset"}
   pairs = entry(0.50, "payload", "backlash"), entry(0.51, "encoder_offset", "backlash")
   assert first(*pairs) == {"encoder_offset", "backlash"}  # two values fewer
   pairs = entry(0.5, "spring", "command_delay"), entry(0.51, "payload", "command_delay")
