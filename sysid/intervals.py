@@ -26,6 +26,7 @@ LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; o
 OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
 RUBS = 0.2  # of the declared dry friction; servos of one batch differ by that much; ours
 _DRY = ("torque", "positive", "negative")  # dry friction that is added to the declared one
+_GAP = (0.7, 3.0)  # times a gap; play that is rigid in the model imitates part of it only; ours
 _DIFFERENCE = 0.004  # of a value's scale; ours
 _Z = 1.96
 
@@ -111,5 +112,8 @@ def around(
     share = PEAK if name == "breakaway" else RELATIVE
     reach = _Z * float(np.sqrt(sigma**2 + (share * own) ** 2 + known**2))
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
-    result[name] = (float(max(value - reach - below, lowest)), float(value + reach))
+    low, high = max(value - reach - below, lowest), value + reach
+    if name == "gap":
+      low, high = min(low, _GAP[0] * value), max(high, _GAP[1] * value)
+    result[name] = (float(low), float(high))
   return result
