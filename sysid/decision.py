@@ -1,7 +1,7 @@
 """Reads a joint's ladder of evidence: nothing, constants off, named effects, or unexplained.
 
-All thresholds are in nats of error (see `race`) and were set on healthy and faulty blind sets of
-the development seeds; none was set on the sets that figures are reported of.
+All thresholds are in nats of error (see `race`). They were set on healthy and faulty blind sets of
+development seeds and of runs that were judged before; figures are reported of sets drawn later.
 """
 
 import dataclasses
