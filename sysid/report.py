@@ -16,6 +16,7 @@ from sysid.logs import Log
 Array = np.ndarray
 
 _FEW = 1e-9
+_WARMER = 1.0  # K by which a joint's temperature must change to be drawn
 _SHOWN = 3  # joints whose held-out overlays are shown
 _LADDER = 12  # hypotheses a joint
 _VERDICTS = {
@@ -198,7 +199,7 @@ def _residuals(item: Found) -> str:
     figures.append(charts.lines(title, "time [s]", f"position residual [{unit}]", curves))
   for name in ("position", "velocity", "load", "temperature"):
     figures.append(_against(item, hypotheses, name))
-  note = "" if any(figures[-1:]) else " These logs hold no temperatures of this joint."
+  note = "" if any(figures[-1:]) else " These logs hold no temperatures of this joint that change."
   return parts.section(
     f"Residual of {item.screened.joint}, before and after",
     "Against time: measured minus simulated position. Against the others: the torque that the"
@@ -225,6 +226,8 @@ def _against(item: Found, hypotheses, name: str) -> str:
       else:
         x.append({"position": r.position, "velocity": r.velocity, "load": r.torque}[name])
       y.append(missing)
+    if name == "temperature" and np.ptp(np.concatenate(x)) < _WARMER:
+      return ""
     curves.append((label, color, np.concatenate(x), np.concatenate(y)))
   hinge = problem.plant.hinge
   torque = "N m" if hinge else "N"
