@@ -14,12 +14,13 @@ import numba
 _DIGEST = "kernels.sha256"
 
 
-def discard_stale(folder: Path, sources: Sequence[str]) -> bool:
+def discard_stale(folder: Path, sources: Sequence[str], used: Sequence[Path] = ()) -> bool:
   """Deletes the cached kernels of modules unless they were made from these very sources.
 
   Args:
     folder: Folder of the modules; numba's cache is its `__pycache__`.
     sources: Names of all modules that take part, without ".py".
+    used: Files elsewhere whose functions are compiled into these.
 
   Returns:
     Whether the cache may be used: False where the folder cannot be written to.
@@ -27,6 +28,8 @@ def discard_stale(folder: Path, sources: Sequence[str]) -> bool:
   digest = hashlib.sha256(numba.__version__.encode())
   for name in sorted(sources):
     digest.update((folder / f"{name}.py").read_bytes())
+  for path in used:
+    digest.update(path.read_bytes())
   cache = folder / "__pycache__"
   record = cache / _DIGEST
   with contextlib.suppress(OSError):

@@ -17,9 +17,14 @@ Shapes: C commands, S samples, T grid points, W windows.
 """
 
 import math
+from pathlib import Path
 
 import numba
 import numpy as np
+
+from scenes.kernel_cache import discard_stale
+from suite.effects import gear_train
+from suite.effects.backlash import LINK_SHARE, ROTOR_WITHOUT_ARMATURE
 
 Array = np.ndarray
 
@@ -34,14 +39,18 @@ NAMES = (
   *("gap", "encoder_on_motor", "encoder_offset"),
   *("droop", "fade", "heating", "time_constant", "derating"),
   *("amplitude", "periods", "phase"),
-  # choices between models: which torque loads the gear, where the dry friction sits
-  *("load_kind", "friction_on_motor"),
+  # a choice between models: which torque loads the gear
+  *("load_kind",),
   # MuJoCo's friction constraint: R of its row, and the rate at which it takes speed away
   *("softness", "stopping_rate"),
   # whether a weakened actuator saturates earlier too, and whether its measured effort tells
   *("scales_limit", "effort_tells"),
   # load friction: its square, and how much larger it is at rest
   *("load_square", "load_at_rest", "load_velocity"),
+  # where the teeth of a gear with play meet
+  *("tooth_stiffness", "tooth_damping", "friction_on_link"),
+  # how far the state follows the readings: share of a difference, and speed per difference
+  *("follow", "follow_speed"),
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 
@@ -52,15 +61,16 @@ NEUTRAL = {
   "load_velocity": 0.1,
   "time_constant": 300.0,
   "derating": 0.004,
+  "tooth_stiffness": 1000.0,
+  "tooth_damping": 0.4,
 }
 """Values that do nothing, where that is not zero."""
 
 _LEAST_STRENGTH = 0.1  # as suite.effects.actuation
-_LINK_SHARE = 0.02  # as suite.effects.backlash
-_ROTOR_WITHOUT_ARMATURE = 0.05  # as suite.effects.backlash
+_CACHE = discard_stale(Path(__file__).parent, ("kernel",), (Path(gear_train.__file__),))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False)
+@numba.njit(cache=_CACHE, nogil=True, fastmath=False)
 def _table_force(q: float, v: float, weights: Array, bounds: Array) -> float:
   """Returns the force of `suite.effects.residual`; bounds: position low, high, velocity."""
   nq, nv = weights.shape
@@ -81,7 +91,7 @@ def _table_force(q: float, v: float, weights: Array, bounds: Array) -> float:
   return total / (norm_q * norm_v)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False)
+@numba.njit(cache=_CACHE, nogil=True, fastmath=False)
 def simulate(
   p: Array,
   step: float,
@@ -98,6 +108,7 @@ def simulate(
   window_start: Array,
   window_position: Array,
   window_velocity: Array,
+  reading: Array,
   weights: Array,
   bounds: Array,
   out_position: Array,
@@ -123,6 +134,7 @@ def simulate(
     window_start: [W] indices of the samples at which the state is set anew; the first is 0.
     window_position: [W].
     window_velocity: [W].
+    reading: [S] measured positions, which the state follows where it is told to; NaN for none.
     weights: [P, V] table of a learned force, empty for none.
     bounds: [4] its position low, high, velocity low, high.
     out_position: [S], written.
@@ -140,15 +152,17 @@ def simulate(
   half, on_motor, encoder = 0.5 * p[21], p[22], p[23]
   droop, fade, heating, cooling, derating = p[24], p[25], p[26], p[27], p[28]
   amplitude, periods, phase = p[29], p[30], p[31]
-  load_kind, on_motor_side = int(p[32]), p[33] > 0.5
-  softness, stopping_rate = p[34], p[35]
-  scales_limit, effort_tells = p[36] > 0.5, p[37] > 0.5
-  load_square, load_at_rest, load_velocity = p[38], p[39], max(p[40], 1e-6)
+  load_kind = int(p[32])
+  softness, stopping_rate = p[33], p[34]
+  scales_limit, effort_tells = p[35] > 0.5, p[36] > 0.5
+  load_square, load_at_rest, load_velocity = p[37], p[38], max(p[39], 1e-6)
+  tooth_stiffness, tooth_damping, friction_on_link = p[40], p[41], p[42]
+  follow, follow_speed = p[43], p[44]
   learned = weights.size > 0
   samples = sample_time.size
   windows = window_start.size
   last = inertia.size - 1
-  rotor = armature * (1.0 - _LINK_SHARE)
+  rotor = armature * (1.0 - LINK_SHARE)
   keep_cool = 1.0 - step / max(cooling, step)
 
   s = 0
@@ -160,6 +174,7 @@ def simulate(
     first = sample_time[s] / (1.0 + rate) - late
     n = math.floor(first / step)
     n = min(max(n, 0), last)
+    first_n = n
     q = window_position[w] - encoder
     v = window_velocity[w]
     time = n * step
@@ -179,11 +194,10 @@ def simulate(
     acceleration = 0.0
     jump = 0.0
     told = 0.0
-    apart = False
-    was_apart = False
     gap_offset = 0.0
-    started = False
     motor_speed = v
+    passed = 0.0
+    link_freely = 0.0  # acceleration of a link by all but the gear, in the last step
     while s < end:
       when = sample_time[s] / (1.0 + rate) - late
       while s < end and when < time and n == 0:
@@ -204,12 +218,9 @@ def simulate(
         share = (reach + step - command_time[pointer + 1]) / step
         later = command[pointer + 1]
       i = min(int(time * (1.0 + rate) / step), last)  # surroundings were measured: stamped time
-      seen_v = motor_speed if apart else v
-      seen_q = q + encoder
-      if half > 0.0 and on_motor > 0.0:
-        seen_q += on_motor * gap_offset
-      before = 0.0 if was_apart else torque  # what the joint felt in the last step
-      was_apart = apart
+      seen_v = motor_speed if half > 0.0 else v
+      seen_q = q + encoder + on_motor * gap_offset
+      before = torque  # of the last step
       strength = gain
       if heating > 0.0:
         heat = heat * keep_cool + heating * step * before * before
@@ -253,7 +264,7 @@ def simulate(
         limit += breakaway * math.exp(-ratio * ratio)
       if load_share > 0.0 or load_square > 0.0:
         carried = before  # of the last step, as suite.effects
-        if load_kind == 1 and not apart:
+        if load_kind == 1:
           carried = before - damping * v
         elif load_kind == 2:
           carried = demand + bias[i] + inertia[i] * acceleration
@@ -268,58 +279,47 @@ def simulate(
           ratio = v / load_velocity
           rubbing *= 1.0 + load_at_rest * math.exp(-ratio * ratio)
         limit += rubbing
-      link = inertia[i]
-      motor = rotor if rotor > 0.0 else _ROTOR_WITHOUT_ARMATURE * link
-      if apart:
-        mass = link + armature - min(rotor, armature)
-        resist, slope_v = drag * abs(v), 2.0 * drag * abs(v)
-        force = passive
+      back_emf = 0.0
+      if outer * lowest < torque < outer * highest:
+        back_emf = strength * per_v
+      if half > 0.0:  # a motor of its own; all friction of the gear train sits there
+        motor = rotor if rotor > 0.0 else ROTOR_WITHOUT_ARMATURE * inertia[i]
+        link = inertia[i] + armature - min(rotor, armature)
+        if n == first_n:
+          gap_offset = half if torque >= 0.0 else -half
+        gap_offset, motor_speed, passed = gear_train.advance(
+          gap_offset, motor_speed, v, link_freely, torque - back_emf * motor_speed,
+          damping - back_emf, (1.0 - friction_on_link) * limit, motor, link, half, tooth_stiffness, tooth_damping, step,
+        )  # fmt: skip
+        mass, force, slowed, dry = link, passed + passive, 0.0, friction_on_link * limit
       else:
-        mass = link + armature
-        resist, slope_v = damping + drag * abs(v), damping + 2.0 * drag * abs(v)
-        if lowest < torque < highest or scales_limit:
-          slope_v -= strength * per_v
-        force = torque + passive
+        mass, force, dry = inertia[i] + armature, torque + passive, limit
+        slowed = damping
       # A step of velocity: the friction that stops it, then damping implicit.
-      dry = 0.0 if apart and on_motor_side else limit
+      resist = slowed + drag * abs(v)
+      slope_v = slowed + 2.0 * drag * abs(v)
+      if half == 0.0:
+        slope_v -= back_emf
       rubbed = (force - resist * v) / mass + stopping_rate * v
       rubbed = min(max(rubbed / (1.0 / mass + softness), -dry), dry)
       speed = v + step * (force - resist * v - rubbed) / (mass + step * slope_v)
       acceleration = (speed - v) / step
       if half > 0.0:
-        if not started:
-          started = True
-          gap_offset = half if torque >= 0.0 else -half
-        if apart:
-          grip = step / motor
-          motor_speed = (motor_speed + grip * torque) / (1.0 + grip * damping)
-          if on_motor_side:
-            most = grip * limit / (1.0 + grip * damping)
-            motor_speed -= min(max(motor_speed, -most), most)
-          gap_offset += (motor_speed - speed) * step
-          if abs(gap_offset) >= half:
-            gap_offset = half if gap_offset > 0.0 else -half
-            speed = (mass * speed + motor * motor_speed) / (mass + motor)
-            motor_speed = speed
-            apart = False
-        else:
-          passed = torque - motor * (speed - v) / step - damping * speed
-          if on_motor_side:
-            passed -= rubbed
-          motor_speed = speed
-          if passed * gap_offset < 0.0:
-            apart = True
+        link_freely = acceleration - passed / mass
       after = q + step * speed
       ahead = time + step
+      apart = 0.0  # the last reading within the step, less what is simulated of it
       while s < end and when < ahead:
         x = max((when - time) / step, 0.0)
         out_position[s] = q + x * (after - q) + encoder + on_motor * gap_offset
         out_velocity[s] = v + x * (speed - v)
+        if follow > 0.0 and not math.isnan(reading[s]):
+          apart = reading[s] - out_position[s]
         s += 1
         if s < end:
           when = sample_time[s] / (1.0 + rate) - late
-      q = after
-      v = speed
+      q = after + follow * apart
+      v = speed + follow_speed * apart
       time = ahead
       n += 1
     for index in range(e, end):

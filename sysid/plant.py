@@ -233,6 +233,7 @@ class JointPlant:
       np.interp(grid, log.time, _other_load(source, joint, log.time))
       for grid, log, source in zip(self._grids, self.logs, logs, strict=True)
     ]
+    self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
     self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
     self.absorbed: set[str] = set()
     self._moments: dict[str, list[list[Surroundings]]] = {}
@@ -297,7 +298,8 @@ class JointPlant:
     self.declared = parameters.copy()
     if surroundings is not None:
       self.surroundings = list(surroundings)
-      self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
+      self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
+    self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
 
   def scaled(self, factor: float) -> list[Surroundings]:
     """Returns `factor` times the surroundings: all masses changed by that share."""
@@ -345,7 +347,7 @@ class JointPlant:
     kernel.simulate(  # type: ignore[call-arg]
       np.ascontiguousarray(p, float), self.step, log.command_time, log.command, log.time,
       *grid, self._loads[index], self.hinge, windows.start, windows.position,  # type: ignore
-      windows.velocity, weights, bounds, out[0], out[1], out[2], out[3],
+      windows.velocity, self._readings[index], weights, bounds, out[0], out[1], out[2], out[3],
     )  # fmt: skip
     return Output(out[0], out[1], out[2], out[3])
 

@@ -184,7 +184,9 @@ def _load(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
 def _backlash(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["gap"]] = v["gap"]
   p[I["encoder_on_motor"]] = v["encoder_on_motor"]
-  p[I["friction_on_motor"]] = v.get("friction_on_motor", 0.0)
+  p[I["tooth_stiffness"]] = v.get("stiffness", kernel.NEUTRAL["tooth_stiffness"])
+  p[I["tooth_damping"]] = v.get("damping", kernel.NEUTRAL["tooth_damping"])
+  p[I["friction_on_link"]] = v.get("friction_on_link", 0.0)
 
 
 def _late(plant: JointPlant, p: Array, v: dict[str, float]) -> None:

@@ -118,7 +118,7 @@ class ThermalDerating(Operator):
     self.temperature_rise[:] = 0.0
 
   def step(self, binding: Binding) -> None:
-    heat = np.square(binding.data.actuator_force)
+    heat = np.square(binding.last_force)
     heat *= self._heating
     self.temperature_rise *= self._cooling
     self.temperature_rise += heat
@@ -144,7 +144,7 @@ class SupplySag(Operator):
     self._gear = np.abs(binding.gear)
 
   def step(self, binding: Binding) -> None:
-    load = float(np.abs(binding.data.actuator_force) @ self._gear)
+    load = float(np.abs(binding.last_force) @ self._gear)
     strength = 1 - self._droop * load - self._fade * binding.data.time
     strength = max(strength, _LEAST_STRENGTH)
     binding.strength *= strength

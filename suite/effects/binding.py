@@ -95,6 +95,10 @@ class Binding:
     self.limit = np.ones(num_actuators)
     """Factor on the actuators' limits at this step."""
     self.ctrl = np.zeros(num_actuators)
+    self.simulated = np.ones(num_actuators, bool)
+    """Which actuators act in MuJoCo [U]: the others' motors are an effect's."""
+    self.last_force = np.zeros(num_actuators)
+    """Force of every actuator in the last step [U]."""
     self.data: Any = None
     """mujoco.MjData of the step."""
 
@@ -188,8 +192,20 @@ class Binding:
     """Writes this step's dry friction into the model."""
     self.model.dof_frictionloss[self.dofs] = self._dry_friction + self.friction
 
-  def actuator_force(self, position: Array, velocity: Array) -> Array:
-    """Returns the force [U] that the actuators give at joint positions and velocities [J]."""
+  def note_last_force(self) -> None:
+    """Notes the forces of the last step, of the actuators that act in MuJoCo."""
+    np.copyto(self.last_force, self.data.actuator_force, where=self.simulated)
+
+  def actuator_torque(self) -> Array:
+    """Returns the actuators' torque on every joint [J] in the last step."""
+    torque = self.data.qfrc_actuator[self.dofs].copy()
+    others = np.flatnonzero(~self.simulated)
+    np.add.at(torque, self.actuator_joint[others], self.last_force[others] * self.gear[others])
+    return torque
+
+  def actuator_force(self, position: Array, velocity: Array) -> tuple[Array, Array]:
+    """Returns the force [U] that the actuators give at joint positions and velocities [J], and how
+    it changes with the velocity of their joint [U], zero where they saturate."""
     ctrl = self.ctrl
     if self._ctrl_low is not None and self._ctrl_high is not None:
       ctrl = np.minimum(np.maximum(ctrl, self._ctrl_low), self._ctrl_high)
@@ -199,10 +215,12 @@ class Binding:
     if self._uses_velocity:
       force += np.multiply(self._per_velocity, velocity[self._of_joint], out=self._work)
     force *= self.strength
+    slope = self._per_velocity * self.strength
     if self._low is not None and self._high is not None:
-      np.maximum(force, self._low * self.limit, out=force)
-      np.minimum(force, self._high * self.limit, out=force)
-    return force
+      low, high = self._low * self.limit, self._high * self.limit
+      slope[(force <= low) | (force >= high)] = 0.0
+      force = np.minimum(np.maximum(force, low), high)
+    return force, slope
 
   def restore(self) -> None:
     """Writes back every value noted when the binding was made."""

@@ -81,12 +81,12 @@ class LoadFriction(Operator):
     self._rate = 1 / np.maximum(parameters["velocity"], _VELOCITY_FLOOR)
     self._falls = bool(self._at_rest.any())
     self._carried = parameters["carried"]
+    self._damping = binding.model.dof_damping[binding.dofs].copy()
     self._sides = bool((self._carried >= 1).any())
     _stick(binding, self._coefficient + self._quadratic)
 
   def step(self, binding: Binding) -> None:
-    data, dofs = binding.data, binding.dofs
-    load = data.qfrc_actuator[dofs].copy()
+    load = binding.actuator_torque()
     if self._sides:
       load = self._of_gear(binding, load)
     np.abs(load, out=load)
@@ -98,8 +98,8 @@ class LoadFriction(Operator):
   def _of_gear(self, binding: Binding, actuator: Array) -> Array:
     """Returns the torque that loads each gear [J], from the actuators'."""
     data, model, dofs = binding.data, binding.model, binding.dofs
-    motor = actuator - model.dof_damping[dofs] * binding.velocity
-    link = actuator + data.qfrc_passive[dofs] + data.qfrc_constraint[dofs]
+    motor = actuator - self._damping * binding.velocity
+    link = data.qfrc_actuator[dofs] + data.qfrc_passive[dofs] + data.qfrc_constraint[dofs]
     link += data.qfrc_applied[dofs] - model.dof_armature[dofs] * data.qacc[dofs]
     sides = np.abs([motor, link])
     forms = (actuator, motor, link, sides.max(axis=0), sides.mean(axis=0))

@@ -97,6 +97,8 @@ class EffectStack:
 
   def reset(self) -> None:
     """Starts an episode: empties delays, cools motors, closes gaps."""
+    if self.binding is not None:
+      self.binding.last_force.fill(0.0)
     for operator in self.operators:
       operator.reset()
 
@@ -117,6 +119,7 @@ class EffectStack:
     if not self._steps:
       return
     binding.data = data
+    binding.note_last_force()
     binding.position[:] = data.qpos[binding.qpos]
     binding.velocity[:] = data.qvel[binding.dofs]
     binding.force.fill(0.0)

@@ -265,8 +265,9 @@ def test_residual_force_is_the_product_of_features_and_weights():
   np.testing.assert_allclose(q, result.y[0], atol=2e-3)
 
 
-# Backlash: motor inertia 0.004 and damping on the motor's side, link 0.006, dry friction 0.02.
+# Backlash: motor inertia 0.004, damping and dry friction 0.02 on the motor's side, link 0.006.
 _GAP = 0.04
+_TEETH = {"stiffness": 3000.0, "damping": 3.0}
 
 
 def _geared():
@@ -275,9 +276,9 @@ def _geared():
   )
 
 
-def _two_masses(controls, *, encoder_on_motor):
+def _two_masses(controls, *, encoder_on_motor, friction_on_link):
   """Motor and link joined by a stiff, damped spring with play; explicit, 20 steps a millisecond."""
-  step, stiffness, damping = _STEP / 20, 3000.0, 3.0
+  step, stiffness, damping = _STEP / 20, _TEETH["stiffness"], _TEETH["damping"]
   motor = link = motor_speed = link_speed = 0.0
   result = []
   for ctrl in controls:
@@ -288,9 +289,11 @@ def _two_masses(controls, *, encoder_on_motor):
       if shaft * over < 0:
         shaft = 0.0
       drive = 5 * (ctrl - (motor if encoder_on_motor else link)) - 0.15 * motor_speed
-      motor_speed += step * (drive - shaft) / 0.004
+      free = motor_speed + step * (drive - shaft) / 0.004
+      slowed = step * (1 - friction_on_link) * 0.02 / 0.004
+      motor_speed = np.sign(free) * max(0.0, abs(free) - slowed)
       free = link_speed + step * shaft / 0.006
-      link_speed = np.sign(free) * max(0.0, abs(free) - step * 0.02 / 0.006)
+      link_speed = np.sign(free) * max(0.0, abs(free) - step * friction_on_link * 0.02 / 0.006)
       motor, link = motor + step * motor_speed, link + step * link_speed
     result.append(link)
   return np.array(result)
@@ -300,7 +303,7 @@ def test_backlash_hysteresis_is_as_wide_as_the_gap():
   # Slow triangle, encoder on the motor: the link follows the motor with the play between them.
   ramp = np.linspace(0, 0.3, 1000)
   cycle = np.concatenate([ramp, ramp[::-1], -ramp, -ramp[::-1]])
-  effect = Effect("backlash", "hinge", {"gap": _GAP, "encoder_on_motor": 1.0})
+  effect = Effect("backlash", "hinge", {"gap": _GAP, "encoder_on_motor": 1.0, "friction_on_link": 1.0})
   q, _, _, _ = _run(_geared(), [effect], np.tile(cycle, 2))
   second = q[4000:]
   nominal, _, _, _ = _run(_geared(), [], np.tile(cycle, 2))
@@ -311,17 +314,20 @@ def test_backlash_hysteresis_is_as_wide_as_the_gap():
   assert (width - width_nominal).mean() == pytest.approx(_GAP, abs=1e-3)
 
 
+@pytest.mark.parametrize("friction_on_link", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("encoder_on_motor", [0.0, 1.0])
-def test_backlash_against_two_masses(encoder_on_motor):
+def test_backlash_against_two_masses(encoder_on_motor, friction_on_link):
   controls = 0.4 * np.sin(2 * np.pi * 1.5 * _times(1000))
-  effect = Effect("backlash", "hinge", {"gap": _GAP, "encoder_on_motor": encoder_on_motor})
+  sides = {"encoder_on_motor": encoder_on_motor, "friction_on_link": friction_on_link}
+  effect = Effect("backlash", "hinge", {"gap": _GAP, **sides, **_TEETH})
   q, _, stack, _ = _run(_geared(), [effect], controls)
-  expected = _two_masses(controls, encoder_on_motor=encoder_on_motor)
+  expected = _two_masses(controls, **sides)
   nominal, _, _, _ = _run(_geared(), [], controls)
   # The first cycle differs: these gears start in contact, the two masses in the middle of the gap.
   error, size = np.std((q - expected)[300:]), np.std((nominal - expected)[300:])
   assert error < min(0.05 * _GAP, 0.25 * size), (error, size)
-  assert np.abs(stack.operator("backlash").offset).max() <= _GAP / 2
+  wound = np.abs(stack.operator("backlash").offset).max() - _GAP / 2
+  assert 0 < wound < 2.0 / _TEETH["stiffness"]  # by the largest torque
 
 
 _GROUND = """
