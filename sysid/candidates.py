@@ -23,6 +23,12 @@ _INF = float("inf")
 _FEWEST_WAVES = 3.0
 """1/rad; ours: teeth and magnets repeat twenty times a turn or more."""
 
+_WIND_UP = 0.004
+"""rad; ours: about what a gear of metal gives way under the torque that it works at."""
+
+_BOUNCY = 0.15
+"""Damping ratio of teeth that meet; ours: they bounce."""
+
 _GAIN_SPREAD = 0.3
 """Of the other constants' spread; ours: a servo's law is set by registers and a data sheet, while
 its friction and inertia are estimates."""
@@ -102,10 +108,7 @@ def library(plant: JointPlant) -> list[Term]:
       "quadratic_drag", joint, "coefficient", 0.0, 2 * torque / speed**2,
       0.1 * torque / speed**2, (0.1 * torque / speed**2,),
     ),
-    Term(
-      "backlash", joint, ("gap",), (0.0,), (0.3 * reach,), (0.03 * reach,),
-      ((0.01 * reach,), (0.05 * reach,)), fixed=(("encoder_on_motor", 0.0),),
-    ),
+    _play(plant, encoder_on_motor=False),
     _one("motor_gain", joint, "gain", 0.15, 3.0, 0.1, (0.75, 1.25)),
     Term(
       "supply_sag", None, ("droop", "fade"), (0.0, 0.0), (0.5 / torque, 0.04),
@@ -129,18 +132,7 @@ def library(plant: JointPlant) -> list[Term]:
       _one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)),
       _one("encoder_offset", joint, "offset", -0.4, 0.4, 0.03, (0.03, -0.03)),
     ]
-    terms.append(
-      Term(
-        "backlash",
-        joint,
-        ("gap",),
-        (0.0,),
-        (0.3 * reach,),
-        (0.03 * reach,),
-        ((0.01 * reach,), (0.05 * reach,)),
-        fixed=(("encoder_on_motor", 1.0),),
-      )
-    )
+    terms.append(_play(plant, encoder_on_motor=True))
   if plant.hinge:
     terms.append(_payload(plant))
     terms.append(
@@ -202,6 +194,32 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
     (0.5 * torque, 300.0, 10.0),
     (0.03 * torque, 0.05, 0.3),
     tuple(waves),
+  )
+
+
+def _play(plant: JointPlant, *, encoder_on_motor: bool) -> Term:
+  """Returns play in the gear, with how stiff its teeth are and how far they bounce.
+
+  They are fitted beside the gap, which a soft gear widens.
+  """
+  reach = _reach(plant)
+  stiffness = _typical_torque(plant) / _WIND_UP
+  inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
+  armature = plant.declared[INDEX["armature"]]
+  smaller = 1.0 / (1.0 / armature + 1.0 / inertia) if armature > 0 else 0.05 * inertia
+  damping = 2.0 * _BOUNCY * float(np.sqrt(stiffness * smaller))
+  return Term(
+    "backlash",
+    plant.joint,
+    ("gap", "stiffness", "damping"),
+    (0.0, 0.1 * stiffness, 0.02 * damping),
+    (0.3 * reach, 10 * stiffness, 20 * damping),
+    (0.03 * reach, 0.3 * stiffness, 0.3 * damping),
+    tuple(
+      (gap * reach, stiffness, times * damping)
+      for gap, times in ((0.01, 1.0), (0.04, 1.0), (0.04, 3.0))
+    ),
+    fixed=(("encoder_on_motor", float(encoder_on_motor)),),
   )
 
 

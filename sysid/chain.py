@@ -12,7 +12,7 @@ import numpy as np
 from sysid import decision, intervals, race
 from sysid.decision import Thresholds
 from sysid.fitting import Fit, Problem
-from sysid.joint import Found
+from sysid.joint import Found, decide
 from sysid.race import Entry
 from sysid.screening import Screened
 from sysid.terms import Term
@@ -108,7 +108,7 @@ def without_refuted(
     if _worse_with(model, item.joint, _as_known(item, chosen), others):
       item.ladder.singles = [e for e in item.ladder.singles if "payload" not in decision.names(e)]
       item.ladder.pairs = [e for e in item.ladder.pairs if "payload" not in decision.names(e)]
-      item.finding = decision.decide(item.ladder, thresholds)
+      item.finding = decide(item.ladder, item.thresholds)
 
 
 def _as_known(item: Found, chosen: Entry) -> Term:
@@ -119,7 +119,7 @@ def _as_known(item: Found, chosen: Entry) -> Term:
   index = [t.kind for t in chosen.fit.terms].index("payload")
   before = sum(len(t.names) for t in chosen.fit.terms[:index])
   term, x = chosen.fit.terms[index], chosen.fit.part(index)
-  spread = np.sqrt(np.diag(intervals.covariance(item.screened.problem, chosen.fit)))
+  spread = np.sqrt(np.diag(intervals.covariance(item.ladder.problem, chosen.fit)))
   prior = np.maximum(spread[before : before + len(x)], _SUREST * np.array(term.scale))
   values = tuple(map(float, x))
   return dataclasses.replace(term, prior=tuple(map(float, prior)), centre=values, starts=(values,))
@@ -161,7 +161,7 @@ def merge_payloads(model: mujoco.MjModel, found: Sequence[Found], thresholds: Th
     items = [by_joint[j] for j in chain if j in by_joint]
     values = entry.fit.values("payload")
     start = np.array([values[n] for n in term.names])
-    parts = [(f.screened.problem, f.screened.calibration) for f in items]
+    parts = [(f.ladder.problem, f.screened.calibration) for f in items]
     entries = share(parts, term, start)
     gain = sum(f.ladder.null.score - e.score for f, e in zip(items, entries, strict=True))
     first, own = entries[0], items[0]

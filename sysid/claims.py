@@ -25,7 +25,7 @@ def effect(item: Found, entry: Entry, term: Term, held_out: float) -> Claim:
     term: the effect.
     held_out: nats that the hypothesis gains over the constants alone on left-out blocks.
   """
-  problem = item.screened.problem
+  problem = item.ladder.problem
   bounds = intervals.intervals(problem, entry.fit, term.kind)
   found = term.effect(entry.fit.part(entry.fit.terms.index(term)), bounds)
   row = {

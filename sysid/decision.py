@@ -25,10 +25,6 @@ _USUAL = (
 """Kinds in the order in which they are named where logs cannot tell them apart; ours: a late
 command is more usual than a late reading. Of a joint alone, a shifted zero is more usual than a
 leaning mount, which several joints can tell from it."""
-_PLAY = 2.0
-"""Nats above the noise up to which play is named. Where motor and link meet next depends on
-microradians, so a sweep through play does not repeat, and no model of it is adequate; what has no
-name did not look like play on blind sets. Ours."""
 _FRICTION_SPREAD = 10.0  # dry friction varies that much more than other constants before it counts
 
 
@@ -148,20 +144,6 @@ def adequate(entry: Entry, thresholds: Thresholds) -> bool:
   return in_all and race.worst_log(entry) <= thresholds.adequate_log
 
 
-def is_play(entry: Entry, others: list[Entry], thresholds: Thresholds) -> bool:
-  """Tells whether a hypothesis has play that nothing else without play comes near to.
-
-  Args:
-    entry: the hypothesis.
-    others: its rivals.
-    thresholds: when one is believed.
-  """
-  if "backlash" not in names(entry) or race.above_floor(entry) > _PLAY:
-    return False
-  rivals = [e for e in others if "backlash" not in names(e) and len(names(e)) <= len(names(entry))]
-  return all(e.score - entry.score > 0.8 * thresholds.margin for e in rivals)
-
-
 def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   """Returns what is concluded about a joint."""
   thresholds = thresholds or Thresholds()
@@ -183,8 +165,7 @@ def decide(ladder: Ladder, thresholds: Thresholds | None = None) -> Finding:
   confounded = [e for e in others if named and e.score - best.score < thresholds.margin]
   size = len(names(best))
   confounded = [e for e in confounded if len(names(e)) <= size]
-  fits = adequate(chosen, thresholds) or is_play(chosen, others, thresholds)
-  if not fits or len(names(chosen)) > _BELIEVED:
+  if not adequate(chosen, thresholds) or len(names(chosen)) > _BELIEVED:
     verdict = "unexplained"
   elif named or constants:
     verdict = "effects"
@@ -212,4 +193,5 @@ def evidence(entry: Entry, ladder: Ladder) -> dict[str, Any]:
     "gain_over_declared_nats": round(float(ladder.declared.score - entry.score), 4),
     "position_rms_in_noise": round(float(np.sqrt(np.mean(entry.levels[:, 0] ** 2))), 3),
     "position_rms_in_noise_by_log": [round(float(v), 2) for v in entry.levels[:, 0]],
+    "state_follows_readings": ladder.problem.plant.follows,
   }

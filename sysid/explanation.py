@@ -74,6 +74,16 @@ def kinds_for(problem: Problem, null: Entry) -> list[Term]:
   ]
 
 
+def alone(
+  problem: Problem, calibration: Term, declared: Entry, null: Entry, *, effort: Effort
+) -> Ladder:
+  """Races single effects."""
+  library = kinds_for(problem, null)
+  start = null.fit.x
+  singles = race.run(problem, [calibration], library, start=start, finalists=effort.finalists)
+  return Ladder(problem, calibration, declared, null, singles, [])
+
+
 def climb(
   problem: Problem,
   calibration: Term,
@@ -84,10 +94,12 @@ def climb(
 ) -> Ladder:
   """Races single effects, then pairs where the best single one leaves something."""
   effort = effort or Effort()
-  library = kinds_for(problem, null)
-  start = null.fit.x
-  singles = race.run(problem, [calibration], library, start=start, finalists=effort.finalists)
-  ladder = Ladder(problem, calibration, declared, null, singles, [])
+  return together(alone(problem, calibration, declared, null, effort=effort), effort=effort)
+
+
+def together(ladder: Ladder, *, effort: Effort) -> Ladder:
+  """Races pairs and longer chains where the best single effect leaves something; returns them."""
+  singles = ladder.singles
   if race.above_floor(singles[0]) > effort.adequate:
     ladder.pairs = pairs(ladder, effort=effort)
     grow(ladder, effort=effort)

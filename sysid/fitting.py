@@ -18,11 +18,14 @@ from sysid.terms import Term, compose
 
 Array = np.ndarray
 
-_DIFFERENCE = 0.004  # of a value's scale; ours
+_DIFFERENCES = (0.004, 0.024)
+"""Steps of finite differences, of a value's scale: from fine to coarse, as friction is rough; ours."""
+_ROUGH = ("backlash",)
+_ROUGH_DIFFERENCES = (0.144, 0.024)
+"""The same of kinds whose courses do not repeat: from coarse to fine; ours."""
 _DAMPINGS = ((1e-6, 1.0), (1e-6, 0.3), (1e-6, 0.08), (1e-3, 1.0), (0.1, 1.0), (3.0, 1.0))
 """Dampings and shares of the step that are tried side by side."""
 _CONVERGED = 1e-4  # relative gain of a step at which a fit ends
-_COARSE = 6.0  # times the step of differences, where fine ones lead nowhere: friction is rough
 _THOROUGH = 20  # evaluations from which a fit that ended looks about before it stays
 _LOOKS = 3  # times it does so
 _SIZES = (0.4, 0.7, 1.4, 2.5)  # times a size that is looked at
@@ -94,6 +97,10 @@ class Problem:
   def masked(self, masks: Sequence[Array]) -> "Problem":
     """Returns the same problem on part of the samples."""
     return Problem(self.plant, masks=masks)
+
+  def following(self) -> "Problem":
+    """Returns the same problem with the state pulled towards the readings; see `JointPlant`."""
+    return Problem(self.plant.following(), masks=self.masks)
 
   def _effort_noise(self) -> float:
     if self.channel == "none":
@@ -222,7 +229,8 @@ class Problem:
   ) -> Fit:
     """Levenberg-Marquardt with bounds; several dampings are tried side by side."""
     x, count, cost = start, 0, float("inf")
-    steps, coarse = _DIFFERENCE * scale, False
+    widths = [width * scale for width in differences(terms)]
+    steps = widths.pop(0)
     while count < limit:
       signed = np.where(x + steps > high, -steps, steps)
       rows = self.residuals(terms, np.vstack([x, x + np.diag(signed)]))
@@ -247,11 +255,18 @@ class Problem:
       if gained > 0:
         x, cost = tried[best], float(costs[best])
       if gained < _CONVERGED * cost:
-        if coarse:
+        if not widths:
           break
-        steps, coarse = _COARSE * steps, True
+        steps = widths.pop(0)
     outputs = self.simulate(terms, x)[0]
     return Fit(tuple(terms), x, cost, self.effort_scale(outputs), count)
+
+
+def differences(terms: Sequence[Term]) -> tuple[float, float]:
+  """Returns the steps of finite differences of a hypothesis, of its values' scales: the second is
+  taken where the first leads nowhere."""
+  rough = any(term.kind in _ROUGH for term in terms)
+  return _ROUGH_DIFFERENCES if rough else _DIFFERENCES
 
 
 def steps_column(steps: Array, scale: Array) -> Array:

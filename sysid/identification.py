@@ -28,7 +28,7 @@ from sysid.common import WHOLE
 from sysid.decision import Thresholds
 from sysid.evaluation import Clocks
 from sysid.explanation import Effort, Ladder
-from sysid.joint import Found, gain_on_left_out, look_again, polished, race_joint
+from sysid.joint import Found, decide, gain_on_left_out, look_again, polished, race_joint
 from sysid.logs import Log, check_against_model, read_log
 from sysid.race import Entry
 from sysid.screening import Screened
@@ -178,7 +178,7 @@ def _without_contradictions(found: list[Found], settings: Settings) -> list[Foun
         ladder = item.ladder
         ladder.singles = [e for e in ladder.singles if kind not in decision.names(e)]
         ladder.pairs = [e for e in ladder.pairs if kind not in decision.names(e)]
-        item.finding = decision.decide(ladder, settings.thresholds)
+        item.finding = decide(ladder, item.thresholds)
   return found
 
 
@@ -206,7 +206,7 @@ def _others(found: list[Found], screened: list[Screened], settings: Settings) ->
       entries.append(race.entry(s.problem, s.problem.fit([s.calibration, term], start)))
     entries.sort(key=lambda e: e.score)
     ladder = Ladder(s.problem, s.calibration, s.declared, s.null, entries, [])
-    finding = decision.decide(ladder, settings.thresholds)
+    finding = decide(ladder, settings.thresholds)
     if finding.named:
       chance = detection.chance_gain(s.problem, s.null, entries, seed=settings.seed)
       result.append(Found(s, ladder, finding, chance, settings.thresholds))

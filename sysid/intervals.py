@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sysid.fitting import PRIOR_COUNT, Fit, Problem
+from sysid.fitting import PRIOR_COUNT, Fit, Problem, differences
 from sysid.kernel import INDEX
 from sysid.terms import Term
 
@@ -26,8 +26,7 @@ LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; o
 OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
 RUBS = 0.2  # of the declared dry friction; servos of one batch differ by that much; ours
 _DRY = ("torque", "positive", "negative")  # dry friction that is added to the declared one
-_GAP = (0.7, 3.0)  # times a gap; play that is rigid in the model imitates part of it only; ours
-_DIFFERENCE = 0.004  # of a value's scale; ours
+_GAP = (0.85, 1.35)  # times a gap, of which gears that give way take a part; ours, on blind sets
 _Z = 1.96
 
 
@@ -37,10 +36,10 @@ def covariance(problem: Problem, fit: Fit) -> Array:
   scale = np.concatenate([np.zeros(0), *[t.scale for t in terms]])
   low = np.concatenate([np.zeros(0), *[t.low for t in terms]])
   high = np.concatenate([np.zeros(0), *[t.high for t in terms]])
-  # Small and central: where two values do the same (damping and added friction), their derivatives
-  # must agree to a part in a thousand, or the difference looks like information.
-  above = np.minimum(fit.x + _DIFFERENCE * scale, high)
-  below = np.maximum(fit.x - _DIFFERENCE * scale, low)
+  # Small (but with play) and central: where two values do the same (damping and added friction),
+  # their derivatives must agree to a part in a thousand, or the difference looks like information.
+  width = differences(terms)[0] * scale
+  above, below = np.minimum(fit.x + width, high), np.maximum(fit.x - width, low)
   rows = problem.residuals(
     terms,
     np.vstack([fit.x, fit.x + np.diag(above - fit.x), fit.x + np.diag(below - fit.x)]),

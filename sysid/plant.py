@@ -3,6 +3,7 @@
 Shapes: N samples of a log, B parameter sets, P parameters (`kernel.NAMES`).
 """
 
+import copy
 import dataclasses
 import os
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,9 @@ Array = np.ndarray
 LONGEST_STEP = 2e-3
 """s; ours: a model with a longer step than this is simulated in parts of it."""
 
+
+FOLLOWED_S = 0.02
+"""s; ours: time in which a state that follows the readings makes up for a difference."""
 
 _SAME = 1e-6
 """Share of a range below which two readings differ by rounding of floating point alone."""
@@ -300,6 +304,25 @@ class JointPlant:
       self.surroundings = list(surroundings)
       self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
     self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
+
+  def following(self) -> "JointPlant":
+    """Returns the same joint with its simulated state pulled towards the readings.
+
+    Which way teeth bounce depends on microradians: the course of a joint with play does not repeat,
+    and a right model strays from it as a wrong one does. A state that follows the readings shows
+    what a model predicts from each on, by an alpha-beta filter (Benedict and Bordner 1962).
+    """
+    period = float(np.median(np.concatenate([np.diff(log.time) for log in self.logs])))
+    share = 1.0 - float(np.exp(-period / FOLLOWED_S))
+    clone = copy.copy(self)
+    speed = share**2 / (2.0 - share) / period
+    clone.declared = with_values(self.declared, {"follow": share, "follow_speed": speed})
+    return clone
+
+  @property
+  def follows(self) -> bool:
+    """Whether the simulated state is pulled towards the readings."""
+    return bool(self.declared[kernel.INDEX["follow"]] > 0)
 
   def scaled(self, factor: float) -> list[Surroundings]:
     """Returns `factor` times the surroundings: all masses changed by that share."""

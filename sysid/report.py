@@ -8,7 +8,7 @@ import numpy as np
 
 from scenes import report_parts as parts
 from suite.effects import Effect, kind_of
-from sysid import balance, charts, decision, evaluation, signatures
+from sysid import balance, charts, decision, evaluation, race, signatures
 from sysid.fitting import Fit
 from sysid.identification import Found, Identified
 from sysid.logs import Log
@@ -172,7 +172,7 @@ def _by_joint(found: Identified) -> str:
     noise = 1e3 * s.problem.position_noise
     names.append(s.joint)
     before.append(noise * float(np.sqrt(np.mean(s.declared.levels[:, 0] ** 2))))
-    levels = chosen.get(s.joint, s.null).levels
+    levels = race.levels(s.problem, chosen.get(s.joint, s.null).fit)
     after.append(noise * float(np.sqrt(np.mean(levels[:, 0] ** 2))))
   series = [("declared", charts.BEFORE, before), ("extended", charts.AFTER, after)]
   return charts.bars(

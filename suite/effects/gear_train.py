@@ -17,7 +17,7 @@ import numpy as np
 
 Array = np.ndarray
 
-PART = 1e-4
+PART = 2.5e-4
 """s, the longest part of a step; ours."""
 _PARTS_A_RADIAN = 4.0  # of the contact's oscillation; ours
 
