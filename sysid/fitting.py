@@ -19,7 +19,7 @@ from sysid.terms import Term, compose
 Array = np.ndarray
 
 _DIFFERENCES = (0.004, 0.024)
-"""Steps of finite differences, of a value's scale: from fine to coarse, as friction is rough; ours."""
+"""Steps of finite differences, of a value's scale: from fine to coarse, as friction is rough."""
 _ROUGH = ("backlash",)
 _ROUGH_DIFFERENCES = (0.144, 0.024)
 """The same of kinds whose courses do not repeat: from coarse to fine; ours."""
@@ -28,6 +28,8 @@ _DAMPINGS = ((1e-6, 1.0), (1e-6, 0.3), (1e-6, 0.08), (1e-3, 1.0), (0.1, 1.0), (3
 _CONVERGED = 1e-4  # relative gain of a step at which a fit ends
 _THOROUGH = 20  # evaluations from which a fit that ended looks about before it stays
 _LOOKS = 3  # times it does so
+_GENERATIONS, _DRAWN, _ELITE = 12, 40, 8  # of values that are drawn where costs are rough; ours
+_SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least; ours
 _SIZES = (0.4, 0.7, 1.4, 2.5)  # times a size that is looked at
 _MOVES = (-3.0, -1.0, 1.0, 3.0)  # scales about a value that may be negative
 _NINE_TENTHS = 0.79  # rms of the inner 90 % of a normal distribution over its own
@@ -193,7 +195,28 @@ class Problem:
         break
       fit = self._descend(terms, begin, low, high, scale, evaluations)
       best = fit if fit.cost < best.cost else best
+    if is_rough(terms) and evaluations >= _THOROUGH:
+      best = self._shake(best, low, high, scale)
     return best
+
+  def _shake(self, fit: Fit, low: Array, high: Array, scale: Array) -> Fit:
+    """Returns a fit improved by the cross-entropy method (Rubinstein 1999).
+
+    Where courses do not repeat, the cost is too rough for derivatives of any width.
+    """
+    random = np.random.default_rng(0)
+    mean, spread = fit.x.copy(), _SHAKEN * scale
+    best, cost = fit.x, fit.cost
+    for _ in range(_GENERATIONS):
+      drawn = np.clip(random.normal(mean, spread, (_DRAWN, len(mean))), low, high)
+      costs = 0.5 * np.sum(np.square(self.residuals(fit.terms, drawn)), axis=1)
+      order = np.argsort(costs)
+      if costs[order[0]] < cost:
+        best, cost = drawn[order[0]], float(costs[order[0]])
+      elite = np.vstack([best, drawn[order[:_ELITE]]])
+      mean, spread = elite.mean(axis=0), elite.std(axis=0) + _LEAST_SHAKEN * scale
+    scale_of = self.effort_scale(self.simulate(fit.terms, best)[0])
+    return Fit(fit.terms, best, cost, scale_of, fit.evaluations)
 
   def _look_about(self, fit: Fit, low: Array, high: Array, scale: Array) -> Array | None:
     """Returns values with one effect's value moved far that cost less, None if there are none.
@@ -262,11 +285,15 @@ class Problem:
     return Fit(tuple(terms), x, cost, self.effort_scale(outputs), count)
 
 
+def is_rough(terms: Sequence[Term]) -> bool:
+  """Tells whether a hypothesis has a kind whose courses do not repeat."""
+  return any(term.kind in _ROUGH for term in terms)
+
+
 def differences(terms: Sequence[Term]) -> tuple[float, float]:
   """Returns the steps of finite differences of a hypothesis, of its values' scales: the second is
   taken where the first leads nowhere."""
-  rough = any(term.kind in _ROUGH for term in terms)
-  return _ROUGH_DIFFERENCES if rough else _DIFFERENCES
+  return _ROUGH_DIFFERENCES if is_rough(terms) else _DIFFERENCES
 
 
 def steps_column(steps: Array, scale: Array) -> Array:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sysid.fitting import PRIOR_COUNT, Fit, Problem, differences
+from sysid.fitting import PRIOR_COUNT, Fit, Problem, differences, is_rough
 from sysid.kernel import INDEX
 from sysid.terms import Term
 
@@ -21,6 +21,7 @@ Array = np.ndarray
 BLOCK_S = 1.0  # s
 SYSTEMATIC = 2.0  # factor on standard deviations; ours, set on blind sets to cover 95 %
 RELATIVE = 0.009  # of a value; what no model of a joint holds: elastic gears, uneven teeth; ours
+BESIDE_PLAY = 0.025  # the same where a course does not repeat; ours
 PEAK = 0.08  # of friction at rest, which yields over a way no rigid model has; ours
 LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; ours
 OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
@@ -85,13 +86,22 @@ def intervals(problem: Problem, fit: Fit, kind: str) -> dict[str, tuple[float, f
       part = slice(at, at + len(term.names))
       dry = float(problem.plant.declared[INDEX["friction"]])
       alone = not fit.terms[0].centre
-      result = around(term, fit.x[part], spread[part], own_latency=alone, friction=dry)
+      share = BESIDE_PLAY if is_rough(fit.terms) else RELATIVE
+      result = around(
+        term, fit.x[part], spread[part], own_latency=alone, friction=dry, relative=share
+      )
     at += len(term.names)
   return result
 
 
 def around(
-  term: Term, x: Array, spread: Array, *, own_latency: bool = False, friction: float = 0.0
+  term: Term,
+  x: Array,
+  spread: Array,
+  *,
+  own_latency: bool = False,
+  friction: float = 0.0,
+  relative: float = RELATIVE,
 ) -> dict[str, tuple[float, float]]:
   """Returns 95 % intervals about values of a term.
 
@@ -102,13 +112,14 @@ def around(
     own_latency: whether nothing tells what latency the machine had before: then a delay is all
       that it has now, and its interval reaches down by what healthy machines have.
     friction: the declared dry friction, N m or N.
+    relative: share of a value that no model of the joint holds.
   """
   result = {}
   for name, value, sigma, lowest in zip(term.names, x, spread, term.low, strict=True):
     own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
     known = LATE if name == "delay" else 0.0
     known = RUBS * friction if name in _DRY and term.kind != "calibration" else known
-    share = PEAK if name == "breakaway" else RELATIVE
+    share = PEAK if name == "breakaway" else relative
     reach = _Z * float(np.sqrt(sigma**2 + (share * own) ** 2 + known**2))
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     low, high = max(value - reach - below, lowest), value + reach

@@ -287,9 +287,11 @@ def simulate(
         link = inertia[i] + armature - min(rotor, armature)
         if n == first_n:
           gap_offset = half if torque >= 0.0 else -half
+        on_motor_side = (1.0 - friction_on_link) * limit
         gap_offset, motor_speed, passed = gear_train.advance(
           gap_offset, motor_speed, v, link_freely, torque - back_emf * motor_speed,
-          damping - back_emf, (1.0 - friction_on_link) * limit, motor, link, half, tooth_stiffness, tooth_damping, step,
+          damping - back_emf, on_motor_side, motor, link, half, tooth_stiffness, tooth_damping,
+          step,
         )  # fmt: skip
         mass, force, slowed, dry = link, passed + passive, 0.0, friction_on_link * limit
       else:

@@ -303,7 +303,9 @@ def test_backlash_hysteresis_is_as_wide_as_the_gap():
   # Slow triangle, encoder on the motor: the link follows the motor with the play between them.
   ramp = np.linspace(0, 0.3, 1000)
   cycle = np.concatenate([ramp, ramp[::-1], -ramp, -ramp[::-1]])
-  effect = Effect("backlash", "hinge", {"gap": _GAP, "encoder_on_motor": 1.0, "friction_on_link": 1.0})
+  effect = Effect(
+    "backlash", "hinge", {"gap": _GAP, "encoder_on_motor": 1.0, "friction_on_link": 1.0}
+  )
   q, _, _, _ = _run(_geared(), [effect], np.tile(cycle, 2))
   second = q[4000:]
   nominal, _, _, _ = _run(_geared(), [], np.tile(cycle, 2))

@@ -102,19 +102,3 @@ def test_of_equal_explanations_the_usual_one_is_named() -> None:
   assert first(*pairs) == {"encoder_offset", "backlash"}  # two values fewer
   pairs = entry(0.5, "spring", "command_delay"), entry(0.51, "payload", "command_delay")
   assert first(*pairs) == {"payload", "command_delay"}
-
-
-def test_play_is_named_though_its_course_does_not_repeat() -> None:
-  def entry(score: float, level: float, *kinds: str):
-    terms = [SimpleNamespace(kind=k, names=("",)) for k in kinds]
-    levels = np.full((3, 1), level)
-    return SimpleNamespace(score=score, levels=levels, fit=SimpleNamespace(terms=terms, x=[0.0]))
-
-  play, thresholds = entry(1.2, 5.0, "backlash"), decision.Thresholds()
-  assert not decision.adequate(play, thresholds)
-  far, near = entry(1.4, 6.0, "motor_gain"), entry(1.25, 5.2, "motor_gain")
-  assert decision.is_play(play, [far], thresholds)
-  assert decision.is_play(play, [entry(1.21, 5.0, "backlash", "payload"), far], thresholds)
-  assert not decision.is_play(play, [near, far], thresholds)
-  assert not decision.is_play(near, [far], thresholds)
-  assert not decision.is_play(entry(2.7, 15.0, "backlash"), [], thresholds)  # too much is left
