@@ -28,7 +28,15 @@ from sysid.common import WHOLE
 from sysid.decision import Thresholds
 from sysid.evaluation import Clocks
 from sysid.explanation import Effort, Ladder
-from sysid.joint import Found, decide, gain_on_left_out, look_again, polished, race_joint
+from sysid.joint import (
+  Found,
+  decide,
+  gain_on_left_out,
+  look_again,
+  may_be_nothing,
+  polished,
+  race_joint,
+)
 from sysid.logs import Log, check_against_model, read_log
 from sysid.race import Entry
 from sysid.screening import Screened
@@ -223,8 +231,11 @@ def _conclude(result: Identified, settings: Settings) -> None:
   chosen = {s.joint: s.null for s in result.screened}
   for item in result.found:
     done = item.finding.verdict == "unexplained" and look_again(item)
-    fit_on = item.finding.named and not done
-    chosen[item.joint] = polished(item, spread) if fit_on else item.finding.chosen
+    entry = polished(item, spread) if item.finding.named and not done else item.finding.chosen
+    if item.finding.named and not done and may_be_nothing(item, entry):
+      item.finding = decision.unnamed(item.finding, item.ladder, item.thresholds)
+      entry = item.finding.chosen
+    chosen[item.joint] = entry
   for item in (f for f in result.found if f.finding.named):
     entry = chosen[item.joint]
     held_out = gain_on_left_out(item.ladder, entry)

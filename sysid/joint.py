@@ -2,7 +2,8 @@
 
 import dataclasses
 
-from sysid import decision, detection, elaboration, explanation, race
+from suite.effects import kind_of
+from sysid import decision, detection, elaboration, explanation, intervals, race
 from sysid.decision import Finding, Thresholds
 from sysid.explanation import Effort, Ladder
 from sysid.race import CLOCKS, Entry
@@ -129,6 +130,20 @@ def polished(item: Found, spread: float) -> Entry:
   as_declared[: len(terms[0].names)] = terms[0].starts[0]
   fits = [problem.fit(terms, x, evaluations=40) for x in (entry.fit.x, as_declared)]
   return race.entry(item.ladder.problem, min(fits, key=lambda f: f.cost))
+
+
+def may_be_nothing(item: Found, entry: Entry) -> bool:
+  """Tells whether the interval of an effect of one value holds the value that does nothing.
+
+  Effects of several values are not asked: a payload's mass may be open where its moment is sure.
+  """
+  for term in entry.fit.terms[1:]:
+    if len(term.names) == 1 and term.kind != "calibration":
+      nothing = kind_of(term.kind).parameter(term.names[0]).nominal
+      ((low, high),) = intervals.intervals(item.ladder.problem, entry.fit, term.kind).values()
+      if low <= nothing <= high:
+        return True
+  return False
 
 
 def look_again(item: Found) -> bool:

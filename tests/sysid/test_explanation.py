@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from suite.effects import Effect
-from sysid import candidates, decision, explanation, identification, race
+from sysid import candidates, decision, explanation, identification, joint, race
 from sysid.fitting import Problem
 from sysid.plant import JointPlant
 from tests.sysid.synthetic import PENDULUM, logs_of
@@ -102,3 +102,13 @@ def test_of_equal_explanations_the_usual_one_is_named() -> None:
   assert first(*pairs) == {"encoder_offset", "backlash"}  # two values fewer
   pairs = entry(0.5, "spring", "command_delay"), entry(0.51, "payload", "command_delay")
   assert first(*pairs) == {"payload", "command_delay"}
+
+
+@pytest.mark.parametrize(("gain", "expected"), [(1.0, True), (0.8, False)])
+def test_an_effect_that_may_be_nothing_is_told(gain: float, expected: bool) -> None:
+  problem = _problem(Effect("motor_gain", "joint", {"gain": gain}))
+  calibration, declared, null = explanation.bare(problem)
+  (term,) = _terms(problem, "motor_gain")
+  entry = race.entry(problem, problem.fit([calibration, term]))
+  ladder = explanation.Ladder(problem, calibration, declared, null, [entry], [])
+  assert joint.may_be_nothing(SimpleNamespace(ladder=ladder), entry) is expected
