@@ -102,8 +102,13 @@ def _with_play(
   )
   ladder = explanation.climb(problem, calibration, declared, null, effort=effort)
   found = _decided(screened, ladder, thresholds, seed=seed)
-  named = found.finding.verdict == "effects" and _PLAY in decision.names(found.finding.chosen)
-  return found if named else None
+  chosen = found.finding.chosen
+  if found.finding.verdict != "effects" or _PLAY not in decision.names(chosen):
+    return None
+  count = len(decision.names(chosen))
+  rivals = [e for e in [*ladder.singles, *ladder.pairs] if len(decision.names(e)) <= count]
+  without = [e for e in rivals if _PLAY not in decision.names(e)]
+  return found if all(e.score - chosen.score > thresholds.margin for e in without) else None
 
 
 def gain_on_left_out(ladder: Ladder, entry: Entry) -> float:
