@@ -97,6 +97,6 @@ def _readings(problem: Problem, entry: Entry, command: Array) -> Array:
   kernel.simulate(  # type: ignore[call-arg]
     p, plant.step, np.arange(len(command)) / _RATE, command, samples, *fields,  # type: ignore
     np.zeros(count), plant.hinge, np.array([0]), command[:1].copy(), np.zeros(1),
-    np.zeros((0, 0)), np.zeros(4), out[0], out[1], out[2], out[3],
+    np.full(len(samples), np.nan), np.zeros((0, 0)), np.zeros(4), out[0], out[1], out[2], out[3],
   )  # fmt: skip
   return out[0]

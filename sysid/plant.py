@@ -302,8 +302,7 @@ class JointPlant:
     self.declared = parameters.copy()
     if surroundings is not None:
       self.surroundings = list(surroundings)
-      self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
-    self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
+      self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
 
   def following(self) -> "JointPlant":
     """Returns the same joint with its simulated state pulled towards the readings.
