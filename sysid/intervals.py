@@ -27,7 +27,9 @@ LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; o
 OWN_LATENCY = 0.0025  # s; what a healthy machine may have of a delay that was found; ours
 RUBS = 0.2  # of the declared dry friction; servos of one batch differ by that much; ours
 _DRY = ("torque", "positive", "negative")  # dry friction that is added to the declared one
-_GAP = (0.85, 1.35)  # times a gap, of which gears that give way take a part; ours, on blind sets
+_PLAY = {"gap": (0.85, 1.35), "stiffness": (0.4, 2.5), "damping": (0.4, 2.5)}
+"""Times a value of play, the least of an interval: gears that give way take a part of the gap, and
+costs are too rough for derivatives to say how sure values are. Ours, on blind sets."""
 _Z = 1.96
 
 
@@ -123,7 +125,7 @@ def around(
     reach = _Z * float(np.sqrt(sigma**2 + (share * own) ** 2 + known**2))
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     low, high = max(value - reach - below, lowest), value + reach
-    if name == "gap":
-      low, high = min(low, _GAP[0] * value), max(high, _GAP[1] * value)
+    if term.kind == "backlash":
+      low, high = min(low, _PLAY[name][0] * value), max(high, _PLAY[name][1] * value)
     result[name] = (float(low), float(high))
   return result
