@@ -96,6 +96,11 @@ class Identified:
     return sorted(items, key=lambda f: -f.screened.excess)
 
   @property
+  def followed(self) -> list[Found]:
+    """The joints with named effects that were judged by a simulation that follows the readings."""
+    return [f for f in self.found if f.finding.named and f.ladder.problem.plant.follows]
+
+  @property
   def least_explained(self) -> Found:
     """The joint that stays unexplained and leaves most, else the one that was raced first."""
     return (self.unexplained or self.found)[0]

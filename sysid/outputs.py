@@ -102,6 +102,13 @@ def identify(
       *content["notes"],
       f"Not explained: {joints}. The effects that are named are those of other joints.",
     ]
+  if found.verdict == "effects" and found.followed:
+    joints = ", ".join(item.joint for item in found.followed)
+    content["notes"] = [
+      *content["notes"],
+      f"Found by a simulation that follows the readings, as courses with play do not repeat:"
+      f" {joints}. The errors before and after are of whole courses, which stray.",
+    ]
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(

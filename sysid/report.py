@@ -112,6 +112,10 @@ def _verdict(content: dict[str, Any]) -> str:
   return parts.section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], *blocks)
 
 
+_FOLLOWED = (
+  "The simulated state follows the readings here: courses with play do not repeat. Errors are of"
+  " what a model predicts from each reading on, so all hypotheses are nearer to the noise."
+)
 _HEADER = ["effect", "where", "parameter", "value", "95 % interval", "unit", "gain [nats]"]
 
 
@@ -270,6 +274,8 @@ def _ladder(found: Identified) -> str:
       label = " + ".join(sorted(names))
       rows.append([label, entry.score, ladder.declared.score - entry.score, mark])
     blocks.append(f"<h3>{html.escape(item.screened.joint)}</h3>")
+    if ladder.problem.plant.follows:
+      blocks.append(f"<p>{_FOLLOWED}</p>")
     blocks.append(parts.table(["hypothesis", "score [nats]", "gain [nats]", ""], rows))
     series = [("gain", charts.AFTER, [row[2] for row in rows])]
     blocks.append(charts.bars("gain over the declared model", "nats", series, [r[0] for r in rows]))
