@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs import JointSeries, Log
-from sysid.plant import fresh, quantum
+from sysid.measured import fresh, quantum
 from sysid.reduction import smooth_motion
 
 _GAP = 3.0  # median periods without a message that count as a gap

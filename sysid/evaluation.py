@@ -13,7 +13,8 @@ from mujoco import rollout
 
 from suite.effects import Effect, EffectStack
 from sysid.logs import Log
-from sysid.plant import actuator_of, fresh, holds_position
+from sysid.measured import fresh
+from sysid.plant import actuator_of, holds_position
 from sysid.reduction import smooth_motion, start_velocity
 
 Array = np.ndarray

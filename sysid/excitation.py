@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid import kernel
 from sysid.fitting import Problem
-from sysid.plant import quantum
+from sysid.measured import quantum
 from sysid.race import Entry
 from sysid.terms import compose
 

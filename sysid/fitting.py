@@ -13,7 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid.kernel import INDEX
-from sysid.plant import JointPlant, Output, quantum
+from sysid.measured import quantum
+from sysid.plant import JointPlant, Output
 from sysid.terms import Term, compose
 
 Array = np.ndarray

@@ -8,15 +8,13 @@ import numpy as np
 
 from scenes import report_parts as parts
 from suite.effects import Effect, kind_of
-from sysid import balance, charts, decision, evaluation, race, signatures
-from sysid.fitting import Fit
-from sysid.identification import Found, Identified
+from sysid import charts, decision, evaluation, race, residual_plots
+from sysid.identification import Identified
 from sysid.logs import Log
 
 Array = np.ndarray
 
 _FEW = 1e-9
-_WARMER = 1.0  # K by which a joint's temperature must change to be drawn
 _SHOWN = 3  # joints whose held-out overlays are shown
 _LADDER = 12  # hypotheses a joint
 _VERDICTS = {
@@ -26,7 +24,6 @@ _VERDICTS = {
   " sits is said below; a learned force lowers the error meanwhile where that is possible, and the"
   " ladder shows the candidates that came nearest.",
 }
-_NOTHING = Fit((), np.zeros(0), 0.0, 1.0, 0)
 
 
 def page(
@@ -51,12 +48,12 @@ def page(
   sections = [
     _verdict(content),
     _errors(found, content),
-    *[_residuals(item) for item in items[:_SHOWN]],
+    *[residual_plots.residuals(item) for item in items[:_SHOWN]],
     _ladder(found),
-    _where(content, details, _unit(found.least_explained)),
+    _where(content, details, residual_plots.unit_of(found.least_explained)),
   ]
   if held:
-    sections.append(_held(found, held, effects, items[:_SHOWN], window_s))
+    sections.append(residual_plots.held_out(found, held, effects, items[:_SHOWN], window_s))
   sections += [_joints(found), _next(content), _audit(details)]
   names = _summary(content["effects"])
   return parts.page(
@@ -82,10 +79,6 @@ def _summary(effects: Sequence[dict[str, Any]]) -> str:
 def _place(effect: dict[str, Any]) -> str:
   places = (effect["joint"], *(effect.get(noun) for noun in ("body", "geom", "sensor")))
   return next((place for place in places if place), "all")
-
-
-def _unit(item: Found) -> str:
-  return "mrad" if item.screened.problem.plant.hinge else "mm"
 
 
 def _verdict(content: dict[str, Any]) -> str:
@@ -158,7 +151,7 @@ def _errors(found: Identified, content: dict[str, Any]) -> str:
   rows.append(["noise of the readings", "", 1e3 * content["error"]["floor"], ""])
   window = content["window_s"]
   how = "whole logs" if window is None else f"windows of {window} s from the measured state"
-  units = sorted({_unit(f) for f in found.found})
+  units = sorted({residual_plots.unit_of(f) for f in found.found})
   text = f"RMSE of position in {' or '.join(units)}, simulated by MuJoCo over {how}."
   worse = [label for label, error in errors if error and evaluation.is_worse(error)]
   if worse:
@@ -181,66 +174,6 @@ def _by_joint(found: Identified) -> str:
   series = [("declared", charts.BEFORE, before), ("extended", charts.AFTER, after)]
   return charts.bars(
     "fitted logs by joint, the others prescribed", "RMS of position [mrad or mm]", series, names
-  )
-
-
-def _residuals(item: Found) -> str:
-  """Returns residuals, before and after, against what they may depend on."""
-  problem, unit = item.screened.problem, _unit(item)
-  after = item.finding.chosen.fit
-  hypotheses = (
-    (_NOTHING, "declared", charts.BEFORE),
-    (after, "extended", charts.AFTER),
-  )
-  figures = []
-  simulated = [problem.simulate(fit.terms, fit.x)[0] for fit, _, _ in hypotheses]
-  for index, log in enumerate(problem.plant.logs):
-    curves = [
-      (name, color, log.time, 1e3 * (log.position - outputs[index].position))
-      for (_, name, color), outputs in zip(hypotheses, simulated, strict=True)
-    ]
-    title = f"{log.name}: residual against time"
-    figures.append(charts.lines(title, "time [s]", f"position residual [{unit}]", curves))
-  for name in ("position", "velocity", "load", "temperature"):
-    figures.append(_against(item, hypotheses, name))
-  note = "" if any(figures[-1:]) else " These logs hold no temperatures of this joint that change."
-  return parts.section(
-    f"Residual of {item.screened.joint}, before and after",
-    "Against time: measured minus simulated position. Against the others: the torque that the"
-    " model lacks (what the measured motion demands by inverse dynamics, less what actuator and"
-    " friction give), medians and quartiles; a flat line at zero is a model that lacks nothing, a"
-    " step at zero velocity is dry friction, a slope over velocity is damping. Against temperature"
-    f" it counts along the actuator's: below zero is an actuator that weakens.{note}",
-    parts.grid([f for f in figures if f], 2),
-  )
-
-
-def _against(item: Found, hypotheses, name: str) -> str:
-  problem = item.screened.problem
-  curves = []
-  for fit, label, color in hypotheses:
-    x, y = [], []
-    for index, log in enumerate(problem.plant.logs):
-      r, missing = balance.missing_torque(problem, fit, index)
-      if name == "temperature":
-        if log.temperature is None:
-          return ""
-        x.append(log.temperature[signatures.EDGES : -signatures.EDGES])
-        missing = missing * np.sign(r.torque)
-      else:
-        x.append({"position": r.position, "velocity": r.velocity, "load": r.torque}[name])
-      y.append(missing)
-    if name == "temperature" and np.ptp(np.concatenate(x)) < _WARMER:
-      return ""
-    curves.append((label, color, np.concatenate(x), np.concatenate(y)))
-  hinge = problem.plant.hinge
-  torque = "N m" if hinge else "N"
-  length = "rad" if hinge else "m"
-  unit = {"position": length, "velocity": f"{length}/s", "load": torque, "temperature": "C"}[name]
-  what = "torque" if hinge else "force"
-  along = " along the actuator's" if name == "temperature" else ""
-  return charts.binned(
-    f"missing {what}{along} against {name}", f"{name} [{unit}]", f"{what} [{torque}]", curves
   )
 
 
@@ -321,42 +254,6 @@ def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> str:
     "<h3>Does it go with anything?</h3><p>Chance of as large a correlation of the whitened"
     " residual, by resampling blocks of a second; small numbers say yes.</p>",
     parts.table(["with", "declared", "extended"], checks),
-  )
-
-
-def _held(
-  found: Identified,
-  held: Sequence[Log],
-  effects: Sequence[Effect],
-  items: Sequence[Found],
-  window_s: float,
-) -> str:
-  figures = []
-  for log in held:
-    measured, time = log.states.position, log.states.stamp
-    assert measured is not None
-    before = evaluation.simulate(found.model, log, window_s=window_s)
-    after = evaluation.simulate(found.model, log, effects, clocks=found.clocks, window_s=window_s)
-    for item in items:
-      joint, unit = item.screened.joint, _unit(item)
-      column = log.states.column(joint)
-      pair = (
-        ("declared", charts.BEFORE, before[:, column]),
-        ("extended", charts.AFTER, after[:, column]),
-      )
-      curves = [(n, c, time, y) for n, c, y in pair]
-      curves = [("measured", charts.MEASURED, time, measured[:, column]), *curves]
-      length = "rad" if unit == "mrad" else "m"
-      figures.append(
-        charts.lines(f"{log.name}: {joint}", "time [s]", f"position [{length}]", curves)
-      )
-      errors = [(n, c, time, 1e3 * (measured[:, column] - y)) for n, c, y in pair]
-      title = f"{log.name}: {joint}, residual"
-      figures.append(charts.lines(title, "time [s]", f"residual [{unit}]", errors))
-  return parts.section(
-    "Logs that were not fitted",
-    "Measured and simulated positions; the commands alone drive the simulation.",
-    parts.grid(figures, 2),
   )
 
 

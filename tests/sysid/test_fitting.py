@@ -9,7 +9,8 @@ import pytest
 from suite.effects import Effect
 from sysid import candidates, detection, intervals, race
 from sysid.fitting import Problem, soft
-from sysid.plant import JointPlant, fresh, quantum
+from sysid.measured import fresh, quantum
+from sysid.plant import JointPlant
 from tests.sysid.synthetic import COUNT, PENDULUM, logs_of
 
 
