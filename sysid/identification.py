@@ -33,9 +33,8 @@ from sysid.joint import (
   decide,
   gain_on_left_out,
   look_again,
-  may_be_nothing,
-  polished,
   race_joint,
+  without_nothing,
 )
 from sysid.logs import Log, check_against_model, read_log
 from sysid.race import Entry
@@ -236,11 +235,8 @@ def _conclude(result: Identified, settings: Settings) -> None:
   chosen = {s.joint: s.null for s in result.screened}
   for item in result.found:
     done = item.finding.verdict == "unexplained" and look_again(item)
-    entry = polished(item, spread) if item.finding.named and not done else item.finding.chosen
-    if item.finding.named and not done and may_be_nothing(item, entry):
-      item.finding = decision.unnamed(item.finding, item.ladder, item.thresholds)
-      entry = item.finding.chosen
-    chosen[item.joint] = entry
+    fit_on = item.finding.named and not done
+    chosen[item.joint] = without_nothing(item, spread) if fit_on else item.finding.chosen
   for item in (f for f in result.found if f.finding.named):
     entry = chosen[item.joint]
     held_out = gain_on_left_out(item.ladder, entry)

@@ -105,6 +105,8 @@ def _with_play(
   chosen = found.finding.chosen
   if found.finding.verdict != "effects" or _PLAY not in decision.names(chosen):
     return None
+  if _PLAY in may_be_nothing(ladder, chosen):
+    return None
   count = len(decision.names(chosen))
   rivals = [e for e in [*ladder.singles, *ladder.pairs] if len(decision.names(e)) <= count]
   without = [e for e in rivals if _PLAY not in decision.names(e)]
@@ -137,18 +139,35 @@ def polished(item: Found, spread: float) -> Entry:
   return race.entry(item.ladder.problem, min(fits, key=lambda f: f.cost))
 
 
-def may_be_nothing(item: Found, entry: Entry) -> bool:
-  """Tells whether the interval of an effect of one value holds the value that does nothing.
+def may_be_nothing(ladder: Ladder, entry: Entry) -> frozenset[str]:
+  """Returns the kinds of a hypothesis whose size may be what does nothing, by its interval.
 
-  Effects of several values are not asked: a payload's mass may be open where its moment is sure.
+  Asked are kinds of one size (of play its gap): a payload's mass may be open where its moment is
+  sure.
   """
+  result = set()
   for term in entry.fit.terms[1:]:
-    if len(term.names) == 1 and term.kind != "calibration":
-      nothing = kind_of(term.kind).parameter(term.names[0]).nominal
-      ((low, high),) = intervals.intervals(item.ladder.problem, entry.fit, term.kind).values()
-      if low <= nothing <= high:
-        return True
-  return False
+    size = term.names[0]
+    if len(term.names) == 1 or term.kind == _PLAY:
+      low, high = intervals.intervals(ladder.problem, entry.fit, term.kind)[size]
+      if low <= kind_of(term.kind).parameter(size).nominal <= high:
+        result.add(term.kind)
+  return frozenset(result)
+
+
+def without_nothing(item: Found, spread: float) -> Entry:
+  """Returns the chosen hypothesis fitted to the end; effects that may be nothing are not named."""
+  entry = polished(item, spread)
+  nothing = may_be_nothing(item.ladder, entry)
+  if not nothing:
+    return entry
+  left = decision.names(entry) - nothing
+  others = [e for e in [*item.ladder.singles, *item.ladder.pairs] if decision.names(e) == left]
+  if left and others and decision.adequate(others[0], item.thresholds):
+    item.finding = dataclasses.replace(item.finding, chosen=others[0])
+    return polished(item, spread)
+  item.finding = decision.unnamed(item.finding, item.ladder, item.thresholds)
+  return item.finding.chosen
 
 
 def look_again(item: Found) -> bool:

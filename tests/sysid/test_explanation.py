@@ -104,11 +104,29 @@ def test_of_equal_explanations_the_usual_one_is_named() -> None:
   assert first(*pairs) == {"payload", "command_delay"}
 
 
-@pytest.mark.parametrize(("gain", "expected"), [(1.0, True), (0.8, False)])
-def test_an_effect_that_may_be_nothing_is_told(gain: float, expected: bool) -> None:
+@pytest.mark.parametrize(("gain", "expected"), [(1.0, {"motor_gain"}), (0.8, set())])
+def test_an_effect_that_may_be_nothing_is_told(gain: float, expected: set[str]) -> None:
   problem = _problem(Effect("motor_gain", "joint", {"gain": gain}))
   calibration, declared, null = explanation.bare(problem)
   (term,) = _terms(problem, "motor_gain")
   entry = race.entry(problem, problem.fit([calibration, term]))
   ladder = explanation.Ladder(problem, calibration, declared, null, [entry], [])
-  assert joint.may_be_nothing(SimpleNamespace(ladder=ladder), entry) is expected
+  assert joint.may_be_nothing(ladder, entry) == expected
+
+
+def test_of_two_effects_the_one_that_may_be_nothing_goes() -> None:
+  problem = _problem(Effect("coulomb_friction", "joint", {"torque": 0.2}))
+  calibration, declared, null = explanation.bare(problem)
+  friction, play = _terms(problem, "coulomb_friction", "backlash")
+  single = race.entry(problem, problem.fit([calibration, friction]))
+  start = np.concatenate([single.fit.x, play.starts[0]])
+  pair = race.entry(problem, problem.fit([calibration, friction, play], start, evaluations=30))
+  assert "backlash" in joint.may_be_nothing(
+    explanation.Ladder(problem, calibration, declared, null, [single], [pair]), pair
+  )
+  ladder = explanation.Ladder(problem, calibration, declared, null, [single], [pair])
+  finding = decision.Finding("effects", pair, True, False, [], [])
+  item = joint.Found(None, ladder, finding, {}, decision.Thresholds())
+  kept = joint.without_nothing(item, 0.06)
+  assert decision.names(kept) == {"coulomb_friction"}
+  assert item.finding.verdict == "effects"
