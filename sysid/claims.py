@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from suite.effects import Effect
+from suite.effects import Effect, kind_of
 from sysid import decision, intervals
 from sysid.common import WHOLE, Shared
 from sysid.joint import Found
@@ -14,6 +14,8 @@ from sysid.terms import Term
 
 Claim = tuple[Effect, dict[str, Any]]
 """An effect and its entry in the report."""
+
+_NOTHING = 1e-9  # of a size
 
 
 def effect(item: Found, entry: Entry, term: Term, held_out: float) -> Claim:
@@ -41,6 +43,13 @@ def effect(item: Found, entry: Entry, term: Term, held_out: float) -> Claim:
     },
   }
   return found, row
+
+
+def is_idle(entry: Entry, term: Term) -> bool:
+  """Tells whether an effect of a hypothesis has the sizes that do nothing."""
+  sizes = [p for p in kind_of(term.kind).parameters if p.name in term.names and not p.shape]
+  values = entry.fit.values(term.kind)
+  return all(abs(values[p.name] - p.nominal) < _NOTHING for p in sizes)
 
 
 def whole(shared: Shared) -> Claim:

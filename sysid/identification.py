@@ -241,7 +241,7 @@ def _conclude(result: Identified, settings: Settings) -> None:
     entry = chosen[item.joint]
     held_out = gain_on_left_out(item.ladder, entry)
     for term in entry.fit.terms:
-      if term.kind != "calibration":
+      if term.kind != "calibration" and not claims.is_idle(entry, term):
         claim = claims.effect(item, entry, term, held_out)
         _claim(result, claim, sure=item.finding.verdict != "unexplained")
   off: list[dict[str, Any]] = []

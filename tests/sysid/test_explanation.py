@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from suite.effects import Effect
-from sysid import candidates, decision, explanation, identification, joint, race
-from sysid.fitting import Problem
+from sysid import candidates, claims, decision, explanation, identification, joint, race
+from sysid.fitting import Fit, Problem
 from sysid.plant import JointPlant
 from tests.sysid.synthetic import PENDULUM, logs_of
 
@@ -130,3 +130,17 @@ def test_of_two_effects_the_one_that_may_be_nothing_goes() -> None:
   kept = joint.without_nothing(item, 0.06)
   assert decision.names(kept) == {"coulomb_friction"}
   assert item.finding.verdict == "effects"
+
+
+def test_an_effect_of_no_size_is_idle() -> None:
+  problem = _problem()
+  calibration, _, null = explanation.bare(problem)
+  payload, friction = _terms(problem, "payload", "asymmetric_friction")
+
+  def entry(term, values: list[float]):
+    x = np.concatenate([null.fit.x, values])
+    return race.entry(problem, Fit((calibration, term), x, 0.0, 1.0, 0))
+
+  assert claims.is_idle(entry(payload, [0.0, 0.1, 0.0, -0.1]), payload)
+  assert not claims.is_idle(entry(payload, [0.1, 0.0, 0.0, 0.0]), payload)
+  assert not claims.is_idle(entry(friction, [0.0, 0.1]), friction)
