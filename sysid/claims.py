@@ -49,7 +49,7 @@ def is_idle(entry: Entry, term: Term) -> bool:
   """Tells whether an effect of a hypothesis has the sizes that do nothing."""
   sizes = [p for p in kind_of(term.kind).parameters if p.name in term.names and not p.shape]
   values = entry.fit.values(term.kind)
-  return all(abs(values[p.name] - p.nominal) < _NOTHING for p in sizes)
+  return bool(sizes) and all(abs(values[p.name] - p.nominal) < _NOTHING for p in sizes)
 
 
 def whole(shared: Shared) -> Claim:
