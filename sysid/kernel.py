@@ -282,7 +282,7 @@ def simulate(
       back_emf = 0.0
       if outer * lowest < torque < outer * highest:
         back_emf = strength * per_v
-      if half > 0.0:  # a motor of its own; all friction of the gear train sits there
+      if half > 0.0:  # a motor of its own
         motor = rotor if rotor > 0.0 else ROTOR_WITHOUT_ARMATURE * inertia[i]
         link = inertia[i] + armature - min(rotor, armature)
         if n == first_n:
