@@ -27,7 +27,7 @@ from sysid.audit import audit
 from sysid.common import WHOLE
 from sysid.decision import Thresholds
 from sysid.evaluation import Clocks
-from sysid.explanation import Effort, Ladder
+from sysid.explanation import Effort, Ladder, even_out
 from sysid.joint import (
   Found,
   decide,
@@ -218,6 +218,7 @@ def _others(found: list[Found], screened: list[Screened], settings: Settings) ->
       entries.append(race.entry(s.problem, s.problem.fit([s.calibration, term], start)))
     entries.sort(key=lambda e: e.score)
     ladder = Ladder(s.problem, s.calibration, s.declared, s.null, entries, [])
+    even_out(ladder)
     finding = decide(ladder, settings.thresholds)
     if finding.named:
       chance = detection.chance_gain(s.problem, s.null, entries, seed=settings.seed)
