@@ -163,11 +163,17 @@ def without_nothing(item: Found, spread: float) -> Entry:
     return entry
   left = decision.names(entry) - nothing
   others = [e for e in [*item.ladder.singles, *item.ladder.pairs] if decision.names(e) == left]
-  if left and others and decision.adequate(others[0], item.thresholds):
+  if left and others and _stands(item, others[0]):
     item.finding = dataclasses.replace(item.finding, chosen=others[0])
     return polished(item, spread)
   item.finding = decision.unnamed(item.finding, item.ladder, item.thresholds)
   return item.finding.chosen
+
+
+def _stands(item: Found, entry: Entry) -> bool:
+  """Tells whether a hypothesis explains a joint and gains on left-out blocks, as names must."""
+  enough = gain_on_left_out(item.ladder, entry) >= item.thresholds.gain
+  return enough and decision.adequate(entry, item.thresholds)
 
 
 def look_again(item: Found) -> bool:

@@ -130,6 +130,10 @@ def test_of_two_effects_the_one_that_may_be_nothing_goes() -> None:
   kept = joint.without_nothing(item, 0.06)
   assert decision.names(kept) == {"coulomb_friction"}
   assert item.finding.verdict == "effects"
+  # What stays must gain enough by itself.
+  item = joint.Found(None, ladder, finding, {}, decision.Thresholds(gain=10.0))
+  assert not decision.names(joint.without_nothing(item, 0.06))
+  assert not item.finding.named
 
 
 def test_an_effect_of_no_size_is_idle() -> None:
