@@ -24,12 +24,12 @@ import rich.console
 import rich.table
 import tyro
 
-from real.virtual import filming, yardstick
-from scenes import train
-from scenes.fused import FusedField
-from scenes.image_quality import psnr, ssim
-from scenes.similarity import Similarity
-from scenes.views import Views
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.builtin import filming, yardstick
+from nerf2real.scenes.field import training as train
+from nerf2real.scenes.field.fused.trainer import FusedField
+from nerf2real.scenes.field.views import Views
+from nerf2real.scenes.quality.image_quality import psnr, ssim
 
 SIZES = ((30, 40), (60, 80))  # picture sizes [H, W] of the policies
 _UNIT = 2.6  # metres of the built-in room that make a unit: all of it lies in the unit cube
@@ -126,8 +126,11 @@ def main(settings: Settings) -> None:
       train.preset("fast"), max_seconds=settings.seconds, blur_max=blur_max
     )
     field, report = train.train(training, chosen, seed=settings.seed)
-    runs[name] = {"steps": report.steps, "seconds": round(report.seconds, 1),
-                  "samples_per_second": round(report.samples_per_second)}  # fmt: skip
+    runs[name] = {
+      "steps": report.steps,
+      "seconds": round(report.seconds, 1),
+      "samples_per_second": round(report.samples_per_second),
+    }
     speed = report.samples_per_second / 1e6
     console.print(f"{name}: {report.steps} steps, {speed:.2f} M samples/s")
     evaluator = FusedField(field, settings=chosen)
@@ -152,9 +155,13 @@ def main(settings: Settings) -> None:
   console.print(table)
   settings.out.parent.mkdir(parents=True, exist_ok=True)
   record = {
-    "date": datetime.date.today().isoformat(), "machine": platform.processor() or "unknown",
-    "seconds": settings.seconds, "runs": runs, "figures": columns, "gain_db": gains,
-  }  # fmt: skip
+    "date": datetime.date.today().isoformat(),
+    "machine": platform.processor() or "unknown",
+    "seconds": settings.seconds,
+    "runs": runs,
+    "figures": columns,
+    "gain_db": gains,
+  }
   settings.out.write_text(json.dumps(record, indent=1))
   console.print(f"kept in {settings.out}")
 

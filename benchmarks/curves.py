@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from agents.dmpo.checkpoints import read_info
+from nerf2real.agents.processes.checkpoints import read_info
 
 WIDTH, HEIGHT = 960, 540  # pixels
 LEFT, RIGHT, TOP, BOTTOM = 80, 20, 60, 60  # margins [pixels]
@@ -36,23 +36,34 @@ def read_run(folder: Path) -> dict[str, Any]:
   last = rows[-1]
   return {
     "about": {
-      "row": "run", "command": launches[0]["command"], "launches": len(launches),
-      "environment": info.get("environment"), "seed": info.get("seed"),
-      "processor": launches[0]["processor"], "cores": launches[0]["cores"],
-      "seconds": round(seconds), "steps": last["steps"], "updates": last["updates"],
+      "row": "run",
+      "command": launches[0]["command"],
+      "launches": len(launches),
+      "environment": info.get("environment"),
+      "seed": info.get("seed"),
+      "processor": launches[0]["processor"],
+      "cores": launches[0]["cores"],
+      "seconds": round(seconds),
+      "steps": last["steps"],
+      "updates": last["updates"],
       "steps_per_second": round(last["steps"] / max(seconds, 1e-9), 1),
       "updates_per_second": round(last["updates"] / max(seconds, 1e-9), 2),
       "settings": info.get("config"),
     },
     "evaluations": [
-      {"row": "evaluation", "steps": r["steps"], "seconds": round(r["time"] - launches[0]["time"]),
-       "return": round(r["return"], 2), "episodes": r["episodes"]}
+      {
+        "row": "evaluation",
+        "steps": r["steps"],
+        "seconds": round(r["time"] - launches[0]["time"]),
+        "return": round(r["return"], 2),
+        "episodes": r["episodes"],
+      }
       | {k: round(r[k], 3) for k in ("success", "localisation_error") if r.get(k) is not None}
       for r in evaluations
     ],
     "acting": _blocks(episodes, "return"),
     "localisation": _blocks(episodes, "localisation_error"),
-  }  # fmt: skip
+  }
 
 
 def _span(times: list[float], launches: list[dict[str, Any]], index: int) -> float:
@@ -68,10 +79,14 @@ def _blocks(episodes: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     return []
   groups = np.array_split(np.array(found), min(BLOCKS, len(found)))
   return [
-    {"row": f"acting {name}", "steps": int(g[-1, 0]), "mean": round(float(g[:, 1].mean()), 3),
-     "episodes": len(g)}
+    {
+      "row": f"acting {name}",
+      "steps": int(g[-1, 0]),
+      "mean": round(float(g[:, 1].mean()), 3),
+      "episodes": len(g),
+    }
     for g in groups
-  ]  # fmt: skip
+  ]
 
 
 def draw(
@@ -173,9 +188,11 @@ def main() -> None:
   for run in runs:
     best = max((r["return"] for r in run["evaluations"]), default=float("nan"))
     about = run["about"]
-    print(f"seed {about['seed']}: best {best:.1f}, {about['steps']:,} steps in "
-          f"{about['seconds'] / 60:.1f} min ({about['steps_per_second']} steps/s, "
-          f"{about['updates_per_second']} updates/s)")  # fmt: skip
+    print(
+      f"seed {about['seed']}: best {best:.1f}, {about['steps']:,} steps in "
+      f"{about['seconds'] / 60:.1f} min ({about['steps_per_second']} steps/s, "
+      f"{about['updates_per_second']} updates/s)"
+    )
 
 
 if __name__ == "__main__":

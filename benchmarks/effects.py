@@ -10,7 +10,7 @@ import time
 import mujoco
 import numpy as np
 
-from suite.effects import KINDS, Effect, EffectStack
+from nerf2real.suite.effects import KINDS, Effect, EffectStack
 
 NUM_JOINTS = 20
 STEPS = 2000

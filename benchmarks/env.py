@@ -27,9 +27,9 @@ import numpy as np
 import tyro
 from dm_control import suite as dm_suite
 
-import suite
-from suite import loading
-from suite.camera import world_from_camera
+from nerf2real import suite
+from nerf2real.suite import loading
+from nerf2real.suite.pictures.camera import world_from_camera
 
 SIZES = ((30, 40), (60, 80))
 _RESETS = 3  # timed after every turn
@@ -162,10 +162,11 @@ def main(settings: Settings) -> None:
   bundle = loading.open_scene(settings.scene)
   renderer = loading.load_renderer(bundle)
   variants = [
-    robot_variant(f"{settings.task}, {h}x{w}", settings, bundle, image_size=(h, w),
-                  renderer=renderer)
+    robot_variant(
+      f"{settings.task}, {h}x{w}", settings, bundle, image_size=(h, w), renderer=renderer
+    )
     for h, w in SIZES
-  ]  # fmt: skip
+  ]
   variants.append(robot_variant(f"{settings.task}, no camera", settings, bundle, image_size=None))
   if settings.humanoid:
     variants.append(humanoid_variant("dm_control humanoid, 30x40", fast=False))
@@ -181,16 +182,23 @@ def main(settings: Settings) -> None:
       variant.turn(settings.steps)
   load.append(os.getloadavg()[0])
   figures = {variant.name: summary(variant) for variant in variants}
-  pictures = {f"{h}x{w}": picture_parts(variant)
-              for variant, (h, w) in zip(variants, SIZES, strict=False)}  # fmt: skip
-  print(f"{processor()}, one core, {settings.rounds} turns of {settings.steps} steps; "
-        f"load of the machine {load[0]:.1f} to {load[1]:.1f}")  # fmt: skip
-  print(f"{'':28s}{'steps/s':>9s}{'by CPU time':>13s}{'median ms':>11s}{'CPU ms':>9s}"
-        f"{'reset CPU ms':>14s}")  # fmt: skip
+  pictures = {
+    f"{h}x{w}": picture_parts(variant) for variant, (h, w) in zip(variants, SIZES, strict=False)
+  }
+  print(
+    f"{processor()}, one core, {settings.rounds} turns of {settings.steps} steps; "
+    f"load of the machine {load[0]:.1f} to {load[1]:.1f}"
+  )
+  print(
+    f"{'':28s}{'steps/s':>9s}{'by CPU time':>13s}{'median ms':>11s}{'CPU ms':>9s}"
+    f"{'reset CPU ms':>14s}"
+  )
   for name, row in figures.items():
-    print(f"{name:28s}{row['steps_per_s']:9.0f}{row['steps_per_s_by_processor_time']:13.0f}"
-          f"{row['median_ms']:11.2f}{row['processor_median_ms']:9.2f}"
-          f"{row['reset_processor_ms']:14.2f}")  # fmt: skip
+    print(
+      f"{name:28s}{row['steps_per_s']:9.0f}{row['steps_per_s_by_processor_time']:13.0f}"
+      f"{row['median_ms']:11.2f}{row['processor_median_ms']:9.2f}"
+      f"{row['reset_processor_ms']:14.2f}"
+    )
   for size, parts in pictures.items():
     listed = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in parts.items())
     print(f"{size} picture, CPU ms: {listed}")

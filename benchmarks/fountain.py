@@ -17,9 +17,9 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from scenes.capture import read_capture
-from scenes.localise import Localisation, localise
-from scenes.similarity import Similarity
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.capture.capture import read_capture
+from nerf2real.scenes.poses.localise import Localisation, localise
 
 MAX_POSITION_RMSE = 0.01  # [m]
 MAX_ROTATION_RMSE = 0.1  # [degree]
@@ -117,16 +117,28 @@ def main(data: Path) -> int:
   complete = result.registered_fraction == 1.0
   rows = (
     ("registered pictures", f"{result.registered_fraction:.0%}", "100%", complete),
-    ("position RMSE [mm]", f"{1e3 * errors.position_rmse:.2f}", f"{1e3 * MAX_POSITION_RMSE:.0f}",
-     errors.position_rmse <= MAX_POSITION_RMSE),
+    (
+      "position RMSE [mm]",
+      f"{1e3 * errors.position_rmse:.2f}",
+      f"{1e3 * MAX_POSITION_RMSE:.0f}",
+      errors.position_rmse <= MAX_POSITION_RMSE,
+    ),
     ("position, largest [mm]", f"{1e3 * errors.position.max():.2f}", "", True),
-    ("rotation RMSE [degree]", f"{errors.rotation_rmse:.4f}", f"{MAX_ROTATION_RMSE}",
-     errors.rotation_rmse <= MAX_ROTATION_RMSE),
-    ("rotation, largest [degree]", f"{errors.rotation.max():.4f}", f"{MAX_ROTATION_RMSE}",
-     errors.rotation.max() <= MAX_ROTATION_RMSE),
+    (
+      "rotation RMSE [degree]",
+      f"{errors.rotation_rmse:.4f}",
+      f"{MAX_ROTATION_RMSE}",
+      errors.rotation_rmse <= MAX_ROTATION_RMSE,
+    ),
+    (
+      "rotation, largest [degree]",
+      f"{errors.rotation.max():.4f}",
+      f"{MAX_ROTATION_RMSE}",
+      errors.rotation.max() <= MAX_ROTATION_RMSE,
+    ),
     ("reprojection error [px]", f"{result.reprojection_error_px:.3f}", "", True),
     ("wall time [s]", f"{seconds:.1f}", "", True),
-  )  # fmt: skip
+  )
   print(f"fountain-P11: {result.strategy}")
   print(f"{'figure':<28}{'found':>10}{'at most':>10}")
   for name, found, limit, passed in rows:

@@ -26,16 +26,15 @@ import mujoco
 import numpy as np
 import tyro
 
-import real
-import suite
-from real.virtual.body import Truth
-from real.virtual.robot import LENS, VirtualRobot
-from scenes.image_quality import psnr
-from suite.camera import CameraSettings
-from suite.gaits.walk import Command, Gait
-from suite.op3 import constants
-from suite.randomisation import RandomisationSettings
-from suite.tasks.base import Start
+from nerf2real import real, suite
+from nerf2real.real.virtual.body import Truth
+from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.scenes.quality.image_quality import psnr
+from nerf2real.suite.gaits.walk import Command, Gait
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.pictures.camera import CameraSettings
+from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.tasks.base import Start
 
 _STEP = constants.CONTROL_TIMESTEP
 _LEG_SWAY, _ARM_SWAY = 0.05, 0.2  # rad
@@ -83,8 +82,9 @@ def sway_actions(count: int, seed: int) -> np.ndarray:
   lower, upper = constants.joint_limits()
   middle, half = (lower + upper) / 2, (upper - lower) / 2
   standing = (constants.standing_targets() - middle) / half
-  upper_body = [name.startswith(("head", "l_sho", "r_sho", "l_el", "r_el"))
-                for name in constants.JOINT_NAMES]  # fmt: skip
+  upper_body = [
+    name.startswith(("head", "l_sho", "r_sho", "l_el", "r_el")) for name in constants.JOINT_NAMES
+  ]
   amplitude = np.where(upper_body, _ARM_SWAY, _LEG_SWAY) / half
   frequency, phase = rng.uniform(0.3, 1.2, 20), rng.uniform(0, 2 * np.pi, 20)
   time = _STEP * np.arange(count)[:, None]
@@ -106,10 +106,15 @@ def _collect(timestep: Any, rows: dict[str, list]) -> None:
 
 def _trace(rows: dict[str, list], places: list, pictures: dict, same: dict, fell: bool) -> Trace:
   return Trace(
-    joints=np.array(rows["joint_positions"]), gyroscope=np.array(rows["gyroscope"]),
-    accelerometer=np.array(rows["accelerometer"]), gravity=np.array(rows["gravity"]),
-    place=np.array(places), pictures=pictures, same_pose=same, fell=fell,
-  )  # fmt: skip
+    joints=np.array(rows["joint_positions"]),
+    gyroscope=np.array(rows["gyroscope"]),
+    accelerometer=np.array(rows["accelerometer"]),
+    gravity=np.array(rows["gravity"]),
+    place=np.array(places),
+    pictures=pictures,
+    same_pose=same,
+    fell=fell,
+  )
 
 
 def _new_rows() -> dict[str, list]:
@@ -122,9 +127,14 @@ class Simulation:
   def __init__(self, settings: Settings):
     size = (30, 40) if settings.picture_steps else None
     self.environment = suite.load(
-      "nerf_nav", image_size=size, random=0, randomisation=_NOMINAL, privileged=False,
-      camera=CameraSettings(lens=LENS), time_limit=settings.seconds + 1.0,
-    )  # fmt: skip
+      "nerf_nav",
+      image_size=size,
+      random=0,
+      randomisation=_NOMINAL,
+      privileged=False,
+      camera=CameraSettings(lens=LENS),
+      time_limit=settings.seconds + 1.0,
+    )
     x, y, yaw = settings.start
     self.environment.task.set_start(Start((x, y), yaw))
     self._data = mujoco.MjData(self.environment.physics.model.ptr)
@@ -169,9 +179,11 @@ def run_virtual(
   camera = settings.picture_steps > 0
   with VirtualRobot(world="room", seed=seed, stepped=True, camera=camera) as robot:
     environment = real.load(
-      "nerf_nav", robot=robot.connection(), image_size=(30, 40) if camera else None,
+      "nerf_nav",
+      robot=robot.connection(),
+      image_size=(30, 40) if camera else None,
       time_limit=settings.seconds + 1.0,
-    )  # fmt: skip
+    )
     with environment:
       for name, motion in actions.items():
         robot.place(*settings.start)
@@ -204,8 +216,9 @@ def compare(simulated: Trace, virtual: Trace) -> dict[str, float]:
   """Returns the figures of one motion on one robot; lengths differ only after a fall."""
   count = min(len(simulated.joints), len(virtual.joints))
   joints = np.rad2deg(_rms(simulated.joints[:count] - virtual.joints[:count]))
-  figures = {f"{name} [deg]": float(v)
-             for name, v in zip(constants.JOINT_NAMES, joints, strict=True)}  # fmt: skip
+  figures = {
+    f"{name} [deg]": float(v) for name, v in zip(constants.JOINT_NAMES, joints, strict=True)
+  }
   figures["all joints, mean [deg]"] = float(joints.mean())
   for name, unit in (("gyroscope", "rad/s"), ("accelerometer", "m/s^2")):
     difference = _rms(getattr(simulated, name)[:count] - getattr(virtual, name)[:count])

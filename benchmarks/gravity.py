@@ -19,14 +19,13 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import numpy as np
 import tyro
 
-import real
-import suite
-from real.motion import RobotSettings
-from real.virtual.robot import VirtualRobot
-from suite.gaits.floor import EmptyFloor
-from suite.gaits.walk import Command, Gait
-from suite.randomisation import RandomisationSettings
-from suite.tasks.base import Start
+from nerf2real import real, suite
+from nerf2real.real.loop.motion import RobotSettings
+from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.suite.gaits.floor import EmptyFloor
+from nerf2real.suite.gaits.walk import Command, Gait
+from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.tasks.base import Start
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2
 
@@ -72,9 +71,13 @@ def rehearsed(seed: int, seconds: float, *, zeroed: bool, endless: bool) -> tupl
   settings = RobotSettings() if zeroed else RobotSettings(rest_time=0.0)
   with VirtualRobot(seed=seed, stepped=True) as robot:
     environment = real.load(
-      "nerf_nav", robot=robot.connection(), image_size=None, scene=EmptyFloor(), time_limit=seconds,
+      "nerf_nav",
+      robot=robot.connection(),
+      image_size=None,
+      scene=EmptyFloor(),
+      time_limit=seconds,
       settings=settings,
-    )  # fmt: skip
+    )
     sensing, line, peak = environment._cycle.sensing, robot.devices.board._line, [0.0]
     take = sensing.take_imu
 
@@ -101,9 +104,14 @@ def main(settings: Settings) -> None:
       print(errors.row(f"virtual robot {seed}{name}"), flush=True)
       peaks.append(peak)
   environment = suite.load(
-    "nerf_nav", scene=EmptyFloor(), image_size=None, random=0, time_limit=settings.seconds,
-    randomisation=RandomisationSettings(pushes=False), privileged=False,
-  )  # fmt: skip
+    "nerf_nav",
+    scene=EmptyFloor(),
+    image_size=None,
+    random=0,
+    time_limit=settings.seconds,
+    randomisation=RandomisationSettings(pushes=False),
+    privileged=False,
+  )
   task = environment.task
   task.set_start(Start((0.0, 0.0), 0.0))
   for episode in range(settings.episodes):

@@ -115,10 +115,13 @@ def _analyse(settings: Settings, name: str) -> tuple[dict[str, Any], dict[str, f
   report: dict[str, Any] = {}
   try:
     result = subprocess.run(
-      [*command, "--out", str(out)], capture_output=True, text=True, timeout=settings.timeout,
+      [*command, "--out", str(out)],
+      capture_output=True,
+      text=True,
+      timeout=settings.timeout,
       check=False,
       env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
+    )
     if result.returncode:
       lines = result.stderr.strip().splitlines() or ["no message"]
       report = {"failed": lines[-1]}

@@ -20,14 +20,14 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-import real
-from real.recorder import Recorder
-from real.virtual.robot import LENS, VirtualRobot
-from suite.op3 import constants
-from suite.op3.op3 import OP3
-from sysid import floor, sensing
-from sysid.logs import read_log
-from sysid.sensed import Part
+from nerf2real import real
+from nerf2real.core.robot_logs.reading import read_log
+from nerf2real.real.recorder.recorder import Recorder
+from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.op3.op3 import OP3
+from nerf2real.sysid.sensors import floor, sensing
+from nerf2real.sysid.sensors.sensed import Part
 
 _STEP = constants.CONTROL_TIMESTEP
 _LATE, _SCALE, _GAIN = 0.04, 1.08, 0.5
@@ -111,9 +111,12 @@ def film(
     with Recorder(path) as recorder:
       gate = Gate(recorder)
       with real.load(
-        "nerf_nav", robot=connection, image_size=(30, 40), recorder=gate,
+        "nerf_nav",
+        robot=connection,
+        image_size=(30, 40),
+        recorder=gate,
         time_limit=(lifting + len(actions)) * _STEP + 1.0,
-      ) as environment:  # fmt: skip
+      ) as environment:
         environment.reset()
         robot.hold(True)
         for index, action in enumerate([*np.repeat(actions[:1], lifting, axis=0), *actions]):
@@ -175,13 +178,14 @@ def standing_model() -> mujoco.MjModel:
 def found(parts: dict[str, Part], *names: str) -> str:
   """Returns what parts of a finding name, in a line."""
   texts = [
-    f"{row['kind']} " + ", ".join(
+    f"{row['kind']} "
+    + ", ".join(
       f"{name} {p['value']:.4f} ({p['low']:.4f} to {p['high']:.4f})"
       for name, p in row["parameters"].items()
     )
     for name in names
     for row in (parts[name].rows if name in parts else ())
-  ]  # fmt: skip
+  ]
   return "; ".join(texts) or "nothing"
 
 
@@ -194,11 +198,17 @@ def main() -> None:
   level = _GAIN ** (1 / _GAMMA)
   cases: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("healthy", "nothing", {"wave": 1, "late": 0.0, "scale": 1.0, "gain": 1.0}),
-    ("late", f"{_LATE} s late, lens {_SCALE} of the declared",
-     {"wave": 1, "late": _LATE, "scale": _SCALE, "gain": 1.0}),
-    ("dark", f"levels {level:.4f} of the first log's",
-     {"wave": 2, "late": 0.0, "scale": 1.0, "gain": _GAIN}),
-  )  # fmt: skip
+    (
+      "late",
+      f"{_LATE} s late, lens {_SCALE} of the declared",
+      {"wave": 1, "late": _LATE, "scale": _SCALE, "gain": 1.0},
+    ),
+    (
+      "dark",
+      f"levels {level:.4f} of the first log's",
+      {"wave": 2, "late": 0.0, "scale": 1.0, "gain": _GAIN},
+    ),
+  )
   for seed in arguments.seeds:
     for name, truth, settings in cases:
       path = arguments.out / f"{name}_{seed}.mcap"

@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from agents.dmpo import config, learning, losses, networks
-from agents.dmpo.config import DmpoConfig
-from agents.dmpo.replay import trajectory_fields
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo import config, learning, losses, networks
+from nerf2real.agents.dmpo.config import DmpoConfig
+from nerf2real.agents.dmpo.replay import trajectory_fields
+from nerf2real.agents.dmpo.specs import Layout
 
 STATE_LAYOUT = Layout(None, None, ("position", "velocity"), (3, 2), (), (), 1)
 PROPRIOCEPTION, PRIVILEGED, ACTIONS = 247, 70, 20  # about the suite's
@@ -75,10 +75,12 @@ def reference(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
     return rng.standard_normal(shape, np.float32)
 
   batch = {
-    "o_tm1": normal(size, layout.state_size), "a_tm1": normal(size, layout.action_size),
-    "r_t": normal(size), "d_t": np.full(size, settings.discount**settings.n_step, np.float32),
+    "o_tm1": normal(size, layout.state_size),
+    "a_tm1": normal(size, layout.action_size),
+    "r_t": normal(size),
+    "d_t": np.full(size, settings.discount**settings.n_step, np.float32),
     "o_t": normal(size, layout.state_size),
-  }  # fmt: skip
+  }
   key = jax.random.PRNGKey(0)
   params = {
     "policy": networks.init_policy(key, net, layout),
@@ -110,11 +112,15 @@ def reference(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
     log_probs = losses.log_prob(fixed[0], actions) + losses.log_prob(fixed[1], actions)
     penalty = functools.partial(rlax.LagrangePenalty, per_dimension=True)
     constraints = [
-      (losses.kl_per_dimension(old, fixed[0]),
-       penalty(duals.alpha_mean, jnp.asarray(settings.epsilon_mean))),
-      (losses.kl_per_dimension(old, fixed[1]),
-       penalty(duals.alpha_stddev, jnp.asarray(settings.epsilon_stddev))),
-    ]  # fmt: skip
+      (
+        losses.kl_per_dimension(old, fixed[0]),
+        penalty(duals.alpha_mean, jnp.asarray(settings.epsilon_mean)),
+      ),
+      (
+        losses.kl_per_dimension(old, fixed[1]),
+        penalty(duals.alpha_stddev, jnp.asarray(settings.epsilon_stddev)),
+      ),
+    ]
     temperature = rlax.LagrangePenalty(duals.temperature, jnp.asarray(settings.epsilon))
     values = jax.lax.stop_gradient(probabilities @ atoms)
     loss_mpo, _ = rlax.mpo_loss(log_probs, values, temperature, constraints, losses.positive)
@@ -166,10 +172,19 @@ def main() -> None:
     description=__doc__, formatter_class=argparse.RawTextHelpFormatter
   )
   parser.add_argument("--seconds", type=float, default=10.0, help="time for each")
-  parser.add_argument("--pictures", metavar="HxW", nargs="+",
-                      help="the paper's settings at these sizes, such as 30x40 60x80")  # fmt: skip
-  parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
-                      help="changes a setting of the agent, such as batch_size=4")  # fmt: skip
+  parser.add_argument(
+    "--pictures",
+    metavar="HxW",
+    nargs="+",
+    help="the paper's settings at these sizes, such as 30x40 60x80",
+  )
+  parser.add_argument(
+    "--set",
+    action="append",
+    default=[],
+    metavar="NAME=VALUE",
+    help="changes a setting of the agent, such as batch_size=4",
+  )
   parser.add_argument("--out", type=Path)
   arguments = parser.parse_args()
   changes = {
@@ -183,8 +198,15 @@ def main() -> None:
     steps = {}
     for size in arguments.pictures:
       height, width = map(int, size.split("x"))
-      layout = Layout("camera", (height, width, 3), ("s",), (PROPRIOCEPTION,),
-                      ("privileged/p",), (PRIVILEGED,), ACTIONS)  # fmt: skip
+      layout = Layout(
+        "camera",
+        (height, width, 3),
+        ("s",),
+        (PROPRIOCEPTION,),
+        ("privileged/p",),
+        (PRIVILEGED,),
+        ACTIONS,
+      )
       steps[size] = ours(settings, layout)
   else:
     settings = config.override(config.preset("state"), changes)
@@ -198,9 +220,12 @@ def main() -> None:
     print(f"{name:>10}: {rate:.2f} updates/s")
   record = {
     "command": shlex.join(["python", *sys.argv]),
-    "device": jax.devices()[0].device_kind, "machine": platform.machine(), "cores": os.cpu_count(),
-    "load": os.getloadavg()[0], "updates_per_second": result,
-  }  # fmt: skip
+    "device": jax.devices()[0].device_kind,
+    "machine": platform.machine(),
+    "cores": os.cpu_count(),
+    "load": os.getloadavg()[0],
+    "updates_per_second": result,
+  }
   out.parent.mkdir(parents=True, exist_ok=True)
   out.write_text(json.dumps(record, indent=1) + "\n")
 

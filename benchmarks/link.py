@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from agents.link import client, sessions
-from agents.link.limiter import LimiterSettings, RateLimiter
-from agents.link.server import LearnerLink
+from nerf2real.agents.link import client, sessions
+from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
+from nerf2real.agents.link.server import LearnerLink
 
 STEPS = 48
 _QUIET = 3.0  # s without a message after which the receiver has all that will come
@@ -167,10 +167,13 @@ def run(name: str, messages: int, stall: float) -> dict[str, Any]:
   rate = (len(before) - 1) / (before[-1] - before[0]) if len(before) > 1 else 0.0
   size = sum(a.nbytes for a in make_trajectory(0).values())
   return {
-    "messages": messages, "stall_s": stall, "lost": messages - len(set(numbers)),
-    "repeated": len(numbers) - len(set(numbers)), "messages_per_second": rate,
+    "messages": messages,
+    "stall_s": stall,
+    "lost": messages - len(set(numbers)),
+    "repeated": len(numbers) - len(set(numbers)),
+    "messages_per_second": rate,
     "mb_per_second": rate * size / 1e6,
-  }  # fmt: skip
+  }
 
 
 def _wake(pid: int, seconds: float) -> None:
@@ -194,9 +197,12 @@ def main() -> None:
       f"{result['messages_per_second']:.0f} messages/s, {result['mb_per_second']:.0f} MB/s"
     )
   record = {
-    "command": "python benchmarks/link.py", "machine": platform.machine(), "cores": os.cpu_count(),
-    "load": os.getloadavg()[0], "results": results,
-  }  # fmt: skip
+    "command": "python benchmarks/link.py",
+    "machine": platform.machine(),
+    "cores": os.cpu_count(),
+    "load": os.getloadavg()[0],
+    "results": results,
+  }
   arguments.out.parent.mkdir(parents=True, exist_ok=True)
   arguments.out.write_text(json.dumps(record, indent=1) + "\n")
 

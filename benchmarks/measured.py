@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
-import sysid
+from nerf2real import sysid
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 

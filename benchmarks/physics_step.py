@@ -18,9 +18,10 @@ import numpy as np
 import tyro
 from dm_control import composer, mjcf
 
-from suite import filters, inertia
-from suite.op3 import constants, op3
-from suite.tasks.state import standing_posture
+from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.randomisation import inertia
+from nerf2real.suite.sensors import filters
+from nerf2real.suite.tasks.state import standing_posture
 
 REFERENCE = 0.000125  # s
 STEPS = (0.00625, 0.005, 0.0025, 0.00125, 0.0005)  # s, each divides the control step
@@ -107,8 +108,10 @@ def main(settings: Settings) -> None:
 
   reference, _ = run(REFERENCE, euler)
   print(f"{settings.episodes} motions of {settings.control_steps * 25} ms; median and 90 %")
-  print(f"{'':26s}{'joints deg':>17s}  {'torso mm':>17s}  {'tilt deg':>17s}  {'rate deg/s':>17s}"
-        "  ms/control step")  # fmt: skip
+  print(
+    f"{'':26s}{'joints deg':>17s}  {'torso mm':>17s}  {'tilt deg':>17s}  {'rate deg/s':>17s}"
+    "  ms/control step"
+  )
   for name, integrator in INTEGRATORS.items():
     for step in STEPS:
       states, cost = run(step, integrator)

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
 
 TARGETS = {(30, 40): 10.0, (60, 80): 25.0}  # ms
 # As the suite gives them: 5 steps of 20 joints, 20 previous controls, 3 gyroscope, 3
@@ -35,10 +35,10 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
   """Exports a policy of the paper's shape with random parameters, and loads it."""
   import jax
 
-  from agents.dmpo import config, networks
-  from agents.dmpo.export import export_policy
-  from agents.dmpo.learning import flatten_params
-  from agents.dmpo.specs import Layout
+  from nerf2real.agents.dmpo import config, networks
+  from nerf2real.agents.dmpo.export import export_policy
+  from nerf2real.agents.dmpo.learning import flatten_params
+  from nerf2real.agents.dmpo.specs import Layout
 
   settings = config.preset("paper")
   layout = Layout("camera", (*size, 3), ("s",), (PROPRIOCEPTION,), (), (), ACTIONS)
@@ -48,9 +48,13 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
   rng = np.random.default_rng(0)
   params = jax.tree.map(lambda x: 0.05 * rng.normal(size=x.shape).astype(np.float32), shapes)
   export_policy(
-    folder, flatten_params({"policy": params}), layout=layout, environment="benchmark",
-    settings=config.to_dict(settings), info={},
-  )  # fmt: skip
+    folder,
+    flatten_params({"policy": params}),
+    layout=layout,
+    environment="benchmark",
+    settings=config.to_dict(settings),
+    info={},
+  )
   return load_policy(folder)
 
 
@@ -74,11 +78,13 @@ def measure(exported: list[ExportedPolicy], steps: int) -> list[dict[str, float]
         processor[index, step] = 1e3 * (time.process_time() - begin_cpu)
   return [
     {
-      "median_ms": float(np.median(w)), "p99_ms": float(np.percentile(w, 99)),
-      "max_ms": float(w.max()), "median_cpu_ms": float(np.median(c)),
+      "median_ms": float(np.median(w)),
+      "p99_ms": float(np.percentile(w, 99)),
+      "max_ms": float(w.max()),
+      "median_cpu_ms": float(np.median(c)),
     }
     for w, c in zip(wall, processor, strict=True)
-  ]  # fmt: skip
+  ]
 
 
 def main() -> None:
@@ -107,9 +113,13 @@ def main() -> None:
     )
   arguments.out.parent.mkdir(parents=True, exist_ok=True)
   record = {
-    "command": "python benchmarks/policy.py", "machine": platform.machine(),
-    "processor": _processor(), "steps": arguments.steps, "load": os.getloadavg()[0], "rows": rows,
-  }  # fmt: skip
+    "command": "python benchmarks/policy.py",
+    "machine": platform.machine(),
+    "processor": _processor(),
+    "steps": arguments.steps,
+    "load": os.getloadavg()[0],
+    "rows": rows,
+  }
   arguments.out.write_text(json.dumps(record, indent=1) + "\n")
 
 

@@ -28,12 +28,14 @@ import rich.console
 import rich.table
 import tyro
 
-from real.virtual import furniture, room
-from scenes import bundle, render, render_reference
-from scenes.cameras import Camera
-from scenes.field import Field
-from scenes.image_quality import psnr
-from scenes.similarity import Similarity
+from nerf2real.core.cameras import Camera
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes import bundle
+from nerf2real.scenes.builtin import furniture, room
+from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.field.render import reference as render_reference
+from nerf2real.scenes.field.render import renderer as render
+from nerf2real.scenes.quality.image_quality import psnr
 
 SIZES = ((30, 40), (60, 80))  # picture sizes [H, W] of the policies
 FIELD_OF_VIEW = np.deg2rad(43.3)  # vertical, Logitech C920
@@ -270,9 +272,14 @@ def main(settings: Settings) -> None:
   for size, rows in result["sizes"].items():
     for row in rows:
       table.add_row(
-        size, row["name"], f"{row['median_ms']:.2f}", f"{row['p95_ms']:.2f}",
-        f"{row['elapsed_ms']:.2f}", f"{row['psnr_db']:.1f}", str(row["views"]),
-      )  # fmt: skip
+        size,
+        row["name"],
+        f"{row['median_ms']:.2f}",
+        f"{row['p95_ms']:.2f}",
+        f"{row['elapsed_ms']:.2f}",
+        f"{row['psnr_db']:.1f}",
+        str(row["views"]),
+      )
   rich.console.Console().print(table)
   settings.out.mkdir(parents=True, exist_ok=True)
   name = "render_" + "_".join(result["processor"].lower().split())

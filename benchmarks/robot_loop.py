@@ -30,13 +30,13 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # idle OpenBLAS threa
 import numpy as np
 import tyro
 
-import real
-from real.clock import SteppedClock, prefer_this_thread
-from real.environment import RobotEnvironment
-from real.safety import SafetyError
-from real.virtual.process import VirtualRobotProcess
-from real.virtual.robot import VirtualRobot
-from suite.op3 import constants
+from nerf2real import real
+from nerf2real.real.loop.clock import SteppedClock, prefer_this_thread
+from nerf2real.real.loop.environment import RobotEnvironment
+from nerf2real.real.safety.monitor import SafetyError
+from nerf2real.real.virtual.process import VirtualRobotProcess
+from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.suite.op3 import constants
 
 RESULTS = Path(__file__).parent / "results" / "robot_loop.json"
 
@@ -119,9 +119,11 @@ def measure(arguments: Arguments) -> dict[str, Any]:
   load = os.getloadavg()[0]
   with robot_for(arguments) as robot:
     environment = real.load(
-      "nerf_nav", robot=robot.connection(), time_limit=2 * arguments.seconds,
+      "nerf_nav",
+      robot=robot.connection(),
+      time_limit=2 * arguments.seconds,
       image_size=(30, 40) if arguments.camera else None,
-    )  # fmt: skip
+    )
     with environment:
       if not arguments.stepped:
         prefer_this_thread(acting=True)

@@ -23,14 +23,13 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
 import tyro
 
-import real
-import suite
-from real.virtual.robot import VirtualRobot
-from suite.gaits.floor import EmptyFloor
-from suite.gaits.walk import Command, Gait
-from suite.gaits.walker import Pose, Walker
-from suite.randomisation import RandomisationSettings
-from suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT, Start
+from nerf2real import real, suite
+from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.suite.gaits.floor import EmptyFloor
+from nerf2real.suite.gaits.walk import Command, Gait
+from nerf2real.suite.gaits.walker import Pose, Walker
+from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT, Start
 
 GOALS = ((0.6, 0.0), (0.6, 0.5), (0.0, 0.5), (-0.3, 0.0), (0.2, -0.3))  # m, ours
 _REACHED = 0.15  # m
@@ -106,9 +105,14 @@ def walk(environment: Any, see: Callable[[], Seen]) -> Result:
 def simulated(count: int) -> Iterator[tuple[str, Result]]:
   """Walks in simulation."""
   environment = suite.load(
-    "nerf_nav", scene=EmptyFloor(), image_size=None, random=0, time_limit=_GOALS_LIMIT + 5,
-    randomisation=RandomisationSettings(pushes=False), privileged=False,
-  )  # fmt: skip
+    "nerf_nav",
+    scene=EmptyFloor(),
+    image_size=None,
+    random=0,
+    time_limit=_GOALS_LIMIT + 5,
+    randomisation=RandomisationSettings(pushes=False),
+    privileged=False,
+  )
   task = environment.task
   task.set_start(Start((0.0, 0.0), 0.0))
 
@@ -125,9 +129,12 @@ def rehearsed(count: int) -> Iterator[tuple[str, Result]]:
   for seed in [None, *range(count)]:
     with VirtualRobot(world="floor", seed=seed, stepped=True) as robot:
       environment = real.load(
-        "nerf_nav", robot=robot.connection(), image_size=None, scene=EmptyFloor(),
+        "nerf_nav",
+        robot=robot.connection(),
+        image_size=None,
+        scene=EmptyFloor(),
         time_limit=_GOALS_LIMIT + 5,
-      )  # fmt: skip
+      )
 
       def see(robot: VirtualRobot = robot) -> Seen:
         truth = robot.truth()
@@ -142,14 +149,18 @@ def rehearsed(count: int) -> Iterator[tuple[str, Result]]:
 
 def main(settings: Settings) -> None:
   """Walks everywhere and prints the table."""
-  lines = ["| plant | first metre [s] | sideways [m] | fell | goals of 5 | fell on the way |",
-           "| --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+  lines = [
+    "| plant | first metre [s] | sideways [m] | fell | goals of 5 | fell on the way |",
+    "| --- | --- | --- | --- | --- | --- |",
+  ]
   for line in lines:
     print(line)
   for name, result in itertools.chain(simulated(settings.episodes), rehearsed(settings.robots)):
     fell = ["no", "yes"]
-    lines.append(f"| {name} | {result.metre:.1f} | {result.sideways:.2f} | {fell[result.fell]} | "
-                 f"{result.goals} | {fell[result.goals_fell]} |")  # fmt: skip
+    lines.append(
+      f"| {name} | {result.metre:.1f} | {result.sideways:.2f} | {fell[result.fell]} | "
+      f"{result.goals} | {fell[result.goals_fell]} |"
+    )
     print(lines[-1], flush=True)
   if settings.out is not None:
     settings.out.parent.mkdir(parents=True, exist_ok=True)

@@ -9,13 +9,14 @@ import cv2
 import mujoco
 import numpy as np
 
-from real.virtual import room, yardstick
-from real.virtual.eye import Eye
-from scenes import collision, report_parts
-from scenes.bundle import Bundle
-from scenes.field import Field
-from scenes.render import Renderer
-from scenes.similarity import Similarity
+from nerf2real.core.pages import parts as report_parts
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.builtin import room, yardstick
+from nerf2real.scenes.builtin.eye import Eye
+from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.geometry import collision
 
 _SIZE = (360, 480)  # height, width of a picture
 _SUPERSAMPLE = 3

@@ -9,9 +9,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from scenes import localise, mapping
-from scenes.bundle import BUILT_IN, Bundle
-from scenes.sources import KnownPoses
+from nerf2real.scenes.bundle import BUILT_IN, Bundle
+from nerf2real.scenes.capture.sources import KnownPoses
+from nerf2real.scenes.poses import localise, mapping
 
 _ITEMS = ("collision", "field.safetensors", "visual.glb", "free_space.pgm", "free_space.yaml")
 

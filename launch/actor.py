@@ -17,11 +17,11 @@ os.environ.setdefault("MKL_NUM_THREADS", "1")
 os.environ.setdefault("MUJOCO_GL", "disabled")  # no environment here draws with GL
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the accelerator is the learner's
 
-from agents.dmpo.actor import ActorProcess, EvaluatorProcess
-from agents.link import sessions
-from agents.link.arguments import add_link_arguments, link_settings
-from agents.link.client import ActorLink
-from agents.link.schema import MessageError
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.arguments import add_link_arguments, link_settings
+from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.link.schema import MessageError
+from nerf2real.agents.processes.actor import ActorProcess, EvaluatorProcess
 
 _EVALUATOR_SEED = 1_000_000  # far from the actors' seeds
 
@@ -34,8 +34,9 @@ def parse() -> argparse.Namespace:
   parser.add_argument("--index", type=int, default=0, help="number of this actor, for its seed")
   parser.add_argument("--seed", type=int, default=0, help="the run's seed")
   parser.add_argument("--evaluate", action="store_true", help="evaluate instead of acting")
-  parser.add_argument("--wait", type=float, default=120.0,
-                      help="time to wait for the learner to appear [s]")  # fmt: skip
+  parser.add_argument(
+    "--wait", type=float, default=120.0, help="time to wait for the learner to appear [s]"
+  )
   add_link_arguments(parser, side="actor")
   return parser.parse_args()
 

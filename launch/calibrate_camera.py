@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from real import calibration
+from nerf2real.real.camera import calibration
 
 _PIXELS = ("fx", "fy", "cx", "cy")
 _MIN_COVERAGE = 0.4  # of the picture's cells: ours; below it the distortion is a guess at the rim
@@ -55,12 +55,16 @@ def show(result: calibration.Calibration) -> None:
     digits = 2 if unit else 4
     table.add_row(name, f"{value:.{digits}f}", f"{stddev:.{digits}f}", unit)
   Console().print(table)
-  print(f"{result.width} x {result.height}, {len(result.views)} views "
-        f"({len(result.rejected)} rejected), RMS {result.rms:.3f} pixel, corners in "
-        f"{result.coverage:.0%} of the picture")  # fmt: skip
+  print(
+    f"{result.width} x {result.height}, {len(result.views)} views "
+    f"({len(result.rejected)} rejected), RMS {result.rms:.3f} pixel, corners in "
+    f"{result.coverage:.0%} of the picture"
+  )
   if result.coverage < _MIN_COVERAGE:
-    print("warning: hold the board in the corners of the picture too; the distortion there is "
-          "extrapolated")  # fmt: skip
+    print(
+      "warning: hold the board in the corners of the picture too; the distortion there is "
+      "extrapolated"
+    )
 
 
 def main() -> None:

@@ -21,11 +21,11 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
 import tyro
 
-import real
-from real.environment import RobotEnvironment
-from real.loading import Connection
-from real.safety import SafetyError
-from suite.op3 import constants
+from nerf2real import real
+from nerf2real.real.loading import Connection
+from nerf2real.real.loop.environment import RobotEnvironment
+from nerf2real.real.safety.monitor import SafetyError
+from nerf2real.suite.op3 import constants
 
 VIRTUAL = "virtual"
 
@@ -56,10 +56,16 @@ def check(arguments: Arguments, robot: str | Connection, recorder: Any = None) -
   if isinstance(camera, str) and camera.isdigit():
     camera = int(camera)
   with real.load(
-    "nerf_nav", robot=robot, camera=camera, image_size=None if camera is None else (60, 80),
-    time_limit=arguments.seconds, offsets=arguments.offsets, lens=arguments.lens,
-    recorder=recorder, dry_run=arguments.dry_run,
-  ) as environment:  # fmt: skip
+    "nerf_nav",
+    robot=robot,
+    camera=camera,
+    image_size=None if camera is None else (60, 80),
+    time_limit=arguments.seconds,
+    offsets=arguments.offsets,
+    lens=arguments.lens,
+    recorder=recorder,
+    dry_run=arguments.dry_run,
+  ) as environment:
     timestep = environment.reset()
     while not timestep.last():
       timestep = environment.step(environment.standing_action)
@@ -74,9 +80,13 @@ def report(environment: RobotEnvironment, observation: Any) -> list[str]:
   if reading is not None:
     goals = constants.standing_targets()
     rows = zip(
-      constants.JOINT_NAMES, reading.positions, goals, reading.currents, reading.temperatures,
+      constants.JOINT_NAMES,
+      reading.positions,
+      goals,
+      reading.currents,
+      reading.temperatures,
       strict=True,
-    )  # fmt: skip
+    )
     for name, angle, goal, amperes, degrees in rows:
       lines.append(
         f"{name:12s} {angle:+12.3f} {angle - goal:+8.3f} {amperes:+12.2f} {degrees:16.0f}"
@@ -102,12 +112,12 @@ def run(arguments: Arguments) -> list[str]:
   with contextlib.ExitStack() as stack:
     recorder = None
     if arguments.record is not None:
-      from real.recorder import Recorder
+      from nerf2real.real.recorder.recorder import Recorder
 
       recorder = stack.enter_context(Recorder(arguments.record))
     robot: str | Connection = arguments.robot
     if arguments.robot == VIRTUAL:
-      from real.virtual.robot import VirtualRobot
+      from nerf2real.real.virtual.robot import VirtualRobot
 
       robot = stack.enter_context(VirtualRobot(stepped=True, seed=0)).connection()
     return check(arguments, robot, recorder)

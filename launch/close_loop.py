@@ -21,15 +21,13 @@ import mujoco
 import numpy as np
 import tyro
 
-import real
-import suite
-import sysid
-from real.loading import Connection
-from real.recorder import Recorder
-from suite.op3 import constants
-from suite.op3.op3 import OP3
-from suite.randomisation import RandomisationSettings
-from suite.tasks.base import Start
+from nerf2real import real, suite, sysid
+from nerf2real.real.loading import Connection
+from nerf2real.real.recorder.recorder import Recorder
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.op3.op3 import OP3
+from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.tasks.base import Start
 
 VIRTUAL = "virtual"
 _STEP = constants.CONTROL_TIMESTEP
@@ -41,9 +39,17 @@ _NOMINAL = RandomisationSettings(
   pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
 )
 _REACH = {
-  "head": 0.35, "sho_pitch": 0.6, "sho_roll": 0.3, "el": 0.35, "hip_yaw": 0.15, "hip_roll": 0.1,
-  "hip_pitch": 0.4, "knee": 0.4, "ank_pitch": 0.4, "ank_roll": 0.25,
-}  # fmt: skip
+  "head": 0.35,
+  "sho_pitch": 0.6,
+  "sho_roll": 0.3,
+  "el": 0.35,
+  "hip_yaw": 0.15,
+  "hip_roll": 0.1,
+  "hip_pitch": 0.4,
+  "knee": 0.4,
+  "ank_pitch": 0.4,
+  "ank_roll": 0.25,
+}
 """rad to both sides, by a part of the joint's name: gravity loads joints, no limb meets another."""
 _SWAY = 0.1  # of the reach, standing on the floor
 
@@ -123,8 +129,9 @@ def motion(kind: str, count: int) -> np.ndarray:
   """
   rng = np.random.default_rng([3, ("sweep", "slow", "steps", "mixed", "sway").index(kind)])
   lower, upper = constants.joint_limits()
-  reach = np.array([next(r for part, r in _REACH.items() if part in name)
-                    for name in constants.JOINT_NAMES])  # fmt: skip
+  reach = np.array(
+    [next(r for part, r in _REACH.items() if part in name) for name in constants.JOINT_NAMES]
+  )
   standing = constants.standing_targets()
   time = _STEP * np.arange(count)[:, None]
   phase = rng.uniform(0, 2 * np.pi, 20)
@@ -154,7 +161,7 @@ def _excite(arguments: Arguments) -> dict[str, np.ndarray]:
   """Records all motions; returns actions and joint positions of the standing one."""
   if arguments.robot != VIRTUAL:
     return _on(Connection(port=arguments.robot), arguments, None)
-  from real.virtual.robot import VirtualRobot
+  from nerf2real.real.virtual.robot import VirtualRobot
 
   with VirtualRobot(stepped=True, seed=arguments.seed) as robot:
     return _on(robot.connection(), arguments, robot)
@@ -203,9 +210,12 @@ def _play(
   rows = []
   lifting = round(_LIFTING / _STEP) if held else 0
   with real.load(
-    "nerf_nav", robot=connection, image_size=None,
-    time_limit=(lifting + len(actions)) * _STEP + 1.0, recorder=recorder,
-  ) as environment:  # fmt: skip
+    "nerf_nav",
+    robot=connection,
+    image_size=None,
+    time_limit=(lifting + len(actions)) * _STEP + 1.0,
+    recorder=recorder,
+  ) as environment:
     environment.reset()
     if held:
       if robot is not None:
@@ -231,9 +241,14 @@ def _play(
 def _suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
   """Returns the joint positions [T, 20] that the suite gives for the same actions."""
   environment = suite.load(
-    "nerf_nav", image_size=None, random=0, randomisation=_NOMINAL, privileged=False,
-    time_limit=len(actions) * _STEP + 1.0, effects=effects,
-  )  # fmt: skip
+    "nerf_nav",
+    image_size=None,
+    random=0,
+    randomisation=_NOMINAL,
+    privileged=False,
+    time_limit=len(actions) * _STEP + 1.0,
+    effects=effects,
+  )
   environment.task.set_start(Start((0.0, 0.0), 0.0))
   environment.reset()
   rows = []
@@ -278,8 +293,8 @@ def gap_table(
 
 def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:
   """Returns what the virtual robot hides beside what was found, in Markdown."""
-  from real.virtual import motors
-  from real.virtual.hidden import Hidden
+  from nerf2real.real.virtual import motors
+  from nerf2real.real.virtual.hidden import Hidden
 
   hidden = Hidden.draw(seed)
   duty = 800 / 128 * motors.COUNTS / (2 * np.pi) / motors.FULL_PWM  # per rad at a P gain of 800

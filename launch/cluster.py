@@ -22,11 +22,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agents.link import sessions
-from agents.link.access import LinkError
-from agents.link.children import last_lines, start_child
-from agents.link.client import ActorLink
-from agents.link.schema import MessageError
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.access import LinkError
+from nerf2real.agents.link.children import last_lines, start_child
+from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.link.schema import MessageError
 
 _LAUNCH = Path(__file__).resolve().parent
 _REFUSED = 2  # exit status of a process whose arguments are wrong: another start would not help
@@ -109,8 +109,13 @@ class Placed:
 class Cluster:
   """Keeps a run's processes placed and running."""
 
-  def __init__(self, arguments: argparse.Namespace, learner_arguments: list[str], endpoint: str,
-               passwords: dict[str, str]):  # fmt: skip
+  def __init__(
+    self,
+    arguments: argparse.Namespace,
+    learner_arguments: list[str],
+    endpoint: str,
+    passwords: dict[str, str],
+  ):
     import ray
 
     self._ray = ray
@@ -129,11 +134,16 @@ class Cluster:
     resource = {arguments.learner_resource: 1e-3} if arguments.learner_resource else {}
     self._learner_arguments = learner
     self.learner = Placed(
-      "learner", "learner.py", [*learner, *(["--resume"] if arguments.resume else [])],
+      "learner",
+      "learner.py",
+      [*learner, *(["--resume"] if arguments.resume else [])],
       files | {"login": f"{_LEARNER}:{passwords[_LEARNER]}\n"},
-      {"num_cpus": arguments.learner_cpus, "num_gpus": arguments.learner_gpus,
-       "resources": resource},
-    )  # fmt: skip
+      {
+        "num_cpus": arguments.learner_cpus,
+        "num_gpus": arguments.learner_gpus,
+        "resources": resource,
+      },
+    )
     files = files | {"login": f"{_ACTOR}:{passwords[_ACTOR]}\n"}
     wait = ["--wait", str(_JOIN_TIMEOUT)]
     needs = {"num_cpus": arguments.actor_cpus, "scheduling_strategy": "SPREAD"}
@@ -245,16 +255,23 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
   parser.add_argument("--preset", help="paper, state, ...")
   parser.add_argument("--seed", type=int, default=0)
   parser.add_argument("--resume", action="store_true", help="continue from the newest checkpoint")
-  parser.add_argument("--address", default="auto",
-                      help="Ray's address; local: a cluster of this machine alone")  # fmt: skip
-  parser.add_argument("--listen", help="the router's endpoint, such as tls/head:7447;\n"
-                      "default: a free port of this machine's address in the cluster")  # fmt: skip
+  parser.add_argument(
+    "--address", default="auto", help="Ray's address; local: a cluster of this machine alone"
+  )
+  parser.add_argument(
+    "--listen",
+    help="the router's endpoint, such as tls/head:7447;\n"
+    "default: a free port of this machine's address in the cluster",
+  )
   parser.add_argument("--learner-cpus", type=float, default=2.0)
   parser.add_argument("--learner-gpus", type=float, default=0.0)
   parser.add_argument("--learner-resource", help="Ray resource of the machine for the learner")
   parser.add_argument("--actor-cpus", type=float, default=1.0)
-  for name, text in (("certificate", "for a tls/ endpoint [PEM]"), ("key", "its private key"),
-                     ("authority", "who signed it")):  # fmt: skip
+  for name, text in (
+    ("certificate", "for a tls/ endpoint [PEM]"),
+    ("key", "its private key"),
+    ("authority", "who signed it"),
+  ):
     parser.add_argument(f"--tls-{name}", type=Path, help=text)
   arguments, rest = parser.parse_known_args()
   tls = [arguments.tls_certificate, arguments.tls_key, arguments.tls_authority]
@@ -306,11 +323,18 @@ def main() -> int:
     return 2
   local = arguments.address == "local"
   try:
-    ray.init(address=None if local else arguments.address, log_to_driver=False,
-             include_dashboard=False, num_cpus=None)  # fmt: skip
+    ray.init(
+      address=None if local else arguments.address,
+      log_to_driver=False,
+      include_dashboard=False,
+      num_cpus=None,
+    )
   except ConnectionError as error:
-    print(f"error: no Ray cluster at {arguments.address!r} ({error}): start one with "
-          "`ray start --head`, or say --address local", file=sys.stderr)  # fmt: skip
+    print(
+      f"error: no Ray cluster at {arguments.address!r} ({error}): start one with "
+      "`ray start --head`, or say --address local",
+      file=sys.stderr,
+    )
     return 2
   stopped: list[int] = []
   for number in (signal.SIGINT, signal.SIGTERM):
@@ -333,8 +357,9 @@ def main() -> int:
       if time.monotonic() - shown > 10:
         shown = time.monotonic()
         waiting = [p.name for p in (cluster.learner, *cluster.others) if p.starting is not None]
-        print(status_line(view) + (f" waiting for free CPUs: {waiting}" if waiting else ""),
-              flush=True)  # fmt: skip
+        print(
+          status_line(view) + (f" waiting for free CPUs: {waiting}" if waiting else ""), flush=True
+        )
       time.sleep(_POLL)
   finally:
     if stopped:

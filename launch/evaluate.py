@@ -27,11 +27,11 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
 import tyro
 
-from agents.dmpo import belief_plot, export
-from real.evaluation import episodes, maps, plants, report, runner, tables
-from real.evaluation.plants import Plant, Sight
-from real.evaluation.policies import Belief, EvaluatedPolicy, GaitPolicy
-from suite import loading
+from nerf2real.agents.dmpo import belief_plot, export
+from nerf2real.evaluation import episodes, maps, plants, report, runner, tables
+from nerf2real.evaluation.plants import Plant, Sight
+from nerf2real.evaluation.policies import Belief, EvaluatedPolicy, GaitPolicy
+from nerf2real.suite import loading
 
 GAIT = "gait"
 _HEAT_CELL = 0.05  # m
@@ -156,27 +156,45 @@ def make_plant(arguments: Arguments, scene: Any, image_size: tuple[int, int] | N
   if arguments.record and arguments.plant != "sim":
     record = _free_name(arguments.out / f"{arguments.plant}_{arguments.protocol}.mcap")
   if arguments.plant == "sim":
-    from real.evaluation.simulated import SimulatedPlant
+    from nerf2real.evaluation.simulated import SimulatedPlant
 
     return SimulatedPlant(
-      scene, arguments.protocol, arguments.perturb, image_size=image_size,
-      effects=arguments.effects, seed=arguments.seed, time_limit=arguments.time_limit,
-    )  # fmt: skip
+      scene,
+      arguments.protocol,
+      arguments.perturb,
+      image_size=image_size,
+      effects=arguments.effects,
+      seed=arguments.seed,
+      time_limit=arguments.time_limit,
+    )
   if arguments.plant == "virtual":
-    from real.evaluation.rehearsed import RehearsedPlant
+    from nerf2real.evaluation.rehearsed import RehearsedPlant
 
     return RehearsedPlant(
-      scene, arguments.protocol, arguments.perturb, image_size=image_size,
-      robot_seed=arguments.robot_seed, time_limit=arguments.time_limit, record=record,
-    )  # fmt: skip
-  from real.evaluation.operated import OperatedPlant
+      scene,
+      arguments.protocol,
+      arguments.perturb,
+      image_size=image_size,
+      robot_seed=arguments.robot_seed,
+      time_limit=arguments.time_limit,
+      record=record,
+    )
+  from nerf2real.evaluation.operated import OperatedPlant
 
   camera: Any = int(arguments.camera) if arguments.camera.isdigit() else arguments.camera
   return OperatedPlant(
-    scene, arguments.protocol, arguments.perturb, robot=arguments.robot, camera=camera,
-    image_size=image_size, time_limit=arguments.time_limit, record=record,
-    offsets=arguments.offsets, lens=arguments.lens, dry_run=arguments.dry_run,
-  )  # fmt: skip
+    scene,
+    arguments.protocol,
+    arguments.perturb,
+    robot=arguments.robot,
+    camera=camera,
+    image_size=image_size,
+    time_limit=arguments.time_limit,
+    record=record,
+    offsets=arguments.offsets,
+    lens=arguments.lens,
+    dry_run=arguments.dry_run,
+  )
 
 
 def _free_name(path: Path) -> Path:
@@ -200,14 +218,21 @@ def choose(listed: tuple[Any, ...], count: int | None) -> list[tuple[int, Any]]:
 def draw_belief(moment: episodes.Moment, goal: tuple[float, float], floor: maps.Map) -> np.ndarray:
   """Draws what a policy believed over the map."""
   density = belief_plot.position_density(
-    np.array(moment.logits), np.array(moment.means), np.array(moment.stddevs), extent=floor.extent,
+    np.array(moment.logits),
+    np.array(moment.means),
+    np.array(moment.stddevs),
+    extent=floor.extent,
     cell=_HEAT_CELL,
-  )  # fmt: skip
+  )
   truth = None if moment.position is None else np.array(moment.position)
   return belief_plot.draw_heat_map(
-    density, extent=floor.extent, truth=truth, target=np.array(goal), background=floor.background,
+    density,
+    extent=floor.extent,
+    truth=truth,
+    target=np.array(goal),
+    background=floor.background,
     pixels_per_cell=3,
-  )  # fmt: skip
+  )
 
 
 def _say(episode: episodes.Episode, number: int, count: int) -> None:
@@ -234,8 +259,13 @@ def run(arguments: Arguments) -> Path | None:
     _run_trials(arguments, scene, store, arguments.trials)
   finally:
     if store.episodes:
-      report.write(path, store.episodes, scene=scene, draw_belief=draw_belief,
-                   settings=dataclasses.asdict(arguments))  # fmt: skip
+      report.write(
+        path,
+        store.episodes,
+        scene=scene,
+        draw_belief=draw_belief,
+        settings=dataclasses.asdict(arguments),
+      )
   said = [*tables.paper_tables(store.episodes), tables.outcome_table(store.episodes)]
   text = "\n".join(tables.as_text(table) for table in said)
   print(f"\n{text}")

@@ -11,8 +11,8 @@ import rich.console
 import rich.progress
 import tyro
 
-from real.virtual import filming
-from real.virtual.eye import EglMissingError
+from nerf2real.scenes.builtin import filming
+from nerf2real.scenes.builtin.eye import EglMissingError
 
 
 @dataclasses.dataclass(frozen=True)

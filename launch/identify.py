@@ -15,7 +15,7 @@ import rich
 import tyro
 from rich.table import Table
 
-import sysid
+from nerf2real import sysid
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,10 +67,9 @@ def _identify(arguments: Arguments) -> int:
         continue
       interval = "" if value["low"] is None else f"{value['low']:.4g} .. {value['high']:.4g}"
       table.add_row(
-        effect["kind"], _place(effect), name, _number(value["value"]), interval,
-        value["unit"],
-      )  # fmt: skip
-  from sysid import evaluation  # after the work: its import takes seconds that --help can spare
+        effect["kind"], _place(effect), name, _number(value["value"]), interval, value["unit"]
+      )
+  from nerf2real.sysid.model import simulation as evaluation
 
   if table.rows:
     rich.print(table)

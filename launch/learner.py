@@ -16,11 +16,11 @@ from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # the environment is only asked for its specs
 
-from agents.dmpo import config as configs
-from agents.dmpo.checkpoints import CheckpointError, read_info
-from agents.dmpo.learner import Learner, RunSettings
-from agents.link.arguments import add_link_arguments, link_settings
-from agents.link.sessions import LinkError
+from nerf2real.agents.dmpo import config as configs
+from nerf2real.agents.link.arguments import add_link_arguments, link_settings
+from nerf2real.agents.link.sessions import LinkError
+from nerf2real.agents.processes.checkpoints import CheckpointError, read_info
+from nerf2real.agents.processes.learner import Learner, RunSettings
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -35,19 +35,39 @@ def parse() -> argparse.Namespace:
   where.add_argument("--listen", default=DEFAULT_ENDPOINT, help="such as tcp/0.0.0.0:7447")
   where.add_argument("--connect", help="a router to join, such as tcp/head:7447")
   parser.add_argument("--preset", default=None, choices=sorted(configs.PRESETS))
-  parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
-                      help="changes a setting of the agent, such as network.vmax=10")  # fmt: skip
+  parser.add_argument(
+    "--set",
+    action="append",
+    default=[],
+    metavar="NAME=VALUE",
+    help="changes a setting of the agent, such as network.vmax=10",
+  )
   parser.add_argument("--seed", type=int, default=0)
   parser.add_argument("--max-env-steps", type=int, help="environment steps of the run")
   parser.add_argument("--resume", action="store_true", help="continue from the newest checkpoint")
-  parser.add_argument("--checkpoint-period", type=float, default=RunSettings.checkpoint_period,
-                      help="time between checkpoints [s]")  # fmt: skip
-  parser.add_argument("--log-period", type=float, default=RunSettings.log_period,
-                      help="time between rows of the log [s]")  # fmt: skip
-  parser.add_argument("--replay-on-disk", action="store_true",
-                      help="keep the replay in files, so that it survives the learner")  # fmt: skip
-  parser.add_argument("--evaluation-period", type=int, default=RunSettings.evaluation_period,
-                      help="environment steps between evaluations")  # fmt: skip
+  parser.add_argument(
+    "--checkpoint-period",
+    type=float,
+    default=RunSettings.checkpoint_period,
+    help="time between checkpoints [s]",
+  )
+  parser.add_argument(
+    "--log-period",
+    type=float,
+    default=RunSettings.log_period,
+    help="time between rows of the log [s]",
+  )
+  parser.add_argument(
+    "--replay-on-disk",
+    action="store_true",
+    help="keep the replay in files, so that it survives the learner",
+  )
+  parser.add_argument(
+    "--evaluation-period",
+    type=int,
+    default=RunSettings.evaluation_period,
+    help="environment steps between evaluations",
+  )
   parser.add_argument("--evaluation-episodes", type=int, default=RunSettings.evaluation_episodes)
   add_link_arguments(parser, side="learner")
   return parser.parse_args()
@@ -98,9 +118,13 @@ def main() -> int:
       evaluation_episodes=arguments.evaluation_episodes,
     )
     learner = Learner(
-      settings, config, endpoint=arguments.connect or arguments.listen,
-      link=link_settings(arguments), resume=arguments.resume, join=arguments.connect is not None,
-    )  # fmt: skip
+      settings,
+      config,
+      endpoint=arguments.connect or arguments.listen,
+      link=link_settings(arguments),
+      resume=arguments.resume,
+      join=arguments.connect is not None,
+    )
   except (ValueError, LinkError, CheckpointError) as error:
     print(f"error: {error}", file=sys.stderr)
     return 2

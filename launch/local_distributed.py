@@ -23,10 +23,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from agents.link import sessions
-from agents.link.children import last_lines, start_child
-from agents.link.client import ActorLink
-from agents.link.schema import MessageError
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.children import last_lines, start_child
+from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.link.schema import MessageError
 
 _LAUNCH = Path(__file__).resolve().parent
 _MAX_RESTARTS = 5  # of one process within _RESTART_WINDOW
@@ -82,8 +82,18 @@ class Supervisor:
     users, login = _credentials(run)
     self.link = sessions.LinkSettings(security=sessions.Security(login=login))
     python = sys.executable
-    learner = [python, str(_LAUNCH / "learner.py"), "--run", str(run), "--listen", self.endpoint,
-               "--users", str(users), "--seed", str(arguments.seed)]  # fmt: skip
+    learner = [
+      python,
+      str(_LAUNCH / "learner.py"),
+      "--run",
+      str(run),
+      "--listen",
+      self.endpoint,
+      "--users",
+      str(users),
+      "--seed",
+      str(arguments.seed),
+    ]
     learner += learner_arguments
     for name in ("env", "preset", "max_env_steps"):
       if getattr(arguments, name) is not None:
@@ -91,8 +101,18 @@ class Supervisor:
     self._learner_command = learner
     first = [*learner, "--resume"] if arguments.resume else learner
     self.learner = Child("learner", first, run / "logs" / "learner.log")
-    actor = [python, str(_LAUNCH / "actor.py"), "--connect", self.endpoint, "--login", str(login),
-             "--seed", str(arguments.seed), "--wait", str(_JOIN_TIMEOUT)]  # fmt: skip
+    actor = [
+      python,
+      str(_LAUNCH / "actor.py"),
+      "--connect",
+      self.endpoint,
+      "--login",
+      str(login),
+      "--seed",
+      str(arguments.seed),
+      "--wait",
+      str(_JOIN_TIMEOUT),
+    ]
     self.others = [
       Child(f"actor-{i}", [*actor, "--index", str(i)], run / "logs" / f"actor-{i}.log")
       for i in range(arguments.actors)
@@ -165,9 +185,12 @@ class StatusView:
       if self._link is None:
         session = sessions.connect(self._supervisor.endpoint, self._supervisor.link, timeout=0)
         self._link = ActorLink(
-          session, self._supervisor.link, actor=f"viewer-{os.getpid()}", role="viewer",
+          session,
+          self._supervisor.link,
+          actor=f"viewer-{os.getpid()}",
+          role="viewer",
           ask_timeout=1.0,
-        )  # fmt: skip
+        )
       answer = self._link.status()
     except (sessions.LinkError, MessageError):
       return
@@ -267,8 +290,10 @@ def main() -> int:
     return 2
   saved = any((arguments.run / "checkpoints").glob("newest-*"))
   if saved and not arguments.resume:
-    print(f"error: {arguments.run} holds a run: add --resume, or name another folder with --run",
-          file=sys.stderr)  # fmt: skip
+    print(
+      f"error: {arguments.run} holds a run: add --resume, or name another folder with --run",
+      file=sys.stderr,
+    )
     return 2
   supervisor = Supervisor(arguments, rest)
   _note_launch(arguments.run)

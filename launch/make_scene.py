@@ -15,9 +15,9 @@ import rich
 import tyro
 from rich.table import Table
 
-from real.virtual import yardstick
-from scenes import pipeline
-from scenes.bundle import Bundle
+from nerf2real.scenes import pipeline
+from nerf2real.scenes.builtin import yardstick
+from nerf2real.scenes.bundle import Bundle
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class Arguments:
   camera_height: float | None = None
   """Median height of the camera above the floor [m]: gives the scale where there is no marker."""
   override: Path | None = None
-  """YAML or JSON that fixes floor, scale, yaw, extent by hand; see scenes/overrides.py."""
+  """YAML or JSON that fixes floor, scale, yaw, extent by hand; see scenes/geometry/overrides.py."""
   baseline: Literal["none", "colmap"] | None = None
   """"colmap" adds the Poisson mesh of the COLMAP points to the report."""
   name: str | None = None

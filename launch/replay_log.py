@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from real import replay
+from nerf2real.real.recorder import replay
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,10 +17,10 @@ import numpy as np
 import tyro
 from rich.progress import track
 
-import suite
-from suite.op3 import constants
-from suite.overview import TopDown
-from suite.third_person import ThirdPerson
+from nerf2real import suite
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.pictures.overview import TopDown
+from nerf2real.suite.pictures.third_person import ThirdPerson
 
 _HEIGHT, _WIDTH = 360, 480  # pixels of the third person's picture and of the enlarged robot's view
 _FRAME_STEPS = 2  # control steps between frames: 20 frames/s
@@ -100,9 +100,12 @@ def describe(task_name: str, environment: suite.environment.Environment) -> str:
 def run(arguments: Arguments) -> list[str]:
   """Runs the episodes; returns a line for each that ended."""
   environment = suite.load(
-    arguments.task, scene=arguments.scene, effects=arguments.effects, random=arguments.seed,
+    arguments.task,
+    scene=arguments.scene,
+    effects=arguments.effects,
+    random=arguments.seed,
     image_size=(arguments.image_height, arguments.image_height * 4 // 3),
-  )  # fmt: skip
+  )
   timestep = environment.reset()
   task = environment.task
   policy = make_policy(arguments.policy, task.standing_action, arguments.seed)
@@ -134,8 +137,9 @@ def _run_steps(arguments, environment, timestep, policy, views, video) -> list[s
       success = f"success after {outcome.success_time:.2f} s" if outcome.success else "no success"
       lines.append(f"episode of {outcome.duration:.2f} s: {success}, ended by {ending}")
     if views is not None and video is not None and step % _FRAME_STEPS == 0:
-      own = cv2.resize(timestep.observation["camera"], (_WIDTH, _HEIGHT),
-                       interpolation=cv2.INTER_NEAREST)  # fmt: skip
+      own = cv2.resize(
+        timestep.observation["camera"], (_WIDTH, _HEIGHT), interpolation=cv2.INTER_NEAREST
+      )
       pictures = [views[0].draw(), own, views[1].draw()]
       video.add(compose(pictures, describe(arguments.task, environment)))
   return lines

@@ -10,9 +10,9 @@ import signal
 import sys
 import threading
 
-from agents.link import sessions
-from agents.link.access import LinkError
-from agents.link.arguments import add_link_arguments, link_settings
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.access import LinkError
+from nerf2real.agents.link.arguments import add_link_arguments, link_settings
 
 
 def main() -> int:

@@ -17,10 +17,10 @@ os.environ.setdefault("MUJOCO_GL", "disabled")
 import cv2
 import numpy as np
 
-from agents.dmpo import belief_plot
-from agents.dmpo.environments import make_environment
-from agents.dmpo.export import ExportedPolicy, load_policy
-from agents.dmpo.specs import planar_pose
+from nerf2real.agents.dmpo import belief_plot
+from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.agents.dmpo.specs import planar_pose
+from nerf2real.agents.processes.environments import make_environment
 
 _CELL = 0.05  # m
 _FREE, _OTHER = 235, 60  # grey levels of the floor where the robot fits, and of all else

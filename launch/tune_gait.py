@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-import suite
-from suite.effects import Effect
-from suite.gaits import walk
-from suite.gaits.floor import EmptyFloor
-from suite.op3 import constants
-from suite.randomisation import RandomisationSettings
-from suite.tasks.base import Start
+from nerf2real import suite
+from nerf2real.suite.effects import Effect
+from nerf2real.suite.gaits import walk
+from nerf2real.suite.gaits.floor import EmptyFloor
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.tasks.base import Start
 
 # Parameter: (lower, upper) bound of the search.
 BOUNDS = {
@@ -45,13 +45,21 @@ BOUNDS = {
 # Worlds in which a candidate walks; the first is the nominal one.
 WORLDS: tuple[tuple[Effect, ...], ...] = (
   (),
-  (Effect("motor_gain", None, {"gain": 0.87}),
-   Effect("load_friction", None, {"coefficient": 0.15})),
-  (Effect("motor_gain", None, {"gain": 1.2}), Effect("floor_friction", None, {"scale": 0.6}),
-   Effect("command_delay", None, {"delay": 0.015})),
-  (Effect("coulomb_friction", None, {"torque": 0.1}), Effect("floor_slope", None, {"y": 0.01}),
-   Effect("parameter_error", None, {"damping": 0.85})),
-)  # fmt: skip
+  (
+    Effect("motor_gain", None, {"gain": 0.87}),
+    Effect("load_friction", None, {"coefficient": 0.15}),
+  ),
+  (
+    Effect("motor_gain", None, {"gain": 1.2}),
+    Effect("floor_friction", None, {"scale": 0.6}),
+    Effect("command_delay", None, {"delay": 0.015}),
+  ),
+  (
+    Effect("coulomb_friction", None, {"torque": 0.1}),
+    Effect("floor_slope", None, {"y": 0.01}),
+    Effect("parameter_error", None, {"damping": 0.85}),
+  ),
+)
 _TARGET_SPEED = 0.15  # m/s: walking faster than this earns nothing more
 _TARGET_TURN = 0.3  # rad/s at full turn
 
@@ -84,10 +92,18 @@ def make_environments(count: int, seconds: float) -> list[suite.environment.Envi
   """Returns one environment without pictures for each world."""
   settings = RandomisationSettings(pushes=False)
   environments = [
-    suite.load("nerf_nav", scene=EmptyFloor(), effects=effects, image_size=None, random=index,
-               time_limit=seconds, randomisation=settings, privileged=False)
+    suite.load(
+      "nerf_nav",
+      scene=EmptyFloor(),
+      effects=effects,
+      image_size=None,
+      random=index,
+      time_limit=seconds,
+      randomisation=settings,
+      privileged=False,
+    )
     for index, effects in enumerate(WORLDS[:count])
-  ]  # fmt: skip
+  ]
   for environment in environments:
     environment.task.set_start(Start((0.0, 0.0), 0.0))
   return environments
@@ -120,8 +136,14 @@ def walk_score(environment, gait: walk.Gait, command: walk.Command) -> tuple[flo
     gain = min(x / wanted, 1.0) - 0.5 * abs(y) / wanted - 0.4 * abs(yaw)
   shaking = 0.1 * effort / max(outcome.duration, 0.1)
   score = gain - shaking if outcome.ending is None else alive - 1.5 + 0.4 * min(gain, 1.0)
-  return score, {"x": float(x), "y": float(y), "yaw": yaw, "seconds": outcome.duration,
-                 "ending": outcome.ending, "shaking": shaking}  # fmt: skip
+  return score, {
+    "x": float(x),
+    "y": float(y),
+    "yaw": yaw,
+    "seconds": outcome.duration,
+    "ending": outcome.ending,
+    "shaking": shaking,
+  }
 
 
 def settings_of(vector: np.ndarray) -> walk.GaitSettings:
@@ -231,8 +253,12 @@ def main() -> None:
     text += f"{scores.max():+.3f} median {np.median(scores):+.3f}  {notes[0]}"
     print(text, flush=True)
     if arguments.out is not None:
-      record = {"score": best, "settings": dataclasses.asdict(settings_of(best_vector)),
-                "walks": notes, "mean": dataclasses.asdict(settings_of(search.mean))}  # fmt: skip
+      record = {
+        "score": best,
+        "settings": dataclasses.asdict(settings_of(best_vector)),
+        "walks": notes,
+        "mean": dataclasses.asdict(settings_of(search.mean)),
+      }
       arguments.out.write_text(json.dumps(record, indent=1))
 
 

@@ -17,11 +17,12 @@ import tyro
 import viser
 from viser import transforms
 
-from scenes import field_view, localise
-from scenes.bundle import Bundle
-from scenes.field import Field
-from scenes.render import Renderer
-from scenes.report_parts import part_color
+from nerf2real.core.pages.parts import part_color
+from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.field.render import browser as field_view
+from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.poses import localise
 
 _CAMERA_STEP = 3  # every third camera is drawn
 
@@ -67,11 +68,16 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
     world = bundle.world_from_unit.apply_pose(pose)
     frusta.append(
       server.scene.add_camera_frustum(
-        f"/cameras/{name}", fov=float(fov), aspect=sfm.camera.width / sfm.camera.height, scale=0.08,
-        wxyz=transforms.SO3.from_matrix(world[:3, :3]).wxyz, position=world[:3, 3],
-        color=(213, 94, 0), thickness=0.004,
+        f"/cameras/{name}",
+        fov=float(fov),
+        aspect=sfm.camera.width / sfm.camera.height,
+        scale=0.08,
+        wxyz=transforms.SO3.from_matrix(world[:3, :3]).wxyz,
+        position=world[:3, 3],
+        color=(213, 94, 0),
+        thickness=0.004,
       )
-    )  # fmt: skip
+    )
     frusta[-1].visible = False  # the view starts among them
   grid = server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
 
@@ -88,8 +94,11 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
       for handle in handles:
         handle.visible = switch.value
 
-  figures = [f"| {key} | {value:.4g} |" if isinstance(value, float) else f"| {key} | {value} |"
-             for key, value in bundle.figures.items() if not isinstance(value, dict)]  # fmt: skip
+  figures = [
+    f"| {key} | {value:.4g} |" if isinstance(value, float) else f"| {key} | {value} |"
+    for key, value in bundle.figures.items()
+    if not isinstance(value, dict)
+  ]
   with server.gui.add_folder("figures", expand_by_default=False):
     server.gui.add_markdown("\n".join(["| figure | value |", "| --- | --- |", *figures]))
 

@@ -15,11 +15,11 @@ import trimesh
 import viser
 from viser import transforms
 
-import suite
-from scenes import field_view
-from suite import loading
-from suite.op3 import constants, op3
-from suite.third_person import best_azimuth, clear_distance, direction
+from nerf2real import suite
+from nerf2real.scenes.field.render import browser as field_view
+from nerf2real.suite import loading
+from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.pictures.third_person import best_azimuth, clear_distance, direction
 
 _SPRING = 40.0  # N/m between the handle that is dragged and the torso
 _MAX_FORCE = 20.0  # N
@@ -71,11 +71,7 @@ class TaskViewer:
   """One environment, shown and controlled through a viser server."""
 
   def __init__(
-    self,
-    environment: Any,
-    server: viser.ViserServer,
-    *,
-    field: field_view.FieldView | None = None,
+    self, environment: Any, server: viser.ViserServer, *, field: field_view.FieldView | None = None
   ):
     """Fills the page.
 
@@ -145,10 +141,16 @@ class TaskViewer:
     else:
       for index, path in enumerate(scene.collision_parts):
         part = trimesh.load_mesh(path)
-        found.append(server.scene.add_mesh_simple(
-          f"/room/{index:03d}", part.vertices, part.faces, color=(150, 165, 180), opacity=0.6,
-          flat_shading=True,
-        ))  # fmt: skip
+        found.append(
+          server.scene.add_mesh_simple(
+            f"/room/{index:03d}",
+            part.vertices,
+            part.faces,
+            color=(150, 165, 180),
+            opacity=0.6,
+            flat_shading=True,
+          )
+        )
     for mesh in found:
       mesh.visible = visible
     return found
@@ -165,9 +167,8 @@ class TaskViewer:
         place = middle.copy()
         place[1 - axis] += sign * size[1 - axis] / 2
         self._server.scene.add_box(
-          f"{name}/{axis}{sign}", color=color, dimensions=(*length, 0.004),
-          position=(*place, 0.01),
-        )  # fmt: skip
+          f"{name}/{axis}{sign}", color=color, dimensions=(*length, 0.004), position=(*place, 0.01)
+        )
 
   def _add_geoms(self) -> dict[int, Any]:
     model = self._environment.physics.model.ptr
@@ -203,9 +204,12 @@ class TaskViewer:
         lambda event: self._start_push(event.target.value)
       )
     self._handle = self._server.scene.add_transform_controls(
-      "/hand", scale=0.16, disable_rotations=True, disable_sliders=True,
+      "/hand",
+      scale=0.16,
+      disable_rotations=True,
+      disable_sliders=True,
       position=self._handle_place(),
-    )  # fmt: skip
+    )
 
     @self._handle.on_update
     def _(event: Any) -> None:

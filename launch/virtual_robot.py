@@ -21,7 +21,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
 import tyro
 
-from real.virtual.robot import VirtualRobot
+from nerf2real.real.virtual.robot import VirtualRobot
 
 _PUSH = 10.0  # N
 _PUSH_TIME = 0.2  # s

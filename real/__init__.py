@@ -12,7 +12,7 @@ __all__ = ["load"]
 def __getattr__(name: str) -> Any:
   # Loaded when asked for: the virtual room and the recorder's process need no environment.
   if name == "load":
-    from real.loading import load
+    from nerf2real.real.loading import load
 
     return load
   raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -6,18 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from real import op3
-from real.bus import Bus
-from real.calibration import read_camera_info
-from real.clock import Clock
-from real.environment import RobotEnvironment
-from real.motion import RobotSettings
-from real.operator import Operator, Terminal
-from real.pictures import CameraSource
-from suite import errors, loading
-from suite.op3 import constants
-from suite.tasks import ball_push, nerf_nav
-from suite.tasks.workspace import find_workspace
+from nerf2real.core import errors
+from nerf2real.real.camera.calibration import read_camera_info
+from nerf2real.real.camera.pictures import CameraSource
+from nerf2real.real.loop.clock import Clock
+from nerf2real.real.loop.environment import RobotEnvironment
+from nerf2real.real.loop.motion import RobotSettings
+from nerf2real.real.safety.operator import Operator, Terminal
+from nerf2real.real.wire import op3
+from nerf2real.real.wire.bus import Bus
+from nerf2real.suite import loading
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.tasks import ball_push, nerf_nav
+from nerf2real.suite.tasks.workspace import find_workspace
 
 _TIME_LIMITS = {nerf_nav.NAME: nerf_nav.TIME_LIMIT, ball_push.NAME: ball_push.TIME_LIMIT}
 
@@ -52,8 +53,8 @@ def load(
   Args:
     task: "nerf_nav" or "ball_push".
     robot: Serial port such as "/dev/ttyUSB0", or a connection.
-    camera: Device number, file or URL for `real.camera`, or an object with `read` and `close`; the
-      connection's if None.
+    camera: Device number, file or URL for `real.camera.device`, or an object with `read` and
+      `close`; the connection's if None.
     scene: Folder of a scene bundle, or an opened one, for its goals and extent; None: the built-in
       room.
     image_size: (height, width) of the picture; None for a robot without a camera.
@@ -63,7 +64,7 @@ def load(
     offsets: The robot's `offset.yaml`; none if None.
     lens: The camera's camera_info YAML (`launch/calibrate_camera.py`), for the recording: what the
       camera does can be found in it only with its lens.
-    recorder: A `real.recorder.Recorder`, which the caller closes.
+    recorder: A `real.recorder.recorder.Recorder`, which the caller closes.
     dry_run: Reads everything and moves nothing.
 
   Returns:
@@ -94,10 +95,18 @@ def load(
       eye = _open_camera(connection.camera if camera is None else camera, image_size)
     operator = connection.operator or Terminal()
     environment = RobotEnvironment(
-      bus, camera=eye, operator=operator, goal_bounds=_floor(bundle.extent), goals=goals,
-      image_size=image_size, head_pan_limit=head_pan, settings=settings, recorder=recorder,
-      time_limit=_TIME_LIMITS[task] if time_limit is None else time_limit, dry_run=dry_run,
-    )  # fmt: skip
+      bus,
+      camera=eye,
+      operator=operator,
+      goal_bounds=_floor(bundle.extent),
+      goals=goals,
+      image_size=image_size,
+      head_pan_limit=head_pan,
+      settings=settings,
+      recorder=recorder,
+      time_limit=_TIME_LIMITS[task] if time_limit is None else time_limit,
+      dry_run=dry_run,
+    )
     environment.set_goal(goal)
     if recorder is not None and seen_through is not None:
       recorder.camera_info(bus.clock.wall(bus.clock.now()), seen_through)
@@ -120,6 +129,6 @@ def _open_camera(source: Any, image_size: tuple[int, int]) -> CameraSource:
     raise ValueError("The robot's camera is missing: give camera=..., or image_size=None.")
   if hasattr(source, "read"):
     return source
-  from real.camera import Camera
+  from nerf2real.real.camera.device import Camera
 
   return Camera.open(source, size=image_size)

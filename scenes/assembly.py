@@ -11,12 +11,16 @@ import cv2
 import numpy as np
 import trimesh
 
-from scenes import align, bundle, collision, convex, evaluate, free_space, fusion, localise, report
-from scenes.render import Renderer
-from scenes.stages import to_plain
+from nerf2real.scenes import bundle
+from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion
+from nerf2real.scenes.poses import localise
+from nerf2real.scenes.quality import held_out as evaluate
+from nerf2real.scenes.quality import report
+from nerf2real.scenes.stages import to_plain
 
 if TYPE_CHECKING:
-  from scenes.pipeline import Job
+  from nerf2real.scenes.pipeline import Job
 
 _NOTICEABLE_EXPOSURE = 1.25  # ours: a ratio above this is warned of
 _ROBOT_VIEWS = 8  # held-out views shown at robot resolution where no truth gives better ones
@@ -72,10 +76,15 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
   if measure is not None:
     truth = measure(
       Reconstruction(
-        job.localisation, job.renderer, job.alignment, parts, job.world_depth,
-        _frame_times(job), job.settings.collision.top,
+        job.localisation,
+        job.renderer,
+        job.alignment,
+        parts,
+        job.world_depth,
+        _frame_times(job),
+        job.settings.collision.top,
       )
-    )  # fmt: skip
+    )
     figures |= truth.figures
     robot_views = truth.robot_views
   else:
@@ -120,11 +129,7 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
   )
   scene = {
     "name": name,
-    "source": {
-      "name": job.source.name,
-      "kind": job.capture.kind,
-      "sha256": job.source_key,
-    },
+    "source": {"name": job.source.name, "kind": job.capture.kind, "sha256": job.source_key},
     "settings": settings,
     "hashes": {stage: result.key for stage, result in results.items()},
     "world_from_unit": transform.to_dict(),

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from scenes import free_space, stages
-from scenes.similarity import Similarity
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes import stages
+from nerf2real.scenes.geometry import free_space
 
 FORMAT = "scene-bundle"
 FORMAT_VERSION = 1

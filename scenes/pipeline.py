@@ -16,35 +16,25 @@ import cv2
 import numpy as np
 import pycolmap
 
-from scenes import align as aligning
-from scenes import (
-  anchors,
-  assembly,
-  bundle,
-  collision_error,
-  convex,
-  evaluate,
-  fusion,
-  image_quality,
-  keyframes,
-  markers,
-  overrides,
-  photometry,
-  poisson,
-  stages,
-)
-from scenes import collision as contact
-from scenes import localise as localising
-from scenes import mesh as meshing
-from scenes.capture import CaptureSettings, read_capture
-from scenes.field import Field
-from scenes.free_space import FreeSpaceSettings, free_space
-from scenes.fused import FusedField
-from scenes.render import Renderer
-from scenes.train import train
-from scenes.train_settings import TrainSettings
-from scenes.train_settings import preset as train_preset
-from scenes.views import Views
+from nerf2real.scenes import assembly, bundle, stages
+from nerf2real.scenes.capture import keyframes
+from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
+from nerf2real.scenes.field import anchors, photometry
+from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.field.fused.trainer import FusedField
+from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.field.settings import TrainSettings
+from nerf2real.scenes.field.settings import preset as train_preset
+from nerf2real.scenes.field.training import train
+from nerf2real.scenes.field.views import Views
+from nerf2real.scenes.geometry import align as aligning
+from nerf2real.scenes.geometry import collision as contact
+from nerf2real.scenes.geometry import convex, fusion, markers, overrides, poisson
+from nerf2real.scenes.geometry import mesh as meshing
+from nerf2real.scenes.geometry.free_space import FreeSpaceSettings, free_space
+from nerf2real.scenes.poses import localise as localising
+from nerf2real.scenes.quality import collision_error, image_quality
+from nerf2real.scenes.quality import held_out as evaluate
 
 STAGES = ".stages"  # folder of the cached stages inside a bundle
 
@@ -98,9 +88,7 @@ def preset(name: str) -> SceneSettings:
     )
   if name == "paper":
     return SceneSettings(
-      capture=CaptureSettings(num_keyframes=1000),
-      train=train_preset("paper"),
-      train_width=1920,
+      capture=CaptureSettings(num_keyframes=1000), train=train_preset("paper"), train_width=1920
     )
   raise ValueError(f"Unknown preset {name!r}; expected one of {', '.join(PRESETS)}.")
 
@@ -121,7 +109,7 @@ def make_scene(
     source: A video, a folder of pictures, a COLMAP model or a transforms.json.
     out: The bundle's folder; stages are cached in it.
     settings: Settings of all stages.
-    override: File that fixes what would be found automatically, see `scenes.overrides`.
+    override: File that fixes what would be found automatically, see `scenes.geometry.overrides`.
     name: The scene's name; that of the output folder if None.
     measure: Adds figures against a known truth.
     show_progress: Whether to draw progress bars.
@@ -233,8 +221,11 @@ class Job:
 
   def train(self) -> None:
     """Trains the field on all views that are not held out."""
-    settings = {"train": self.settings.train, "held_out_every": self.settings.held_out_every,
-                "train_width": self.settings.train_width}  # fmt: skip
+    settings = {
+      "train": self.settings.train,
+      "held_out_every": self.settings.held_out_every,
+      "train_width": self.settings.train_width,
+    }
 
     def run(folder: Path, progress: stages.Progress) -> None:
       training, _ = self.views().split(self.settings.held_out_every)
@@ -302,8 +293,11 @@ class Job:
 
   def world(self) -> None:
     """Finds floor, scale, yaw and extent."""
-    settings = {"align": self.settings.align, "marker_side": self.settings.marker_side,
-                "override": self._override_key}  # fmt: skip
+    settings = {
+      "align": self.settings.align,
+      "marker_side": self.settings.marker_side,
+      "override": self._override_key,
+    }
 
     def run(folder: Path, progress: stages.Progress) -> None:
       found = self.localisation
@@ -315,9 +309,11 @@ class Job:
           progress=lambda fraction, text: progress(0.6 * fraction, text),
         )
         marker = markers.marker_scale(
-          detections, camera=found.camera, frame_from_camera=found.world_from_camera,
+          detections,
+          camera=found.camera,
+          frame_from_camera=found.world_from_camera,
           side=self.settings.marker_side,
-        )  # fmt: skip
+        )
       points, normals = self.unit_depth.surface_points(stride=2)
       result = aligning.align(
         points=found.points,
@@ -348,15 +344,21 @@ class Job:
     def run(folder: Path, progress: stages.Progress) -> None:
       place = self.alignment
       grid = fusion.fuse(
-        self.world_depth, lower=place.extent_lower, upper=place.extent_upper,
-        voxel=settings.voxel, truncation=settings.truncation,
+        self.world_depth,
+        lower=place.extent_lower,
+        upper=place.extent_upper,
+        voxel=settings.voxel,
+        truncation=settings.truncation,
         progress=lambda fraction, text: progress(0.5 * fraction, text),
-      )  # fmt: skip
+      )
       if settings.source == "density":
         grid = meshing.density_to_grid(
-          self._densities(grid), lower=grid.lower, voxel=grid.voxel,
-          threshold=settings.density_threshold, carved=grid,
-        )  # fmt: skip
+          self._densities(grid),
+          lower=grid.lower,
+          voxel=grid.voxel,
+          threshold=settings.density_threshold,
+          carved=grid,
+        )
       grid = meshing.drop_floaters(grid, min_component=settings.min_component)
       found = meshing.drop_small_pieces(meshing.surface(grid), min_component=settings.min_component)
       progress(0.7, "fewer faces")
@@ -386,18 +388,24 @@ class Job:
       shape = dataclasses.replace(settings.collision, floor_threshold=place.floor_threshold)
       top = np.minimum(place.extent_upper, [np.inf, np.inf, shape.top])
       grid = contact.solid_grid(
-        self.world_depth, lower=place.extent_lower, upper=place.extent_upper, settings=shape,
+        self.world_depth,
+        lower=place.extent_lower,
+        upper=place.extent_upper,
+        settings=shape,
         progress=lambda fraction, text: progress(0.2 * fraction, text),
-      )  # fmt: skip
+      )
       parts = convex.decompose(
         grid, settings=shape.parts, progress=lambda f, text: progress(0.2 + 0.6 * f, text)
       )
       contact.write_parts(parts, folder / "collision")
       progress(0.8, "free space")
       space = free_space(
-        parts, lower=place.extent_lower, upper=place.extent_upper, seen=grid,
+        parts,
+        lower=place.extent_lower,
+        upper=place.extent_upper,
+        seen=grid,
         settings=settings.free_space,
-      )  # fmt: skip
+      )
       space.write(folder / "free_space.pgm")
       goals = space.default_goals(
         count=settings.free_space.goals, clearance=settings.free_space.goal_clearance
@@ -405,9 +413,13 @@ class Job:
       progress(0.85, "distance to the seen surface")
       points, _ = self.world_depth.surface_points(stride=2)
       error = collision_error.collision_error(
-        parts, points, eyes=self.world_depth.positions, lower=place.extent_lower, upper=top,
+        parts,
+        points,
+        eyes=self.world_depth.positions,
+        lower=place.extent_lower,
+        upper=top,
         floor_threshold=place.floor_threshold,
-      )  # fmt: skip
+      )
       values = {
         "goals": goals.tolist(),
         "free_area_m2": float(space.reachable.sum() * space.resolution**2),
@@ -418,9 +430,8 @@ class Job:
       (folder / "contact.json").write_text(json.dumps(values, indent=1))
 
     self.stages.run(
-      "contact", run, settings=[settings.collision, settings.free_space],
-      inputs=self._keys("world"),
-    )  # fmt: skip
+      "contact", run, settings=[settings.collision, settings.free_space], inputs=self._keys("world")
+    )
 
   def poisson(self) -> None:
     """Renders the paper's baseline, the Poisson mesh of the COLMAP points, at held-out views."""
@@ -449,5 +460,6 @@ class Job:
         json.dumps({"baseline_psnr_db": float(np.mean(quality))})
       )
 
-    self.stages.run("baseline", run, settings=self.settings.held_out_every,
-                     inputs=self._keys("poses"))  # fmt: skip
+    self.stages.run(
+      "baseline", run, settings=self.settings.held_out_every, inputs=self._keys("poses")
+    )

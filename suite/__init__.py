@@ -9,6 +9,6 @@ import warnings
 # The simulation needs none.
 warnings.filterwarnings("ignore", ".*DISPLAY environment variable is missing", module="glfw")
 
-from suite.loading import ALL_TASKS, load  # noqa: E402  (the filter must come first)
+from nerf2real.suite.loading import ALL_TASKS, load  # noqa: E402  (the filter must come first)
 
 __all__ = ["ALL_TASKS", "load"]

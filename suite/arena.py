@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from dm_control import composer
 
-from suite.op3 import op3
+from nerf2real.suite.op3 import op3
 
 FLOOR_FRICTION = (1.0, 0.005, 0.0001)  # sliding, torsional, rolling: ours (MuJoCo's defaults)
 _FLOOR_COLOR = (0.55, 0.52, 0.48, 1.0)
@@ -14,20 +14,20 @@ _MARGIN = 1.0  # m of floor around the scene's extent
 
 # Colours of the convex parts in third-person pictures (Okabe and Ito's palette, softened).
 _PART_COLORS = (
-  (0.35, 0.55, 0.70, 1.0), (0.80, 0.65, 0.35, 1.0), (0.35, 0.62, 0.52, 1.0),
-  (0.75, 0.58, 0.68, 1.0), (0.55, 0.70, 0.82, 1.0), (0.78, 0.50, 0.38, 1.0),
-)  # fmt: skip
+  (0.35, 0.55, 0.70, 1.0),
+  (0.80, 0.65, 0.35, 1.0),
+  (0.35, 0.62, 0.52, 1.0),
+  (0.75, 0.58, 0.68, 1.0),
+  (0.55, 0.70, 0.82, 1.0),
+  (0.78, 0.50, 0.38, 1.0),
+)
 
 
 class SceneArena(composer.Arena):
   """A room as MuJoCo collides with it: z up, metres, floor at z = 0."""
 
   def _build(
-    self,
-    collision_parts: list[Path],
-    extent: tuple[np.ndarray, np.ndarray],
-    *,
-    name: str = "scene",
+    self, collision_parts: list[Path], extent: tuple[np.ndarray, np.ndarray], *, name: str = "scene"
   ) -> None:
     """Builds the arena.
 
@@ -57,14 +57,23 @@ class SceneArena(composer.Arena):
     root.visual.quality.set_attributes(shadowsize=0, offsamples=0)
     getattr(root.visual, "global").set_attributes(offwidth=1280, offheight=960)
     root.worldbody.add(
-      "light", name="sky", pos=(*center, 3.0), dir=(0, 0, -1), diffuse=(0.5, 0.5, 0.5),
+      "light",
+      name="sky",
+      pos=(*center, 3.0),
+      dir=(0, 0, -1),
+      diffuse=(0.5, 0.5, 0.5),
       castshadow=False,
-    )  # fmt: skip
+    )
     self._floor = root.worldbody.add(
-      "geom", name="floor", type="plane", pos=(*center, 0.0),
-      size=(*(half + _MARGIN), 0.1), friction=FLOOR_FRICTION, rgba=_FLOOR_COLOR,
+      "geom",
+      name="floor",
+      type="plane",
+      pos=(*center, 0.0),
+      size=(*(half + _MARGIN), 0.1),
+      friction=FLOOR_FRICTION,
+      rgba=_FLOOR_COLOR,
       group=op3.FLOOR_GROUP,
-    )  # fmt: skip
+    )
     self._parts = []
     for index, path in enumerate(collision_parts):
       mesh = root.asset.add(

@@ -2,7 +2,8 @@
 
 Composer's own reset recompiles the model (43 to 222 ms) and its observation updater visits every
 observable at every physics step. Here randomisation writes to the compiled model, and the sensor
-path of `suite.proprioception` keeps its own buffers: observables are read when a control step ends.
+path of `suite.sensors.proprioception` keeps its own buffers: observables are read when a
+control step ends.
 """
 
 import collections
@@ -17,7 +18,7 @@ from dm_control.composer.observation import observable
 from dm_control.rl import control
 from dm_env import specs
 
-from suite import errors
+from nerf2real.core import errors
 
 
 class Reading(observable.Generic):
@@ -127,6 +128,7 @@ class Environment(composer.Environment):
     # Counts start at zero in every episode, so any count is a new warning.
     counts = self._physics.data.ptr.warning.number
     if counts.any():
-      names = [name for name, count in zip(mujoco.mjtWarning.__members__, counts, strict=False)
-               if count]  # fmt: skip
+      names = [
+        name for name, count in zip(mujoco.mjtWarning.__members__, counts, strict=False) if count
+      ]
       raise control.PhysicsError(f"MuJoCo reports {', '.join(names)}: the simulation is invalid.")

@@ -4,17 +4,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from suite import errors
-from suite.camera import CameraSettings, FieldRenderer, RobotCamera
-from suite.effects import Effect, read_effects
-from suite.environment import Environment
-from suite.randomisation import RandomisationSettings
-from suite.tasks import ball_push, nerf_nav
-from suite.tasks.base import RobotTask
-from suite.tasks.settings import PHYSICS_TIMESTEP, TaskSettings
+from nerf2real.core import errors
+from nerf2real.suite.effects import Effect, read_effects
+from nerf2real.suite.environment import Environment
+from nerf2real.suite.pictures.camera import CameraSettings, FieldRenderer, RobotCamera
+from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.tasks import ball_push, nerf_nav
+from nerf2real.suite.tasks.base import RobotTask
+from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP, TaskSettings
 
 if TYPE_CHECKING:
-  from scenes.render import Renderer
+  from nerf2real.scenes.field.render.renderer import Renderer
 
 # Name to (class, length of an episode [s]).
 _TASKS: dict[str, tuple[type[RobotTask], float]] = {
@@ -69,9 +69,11 @@ def load(
   robot_camera = None
   if lens is not None:
     robot_camera = RobotCamera(
-      renderer or load_renderer(bundle), lens,
-      world_from_unit=bundle.world_from_unit, settings=camera,
-    )  # fmt: skip
+      renderer or load_renderer(bundle),
+      lens,
+      world_from_unit=bundle.world_from_unit,
+      settings=camera,
+    )
   task_class, default_limit = _TASKS[task]
   settings = TaskSettings(
     time_limit=default_limit if time_limit is None else time_limit,
@@ -92,7 +94,7 @@ def load(
 def open_scene(scene: Any) -> Any:
   """Returns an opened bundle from a folder, None (the built-in room) or a bundle."""
   if scene is None or isinstance(scene, str | Path):
-    from scenes.bundle import Bundle
+    from nerf2real.scenes.bundle import Bundle
 
     return Bundle.load(scene)
   if not hasattr(scene, "collision_parts"):
@@ -120,8 +122,8 @@ def load_renderer(bundle: Any) -> "Renderer":
   """Returns a renderer of a bundle's field on this machine's CPU."""
   import safetensors
 
-  from scenes.field import Field
-  from scenes.render import Renderer
+  from nerf2real.scenes.field.field import Field
+  from nerf2real.scenes.field.render.renderer import Renderer
 
   try:
     field = Field.load(bundle.field_path)

@@ -5,7 +5,7 @@ import collections
 import numpy as np
 from dm_env import specs
 
-from suite.op3 import constants
+from nerf2real.suite.op3 import constants
 
 HISTORY = 5  # control steps (paper: "a history of past 5 proprioceptive observations")
 

@@ -4,14 +4,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-  from sysid.identification import Settings
-  from sysid.outputs import evaluate, identify
+  from nerf2real.sysid.selection.identification import Settings
+  from nerf2real.sysid.selection.outputs import evaluate, identify
 
 __all__ = ["Settings", "evaluate", "identify"]
 
 _HOMES = {
-  "Settings": "sysid.identification", "evaluate": "sysid.outputs", "identify": "sysid.outputs",
-}  # fmt: skip
+  "Settings": "nerf2real.sysid.selection.identification",
+  "evaluate": "nerf2real.sysid.selection.outputs",
+  "identify": "nerf2real.sysid.selection.outputs",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -10,8 +10,8 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from agents.dmpo.inference import Policy, PolicyState, PolicyStep
-from agents.dmpo.specs import FlatObservation, Layout, planar_pose
+from nerf2real.agents.dmpo.inference import Policy, PolicyState, PolicyStep
+from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
 
 Trajectory = dict[str, np.ndarray]
 

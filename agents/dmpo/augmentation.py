@@ -11,8 +11,8 @@ import dm_pix
 import jax
 import jax.numpy as jnp
 
-from agents.dmpo.config import AugmentationConfig
-from agents.dmpo.shapes import check_shapes
+from nerf2real.agents.dmpo.config import AugmentationConfig
+from nerf2real.agents.dmpo.shapes import check_shapes
 
 
 def augment(key: jax.Array, images: jax.Array, config: AugmentationConfig) -> jax.Array:

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents.dmpo import networks
-from agents.dmpo.config import NetworkConfig
-from agents.dmpo.shapes import check_shapes
+from nerf2real.agents.dmpo import networks
+from nerf2real.agents.dmpo.config import NetworkConfig
+from nerf2real.agents.dmpo.shapes import check_shapes
 
 POSE_SIZE = 3  # x [m], y [m], yaw [rad]
 _MIN_STDDEV = 0.01  # m and rad: keeps a component from collapsing onto one state; ours

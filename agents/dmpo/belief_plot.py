@@ -12,12 +12,7 @@ _MARKER_SIZE = 0.025  # of the picture's longer side
 
 
 def position_density(
-  logits: np.ndarray,
-  means: np.ndarray,
-  stddevs: np.ndarray,
-  *,
-  extent: Extent,
-  cell: float = 0.05,
+  logits: np.ndarray, means: np.ndarray, stddevs: np.ndarray, *, extent: Extent, cell: float = 0.05
 ) -> np.ndarray:
   """Density [1/m^2] of x, y on a grid [rows, columns]; row 0 is at the largest y, as on a map."""
   x_from, x_to, y_from, y_to = extent

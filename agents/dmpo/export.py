@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.dmpo.inference import Policy
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.inference import Policy
+from nerf2real.agents.dmpo.specs import Layout
 
 FORMAT_VERSION = 1
 _ARRAYS, _RECORD = "policy.npz", "policy.json"

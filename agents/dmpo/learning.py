@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from agents.dmpo import augmentation, belief, losses, networks, returns
-from agents.dmpo.config import DmpoConfig
-from agents.dmpo.networks import LstmState, Params
-from agents.dmpo.specs import Layout, planar_pose
+from nerf2real.agents.dmpo import augmentation, belief, losses, networks, returns
+from nerf2real.agents.dmpo.config import DmpoConfig
+from nerf2real.agents.dmpo.networks import LstmState, Params
+from nerf2real.agents.dmpo.specs import Layout, planar_pose
 
 Metrics = dict[str, jax.Array]
 
@@ -104,8 +104,11 @@ def make_learning(config: DmpoConfig, layout: Layout) -> Learning:
     )
     new, optimiser_states = [], []
     states = (
-      state.policy_optimiser, state.critic_optimiser, state.dual_optimiser, state.belief_optimiser
-    )  # fmt: skip
+      state.policy_optimiser,
+      state.critic_optimiser,
+      state.dual_optimiser,
+      state.belief_optimiser,
+    )
     for name, grads, params, optimiser_state in zip(
       optimisers, gradients, trained, states, strict=True
     ):
@@ -183,9 +186,12 @@ def total_loss(
   values = jax.lax.stop_gradient(probabilities @ atoms)  # [N, B, T]
 
   loss_critic, metrics = critic_loss(
-    critic, critic_inputs=critic_inputs, batch=batch,
-    target_probabilities=jax.lax.stop_gradient(probabilities.mean(0)), config=config,
-  )  # fmt: skip
+    critic,
+    critic_inputs=critic_inputs,
+    batch=batch,
+    target_probabilities=jax.lax.stop_gradient(probabilities.mean(0)),
+    config=config,
+  )
 
   flat = size * time
   present = (jnp.arange(time) <= last[:, None]).astype(jnp.float32)  # [B, T], 0 for padding

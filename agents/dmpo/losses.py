@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents.dmpo.shapes import check_shapes
+from nerf2real.agents.dmpo.shapes import check_shapes
 
 _MIN_DUAL = 1e-8  # added to softplus(raw), reference implementation
 _MIN_RAW_DUAL = -18.0  # smallest raw value of a dual variable, reference implementation

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents.dmpo.config import NetworkConfig
-from agents.dmpo.losses import Gaussian
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.config import NetworkConfig
+from nerf2real.agents.dmpo.losses import Gaussian
+from nerf2real.agents.dmpo.specs import Layout
 
 Params = dict[str, Any]
 

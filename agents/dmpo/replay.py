@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.specs import Layout
 
 _INDEX_FILE = "index.json"
 _ORIGIN = "origin"  # uint64 [capacity, 3]: actor's key, trajectory's number, insertion number + 1

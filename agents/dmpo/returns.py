@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from agents.dmpo.shapes import check_shapes
+from nerf2real.agents.dmpo.shapes import check_shapes
 
 
 class NStep(NamedTuple):

@@ -40,18 +40,26 @@ def access_control(users: list[str], prefix: str, *, learner: str | None) -> dic
   inward.append("declare_liveliness_subscriber")
   rules: list[dict[str, Any]] = [
     {
-      "id": "from actors", "permission": "allow", "flows": ["ingress"], "messages": inward,
+      "id": "from actors",
+      "permission": "allow",
+      "flows": ["ingress"],
+      "messages": inward,
       "key_exprs": [f"{prefix}/{k}/**" for k in ("trajectory", "metrics", "ask", "alive")],
     },
     {
-      "id": "to actors", "permission": "allow", "flows": ["egress"],
+      "id": "to actors",
+      "permission": "allow",
+      "flows": ["egress"],
       "messages": [
-        "reply", "declare_queryable", "declare_subscriber", "liveliness_token",
+        "reply",
+        "declare_queryable",
+        "declare_subscriber",
+        "liveliness_token",
         "declare_liveliness_subscriber",
       ],
       "key_exprs": [f"{prefix}/**"],
     },
-  ]  # fmt: skip
+  ]
   subjects = [{"id": "actors", "usernames": sorted(set(users) - {learner})}]
   policies = [{"rules": ["from actors", "to actors"], "subjects": ["actors"]}]
   if not subjects[0]["usernames"]:
@@ -62,17 +70,28 @@ def access_control(users: list[str], prefix: str, *, learner: str | None) -> dic
   if learner is not None:
     rules.append(
       {
-        "id": "learner", "permission": "allow", "flows": ["ingress", "egress"],
+        "id": "learner",
+        "permission": "allow",
+        "flows": ["ingress", "egress"],
         "messages": [
-          "put", "query", "reply", "declare_queryable", "declare_subscriber", "liveliness_token",
-          "liveliness_query", "declare_liveliness_subscriber",
+          "put",
+          "query",
+          "reply",
+          "declare_queryable",
+          "declare_subscriber",
+          "liveliness_token",
+          "liveliness_query",
+          "declare_liveliness_subscriber",
         ],
         "key_exprs": [f"{prefix}/**"],
       }
-    )  # fmt: skip
+    )
     subjects.append({"id": "learner", "usernames": [learner]})
     policies.append({"rules": ["learner"], "subjects": ["learner"]})
   return {
-    "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects,
+    "enabled": True,
+    "default_permission": "deny",
+    "rules": rules,
+    "subjects": subjects,
     "policies": policies,
-  }  # fmt: skip
+  }

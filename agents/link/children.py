@@ -18,10 +18,14 @@ def start_child(command: list[str], *, log: Path) -> subprocess.Popen:
   """
   with log.open("ab") as stream:
     return subprocess.Popen(
-      command, stdout=stream, stderr=stream, stdin=subprocess.DEVNULL,
-      env=os.environ | {"PYTHONUNBUFFERED": "1"}, start_new_session=True,
+      command,
+      stdout=stream,
+      stderr=stream,
+      stdin=subprocess.DEVNULL,
+      env=os.environ | {"PYTHONUNBUFFERED": "1"},
+      start_new_session=True,
       preexec_fn=_die_with_parent,
-    )  # fmt: skip
+    )
 
 
 def last_lines(log: Path, count: int = 8) -> str:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from agents.link import schema
-from agents.link.delivery import Outbox
-from agents.link.schema import MessageError
-from agents.link.sessions import LinkSettings
-from agents.link.sessions import close as close_session
+from nerf2real.agents.link import schema
+from nerf2real.agents.link.delivery import Outbox
+from nerf2real.agents.link.schema import MessageError
+from nerf2real.agents.link.sessions import LinkSettings
+from nerf2real.agents.link.sessions import close as close_session
 
 _PARAMETERS_TIMEOUT = 30.0  # s; 8 MB take 0.1 s
 
@@ -96,9 +96,12 @@ class ActorLink:
       held: steps granted before and not sent yet; what waits in the outbox is added.
     """
     values = {
-      "actor": self.actor, "wanted": wanted, "held": held + self.outbox.steps,
-      "version": max(self.version, 0), "oldest": self.outbox.oldest,
-    }  # fmt: skip
+      "actor": self.actor,
+      "wanted": wanted,
+      "held": held + self.outbox.steps,
+      "version": max(self.version, 0),
+      "oldest": self.outbox.oldest,
+    }
     message = self.ask("credit", schema.encode("credit", values), kind="grant")
     if message is None:
       return None

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from agents.link import schema
-from agents.link.delivery import Ledger
-from agents.link.limiter import RateLimiter
-from agents.link.schema import MessageError
-from agents.link.sessions import LinkSettings
+from nerf2real.agents.link import schema
+from nerf2real.agents.link.delivery import Ledger
+from nerf2real.agents.link.limiter import RateLimiter
+from nerf2real.agents.link.schema import MessageError
+from nerf2real.agents.link.sessions import LinkSettings
 
 # Versions kept for the evaluator: when it reports a best return, they are still here to be saved.
 _HELD_VERSIONS = 4

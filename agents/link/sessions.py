@@ -14,7 +14,7 @@ from typing import Any
 
 import zenoh
 
-from agents.link.access import LinkError, access_control, read_users
+from nerf2real.agents.link.access import LinkError, access_control, read_users
 
 _log = logging.getLogger(__name__)
 

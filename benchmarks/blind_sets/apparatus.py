@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from suite.op3 import constants
+from nerf2real.suite.op3 import constants
 
 KINDS = ("pendulum", "arm", "op3")
 
@@ -73,9 +73,13 @@ def _pendulum(rng: np.random.Generator) -> Apparatus:
       <inertial pos="0 0 {-length:.4f}" mass="{mass:.4f}" diaginertia="1e-4 1e-4 1e-4"/>
     </body>"""
   return Apparatus(
-    "pendulum", _document("xm430_pendulum", body, ["joint"], gain),
-    rng.uniform(-0.3, 0.3, 1), rng.uniform(0.9, 1.3, 1), 16.0, 2e-4,
-  )  # fmt: skip
+    "pendulum",
+    _document("xm430_pendulum", body, ["joint"], gain),
+    rng.uniform(-0.3, 0.3, 1),
+    rng.uniform(0.9, 1.3, 1),
+    16.0,
+    2e-4,
+  )
 
 
 def _arm(rng: np.random.Generator) -> Apparatus:
@@ -95,9 +99,13 @@ def _arm(rng: np.random.Generator) -> Apparatus:
     above = -length
   count = len(names)
   return Apparatus(
-    "arm", _document("servo_arm", text + close.rstrip("\n"), names, GAIN),
-    rng.uniform(-0.4, 0.4, count), rng.uniform(0.5, 0.9, count), 14.0, 2e-4,
-  )  # fmt: skip
+    "arm",
+    _document("servo_arm", text + close.rstrip("\n"), names, GAIN),
+    rng.uniform(-0.4, 0.4, count),
+    rng.uniform(0.5, 0.9, count),
+    14.0,
+    2e-4,
+  )
 
 
 def _op3(rng: np.random.Generator) -> Apparatus:
@@ -126,9 +134,13 @@ def _op3(rng: np.random.Generator) -> Apparatus:
   order = [joints.index(model.joint(index).name) for index in range(model.njnt)]
   ordered = [joints[index] for index in order]
   return Apparatus(
-    "op3", _document("op3_on_stand", body(torso, "    ").rstrip("\n"), ordered, GAIN),
-    center[order] + rng.uniform(-0.05, 0.05, 20), rng.uniform(0.18, 0.28, 20), 12.0, 2.5e-4,
-  )  # fmt: skip
+    "op3",
+    _document("op3_on_stand", body(torso, "    ").rstrip("\n"), ordered, GAIN),
+    center[order] + rng.uniform(-0.05, 0.05, 20),
+    rng.uniform(0.18, 0.28, 20),
+    12.0,
+    2.5e-4,
+  )
 
 
 def _numbers(values) -> str:

@@ -142,8 +142,11 @@ def _one_sided(rng: np.random.Generator, drawn: Parameters) -> Parameters:
 def _gain(rng: np.random.Generator, drawn: Parameters) -> Parameters:
   weaker = rng.random() < 0.6
   gain = 1 - drawn["change"] if weaker else 1 + drawn["change"]
-  return {"gain": gain, "limit_scales": float(rng.random() < 0.5),
-          "effort_sees_it": float(rng.random() < 0.5)}  # fmt: skip
+  return {
+    "gain": gain,
+    "limit_scales": float(rng.random() < 0.5),
+    "effort_sees_it": float(rng.random() < 0.5),
+  }
 
 
 def _sag(rng: np.random.Generator, drawn: Parameters) -> Parameters:
@@ -209,18 +212,24 @@ LIBRARY: dict[str, Maker] = {
     {"breakaway": Range(0.08, 0.5), "velocity": Range(0.05, 0.4)}, ("breakaway",), _stribeck
   ),
   "load_friction": Maker(
-    {"coefficient": Range(0.08, 0.4)}, ("coefficient",),
-    _sets(load="coefficient", load_of_motor="of_motor"), finish=_load,
+    {"coefficient": Range(0.08, 0.4)},
+    ("coefficient",),
+    _sets(load="coefficient", load_of_motor="of_motor"),
+    finish=_load,
   ),
   "asymmetric_friction": Maker(
-    {"positive": Range(0.02, 0.08), "negative": Range(0.12, 0.5)}, ("positive", "negative"),
-    _adds(positive="positive", negative="negative"), finish=_one_sided,
+    {"positive": Range(0.02, 0.08), "negative": Range(0.12, 0.5)},
+    ("positive", "negative"),
+    _adds(positive="positive", negative="negative"),
+    finish=_one_sided,
   ),
   "quadratic_drag": Maker(
     {"coefficient": Range(0.06, 0.6)}, ("coefficient",), _adds(quadratic="coefficient")
   ),
   "backlash": Maker(
-    {"gap": Range(0.006, 0.05)}, ("gap",), _adds(gap="gap", encoder_on_motor="encoder_on_motor"),
+    {"gap": Range(0.006, 0.05)},
+    ("gap",),
+    _adds(gap="gap", encoder_on_motor="encoder_on_motor"),
     finish=_motor_side,
   ),
   "encoder_offset": Maker(
@@ -228,50 +237,77 @@ LIBRARY: dict[str, Maker] = {
   ),
   "motor_gain": Maker({"change": Range(0.1, 0.4)}, ("gain",), _motor_gain, finish=_gain),
   "supply_sag": Maker(
-    {"droop": Range(0.01, 0.08), "fade": Range(0.003, 0.012)}, ("droop", "fade"), _supply_sag,
-    True, finish=_sag,
+    {"droop": Range(0.01, 0.08), "fade": Range(0.003, 0.012)},
+    ("droop", "fade"),
+    _supply_sag,
+    True,
+    finish=_sag,
   ),
   "torque_limit": Maker(
     {"lost": Range(0.3, 0.8, logarithmic=False)}, ("limit",), _torque_limit, finish=_limit
   ),
   "thermal_derating": Maker(
     {"heating": Range(0.3, 3.0), "time_constant": Range(60, 400), "derating": Range(0.003, 0.01)},
-    ("heating",), _sets(heating="heating", cooling_time="time_constant", derating="derating"),
+    ("heating",),
+    _sets(heating="heating", cooling_time="time_constant", derating="derating"),
   ),
   "payload": Maker(
     {"mass": Range(0.04, 0.35), **{f"off_{a}": Range(0.005, 0.05, signed=True) for a in "xyz"}},
-    ("mass",), _payload,
+    ("mass",),
+    _payload,
   ),
   "spring": Maker(
-    {"stiffness": Range(0.4, 4.0), "reference": Range(0.02, 0.8, signed=True)}, ("stiffness",),
+    {"stiffness": Range(0.4, 4.0), "reference": Range(0.02, 0.8, signed=True)},
+    ("stiffness",),
     _sets(spring_stiffness="stiffness", spring_reference="reference"),
   ),
   "cogging": Maker(
-    {"amplitude": Range(0.08, 0.4), "periods": Range(6, 40),
-     "phase": Range(-3.1, 3.1, logarithmic=False)}, ("amplitude",),
+    {
+      "amplitude": Range(0.08, 0.4),
+      "periods": Range(6, 40),
+      "phase": Range(-3.1, 3.1, logarithmic=False),
+    },
+    ("amplitude",),
     _sets(cogging_amplitude="amplitude", cogging_periods="periods", cogging_phase="phase"),
   ),
   # One joint alone cannot tell tilted gravity from an offset encoder: not drawn for the pendulum.
   "gravity_tilt": Maker(
-    {"x": Range(0.04, 0.2, signed=True), "y": Range(0.04, 0.2, signed=True)}, ("x", "y"),
-    _gravity_tilt, True, _MULTI,
+    {"x": Range(0.04, 0.2, signed=True), "y": Range(0.04, 0.2, signed=True)},
+    ("x", "y"),
+    _gravity_tilt,
+    True,
+    _MULTI,
   ),
   "parameter_error": Maker(
-    {"damping": Range(0.08, 0.2, signed=True), "armature": Range(0.08, 0.2, signed=True),
-     "friction": Range(0.08, 0.3, signed=True)}, ("damping", "armature", "friction"),
-    _parameter_error, True, finish=_off_by,
+    {
+      "damping": Range(0.08, 0.2, signed=True),
+      "armature": Range(0.08, 0.2, signed=True),
+      "friction": Range(0.08, 0.3, signed=True),
+    },
+    ("damping", "armature", "friction"),
+    _parameter_error,
+    True,
+    finish=_off_by,
   ),
-}  # fmt: skip
+}
 
 OUTSIDE: dict[str, Maker] = {
   "sticking_spot": Maker(
-    {"depth": Range(0.25, 0.9), "center": Range(0.02, 0.4, signed=True),
-     "width": Range(0.03, 0.12)}, ("depth",),
+    {
+      "depth": Range(0.25, 0.9),
+      "center": Range(0.02, 0.4, signed=True),
+      "width": Range(0.03, 0.12),
+    },
+    ("depth",),
     _sets(stick_depth="depth", stick_center="center", stick_width="width"),
   ),
   "time_varying_stiffness": Maker(
-    {"stiffness": Range(1.5, 6.0), "period": Range(3.0, 9.0),
-     "reference": Range(0.05, 0.6, signed=True)}, ("stiffness",),
+    {
+      "stiffness": Range(1.5, 6.0),
+      "period": Range(3.0, 9.0),
+      "reference": Range(0.05, 0.6, signed=True),
+    },
+    ("stiffness",),
     _sets(varying_stiffness="stiffness", varying_period="period", varying_reference="reference"),
   ),
   "flexible_link": Maker(
@@ -280,34 +316,44 @@ OUTSIDE: dict[str, Maker] = {
     _sets(flexible_inertia="inertia", flexible_rate="rate", flexible_damping="damping"),
   ),
   "torque_dropout": Maker(
-    {"every": Range(0.6, 2.0), "lasting": Range(0.06, 0.25)}, ("lasting",), _dropout,
+    {"every": Range(0.6, 2.0), "lasting": Range(0.06, 0.25)},
+    ("lasting",),
+    _dropout,
     finish=_with_seed,
   ),
   "magnetic_detent": Maker(
-    {"torque": Range(0.25, 1.0), "center": Range(0.02, 0.45, signed=True),
-     "width": Range(0.03, 0.1)}, ("torque",),
+    {
+      "torque": Range(0.25, 1.0),
+      "center": Range(0.02, 0.45, signed=True),
+      "width": Range(0.03, 0.1),
+    },
+    ("torque",),
     _sets(detent_torque="torque", detent_center="center", detent_width="width"),
   ),
   "rubber_damper": Maker(
-    {"stiffness": Range(1.5, 6.0), "time": Range(0.15, 0.8)}, ("stiffness",),
+    {"stiffness": Range(1.5, 6.0), "time": Range(0.15, 0.8)},
+    ("stiffness",),
     _sets(rubber_stiffness="stiffness", rubber_time="time"),
   ),
   "soft_stop": Maker(
-    {"stiffness": Range(5.0, 25.0), "place": Range(0.05, 0.3),
-     "center": Range(0.01, 0.1, signed=True)}, ("stiffness",), _soft_stop, finish=_with_side,
+    {
+      "stiffness": Range(5.0, 25.0),
+      "place": Range(0.05, 0.3),
+      "center": Range(0.01, 0.1, signed=True),
+    },
+    ("stiffness",),
+    _soft_stop,
+    finish=_with_side,
   ),
-  "growing_friction": Maker(
-    {"rate": Range(0.02, 0.06)}, ("rate",), _adds(growing_friction="rate")
-  ),
+  "growing_friction": Maker({"rate": Range(0.02, 0.06)}, ("rate",), _adds(growing_friction="rate")),
   "outside_disturbance": Maker(
-    {"torque": Range(0.15, 0.6), "rate": Range(4.0, 25.0)}, ("torque",),
+    {"torque": Range(0.15, 0.6), "rate": Range(4.0, 25.0)},
+    ("torque",),
     _sets(disturbance="torque", disturbance_rate="rate"),
   ),
-  "weak_in_one_direction": Maker(
-    {"share": Range(0.2, 0.5)}, ("share",), _sets(weak_side="share")
-  ),
+  "weak_in_one_direction": Maker({"share": Range(0.2, 0.5)}, ("share",), _sets(weak_side="share")),
   "dead_band": Maker({"counts": Range(12.0, 45.0)}, ("counts",), _sets(dead_band="counts")),
-}  # fmt: skip
+}
 
 MAKERS = {**LIBRARY, **OUTSIDE}
 

@@ -110,11 +110,21 @@ class Trace(NamedTuple):
 def make_servos(count: int, **constants: np.ndarray | float) -> Servo:
   """Returns servos with the given constants; all others as on a perfect machine."""
   defaults = {
-    "stribeck_velocity": 0.1, "presliding": 3e-4, "gear_stiffness": 1000.0, "gear_damping": 0.4,
-    "electrical_lag": 0.0, "cooling_time": 300.0, "duty_limit": FULL_DUTY, "stick_width": 1.0,
-    "rubber_time": 1.0, "flexible_rate": 1.0, "varying_period": 1.0, "detent_width": 1.0,
-    "stop_angle": NEVER, "stop_side": 1.0,
-  }  # fmt: skip
+    "stribeck_velocity": 0.1,
+    "presliding": 3e-4,
+    "gear_stiffness": 1000.0,
+    "gear_damping": 0.4,
+    "electrical_lag": 0.0,
+    "cooling_time": 300.0,
+    "duty_limit": FULL_DUTY,
+    "stick_width": 1.0,
+    "rubber_time": 1.0,
+    "flexible_rate": 1.0,
+    "varying_period": 1.0,
+    "detent_width": 1.0,
+    "stop_angle": NEVER,
+    "stop_side": 1.0,
+  }
   values = {**dict.fromkeys(Servo._fields, 0.0), **defaults, **constants}
   arrays = {name: np.asarray(value, float) for name, value in values.items()}
   return Servo(**{name: np.broadcast_to(a, (count,)).copy() for name, a in arrays.items()})
@@ -156,9 +166,20 @@ def simulate(
   if dropouts is None:
     dropouts = np.zeros((0, 3))
   _run(
-    tree, servo, world, make_work(count), start_angles.astype(float), arrivals, commands, start,
-    1.0 / world.ticks_per_second, substeps, encoder_noise, dropouts, trace,
-  )  # fmt: skip
+    tree,
+    servo,
+    world,
+    make_work(count),
+    start_angles.astype(float),
+    arrivals,
+    commands,
+    start,
+    1.0 / world.ticks_per_second,
+    substeps,
+    encoder_noise,
+    dropouts,
+    trace,
+  )
   return trace
 
 
@@ -210,9 +231,20 @@ def _duty_count(servo, world, j, goal, reading):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _run(
-  tree, servo, world, work, start_angles, arrivals, commands, start, tick, substeps, noise,
-  dropouts, trace,
-):  # fmt: skip
+  tree,
+  servo,
+  world,
+  work,
+  start_angles,
+  arrivals,
+  commands,
+  start,
+  tick,
+  substeps,
+  noise,
+  dropouts,
+  trace,
+):
   count = len(start_angles)
   ticks = len(trace.volts)
   dt = tick / substeps

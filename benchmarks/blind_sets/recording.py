@@ -5,7 +5,7 @@ import pathlib
 
 import numpy as np
 
-from sysid import log_writer
+from nerf2real.core.robot_logs import writer as log_writer
 
 from .apparatus import Apparatus
 from .machine import Machine, Reading
@@ -79,11 +79,18 @@ def record(
   effort_noise = rng.normal(0, reading.effort_noise, (messages, count))
 
   trace = simulate(
-    machine.tree, machine.servo, world=machine.world, start_angles=commands[0],
-    arrivals=arrivals, commands=commands, start=start, ticks=ticks, step=apparatus.step,
+    machine.tree,
+    machine.servo,
+    world=machine.world,
+    start_angles=commands[0],
+    arrivals=arrivals,
+    commands=commands,
+    start=start,
+    ticks=ticks,
+    step=apparatus.step,
     encoder_noise=noise,
     dropouts=np.array(machine.dropouts, float).reshape(-1, 3) if machine.dropouts else None,
-  )  # fmt: skip
+  )
 
   def at(times: np.ndarray) -> np.ndarray:
     """Returns the ticks whose tables are read at times [T, J]."""

@@ -73,11 +73,15 @@ def read_tree(model: mujoco.MjModel) -> Tree:
     principal = _matrix(model.body_iquat[body])
     columns.append(
       [
-        rows.get(parent, -1), offset, rotation, model.jnt_axis[joint].copy(),
-        float(model.body_mass[body]), model.body_ipos[body].copy(),
+        rows.get(parent, -1),
+        offset,
+        rotation,
+        model.jnt_axis[joint].copy(),
+        float(model.body_mass[body]),
+        model.body_ipos[body].copy(),
         principal @ np.diag(model.body_inertia[body]) @ principal.T,
       ]
-    )  # fmt: skip
+    )
   return Tree(*(np.array(column) for column in zip(*columns, strict=True)))
 
 
@@ -96,10 +100,18 @@ def attach_point_mass(tree: Tree, body: int, mass: float, position: np.ndarray) 
 def make_work(count: int) -> Work:
   """Returns scratch arrays for a tree of `count` joints."""
   return Work(
-    np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 6)), np.zeros((count, 6)),
-    np.zeros((count, 6)), np.zeros((count, 6)), np.zeros((count, 3)), np.zeros((count, 3, 3)),
-    np.zeros(count), np.zeros((count, count)), np.zeros(count),
-  )  # fmt: skip
+    np.zeros((count, 3)),
+    np.zeros((count, 3, 3)),
+    np.zeros((count, 6)),
+    np.zeros((count, 6)),
+    np.zeros((count, 6)),
+    np.zeros((count, 6)),
+    np.zeros((count, 3)),
+    np.zeros((count, 3, 3)),
+    np.zeros(count),
+    np.zeros((count, count)),
+    np.zeros(count),
+  )
 
 
 def _point_inertia(mass: float, arm: np.ndarray) -> np.ndarray:

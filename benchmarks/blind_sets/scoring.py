@@ -211,9 +211,11 @@ def table(scores: list[Score]) -> list[Row]:
     _share("outside: unexplained", [s.unexplained for s in seen], 0.9),
     _share(
       "outside: wrong confident name",
-      [not s.none_wrong if s.mix == "outside" else None for s in seen], 0.05, most=True,
+      [not s.none_wrong if s.mix == "outside" else None for s in seen],
+      0.05,
+      most=True,
     ),
-  ]  # fmt: skip
+  ]
   errors = [e for s in seen for e in s.size_errors]
   covered = [c for s in seen for c in s.covered]
   rows.append(_median("sizes: relative error, median", errors, 0.05))
@@ -229,9 +231,10 @@ def table(scores: list[Score]) -> list[Row]:
   rows.append(
     _median(
       "held-out error, after over the stated floor, median",
-      [s.over_floor for s in effects if s.over_floor is not None], 1.15,
+      [s.over_floor for s in effects if s.over_floor is not None],
+      1.15,
     )
-  )  # fmt: skip
+  )
   healthy = [s.over_healthy for s in effects if s.over_healthy is not None]
   over = _median("held-out error, after over the healthy machine's, median", healthy, 1.0)
   rows.append(dataclasses.replace(over, target="-", met=None))

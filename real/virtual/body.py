@@ -14,10 +14,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from real.virtual.hidden import Hidden
-from real.virtual.motors import Motors
-from suite import filters
-from suite.op3 import constants, op3
+from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual.motors import Motors
+from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.sensors import filters
 
 STEP = 0.001  # s
 WORLDS = ("floor", "room")
@@ -57,9 +57,14 @@ class Body:
   """The plant: call `advance`, set motor goals, read sensors; threads may call it."""
 
   def __init__(
-    self, *, world: str = "floor", hidden: Hidden | None = None, ball: bool = False, furnish=None,
+    self,
+    *,
+    world: str = "floor",
+    hidden: Hidden | None = None,
+    ball: bool = False,
+    furnish=None,
     looks: bool = True,
-  ):  # fmt: skip
+  ):
     """Builds the world and hangs the robot at its origin.
 
     Args:
@@ -235,7 +240,7 @@ class Body:
 def _build(world: str, hidden: Hidden, ball: bool, furnish, looks: bool) -> mujoco.MjModel:
   """Returns the compiled world with the robot in it."""
   if world == "room":
-    from real.virtual import room
+    from nerf2real.scenes.builtin import room
 
     spec = room.build_room(looks=looks)
   else:
@@ -256,18 +261,28 @@ def _build(world: str, hidden: Hidden, ball: bool, furnish, looks: bool) -> mujo
   spec.attach(_robot(hidden), prefix=PREFIX, frame=spec.worldbody.add_frame())
   hand = spec.worldbody.add_body(name="hand", mocap=True, pos=[0, 0, _HELD_HEIGHT])
   spec.add_equality(
-    name="hand", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
-    name1=hand.name, name2=PREFIX + constants.TORSO_LINK,
+    name="hand",
+    type=mujoco.mjtEq.mjEQ_WELD,
+    objtype=mujoco.mjtObj.mjOBJ_BODY,
+    name1=hand.name,
+    name2=PREFIX + constants.TORSO_LINK,
     # anchor 0, relative pose identity, torque scale 1
-    data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0], active=True,
-  )  # fmt: skip
+    data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0],
+    active=True,
+  )
   if ball:
     body = spec.worldbody.add_body(name="ball", pos=[0, 0, 5.0])
     body.add_freejoint(name="ball")
     body.add_geom(
-      name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[_BALL_RADIUS, 0, 0],
-      mass=_BALL_MASS, rgba=_ORANGE, group=0, condim=6, friction=[0.6, 0.01, 0.002],
-    )  # fmt: skip
+      name="ball",
+      type=mujoco.mjtGeom.mjGEOM_SPHERE,
+      size=[_BALL_RADIUS, 0, 0],
+      mass=_BALL_MASS,
+      rgba=_ORANGE,
+      group=0,
+      condim=6,
+      friction=[0.6, 0.01, 0.002],
+    )
   return spec.compile()
 
 
@@ -287,9 +302,13 @@ def _robot(hidden: Hidden) -> mujoco.MjSpec:
   torso.add_freejoint(name="root")
   if hidden.payload > 0:
     torso.add_body(name="payload", pos=list(hidden.payload_position)).add_geom(
-      type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], mass=hidden.payload, group=4,
-      contype=0, conaffinity=0,
-    )  # fmt: skip
+      type=mujoco.mjtGeom.mjGEOM_SPHERE,
+      size=[0.01, 0, 0],
+      mass=hidden.payload,
+      group=4,
+      contype=0,
+      conaffinity=0,
+    )
   for name in constants.FOOT_LINKS:
     for geom in spec.body(name).geoms:
       geom.friction[0] = hidden.foot_friction

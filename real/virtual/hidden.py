@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from real.virtual.motors import GEAR_SHARE, MotorParameters
+from nerf2real.real.virtual.motors import GEAR_SHARE, MotorParameters
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

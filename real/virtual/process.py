@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from real.loading import Connection
-from real.operator import Hand
-from real.virtual.body import Truth
+from nerf2real.real.loading import Connection
+from nerf2real.real.safety.operator import Hand
+from nerf2real.real.virtual.body import Truth
 
 _START_TIMEOUT = 120.0  # s: painting the room takes 10 s on an idle machine
 _STOP_TIMEOUT = 5.0  # s
@@ -105,7 +105,7 @@ class VirtualRobotProcess:
 
 def _serve(pipe: Pipe, arguments: dict[str, Any]) -> None:
   """Runs the robot and does what it is asked until the pipe ends."""
-  from real.virtual.robot import VirtualRobot
+  from nerf2real.real.virtual.robot import VirtualRobot
 
   try:
     robot = VirtualRobot(**arguments)

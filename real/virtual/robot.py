@@ -14,19 +14,19 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from real.clock import Clock, RealClock, SteppedClock
-from real.loading import Connection
-from real.operator import Hand
-from real.virtual.body import Body, Truth
-from real.virtual.devices import Devices
-from real.virtual.eye import Eye
-from real.virtual.faults import Faults
-from real.virtual.hidden import Hidden
-from real.virtual.protocol_rehearsal import Cable
-from real.virtual.stream import CameraStream, Sensor
-from real.virtual.wire import Wire
-from scenes.cameras import Camera
-from suite.op3 import constants
+from nerf2real.core.cameras import Camera
+from nerf2real.real.loading import Connection
+from nerf2real.real.loop.clock import Clock, RealClock, SteppedClock
+from nerf2real.real.safety.operator import Hand
+from nerf2real.real.virtual.body import Body, Truth
+from nerf2real.real.virtual.bus.devices import Devices
+from nerf2real.real.virtual.bus.faults import Faults
+from nerf2real.real.virtual.bus.protocol_rehearsal import Cable
+from nerf2real.real.virtual.bus.wire import Wire
+from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual.stream import CameraStream, Sensor
+from nerf2real.scenes.builtin.eye import Eye
+from nerf2real.suite.op3 import constants
 
 # The lens of the virtual robot's camera: as wide as the C920 of the facts, not quite without
 # distortion, its axis not quite in the middle. Ours.
@@ -106,10 +106,20 @@ class VirtualRobot:
   """A robot to rehearse with."""
 
   def __init__(
-    self, *, world: str = "floor", seed: int | None = None, hidden: Hidden | None = None,
-    stepped: bool = False, camera: bool = False, ball: bool = False, lens: Camera = LENS,
-    latency: float = 0.04, gain: float = 1.0, noise: float = 2.0, furnish=None,
-  ):  # fmt: skip
+    self,
+    *,
+    world: str = "floor",
+    seed: int | None = None,
+    hidden: Hidden | None = None,
+    stepped: bool = False,
+    camera: bool = False,
+    ball: bool = False,
+    lens: Camera = LENS,
+    latency: float = 0.04,
+    gain: float = 1.0,
+    noise: float = 2.0,
+    furnish=None,
+  ):
     """Builds the robot, hanging in the hand of a person, supply off.
 
     Args:

@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from suite.effects.binding import Binding
-from suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 
 _LEAST_STRENGTH = 0.1  # ours: a servo that hot or starved has shut down; keeps the model regular
 

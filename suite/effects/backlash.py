@@ -14,9 +14,9 @@ link (its output gear), so that a light link stays regular.
 import mujoco
 import numpy as np
 
-from suite.effects import gear_train
-from suite.effects.binding import Binding
-from suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects import gear_train
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 
 LINK_SHARE = 0.02  # of the armature, ours
 ROTOR_WITHOUT_ARMATURE = 0.05  # of the joint's inertia, ours, for a model that declares none
@@ -92,10 +92,21 @@ class Backlash(Operator):
     self._last_velocity = velocity
     friction = self._friction_on_motor * (self._friction + binding.friction[geared])
     gear_train.advance_joints(
-      self.offset, self._speed, velocity, others, torque - back_emf * self._speed,
-      self._damping - back_emf, friction, self._rotor, mobility, self._half, self._stiffness,
-      self._tooth_damping, binding.timestep, self._passed,
-    )  # fmt: skip
+      self.offset,
+      self._speed,
+      velocity,
+      others,
+      torque - back_emf * self._speed,
+      self._damping - back_emf,
+      friction,
+      self._rotor,
+      mobility,
+      self._half,
+      self._stiffness,
+      self._tooth_damping,
+      binding.timestep,
+      self._passed,
+    )
     binding.friction[geared] *= self._friction_on_link
     binding.force[geared] += self._passed
     binding.last_force[self._driven] = force[self._driven]

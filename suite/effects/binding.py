@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from suite import inertia
+from nerf2real.suite.randomisation import inertia
 
 Array = np.ndarray
 _LISTED = 30  # names in an error message
@@ -107,10 +107,12 @@ class Binding:
     by_joint = {int(j): i for i, j in enumerate(self.joint_ids)}
     on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     self.actuator_joint = np.array(
-      [by_joint.get(int(model.actuator_trnid[u, 0]), -1) if on_joint[u] else -1
-       for u in range(model.nu)],
+      [
+        by_joint.get(int(model.actuator_trnid[u, 0]), -1) if on_joint[u] else -1
+        for u in range(model.nu)
+      ],
       int,
-    )  # fmt: skip
+    )
     """Index into the joints [U], -1 for an actuator that drives none of them."""
     self.gear = model.actuator_gear[:, 0].copy()
     self.affine = (

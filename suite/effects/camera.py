@@ -5,9 +5,9 @@ import math
 import cv2
 import numpy as np
 
-from suite import filters
-from suite.effects.binding import Binding
-from suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.sensors import filters
 
 
 class CameraGain(Operator):

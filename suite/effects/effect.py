@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from suite.effects.binding import Binding
+from nerf2real.suite.effects.binding import Binding
 
 Array = np.ndarray
 Value = float | Sequence[float]

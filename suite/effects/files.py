@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from suite.effects.effect import Effect, Parameter, Value
-from suite.effects.registry import kind_of
+from nerf2real.suite.effects.effect import Effect, Parameter, Value
+from nerf2real.suite.effects.registry import kind_of
 
 
 def check(effect: Effect) -> None:
@@ -75,11 +75,7 @@ def from_list(items: Any) -> list[Effect]:
 
 
 def _parse(item: Any) -> Effect:
-  if not isinstance(item, Mapping) or not {"kind"} <= set(item) <= {
-    "kind",
-    "target",
-    "parameters",
-  }:
+  if not isinstance(item, Mapping) or not {"kind"} <= set(item) <= {"kind", "target", "parameters"}:
     found = sorted(item) if isinstance(item, Mapping) else type(item).__name__
     raise ValueError(f"Found {found}, expected an object with kind, target and parameters.")
   kind = kind_of(item["kind"])

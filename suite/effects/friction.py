@@ -9,8 +9,8 @@ which divides the creep by 100; `solimpfriction="0.999 0.999"` says the same in 
 
 import numpy as np
 
-from suite.effects.binding import Binding
-from suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 
 _IMPEDANCE = 0.999  # ours, see above
 _VELOCITY_FLOOR = 1e-6  # rad/s, against division by zero

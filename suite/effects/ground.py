@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from suite.effects.binding import Binding
-from suite.effects.effect import Effect, Kind, Operator, Parameter
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Effect, Kind, Operator, Parameter
 
 
 def _geoms(binding: Binding, effect: Effect, *, planes: bool) -> list[int]:

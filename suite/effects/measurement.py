@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 
-from suite.effects.binding import Binding
-from suite.effects.effect import Array, Kind, Operator, Parameter
-from suite.effects.passive import rotation_matrix
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects.passive import rotation_matrix
 
 _JOINT_CHANNELS = ("joint_positions", "joint_velocities")
 _IMU_CHANNELS = ("gyroscope", "accelerometer")

@@ -5,9 +5,9 @@ import math
 import mujoco
 import numpy as np
 
-from suite import inertia
-from suite.effects.binding import Binding
-from suite.effects.effect import Kind, Operator, Parameter
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Kind, Operator, Parameter
+from nerf2real.suite.randomisation import inertia
 
 
 class ParameterError(Operator):

@@ -1,6 +1,6 @@
 """Every kind of effect, in the order in which they are put into a model."""
 
-from suite.effects import (
+from nerf2real.suite.effects import (
   actuation,
   backlash,
   camera,
@@ -10,7 +10,7 @@ from suite.effects import (
   passive,
   residual,
 )
-from suite.effects.effect import Kind
+from nerf2real.suite.effects.effect import Kind
 
 # Order: constants first (errors of declared ones before additions), then forces and strength;
 # backlash after all that changes the motor's torque; measurement chains from the sensor outwards.

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from suite.effects.binding import Binding
-from suite.effects.effect import Array, Effect, Kind, Operator, Parameter
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Array, Effect, Kind, Operator, Parameter
 
 
 def basis(value: Array, low: float, high: float, *, count: int) -> Array:

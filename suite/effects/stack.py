@@ -7,11 +7,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from suite import inertia
-from suite.effects import files
-from suite.effects.binding import Binding
-from suite.effects.effect import Array, Effect, Operator
-from suite.effects.registry import KINDS
+from nerf2real.suite.effects import files
+from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.effect import Array, Effect, Operator
+from nerf2real.suite.effects.registry import KINDS
+from nerf2real.suite.randomisation import inertia
 
 
 class EffectStack:

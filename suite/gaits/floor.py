@@ -8,7 +8,7 @@ _HALF_SIZE = 10.0  # m
 
 
 class _Free:
-  """All of the floor is free; the interface of `scenes.free_space.FreeSpace`."""
+  """All of the floor is free; the interface of `scenes.geometry.free_space.FreeSpace`."""
 
   def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
     """Draws x, y, yaw [count, 3] near the middle."""

@@ -7,7 +7,7 @@ the right-hand rule about x (forward), y (left) and z (up); a knee that bends is
 
 import numpy as np
 
-from suite.op3 import constants
+from nerf2real.suite.op3 import constants
 
 HIP_OFFSET = 0.035  # m from the middle to a hip, sideways (links.csv, hip_yaw_link)
 HIP_DROP = 0.0285  # m from the torso's origin down to the hips' centre (links.csv, hip_roll_link)

@@ -11,9 +11,9 @@ import dataclasses
 
 import numpy as np
 
-from suite import filters
-from suite.gaits import legs
-from suite.op3 import constants
+from nerf2real.suite.gaits import legs
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.sensors import filters
 
 _TIMESTEP = constants.CONTROL_TIMESTEP
 
@@ -72,12 +72,7 @@ class Command:
 class Gait:
   """The gait: one action a control step."""
 
-  def __init__(
-    self,
-    settings: GaitSettings | None = None,
-    *,
-    head_pan_limit: float | None = None,
-  ):
+  def __init__(self, settings: GaitSettings | None = None, *, head_pan_limit: float | None = None):
     """Creates a gait.
 
     Args:
@@ -170,9 +165,11 @@ class Gait:
       cosine, sine = np.cos(settings.lean), np.sin(settings.lean)
       x, z = cosine * ankle[0] - sine * ankle[2], sine * ankle[0] + cosine * ankle[2]
       leg = legs.leg_angles(
-        np.array([x, ankle[1], z]), foot_roll=0.0, foot_pitch=-settings.lean,
+        np.array([x, ankle[1], z]),
+        foot_roll=0.0,
+        foot_pitch=-settings.lean,
         yaw=reach * turn * settings.max_turn / 2,
-      )  # fmt: skip
+      )
       # The other foot is lifted: this hip carries the torso and sags inwards.
       _, other = _foot(own_phase - np.pi, settings.swing)
       leg[1] += side * amplitude * other * settings.tilt
@@ -182,8 +179,10 @@ class Gait:
   def _invert(self, targets: np.ndarray) -> np.ndarray:
     """Returns the action whose filtered value comes nearest to the targets."""
     strength = self._filter.strength
-    wanted = (np.clip(targets, self._middle - self._half_range, self._middle + self._half_range)
-              - self._middle) / self._half_range  # fmt: skip
+    wanted = (
+      np.clip(targets, self._middle - self._half_range, self._middle + self._half_range)
+      - self._middle
+    ) / self._half_range
     assert self._filter.value is not None
     action = np.clip((wanted - strength * self._filter.value) / (1 - strength), -1.0, 1.0)
     action = action.astype(np.float32)

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from suite.gaits.planner import Planner
-from suite.gaits.walk import Command, Gait, GaitSettings
-from suite.op3 import constants
+from nerf2real.suite.gaits.planner import Planner
+from nerf2real.suite.gaits.walk import Command, Gait, GaitSettings
+from nerf2real.suite.op3 import constants
 
 _TIMESTEP = constants.CONTROL_TIMESTEP
 
@@ -130,9 +130,11 @@ class Walker:
   def _walk_to(self, goal: np.ndarray) -> Command:
     if np.linalg.norm(goal - self.pose.xy) < self.steering.arrival:
       return Command(step=False)
-    if self._path is None or self._time >= self._planned + self.steering.replan or (
-      self._path[-1] != goal
-    ).any():  # fmt: skip
+    if (
+      self._path is None
+      or self._time >= self._planned + self.steering.replan
+      or (self._path[-1] != goal).any()
+    ):
       self._path, self._planned = self._planner.path(self.pose.xy, goal), self._time
     return self._aim(self._lookahead(self._path))
 

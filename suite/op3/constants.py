@@ -9,7 +9,7 @@ known when these numbers are used:
   the pose reward measures against; what the servos are told (`standing_targets`) is clipped to the
   ranges.
 - Equation of r_pose: printed without a minus sign, although the text calls the term a
-  regularisation towards the pose. `suite/rewards.py` implements a penalty (negative).
+  regularisation towards the pose. `suite/tasks/rewards.py` implements a penalty (negative).
 """
 
 import csv

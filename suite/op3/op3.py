@@ -11,7 +11,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
-from suite.op3 import constants
+from nerf2real.suite.op3 import constants
 
 # MuJoCo geom groups, shared by everything in `suite`.
 VISIBLE_GROUP = 0  # dynamic geoms that the robot's camera sees
@@ -44,10 +44,8 @@ _GEOMS: dict[str, list[tuple[str, tuple[float, ...], tuple[float, float, float],
   "hip_pitch_link": [("box", (0.017, 0.016, 0.048), (0.0, -0.019, -0.054), _LIGHT)],
   "knee_link": [("box", (0.013, 0.015, 0.048), (0.0, -0.021, -0.053), _LIGHT)],
   "ank_pitch_link": [("box", (0.028, 0.016, 0.019), (-0.020, -0.019, 0.012), _DARK)],
-  "ank_roll_link": [
-    ("box", size, position, _DARK) for size, position in constants.FOOT_BOXES
-  ],
-}  # fmt: skip
+  "ank_roll_link": [("box", size, position, _DARK) for size, position in constants.FOOT_BOXES],
+}
 
 
 class OP3(composer.Robot):
@@ -70,20 +68,26 @@ class OP3(composer.Robot):
     self._joints = tuple(self._root.find("joint", joint) for joint in constants.JOINT_NAMES)
     self._actuators = tuple(
       self._root.actuator.add(
-        "position", name=joint.name, joint=joint, kp=constants.POSITION_GAIN,
+        "position",
+        name=joint.name,
+        joint=joint,
+        kp=constants.POSITION_GAIN,
         ctrlrange=(lower, upper),
         forcerange=(-constants.TORQUE_LIMIT, constants.TORQUE_LIMIT),
       )
       for joint, lower, upper in zip(self._joints, self._lower, self._upper, strict=True)
-    )  # fmt: skip
+    )
     for first, second in constants.EXCLUDED_CONTACTS:
       self._root.contact.add(
         "exclude", name=f"{first}_{second}", body1=self._bodies[first], body2=self._bodies[second]
       )
     self._camera = self._bodies[constants.CAMERA_LINK].add(
-      "camera", name="head_camera", pos=constants.CAMERA_POSITION,
-      xyaxes=(0, -1, 0, 0, 0, 1), fovy=float(np.rad2deg(constants.CAMERA_VERTICAL_FOV)),
-    )  # fmt: skip
+      "camera",
+      name="head_camera",
+      pos=constants.CAMERA_POSITION,
+      xyaxes=(0, -1, 0, 0, 0, 1),
+      fovy=float(np.rad2deg(constants.CAMERA_VERTICAL_FOV)),
+    )
     self._imu = self.torso.add("site", name="imu", pos=constants.IMU_POSITION, size=(0.004,))
     self._imu.group = 4  # hidden in pictures
     self._gyroscope = self._root.sensor.add("gyro", name="gyroscope", site=self._imu)
@@ -102,18 +106,27 @@ class OP3(composer.Robot):
     )
     if link.joint != "free":
       body.add(
-        "joint", name=link.joint, type="hinge", axis=link.axis,
-        damping=constants.JOINT_DAMPING, armature=constants.ARMATURE,
+        "joint",
+        name=link.joint,
+        type="hinge",
+        axis=link.axis,
+        damping=constants.JOINT_DAMPING,
+        armature=constants.ARMATURE,
         frictionloss=constants.FRICTION_LOSS,
-      )  # fmt: skip
+      )
     side = -1.0 if link.name.startswith("r_") else 1.0
     part = link.name[2:] if link.name[:2] in ("l_", "r_") else link.name
     for index, (kind, size, position, color) in enumerate(_GEOMS[part]):
       body.add(
-        "geom", name=f"{link.name}_{index}", type=kind, size=size, rgba=color, mass=0,
+        "geom",
+        name=f"{link.name}_{index}",
+        type=kind,
+        size=size,
+        rgba=color,
+        mass=0,
         pos=(position[0], side * position[1], position[2]),
         group=HEAD_GROUP if part.startswith("head") else VISIBLE_GROUP,
-      )  # fmt: skip
+      )
     return body
 
   def _build_observables(self) -> "OP3Observables":

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from suite import protocols, rewards
-from suite.ball import Ball
-from suite.camera import RobotCamera
-from suite.op3 import constants
-from suite.tasks import touch
-from suite.tasks.base import RobotTask
-from suite.tasks.privileged import Quantity
-from suite.tasks.settings import TaskSettings
-from suite.tasks.state import Start
-from suite.tasks.workspace import Workspace, find_workspace
+from nerf2real.suite import protocols
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.pictures.camera import RobotCamera
+from nerf2real.suite.tasks import rewards, touch
+from nerf2real.suite.tasks.ball import Ball
+from nerf2real.suite.tasks.base import RobotTask
+from nerf2real.suite.tasks.privileged import Quantity
+from nerf2real.suite.tasks.settings import TaskSettings
+from nerf2real.suite.tasks.state import Start
+from nerf2real.suite.tasks.workspace import Workspace, find_workspace
 
 NAME = "ball_push"
 TIME_LIMIT = protocols.BALL_TIME_LIMIT  # s (paper)
@@ -50,9 +50,11 @@ class BallPush(RobotTask):
       workspace: Where the workspace lies; found in the free floor of the scene if None.
     """
     super().__init__(
-      scene, camera=camera, settings=settings or TaskSettings(time_limit=TIME_LIMIT),
+      scene,
+      camera=camera,
+      settings=settings or TaskSettings(time_limit=TIME_LIMIT),
       head_pan_limit=constants.BALL_PUSHING_HEAD_PAN,
-    )  # fmt: skip
+    )
     self.workspace = workspace or find_workspace(scene)
     self.ball = Ball()
     self._arena.add_free_entity(self.ball)

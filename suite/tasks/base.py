@@ -12,19 +12,19 @@ import numpy as np
 from dm_control import composer
 from dm_env import specs
 
-from suite import filters
-from suite import randomisation as randomising
-from suite import specs as policy_specs
-from suite.arena import SceneArena
-from suite.camera import RobotCamera
-from suite.effects import EffectStack
-from suite.environment import Reading
-from suite.op3 import constants, op3
-from suite.proprioception import Proprioception
-from suite.tasks import privileged, touch
-from suite.tasks.delayed_picture import DelayedPicture
-from suite.tasks.settings import TaskSettings
-from suite.tasks.state import RobotIndices, RobotState, Start
+from nerf2real.suite import specs as policy_specs
+from nerf2real.suite.arena import SceneArena
+from nerf2real.suite.effects import EffectStack
+from nerf2real.suite.environment import Reading
+from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.pictures.camera import RobotCamera
+from nerf2real.suite.randomisation import draws as randomising
+from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.proprioception import Proprioception
+from nerf2real.suite.tasks import privileged, touch
+from nerf2real.suite.tasks.delayed_picture import DelayedPicture
+from nerf2real.suite.tasks.settings import TaskSettings
+from nerf2real.suite.tasks.state import RobotIndices, RobotState, Start
 
 MIN_UPRIGHT = 0.5  # cosine of the torso's tilt below which it has fallen (60 degrees): ours
 MIN_HEIGHT = 0.14  # m of the torso's origin above the floor (standing: 0.246): ours
@@ -82,8 +82,7 @@ class RobotTask(composer.Task):
     self._standing = (constants.standing_targets() - self._middle) / self._half_range
     self._action_filter = filters.ExponentialFilter(constants.ACTION_FILTER)
     self._proprioception = Proprioception(
-      physics_timestep=settings.physics_timestep,
-      substeps=self._substeps,
+      physics_timestep=settings.physics_timestep, substeps=self._substeps
     )
     self.start: Start | None = None  # if set, every episode starts here (evaluation, rehearsal)
     self.hand_force = np.zeros(3)  # N on the torso in the world, in addition to the pushes
@@ -156,16 +155,21 @@ class RobotTask(composer.Task):
     self._touch = touch.Touch(model, root=self._indices.root, feet=self._indices.feet)
     self._effects = self._bind_effects()
     self._randomiser = randomising.Randomiser(
-      model, torso=self._robot.torso.full_identifier, ball=self._ball_geom(),
+      model,
+      torso=self._robot.torso.full_identifier,
+      ball=self._ball_geom(),
       imu_sites=(self._robot.imu.full_identifier,),
-    )  # fmt: skip
+    )
     self._picture: DelayedPicture | None = None
     if self.robot_camera is not None:
       self.robot_camera.bind(model, int(physics.bind(self._robot.camera).element_id))
       self._picture = DelayedPicture(
-        model, self.robot_camera, randomisation=self.settings.randomisation,
-        timestep=self._timestep, substeps=self._substeps,
-      )  # fmt: skip
+        model,
+        self.robot_camera,
+        randomisation=self.settings.randomisation,
+        timestep=self._timestep,
+        substeps=self._substeps,
+      )
     self._substep = 0
 
   def _bind_effects(self) -> EffectStack:
@@ -205,11 +209,14 @@ class RobotTask(composer.Task):
     mujoco.mj_forward(self._model, self._data)
     self._random_state = random_state
     self._proprioception.reset(
-      self._data.sensordata[self._indices.imu], self._data.qpos[self._indices.joint_qpos],
+      self._data.sensordata[self._indices.imu],
+      self._data.qpos[self._indices.joint_qpos],
       self._control,
-      imu_delay=self.draws.imu_delay, joint_delay=self.draws.joint_delay,
-      jitter=self.draws.jitter, rng=np.random.default_rng(random_state.randint(2**31)),
-    )  # fmt: skip
+      imu_delay=self.draws.imu_delay,
+      joint_delay=self.draws.joint_delay,
+      jitter=self.draws.jitter,
+      rng=np.random.default_rng(random_state.randint(2**31)),
+    )
     if self._picture is not None:
       self._picture.reset(self._data.qpos)
     self._state = self._indices.read()

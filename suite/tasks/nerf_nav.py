@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from suite import protocols, rewards
-from suite.camera import RobotCamera
-from suite.op3 import constants
-from suite.tasks.base import RobotTask
-from suite.tasks.settings import TaskSettings
-from suite.tasks.state import Start
+from nerf2real.suite import protocols
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.pictures.camera import RobotCamera
+from nerf2real.suite.tasks import rewards
+from nerf2real.suite.tasks.base import RobotTask
+from nerf2real.suite.tasks.settings import TaskSettings
+from nerf2real.suite.tasks.state import Start
 
 NAME = "nerf_nav"
 # s: ours, the paper names no limit for navigation; three times its median time to a goal (10.3 s).

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.op3 import constants
-from suite.randomisation import NUM_DRAWS, EpisodeDraws
-from suite.tasks.state import RobotState
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.randomisation.draws import NUM_DRAWS, EpisodeDraws
+from nerf2real.suite.tasks.state import RobotState
 
 PREFIX = "privileged/"
 _JOINTS = len(constants.JOINT_NAMES)

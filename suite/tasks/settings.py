@@ -3,9 +3,9 @@
 import dataclasses
 from collections.abc import Sequence
 
-from suite.effects import Effect
-from suite.op3 import constants
-from suite.randomisation import RandomisationSettings
+from nerf2real.suite.effects import Effect
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.randomisation.draws import RandomisationSettings
 
 PHYSICS_TIMESTEP = 0.0025  # s: benchmarks/physics_step.py, results in suite/README.md
 

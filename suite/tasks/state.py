@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 from dm_control import composer, mjcf
 
-from suite import rewards
-from suite.op3 import constants, op3
-from suite.tasks.settings import PHYSICS_TIMESTEP
+from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.tasks import rewards
+from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP
 
 
 class RobotState(NamedTuple):
@@ -17,7 +17,7 @@ class RobotState(NamedTuple):
 
   position: np.ndarray  # torso [3] in the world [m]
   rotation: np.ndarray  # world from torso [3, 3]
-  aligned: np.ndarray  # world from gravity-aligned frame [3, 3] (suite.rewards)
+  aligned: np.ndarray  # world from gravity-aligned frame [3, 3] (suite.tasks.rewards)
   velocity: np.ndarray  # torso [3] in the world [m/s]
   angular_velocity: np.ndarray  # torso [3] in the world [rad/s]
   feet_velocity: np.ndarray  # midpoint of the feet [3], gravity-aligned frame [m/s]

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from suite.op3 import op3
+from nerf2real.suite.op3 import op3
 
 _SCENE, _FLOOR = 1, 2  # bits
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from suite import protocols
+from nerf2real.suite import protocols
 
 _STEP = 0.1  # m between the places that are tried, and between the points that are counted
 _MIN_FREE = 0.25  # share of the workspace that a robot must be able to stand on: ours

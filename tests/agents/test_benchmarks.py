@@ -14,9 +14,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def _run(script, out, *arguments):
   subprocess.run(
-    [sys.executable, ROOT / "benchmarks" / script, "--out", out, *arguments], check=True,
-    capture_output=True, timeout=120, env=os.environ | {"PYTHONPATH": str(ROOT)},
-  )  # fmt: skip
+    [sys.executable, ROOT / "benchmarks" / script, "--out", out, *arguments],
+    check=True,
+    capture_output=True,
+    timeout=120,
+    env=os.environ | {"PYTHONPATH": str(ROOT)},
+  )
   return json.loads(out.read_text())
 
 
@@ -38,10 +41,17 @@ def test_link(tmp_path):
 def _write_run(folder, *, slope):
   folder.mkdir()
   rows = [
-    {"time": 100.0 + i, "source": source, "steps": 1000 * i, "updates": 250 * i,
-     "return": slope * i, "episodes": 5}
-    for i in range(1, 5) for source in ("actor-0-a", "evaluator-0-b")
-  ]  # fmt: skip
+    {
+      "time": 100.0 + i,
+      "source": source,
+      "steps": 1000 * i,
+      "updates": 250 * i,
+      "return": slope * i,
+      "episodes": 5,
+    }
+    for i in range(1, 5)
+    for source in ("actor-0-a", "evaluator-0-b")
+  ]
   (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
   launch = {"time": 99.0, "command": "python x", "processor": "p", "cores": 1}
   (folder / "launches.jsonl").write_text(json.dumps(launch) + "\n")
@@ -51,15 +61,35 @@ def test_curves(tmp_path):
   for name, slope in (("a", 100.0), ("b", 200.0)):
     _write_run(tmp_path / name, slope=slope)
   subprocess.run(
-    [sys.executable, ROOT / "benchmarks/curves.py", "--name", "x", "--out", tmp_path,
-     tmp_path / "a", tmp_path / "b", "--target", "700"],
-    check=True, capture_output=True, timeout=60, env=os.environ | {"PYTHONPATH": str(ROOT)},
-  )  # fmt: skip
+    [
+      sys.executable,
+      ROOT / "benchmarks/curves.py",
+      "--name",
+      "x",
+      "--out",
+      tmp_path,
+      tmp_path / "a",
+      tmp_path / "b",
+      "--target",
+      "700",
+    ],
+    check=True,
+    capture_output=True,
+    timeout=60,
+    env=os.environ | {"PYTHONPATH": str(ROOT)},
+  )
   rows = [json.loads(line) for line in (tmp_path / "curves_x.jsonl").read_text().splitlines()]
   assert [r["seconds"] for r in rows if r["row"] == "run"] == [5, 5]
   assert [r["return"] for r in rows if r["row"] == "evaluation"] == [
-    100, 200, 300, 400, 200, 400, 600, 800
-  ]  # fmt: skip
+    100,
+    200,
+    300,
+    400,
+    200,
+    400,
+    600,
+    800,
+  ]
   picture = cv2.imread(str(tmp_path / "curves_x.png")).astype(int)
   red, blue = (
     np.argwhere(np.abs(picture - colour[::-1]).max(-1) == 0)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from agents.dmpo import acting, cue_task, environments
-from agents.dmpo.export import load_policy
-from tests.agents.test_runs import finish, rows, start
+from nerf2real.agents.dmpo import acting
+from nerf2real.agents.dmpo.export import load_policy
+from nerf2real.agents.processes import cue_task, environments
+from tests.agents.processes.test_runs import finish, rows, start
 
 MINUTES = 15
 EPISODES = 100
@@ -17,9 +18,20 @@ MEMORYLESS_BOUND = 4 * cue_task.REWARDED_STEPS / np.sqrt(EPISODES)
 def test_recurrent_policy_remembers_the_cue(tmp_path):
   run = tmp_path / "run"
   process = start(
-    run, "--env", "agents:cue", "--preset", "vision_small", "--actors", "1",
-    "--max-env-steps", "8000", "--evaluation-period", "1000", "--evaluation-episodes", "20",
-  )  # fmt: skip
+    run,
+    "--env",
+    "agents:cue",
+    "--preset",
+    "vision_small",
+    "--actors",
+    "1",
+    "--max-env-steps",
+    "8000",
+    "--evaluation-period",
+    "1000",
+    "--evaluation-episodes",
+    "20",
+  )
   finish(process, timeout=MINUTES * 60, run=run)
   exported = load_policy(run / "policy" / "best")
   agent = acting.Agent(exported.policy, exported.layout, seed=0, deterministic=True)

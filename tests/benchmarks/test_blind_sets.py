@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks.blind_sets import apparatus as apparatuses
 from benchmarks.blind_sets import effects, machine, plant, recording, rigid_body, sets
-from sysid import logs
+from nerf2real.core.robot_logs import reading as logs
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -41,11 +41,17 @@ def _clean(apparatus, *, ticks_per_second):
 def _run(apparatus, servo, world, commands, period, duration, tree=None):
   ticks = round(duration * world.ticks_per_second)
   trace = plant.simulate(
-    tree or rigid_body.read_tree(apparatus.model), servo, world=world,
-    start_angles=commands[0], arrivals=np.arange(len(commands)) * period, commands=commands,
-    start=0.0, ticks=ticks, step=apparatus.step,
+    tree or rigid_body.read_tree(apparatus.model),
+    servo,
+    world=world,
+    start_angles=commands[0],
+    arrivals=np.arange(len(commands)) * period,
+    commands=commands,
+    start=0.0,
+    ticks=ticks,
+    step=apparatus.step,
     encoder_noise=np.zeros((ticks, commands.shape[1])),
-  )  # fmt: skip
+  )
   return trace.position / world.counts_per_radian, trace
 
 
@@ -227,9 +233,13 @@ def test_a_measurement_delay_shifts_positions_and_not_efforts():
   rng = np.random.default_rng(4)
   apparatus = apparatuses.make_apparatus("pendulum", rng)
   reading = machine.Reading(
-    stale=0.0, encoder_noise=0.0, velocity_noise=0.0, effort_noise=0.0, read_jitter=0.0,
+    stale=0.0,
+    encoder_noise=0.0,
+    velocity_noise=0.0,
+    effort_noise=0.0,
+    read_jitter=0.0,
     stamp_jitter=0.0,
-  )  # fmt: skip
+  )
   late = machine.build_machine(apparatus, rng)
   prompt = copy.deepcopy(late)
   effects.Drawn("measurement_delay", 0, {"delay": 0.03}).apply(late)
@@ -258,9 +268,15 @@ def test_sets_are_what_their_seed_says(tmp_path):
   assert first.answer["error_ratio"] > 1.5
   names = {path.stem for path in (tmp_path / "a").glob("*.mcap")}
   assert names == {
-    "train_1_sweep", "train_2_slow", "train_3_steps", "held_1_multisine", "held_2_sweep",
-    "reference_1_sweep", "reference_2_slow", "reference_3_steps",
-  }  # fmt: skip
+    "train_1_sweep",
+    "train_2_slow",
+    "train_3_steps",
+    "held_1_multisine",
+    "held_2_sweep",
+    "reference_1_sweep",
+    "reference_2_slow",
+    "reference_3_steps",
+  }
   model = mujoco.MjModel.from_xml_path(str(tmp_path / "a" / "model.xml"))
   for path in (tmp_path / "a").glob("*.mcap"):
     log = logs.read_log(path)
@@ -273,9 +289,18 @@ def test_sets_are_what_their_seed_says(tmp_path):
 def test_the_command_writes_answers_and_resumes(tmp_path):
   root = pathlib.Path(__file__).resolve().parents[2]
   command = [
-    sys.executable, str(root / "benchmarks/make_blind_sets.py"), "--out", str(tmp_path),
-    "--seed", "3", "--mix", "healthy", "--plants", "pendulum", "--count",
-  ]  # fmt: skip
+    sys.executable,
+    str(root / "benchmarks/make_blind_sets.py"),
+    "--out",
+    str(tmp_path),
+    "--seed",
+    "3",
+    "--mix",
+    "healthy",
+    "--plants",
+    "pendulum",
+    "--count",
+  ]
   subprocess.run([*command, "1"], check=True, capture_output=True, timeout=120)
   written = (tmp_path / "3_000" / "train_1_sweep.mcap").stat().st_mtime_ns
   subprocess.run([*command, "1"], check=True, capture_output=True, timeout=120)

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from benchmarks.blind_sets import effects, scoring
-from suite.effects import KINDS
+from nerf2real.suite.effects import KINDS
 
 
 def _truth(mix, *found, **more):
@@ -35,10 +35,11 @@ def test_a_right_name():
   score = scoring.score(
     _truth("single", DELAY, healthy_held_error=0.002),
     _report(
-      _effect("command_delay", delay=0.0315), CONSTANTS,
+      _effect("command_delay", delay=0.0315),
+      CONSTANTS,
       error={"held": {"before": 0.04, "after": 0.004}, "floor": 0.0025},
     ),
-  )  # fmt: skip
+  )
   assert score.right_first and score.right_joint and score.none_wrong
   assert score.size_errors == pytest.approx([0.05]) and score.covered == [True]
   assert score.gain == pytest.approx(10) and score.over_floor == pytest.approx(1.6)
@@ -153,11 +154,20 @@ def test_the_harness_scores_kept_reports(tmp_path):
   (tmp_path / "sets" / "answers.json").write_text(json.dumps(answers))
   subprocess.run(
     [
-      sys.executable, str(root / "benchmarks/identify.py"), "--sets", str(tmp_path / "sets"),
-      "--out", str(tmp_path / "out"), "--results", str(tmp_path), "--done-only",
+      sys.executable,
+      str(root / "benchmarks/identify.py"),
+      "--sets",
+      str(tmp_path / "sets"),
+      "--out",
+      str(tmp_path / "out"),
+      "--results",
+      str(tmp_path),
+      "--done-only",
     ],
-    check=True, capture_output=True, timeout=60,
-  )  # fmt: skip
+    check=True,
+    capture_output=True,
+    timeout=60,
+  )
   text = (tmp_path / "identify.md").read_text()
   assert "| single: right name first | 100 % | 1 | >= 90 % | yes |" in text
   assert "| healthy: accused | 100 % | 1 | <= 5 % | no |" in text

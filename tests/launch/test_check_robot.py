@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from launch import check_robot
-from real.virtual.devices import IDS
-from real.virtual.robot import VirtualRobot
-from suite.op3 import constants
+from nerf2real.real.virtual.bus.devices import IDS
+from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.suite.op3 import constants
 
 _ROOT = Path(__file__).parents[2]
 
@@ -60,8 +60,11 @@ def test_a_failing_robot_is_reported():
 def test_a_missing_port_is_one_line():
   found = subprocess.run(
     [sys.executable, "launch/check_robot.py", "--robot", "/dev/none"],
-    cwd=_ROOT, capture_output=True, text=True, timeout=120,
-  )  # fmt: skip
+    cwd=_ROOT,
+    capture_output=True,
+    text=True,
+    timeout=120,
+  )
   assert found.returncode == 1
   assert found.stderr.startswith("error: ") and "/dev/none" in found.stderr
   assert found.stderr.count("\n") == 1

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from suite.effects import Effect, read_effects, write_effects
-from suite.op3 import constants
-from sysid.logs import check_against_model, read_log
+from nerf2real.core.robot_logs.reading import check_against_model, read_log
+from nerf2real.suite.effects import Effect, read_effects, write_effects
+from nerf2real.suite.op3 import constants
 
 _LAUNCH = Path(__file__).parents[2] / "launch"
 

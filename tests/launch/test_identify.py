@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid import log_writer
+from nerf2real.core.robot_logs import writer as log_writer
 from tests.sysid.synthetic import ARM, PENDULUM
 
 _LAUNCH = Path(__file__).parents[2] / "launch"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import viser
 
-import suite
+from nerf2real import suite
 from tests.suite.synthetic import FlatRenderer, make_room
 
 _LAUNCH = Path(__file__).parents[2] / "launch"

@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 
-import real
-from real.motion import RobotSettings
-from real.virtual.hidden import Hidden
-from real.virtual.robot import VirtualRobot
+from nerf2real import real
+from nerf2real.real.loop.motion import RobotSettings
+from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual.robot import VirtualRobot
 
 
 class Picture:

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-import real
+from nerf2real import real
 
 
 def test_the_readme_example_runs():

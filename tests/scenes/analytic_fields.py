@@ -6,9 +6,9 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
-from scenes.contraction import from_grid_coordinates
-from scenes.encoding import is_dense
-from scenes.field import Field, FieldSettings
+from nerf2real.scenes.field.contraction import from_grid_coordinates
+from nerf2real.scenes.field.encoding import is_dense
+from nerf2real.scenes.field.field import Field, FieldSettings
 
 _GAIN = 3.0  # the layer norm makes +-8 of the feature's sign; times this it is the raw density
 

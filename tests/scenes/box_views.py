@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from scenes.cameras import Camera
-from scenes.views import Views
+from nerf2real.core.cameras import Camera
+from nerf2real.scenes.field.views import Views
 
 HALF_SIZE = 0.8  # the walls are at +-0.8 units
 
@@ -24,8 +24,9 @@ def make_views(
   count: int, *, width: int = 32, height: int = 24, seed: int = 0, anchors: int = 0
 ) -> Views:
   """Films the box from inside with random turns; `anchors` pixels a picture know their distance."""
-  camera = Camera(width=width, height=height, fx=0.8 * width, fy=0.8 * width, cx=width / 2,
-                  cy=height / 2, k1=0.03)  # fmt: skip
+  camera = Camera(
+    width=width, height=height, fx=0.8 * width, fy=0.8 * width, cx=width / 2, cy=height / 2, k1=0.03
+  )
   rng = np.random.default_rng(seed)
   images, poses, known = [], [], [np.zeros((0, 4), np.float32)]
   for _ in range(count):

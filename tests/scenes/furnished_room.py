@@ -3,7 +3,8 @@
 import mujoco
 import numpy as np
 
-from scenes import cameras, fusion
+from nerf2real.core import cameras
+from nerf2real.scenes.geometry import fusion
 
 # Centre and half size of each box [m]: a room of 5 x 4 x 2.5 m, floor at z = 0.
 WALLS = {
@@ -77,9 +78,19 @@ def depth_views(poses: np.ndarray, camera: cameras.Camera, *, noise=0.0, rng=Non
   for n, pose in enumerate(poses):
     hit, found = np.empty(len(rays), np.int32), np.empty(len(rays))
     mujoco.mj_multiRay(
-      m, d, pose[:3, 3], (rays @ pose[:3, :3].T).ravel(), None, True, -1, hit, found, None,
-      len(rays), 1e6,
-    )  # fmt: skip
+      m,
+      d,
+      pose[:3, 3],
+      (rays @ pose[:3, :3].T).ravel(),
+      None,
+      True,
+      -1,
+      hit,
+      found,
+      None,
+      len(rays),
+      1e6,
+    )
     depth[n] = np.where(hit >= 0, found, np.inf)  # rays have z = 1: the parameter is the z-depth
   if noise:
     depth *= 1 + noise * rng.standard_normal(depth.shape)

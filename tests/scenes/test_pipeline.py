@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from real.virtual import filming, yardstick
-from scenes import bundle, convex, pipeline
-from scenes import collision as contact
-from scenes.bundle import Bundle, BundleError
-from scenes.train_settings import preset as train_preset
+from nerf2real.scenes import bundle, pipeline
+from nerf2real.scenes.builtin import filming, yardstick
+from nerf2real.scenes.bundle import Bundle, BundleError
+from nerf2real.scenes.field.settings import preset as train_preset
+from nerf2real.scenes.geometry import collision as contact
+from nerf2real.scenes.geometry import convex
 
 _FRAMES = 40
 _SIZE = (160, 120)  # width, height
@@ -40,9 +41,19 @@ def source(tmp_path_factory):
         pose = truth["world_from_camera"][index] @ np.diag([1, -1, -1, 1])  # OpenGL's axes
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
   camera = truth["camera"].resized(*_SIZE)
-  about = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
-           "k1": camera.k1, "k2": camera.k2, "p1": camera.p1, "p2": camera.p2,
-           "w": camera.width, "h": camera.height, "frames": frames}  # fmt: skip
+  about = {
+    "fl_x": camera.fx,
+    "fl_y": camera.fy,
+    "cx": camera.cx,
+    "cy": camera.cy,
+    "k1": camera.k1,
+    "k2": camera.k2,
+    "p1": camera.p1,
+    "p2": camera.p2,
+    "w": camera.width,
+    "h": camera.height,
+    "frames": frames,
+  }
   (folder / "transforms.json").write_text(json.dumps(about))
   return folder / "transforms.json"
 

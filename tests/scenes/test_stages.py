@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from scenes.stages import StageError, Stages, hash_path, write_atomically
+from nerf2real.scenes.stages import StageError, Stages, hash_path, write_atomically
 
 
 def make(folder):

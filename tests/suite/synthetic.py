@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scenes.similarity import Similarity
+from nerf2real.core.similarity import Similarity
 
 # Boxes (lower, upper) [m]: walls of a 6 x 5 m room and furniture.
 BOXES = (
@@ -22,7 +22,7 @@ FREE = ((-2.6, -2.1), (1.6, 2.1))  # lower and upper corner of the free floor
 
 
 class FreeFloor:
-  """A rectangle of free floor, with the interface of `scenes.free_space.FreeSpace`."""
+  """A rectangle of free floor, with the interface of `scenes.geometry.free_space.FreeSpace`."""
 
   def sample(self, rng, count):
     return np.column_stack([rng.uniform(*FREE, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
@@ -62,7 +62,7 @@ def make_room(folder: Path) -> Room:
 
 
 class FlatRenderer:
-  """Renders one colour at one depth, with the interface of `scenes.render.Renderer`."""
+  """Renders one colour at one depth, with the interface of `Renderer`."""
 
   def __init__(self, color=(40, 80, 120), depth=np.inf):
     self.color, self.depth = color, depth  # depth in the unit frame

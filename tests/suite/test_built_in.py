@@ -5,13 +5,13 @@ import time
 import numpy as np
 import pytest
 
-import suite
-from suite import loading, protocols
+from nerf2real import suite
+from nerf2real.suite import loading, protocols
 
 
 @pytest.fixture(scope="module")
 def room():
-  from scenes import bundle
+  from nerf2real.scenes import bundle
 
   if not (bundle.BUILT_IN / "scene.json").is_file():
     pytest.skip("the built-in room is not in this checkout")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from dm_control import composer, mjcf
 
-from suite.op3 import constants, op3
-from suite.tasks.settings import PHYSICS_TIMESTEP
-from suite.tasks.state import standing_posture
+from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP
+from nerf2real.suite.tasks.state import standing_posture
 
 
 def _table():
@@ -74,9 +74,13 @@ def test_servos_are_p_only_with_the_declared_constants(physics):
 def test_limits_are_the_papers_and_mirrored(physics):
   model = physics.model.ptr
   expected = {
-    "head_pan": (-0.79, 0.79), "head_tilt": (-0.79, -0.157), "l_hip_roll": (-0.4, -0.1),
-    "l_knee": (-0.2, 2.0), "r_hip_pitch": (-1.57, 0.45), "r_sho_roll": (-0.8, 0.0),
-  }  # fmt: skip
+    "head_pan": (-0.79, 0.79),
+    "head_tilt": (-0.79, -0.157),
+    "l_hip_roll": (-0.4, -0.1),
+    "l_knee": (-0.2, 2.0),
+    "r_hip_pitch": (-1.57, 0.45),
+    "r_sho_roll": (-0.8, 0.0),
+  }
   for name, limits in expected.items():
     np.testing.assert_array_equal(model.actuator(f"op3/{name}").ctrlrange, limits)
   for name in constants.JOINT_NAMES:
@@ -135,8 +139,10 @@ def test_stands_still_for_a_minute_on_its_feet_alone(physics):
   floor = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[0])
   touching = {
     model.body(int(model.geom_bodyid[g])).name
-    for pair in data.contact.geom for g in pair if g != floor
-  }  # fmt: skip
+    for pair in data.contact.geom
+    for g in pair
+    if g != floor
+  }
   assert touching == {"op3/l_ank_roll_link", "op3/r_ank_roll_link"}
 
 

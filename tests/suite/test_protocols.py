@@ -6,7 +6,7 @@ import types
 import numpy as np
 import pytest
 
-from suite import protocols
+from nerf2real.suite import protocols
 
 
 def test_navigation_has_every_combination_twice():
@@ -62,9 +62,10 @@ def _room(half_width, *, goals):
     return bay | ((np.abs(x) < half_width) & (np.abs(y) < half_width))
 
   return types.SimpleNamespace(
-    extent=(np.full(2, -3.0), np.full(2, 3.0)), goals=np.array(goals),
+    extent=(np.full(2, -3.0), np.full(2, 3.0)),
+    goals=np.array(goals),
     free_space=types.SimpleNamespace(is_reachable=is_reachable),
-  )  # fmt: skip
+  )
 
 
 def test_starts_have_room_to_turn():

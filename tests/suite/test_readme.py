@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-import suite
+from nerf2real import suite
 
 
 def test_the_readme_example_runs():

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.cameras import Camera
-from sysid import log_writer
-from sysid.logs import Log, read_log
+from nerf2real.core.cameras import Camera
+from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.core.robot_logs.reading import Log, read_log
 
 START = 1_700_000_000_000_000_000
 LENS = Camera(
@@ -70,10 +70,14 @@ def angles(time: np.ndarray, motion: str, seed: int) -> np.ndarray:
   ramp = np.clip(time / 1.0, 0, 1)
   ramp = ramp**2 * (3 - 2 * ramp)
   waves = [
-    size * ramp * (np.sin(2 * np.pi * rate[i, 0] * time + phase[i, 0])
-                   + 0.5 * np.sin(2 * np.pi * rate[i, 1] * time + phase[i, 1]))
+    size
+    * ramp
+    * (
+      np.sin(2 * np.pi * rate[i, 0] * time + phase[i, 0])
+      + 0.5 * np.sin(2 * np.pi * rate[i, 1] * time + phase[i, 1])
+    )
     for i, size in enumerate((0.5, 0.25))
-  ]  # fmt: skip
+  ]
   both = np.stack(waves, axis=-1)
   return both * {"both": (1, 1), "pan": (1, 0), "still": (0, 0)}[motion]
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import butter, sosfilt
 from scipy.spatial.transform import Rotation
 
-from sysid.logs import ImuSeries, JointSeries, Log
+from nerf2real.core.robot_logs.reading import ImuSeries, JointSeries, Log
 
 _STEP = 5e-4  # s
 _COUNT = 2 * np.pi / 4096

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from suite.effects import Effect
-from sysid import evaluation
-from sysid.logs import JointSeries, Log
+from nerf2real.core.robot_logs.reading import JointSeries, Log
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.model import simulation as evaluation
 
 COUNT = 2 * np.pi / 4096  # rad, of an XM430's encoder
 
@@ -82,8 +82,11 @@ def log_of(
     start_ns=0,
     commands=JointSeries(joints, time, time, command, None, None),
     states=JointSeries(joints, states, states, blank, None, None),
-    pwm=None, imu=None, battery=None, temperatures={},
-  )  # fmt: skip
+    pwm=None,
+    imu=None,
+    battery=None,
+    temperatures={},
+  )
   positions = evaluation.simulate(model, log, effects)
   if rounding:
     positions = np.round(positions / rounding) * rounding

@@ -5,8 +5,8 @@ import re
 
 import numpy as np
 
-import sysid
-from sysid.logs import read_log
+from nerf2real import sysid
+from nerf2real.core.robot_logs.reading import read_log
 
 
 def test_the_example_writes_a_log(tmp_path, monkeypatch):

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from dm_env import specs
 
-from agents.dmpo import acting, config, environments, export, inference, learning, networks
-from agents.dmpo.replay import check_trajectory, trajectory_fields
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo import acting, config, export, inference, learning, networks
+from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
+from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.processes import environments
 
 PRESET = config.override(config.preset("vision_small"), {"network.lstm_size": 8})
 
@@ -22,9 +23,13 @@ def _exported(folder, environment_name="agents:cue"):
   layout = Layout.of(environment)
   params = jax.jit(lambda key: networks.init_policy(key, PRESET.network, layout))(jax.random.key(0))
   export.export_policy(
-    folder, learning.flatten_params({"policy": params}), layout=layout,
-    environment=environment_name, settings=config.to_dict(PRESET), info={"updates": 3},
-  )  # fmt: skip
+    folder,
+    learning.flatten_params({"policy": params}),
+    layout=layout,
+    environment=environment_name,
+    settings=config.to_dict(PRESET),
+    info={"updates": 3},
+  )
   return environment, layout
 
 
@@ -52,9 +57,13 @@ def test_every_transition_once_and_states_where_they_belong(cue):
     observation = layout.flatten(timestep.observation)
     rewards.append(timestep.reward)
     trajectory = builder.add(
-      action, timestep.reward, timestep.discount,
-      observation=observation, state=agent.state, last=timestep.last(),
-    )  # fmt: skip
+      action,
+      timestep.reward,
+      timestep.discount,
+      observation=observation,
+      state=agent.state,
+      last=timestep.last(),
+    )
     if trajectory:
       trajectories.append(trajectory)
   fields = trajectory_fields(layout, lstm_size=8)

@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 
-from agents.dmpo import augmentation
-from agents.dmpo.config import AugmentationConfig
+from nerf2real.agents.dmpo import augmentation
+from nerf2real.agents.dmpo.config import AugmentationConfig
 
 CONFIG = AugmentationConfig()
 

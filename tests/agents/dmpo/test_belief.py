@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from agents.dmpo import belief, belief_plot, specs
-from agents.dmpo.config import NetworkConfig
+from nerf2real.agents.dmpo import belief, belief_plot, specs
+from nerf2real.agents.dmpo.config import NetworkConfig
 
 
 def _mixture(seed=0):

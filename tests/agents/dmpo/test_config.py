@@ -6,17 +6,32 @@ import json
 
 import pytest
 
-from agents.dmpo import config
+from nerf2real.agents.dmpo import config
 
 # Byravan et al. 2022, appendix, table of DMPO hyperparameters, in its order.
 TABLE = {
-  "policy_learning_rate": 1e-4, "critic_learning_rate": 1e-4, "dual_learning_rate": 1e-2,
-  "trajectory_length": 48, "batch_size": 32, "steps_per_update": 8, "discount": 0.99,
-  "init_log_temperature": 10, "init_log_alpha_mean": 10, "init_log_alpha_stddev": 1000,
-  "epsilon": 0.1, "epsilon_mean": 0.0025, "epsilon_stddev": 1e-6, "epsilon_action_penalty": 0.001,
-  "per_dimension_kl": True, "action_penalization": True, "n_step": 5, "target_actor_period": 25,
-  "target_critic_period": 100, "network.vmin": -150, "network.vmax": 150,
-}  # fmt: skip
+  "policy_learning_rate": 1e-4,
+  "critic_learning_rate": 1e-4,
+  "dual_learning_rate": 1e-2,
+  "trajectory_length": 48,
+  "batch_size": 32,
+  "steps_per_update": 8,
+  "discount": 0.99,
+  "init_log_temperature": 10,
+  "init_log_alpha_mean": 10,
+  "init_log_alpha_stddev": 1000,
+  "epsilon": 0.1,
+  "epsilon_mean": 0.0025,
+  "epsilon_stddev": 1e-6,
+  "epsilon_action_penalty": 0.001,
+  "per_dimension_kl": True,
+  "action_penalization": True,
+  "n_step": 5,
+  "target_actor_period": 25,
+  "target_critic_period": 100,
+  "network.vmin": -150,
+  "network.vmax": 150,
+}
 
 
 @pytest.mark.parametrize("name", TABLE)

@@ -5,23 +5,36 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.dmpo import config, learning, networks
-from agents.dmpo.replay import Replay, trajectory_fields
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo import config, learning, networks
+from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
+from nerf2real.agents.dmpo.specs import Layout
 
 LAYOUT = Layout(
-  "camera", (6, 8, 3), ("s",), (3,),
-  ("privileged/robot_position", "privileged/robot_rotation"), (3, 9), 2,
-)  # fmt: skip
+  "camera",
+  (6, 8, 3),
+  ("s",),
+  (3,),
+  ("privileged/robot_position", "privileged/robot_rotation"),
+  (3, 9),
+  2,
+)
 CONFIG = config.override(
   config.DmpoConfig(),
   {
-    "network.policy_layers": (8,), "network.critic_layers": (8,), "network.image_channels": (3,),
-    "network.image_blocks": 1, "network.image_features": 5, "network.lstm_size": 4,
-    "network.belief_layers": (6,), "trajectory_length": 6, "num_samples": 4,
-    "target_actor_period": 2, "target_critic_period": 3, "min_replay_steps": 1,
+    "network.policy_layers": (8,),
+    "network.critic_layers": (8,),
+    "network.image_channels": (3,),
+    "network.image_blocks": 1,
+    "network.image_features": 5,
+    "network.lstm_size": 4,
+    "network.belief_layers": (6,),
+    "trajectory_length": 6,
+    "num_samples": 4,
+    "target_actor_period": 2,
+    "target_critic_period": 3,
+    "min_replay_steps": 1,
   },
-)  # fmt: skip
+)
 
 
 def _batch(layout, lstm_size, length, size=4, seed=0):
@@ -94,14 +107,20 @@ def test_padding_has_no_influence():
   def gradients(batch):
     trained = (state.policy, state.critic, state.duals, state.belief)
     return jax.grad(learning.total_loss, (0, 1, 2), has_aux=True)(
-      trained, state.target_policy, state.target_critic,
-      batch=batch, key=jax.random.key(1), config=CONFIG, layout=layout,
-    )[0]  # fmt: skip
+      trained,
+      state.target_policy,
+      state.target_critic,
+      batch=batch,
+      key=jax.random.key(1),
+      config=CONFIG,
+      layout=layout,
+    )[0]
 
   jax.tree.map(
     lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8),
-    gradients(batch), gradients(rubbish),
-  )  # fmt: skip
+    gradients(batch),
+    gradients(rubbish),
+  )
   of_targets = gradients(batch)[1:]
   assert all(not x.any() for x in jax.tree.leaves(of_targets))  # nothing reaches the targets
 
@@ -112,23 +131,34 @@ def test_it_learns_a_one_step_problem():
   settings = config.override(
     config.preset("state"),
     {
-      "network.policy_layers": (16,), "network.critic_layers": (32, 32), "network.vmin": -3.0,
-      "network.vmax": 2.0, "trajectory_length": 2, "policy_learning_rate": 5e-3,
-      "critic_learning_rate": 5e-3, "target_critic_period": 20, "epsilon_mean": 0.05,
-      "epsilon_stddev": 1e-3, "init_log_alpha_stddev": 1.0, "init_log_alpha_mean": 1.0,
+      "network.policy_layers": (16,),
+      "network.critic_layers": (32, 32),
+      "network.vmin": -3.0,
+      "network.vmax": 2.0,
+      "trajectory_length": 2,
+      "policy_learning_rate": 5e-3,
+      "critic_learning_rate": 5e-3,
+      "target_critic_period": 20,
+      "epsilon_mean": 0.05,
+      "epsilon_stddev": 1e-3,
+      "init_log_alpha_stddev": 1.0,
+      "init_log_alpha_mean": 1.0,
       "init_log_temperature": -1.0,
     },
-  )  # fmt: skip
+  )
   functions = learning.make_learning(settings, layout)
   state = jax.jit(functions.init)(jax.random.key(0))
   rng = np.random.default_rng(0)
   for _ in range(200):
     actions = rng.uniform(-1, 1, (64, 2, 1)).astype(np.float32)
     batch = {
-      "state": np.ones((64, 2, 1), np.float32), "privileged": np.zeros((64, 2, 0), np.float32),
-      "action": actions, "reward": 1 - (actions[..., 0] - 0.5) ** 2,
-      "discount": np.zeros((64, 2), np.float32), "last": np.ones(64, np.int32),
-    }  # fmt: skip
+      "state": np.ones((64, 2, 1), np.float32),
+      "privileged": np.zeros((64, 2, 0), np.float32),
+      "action": actions,
+      "reward": 1 - (actions[..., 0] - 0.5) ** 2,
+      "discount": np.zeros((64, 2), np.float32),
+      "last": np.ones(64, np.int32),
+    }
     state, metrics = functions.update(state, batch)
   head = networks.policy_head(state.policy, jnp.zeros((1, 0)), jnp.ones((1, 1)), settings.network)
   assert abs(float(head.mean[0, 0]) - 0.5) < 0.15

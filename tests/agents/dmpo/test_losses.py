@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.dmpo import losses
-from agents.dmpo.losses import Gaussian, MpoEpsilons
+from nerf2real.agents.dmpo import losses
+from nerf2real.agents.dmpo.losses import Gaussian, MpoEpsilons
 
 N, B, D = 7, 5, 3
 EPSILONS = MpoEpsilons(0.1, 0.0025, 1e-6, 0.001)
@@ -139,9 +139,13 @@ def test_padding_does_not_count():
   padded, _ = _ours(duals, online, target, actions, values, penalty=True, weights=weights)
   cut = lambda x: x[..., :3, :]  # noqa: E731
   whole, _ = _ours(
-    duals, Gaussian(*map(cut, online)), Gaussian(*map(cut, target)), cut(actions), values[:, :3],
+    duals,
+    Gaussian(*map(cut, online)),
+    Gaussian(*map(cut, target)),
+    cut(actions),
+    values[:, :3],
     penalty=True,
-  )  # fmt: skip
+  )
   np.testing.assert_allclose(padded, whole, rtol=1e-6)
 
 

@@ -5,14 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.dmpo import inference, learning, networks
-from agents.dmpo.config import NetworkConfig
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo import inference, learning, networks
+from nerf2real.agents.dmpo.config import NetworkConfig
+from nerf2real.agents.dmpo.specs import Layout
 
 SMALL = NetworkConfig(
-  policy_layers=(12, 9), critic_layers=(10, 8), image_channels=(4, 6), image_blocks=1,
-  image_features=10, lstm_size=7, belief_layers=(6,),
-)  # fmt: skip
+  policy_layers=(12, 9),
+  critic_layers=(10, 8),
+  image_channels=(4, 6),
+  image_blocks=1,
+  image_features=10,
+  lstm_size=7,
+  belief_layers=(6,),
+)
 LAYOUT = Layout("camera", (11, 14, 3), ("goal", "gyro"), (2, 5), ("privileged/v",), (4,), 3)
 
 
@@ -81,9 +86,12 @@ def test_stored_state_continues_an_episode():
   np.testing.assert_allclose(half.action.mean, whole.action.mean[:, 3:], rtol=1e-4, atol=1e-5)
   np.testing.assert_allclose(half.embedding, whole.embedding[:, 3:], rtol=1e-4, atol=1e-5)
   forgotten = unroll(
-    params, SMALL, state=state[:, 3:], images=images[:, 3:] / 255.0,
+    params,
+    SMALL,
+    state=state[:, 3:],
+    images=images[:, 3:] / 255.0,
     initial=jax.tree.map(jnp.zeros_like, stored),
-  )  # fmt: skip
+  )
   assert np.abs(forgotten.embedding - whole.embedding[:, 3:]).max() > 1e-3
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from agents.dmpo.replay import Replay, check_trajectory, trajectory_fields
-from agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.replay import Replay, check_trajectory, trajectory_fields
+from nerf2real.agents.dmpo.specs import Layout
 
 LAYOUT = Layout("camera", (4, 5, 3), ("s",), (2,), ("privileged/p",), (3,), 2)
 FIELDS = trajectory_fields(LAYOUT, lstm_size=6)

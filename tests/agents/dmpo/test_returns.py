@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from agents.dmpo import returns
+from nerf2real.agents.dmpo import returns
 
 T, K = 9, 11
 

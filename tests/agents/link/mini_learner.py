@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.dmpo.replay import Field, Replay, check_trajectory
-from agents.link import sessions
-from agents.link.limiter import LimiterSettings, RateLimiter
-from agents.link.server import LearnerLink
+from nerf2real.agents.dmpo.replay import Field, Replay, check_trajectory
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
+from nerf2real.agents.link.server import LearnerLink
 
 FIELDS = {"reward": Field((), "float32"), "image": Field((30, 40, 3), "uint8")}
 LENGTH = 48
@@ -49,9 +49,8 @@ def main() -> None:
     sessions.connect(endpoint, settings, timeout=5) if join else sessions.listen(endpoint, settings)
   )
   link = LearnerLink(
-    session, settings, limiter=limiter, insert=insert, description={},
-    known=replay.origins(),
-  )  # fmt: skip
+    session, settings, limiter=limiter, insert=insert, description={}, known=replay.origins()
+  )
   link.publish_parameters({"w": np.full(3, 7, np.float32)}, version=1)
   print("ready", flush=True)
   while True:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from agents.link.delivery import Ledger, Outbox
+from nerf2real.agents.link.delivery import Ledger, Outbox
 
 
 def test_exactly_once_over_a_bad_line():

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.dmpo.replay import Replay
-from agents.link import client, schema, sessions
-from agents.link.server import actor_key
+from nerf2real.agents.dmpo.replay import Replay
+from nerf2real.agents.link import client, schema, sessions
+from nerf2real.agents.link.server import actor_key
 from tests.agents.link import mini_learner
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -39,9 +39,15 @@ class Learner:
     self.start()
 
   def start(self):
-    command = [sys.executable, mini_learner.__file__, self.endpoint, str(self._folder),
-               str(self._lease), *([str(self._users)] if self._users else []),
-               *(["join"] if self._joins else [])]  # fmt: skip
+    command = [
+      sys.executable,
+      mini_learner.__file__,
+      self.endpoint,
+      str(self._folder),
+      str(self._lease),
+      *([str(self._users)] if self._users else []),
+      *(["join"] if self._joins else []),
+    ]
     self.process = subprocess.Popen(command, stdout=subprocess.PIPE, env=_environment(), text=True)
     assert self.process.stdout.readline() == "ready\n"
 
@@ -89,9 +95,11 @@ def _act(link, count, *, timeout=60.0, pause=0.0):
 def _stored(learner, tmp_path):
   """(actor, number) to the reward stored, read from the files as they are."""
   replay = Replay(
-    mini_learner.FIELDS, length=mini_learner.LENGTH,
-    capacity_steps=1000 * (mini_learner.LENGTH - 1), folder=tmp_path / "replay",
-  )  # fmt: skip
+    mini_learner.FIELDS,
+    length=mini_learner.LENGTH,
+    capacity_steps=1000 * (mini_learner.LENGTH - 1),
+    folder=tmp_path / "replay",
+  )
   origins = replay.origins()
   assert len(origins) == len(set(origins)), "A trajectory was inserted twice."
   return origins
@@ -275,10 +283,28 @@ def test_nothing_else_listens_and_nothing_is_scouted(learner):
 
 def test_tls(tmp_path):
   key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
-  command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256",
-             "-nodes", "-days", "2", "-subj", "/CN=localhost", "-addext",
-             "subjectAltName=DNS:localhost", "-addext", "basicConstraints=critical,CA:FALSE",
-             "-keyout", key, "-out", certificate]  # fmt: skip
+  command = [
+    "openssl",
+    "req",
+    "-x509",
+    "-newkey",
+    "ec",
+    "-pkeyopt",
+    "ec_paramgen_curve:P-256",
+    "-nodes",
+    "-days",
+    "2",
+    "-subj",
+    "/CN=localhost",
+    "-addext",
+    "subjectAltName=DNS:localhost",
+    "-addext",
+    "basicConstraints=critical,CA:FALSE",
+    "-keyout",
+    key,
+    "-out",
+    certificate,
+  ]
   try:
     subprocess.run(command, check=True, capture_output=True)
   except (OSError, subprocess.CalledProcessError) as error:

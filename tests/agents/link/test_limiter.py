@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 
-from agents.link.limiter import LimiterSettings, RateLimiter
+from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 
 
 def _limiter(**changes):
   settings = {
-    "steps_per_update": 8.0, "min_replay_steps": 100, "trajectory_steps": 16, "max_steps": 2000,
-  }  # fmt: skip
+    "steps_per_update": 8.0,
+    "min_replay_steps": 100,
+    "trajectory_steps": 16,
+    "max_steps": 2000,
+  }
   start = {k: changes.pop(k) for k in ("steps", "updates") if k in changes}
   return RateLimiter(LimiterSettings(**(settings | changes)), **start)
 

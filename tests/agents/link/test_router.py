@@ -4,8 +4,8 @@ import socket
 
 import pytest
 
-from agents.link import sessions
-from agents.link.access import LinkError, access_control, read_users
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.access import LinkError, access_control, read_users
 from tests.agents.link import mini_learner
 from tests.agents.link.test_faults import Learner, _act, _join, _login, _stored
 

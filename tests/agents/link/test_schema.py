@@ -8,8 +8,8 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from agents.link import schema
-from agents.link.schema import MessageError
+from nerf2real.agents.link import schema
+from nerf2real.agents.link.schema import MessageError
 
 GOOD = schema.encode("credit", {"n": 3, "who": "a"}, {"x": np.arange(6, dtype=np.float32)})
 

@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from real.virtual.body import STEP, Body
-from real.virtual.hidden import Hidden
-from suite.op3 import constants
-from suite.tasks.state import standing_posture
+from nerf2real.real.virtual.body import STEP, Body
+from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.tasks.state import standing_posture
 
 
 def _stand(body, seconds):

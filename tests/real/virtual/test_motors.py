@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from real.virtual.hidden import Hidden
-from real.virtual.motors import MotorParameters, Motors
+from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual.motors import MotorParameters, Motors
 
 
 def _motors(**changes):

@@ -12,12 +12,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from real.bus import Bus, BusError
-from real.servos import Servos
-from real.virtual.eye import EglMissingError
-from real.virtual.process import VirtualRobotProcess
-from real.virtual.robot import LENS, VirtualRobot
-from suite.op3 import constants
+from nerf2real.real.virtual.process import VirtualRobotProcess
+from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.real.wire.bus import Bus, BusError
+from nerf2real.real.wire.servos import Servos
+from nerf2real.scenes.builtin.eye import EglMissingError
+from nerf2real.suite.op3 import constants
 
 _ROOT = Path(__file__).parents[3]
 _TARGET = np.array([1.2, 0.15, 0.5])  # m, middle of a red box
@@ -25,9 +25,12 @@ _TARGET = np.array([1.2, 0.15, 0.5])  # m, middle of a red box
 
 def _furnish(spec):
   spec.worldbody.add_geom(
-    type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02, 0.08, 0.08], pos=_TARGET.tolist(),
-    rgba=[1, 0, 0, 1], group=2,
-  )  # fmt: skip
+    type=mujoco.mjtGeom.mjGEOM_BOX,
+    size=[0.02, 0.08, 0.08],
+    pos=_TARGET.tolist(),
+    rgba=[1, 0, 0, 1],
+    group=2,
+  )
   spec.worldbody.add_light(
     type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=[1, 0, -0.3], ambient=[0.4, 0.4, 0.4]
   )
@@ -127,12 +130,22 @@ def test_the_command_prints_the_port_and_ends_by_itself(tmp_path):
   link = tmp_path / "op3"
   process = subprocess.Popen(
     [
-      sys.executable, "launch/virtual_robot.py", "--world", "floor", "--no-camera",
-      "--link", str(link), "--seconds", "8",
+      sys.executable,
+      "launch/virtual_robot.py",
+      "--world",
+      "floor",
+      "--no-camera",
+      "--link",
+      str(link),
+      "--seconds",
+      "8",
     ],
-    cwd=_ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    cwd=_ROOT,
+    stdout=subprocess.PIPE,
+    stderr=subprocess.PIPE,
+    text=True,
     env=os.environ | {"PYTHONPATH": str(_ROOT)},
-  )  # fmt: skip
+  )
   try:
     ready, _, _ = select.select([process.stdout], [], [], 90)
     line = process.stdout.readline() if ready else ""

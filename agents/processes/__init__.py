@@ -1,0 +1,1 @@
+"""Learner and actor processes, with their checkpoints, logs and environments."""

@@ -1,0 +1,1 @@
+"""Common ground of all packages: cameras, rotations, files, progress, logs, pages."""

@@ -1,0 +1,136 @@
+"""The OPENCV camera model (pinhole with radial and tangential distortion).
+
+Pixel coordinates follow COLMAP: the centre of the upper left pixel is (0.5, 0.5). Camera axes
+follow OpenCV: x right, y down, z forward. Shapes: H height, W width.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+_UNDISTORT_ITERATIONS = 20  # Newton steps; converges in fewer than 10 for lenses of phones
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Camera:
+  """An OPENCV camera.
+
+  Source: OpenCV documentation, calib3d, equations of the distortion model; COLMAP's model OPENCV.
+  """
+
+  width: int  # picture width [pixel]
+  height: int  # picture height [pixel]
+  fx: float  # focal length along x [pixel]
+  fy: float  # focal length along y [pixel]
+  cx: float  # principal point, x [pixel]
+  cy: float  # principal point, y [pixel]
+  k1: float = 0.0  # radial distortion, second order
+  k2: float = 0.0  # radial distortion, fourth order
+  p1: float = 0.0  # tangential distortion
+  p2: float = 0.0  # tangential distortion
+
+  def __post_init__(self):
+    if self.width < 1 or self.height < 1:
+      raise ValueError(
+        f"A camera needs a picture of at least 1x1 pixel, found {self.width}x{self.height}."
+      )
+    if not (self.fx > 0 and self.fy > 0):
+      raise ValueError(f"Focal lengths must be positive, found fx={self.fx}, fy={self.fy}.")
+
+  @property
+  def matrix(self) -> np.ndarray:
+    """The intrinsic matrix [3, 3]."""
+    return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
+
+  @property
+  def distortion(self) -> np.ndarray:
+    """The coefficients k1, k2, p1, p2 [4], in OpenCV's order."""
+    return np.array([self.k1, self.k2, self.p1, self.p2], np.float64)
+
+  @property
+  def pixel_angle(self) -> float:
+    """The mean angle that one pixel spans at the picture's centre [rad]."""
+    return 2.0 / (self.fx + self.fy)
+
+  def resized(self, width: int, height: int) -> "Camera":
+    """Returns this camera with its picture resampled to another size."""
+    sx, sy = width / self.width, height / self.height
+    return dataclasses.replace(
+      self,
+      width=width,
+      height=height,
+      fx=self.fx * sx,
+      fy=self.fy * sy,
+      cx=self.cx * sx,
+      cy=self.cy * sy,
+    )
+
+  def distort(self, points: np.ndarray) -> np.ndarray:
+    """Maps ideal image-plane points (x/z, y/z) [..., 2] to distorted ones [..., 2]."""
+    x, y = points[..., 0], points[..., 1]
+    xx, yy, xy = x * x, y * y, x * y
+    r2 = xx + yy
+    radial = 1 + self.k1 * r2 + self.k2 * r2 * r2
+    return np.stack(
+      [
+        x * radial + 2 * self.p1 * xy + self.p2 * (r2 + 2 * xx),
+        y * radial + self.p1 * (r2 + 2 * yy) + 2 * self.p2 * xy,
+      ],
+      axis=-1,
+    )
+
+  def undistort(self, points: np.ndarray) -> np.ndarray:
+    """Inverts `distort` by Newton's method: distorted [..., 2] to ideal points [..., 2]."""
+    target = np.asarray(points, np.float64)
+    ideal = target.copy()
+    for _ in range(_UNDISTORT_ITERATIONS):
+      x, y = ideal[..., 0], ideal[..., 1]
+      r2 = x * x + y * y
+      radial = 1 + self.k1 * r2 + self.k2 * r2 * r2
+      slope = self.k1 + 2 * self.k2 * r2  # d radial / d r2
+      a = radial + 2 * x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
+      b = 2 * x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y
+      d = radial + 2 * y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x
+      residual = self.distort(ideal) - target
+      determinant = a * d - b * b
+      ideal = ideal - np.stack(
+        [
+          (d * residual[..., 0] - b * residual[..., 1]) / determinant,
+          (a * residual[..., 1] - b * residual[..., 0]) / determinant,
+        ],
+        axis=-1,
+      )
+    return ideal
+
+  def project(self, points: np.ndarray) -> np.ndarray:
+    """Projects points in the camera frame [..., 3] to pixels [..., 2]; z must be positive."""
+    points = np.asarray(points, np.float64)
+    plane = self.distort(points[..., :2] / points[..., 2:])
+    return plane * [self.fx, self.fy] + [self.cx, self.cy]
+
+  def rays(self, pixels: np.ndarray | None = None) -> np.ndarray:
+    """Returns viewing directions with z = 1 in the camera frame.
+
+    Args:
+      pixels: Pixel coordinates [..., 2]; the centres of all pixels [H, W, 2] if None.
+
+    Returns:
+      Directions [..., 3], not normalised: a sample at parameter t has depth t.
+    """
+    if pixels is None:
+      u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+      pixels = np.stack([u, v], axis=-1)
+    plane = (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+    ideal = self.undistort(plane)
+    return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
+
+  def to_dict(self) -> dict[str, Any]:
+    """Returns the fields as plain numbers, for JSON."""
+    return dataclasses.asdict(self)
+
+  @classmethod
+  def from_vertical_fov(cls, fov: float, width: int, height: int) -> "Camera":
+    """Returns an ideal pinhole camera with a vertical field of view [rad]."""
+    focal = 0.5 * height / np.tan(0.5 * fov)
+    return cls(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)

@@ -1,0 +1,1 @@
+"""HTML pages: one kit for every report."""

@@ -1,0 +1,1 @@
+"""Robot logs: MCAP files with ROS 2 messages, written and read without ROS."""

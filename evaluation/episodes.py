@@ -1,0 +1,131 @@
+"""What is kept of an evaluation: one line of JSON for each episode, appended as it ends."""
+
+import dataclasses
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+SUCCESS, COLLISION, FALL, LOST, STOPPED = "success", "collision", "fall", "lost", "stopped"
+OUTCOMES = (SUCCESS, COLLISION, FALL, LOST, STOPPED)
+FILE = "episodes.jsonl"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Setting:
+  """What an episode belongs to; episodes of one setting are counted together."""
+
+  policy: str  # its name
+  policy_id: str  # digest of its parameters
+  resolution: str  # of its pictures, such as "30 x 40"; "no camera"
+  plant: str  # "sim", "virtual" or "robot"
+  plant_id: str  # which robot: the virtual one's seed, the robot's name
+  protocol: str  # "navigation", "ball" or "gain"
+  perturbation: str  # "none", or what was disturbed
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Moment:
+  """What a policy believed at a moment."""
+
+  time: float  # s
+  position: tuple[float, float] | None  # true x, y [m]
+  logits: list[float]  # [M]
+  means: list[list[float]]  # [M, 3] m, m, rad
+  stddevs: list[list[float]]  # [M, 3]
+  picture: str = ""  # what it saw, PNG in base64
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Episode:
+  """One episode."""
+
+  setting: Setting
+  group: str  # within a protocol: "navigation", "center", "wall", "gain 50"
+  index: int  # of the trial in the protocol
+  goal: tuple[float, float]  # m
+  outcome: str  # one of OUTCOMES
+  detail: str = ""  # more about why it ended
+  time: float | None = None  # s until the goal was reached
+  duration: float = 0.0  # s
+  localisation_error: float | None = None  # m, mean over the episode
+  path: list[list[float]] = dataclasses.field(default_factory=list)  # [t, x, y, yaw] every 0.2 s
+  ball_path: list[list[float]] = dataclasses.field(default_factory=list)  # [t, x, y]
+  moments: list[Moment] = dataclasses.field(default_factory=list)
+
+  @property
+  def success(self) -> bool:
+    """Whether the goal was reached as the paper counts it."""
+    return self.outcome == SUCCESS
+
+  @property
+  def key(self) -> tuple[Any, ...]:
+    """What tells episodes apart: an evaluation runs each once."""
+    return (*dataclasses.astuple(self.setting), self.index)
+
+
+def _decode(line: str) -> Episode:
+  fields = json.loads(line)
+  fields["setting"] = Setting(**fields["setting"])
+  fields["moments"] = [
+    Moment(**{**m, "position": None if m["position"] is None else tuple(m["position"])})
+    for m in fields.get("moments", [])
+  ]
+  fields["goal"] = tuple(fields["goal"])
+  return Episode(**fields)
+
+
+class Store:
+  """The episodes of an evaluation's folder."""
+
+  def __init__(self, folder: Path):
+    """Opens a folder, and reads what earlier runs left.
+
+    Raises:
+      ValueError: A line other than the last is damaged.
+    """
+    self.path = Path(folder) / FILE
+    self.path.parent.mkdir(parents=True, exist_ok=True)
+    self.episodes: list[Episode] = []
+    if self.path.exists():
+      self._read()
+
+  def _read(self) -> None:
+    text = self.path.read_text()
+    lines = text.splitlines()
+    for number, line in enumerate(lines):
+      try:
+        self.episodes.append(_decode(line))
+      except (ValueError, KeyError, TypeError) as error:
+        if number == len(lines) - 1:  # the run was cut off while it wrote: that episode is rerun
+          kept = "".join(f"{whole}\n" for whole in lines[:-1])
+          self.path.write_text(kept)
+          return
+        raise ValueError(
+          f"{self.path}, line {number + 1} is damaged ({error}): remove that line, its episode is "
+          "run again."
+        ) from error
+    if text and not text.endswith("\n"):
+      self.path.write_text(text + "\n")
+
+  def done(self) -> set[tuple[Any, ...]]:
+    """Returns the keys of the episodes that are there."""
+    return {episode.key for episode in self.episodes}
+
+  def add(self, episode: Episode) -> None:
+    """Keeps an episode."""
+    with self.path.open("a") as stream:
+      stream.write(json.dumps(dataclasses.asdict(episode)) + "\n")
+    self.episodes.append(episode)
+
+
+def select(episodes: Iterable[Episode], **wanted: str) -> list[Episode]:
+  """Returns the episodes whose setting, or group, has these values."""
+  return [
+    episode
+    for episode in episodes
+    if all(
+      (episode.group if name == "group" else getattr(episode.setting, name)) == value
+      for name, value in wanted.items()
+    )
+  ]

@@ -1,0 +1,183 @@
+"""A robot as a plant: a person places it, one episode after another, and says how it went."""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import dm_env
+import numpy as np
+
+from nerf2real import real
+from nerf2real.evaluation import episodes, perturbations, starts
+from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
+from nerf2real.real.camera.device import Controls
+from nerf2real.real.loading import Connection
+from nerf2real.real.loop.clock import RealClock, prefer_this_thread
+from nerf2real.real.recorder.recorder import Recorder
+from nerf2real.real.safety.monitor import Reason
+from nerf2real.real.safety.operator import Terminal
+from nerf2real.suite import protocols
+from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.protocols import DEFAULT_GAIN, BallTrial
+from nerf2real.suite.tasks.workspace import find_workspace
+
+_VERDICTS = {"s": episodes.SUCCESS, "c": episodes.COLLISION, "f": episodes.FALL, "l": episodes.LOST}
+_QUESTION = "What happened? [s]uccess, [c]ollision, [f]all, [l]ost, [r]epeat the episode: "
+
+
+class RepeatError(Exception):
+  """The operator wants the episode again."""
+
+
+class OperatedPlant(Plant):
+  """Episodes on a robot. Any key ends one; there is no pose unless an observer gives it."""
+
+  name = "robot"
+
+  def __init__(
+    self,
+    scene: Any,
+    protocol: str,
+    perturbation: str = perturbations.NONE,
+    *,
+    robot: Any,
+    camera: Any,
+    image_size: tuple[int, int] | None,
+    robot_name: str = "op3",
+    time_limit: float | None = None,
+    record: Path | None = None,
+    offsets: Path | None = None,
+    lens: Path | None = None,
+    dry_run: bool = False,
+    observer: Callable[[], Sight] | None = None,
+    ask: Callable[[str], str] | None = None,
+    say: Callable[[str], None] = print,
+  ):
+    """Connects to the robot; nothing moves yet.
+
+    Args:
+      scene: An opened bundle of the room.
+      protocol: One of `plants.PROTOCOLS`.
+      perturbation: One of `perturbations.PERTURBATIONS`.
+      robot: Serial port, or a `real.loading.Connection`.
+      camera: Device number, file or URL.
+      image_size: Height and width of the policy's picture; None for no camera.
+      robot_name: Which robot, for the tables.
+      time_limit: Length of an episode [s]; the task's own if None.
+      record: Where the run is recorded; not recorded if None.
+      offsets: The robot's `offset.yaml`.
+      lens: The camera's camera_info YAML, for the recording.
+      dry_run: Everything is read, asked and computed, and nothing moves; no verdict is asked for.
+      observer: Motion capture, if there is any.
+      ask: Puts a question to the operator and returns the answer; None: at this terminal.
+      say: Tells the operator something.
+    """
+    super().__init__(scene, protocol, perturbation)
+    self.plant_id = robot_name
+    connection = Connection(port=robot) if isinstance(robot, str) else robot
+    if ask is None:  # through the terminal that the stop key is read from, never beside it
+      terminal = Terminal()
+      connection = dataclasses.replace(connection, operator=terminal)
+      ask = terminal.ask
+    self._observer, self._ask, self._say = observer, ask, say
+    self._starts = protocols.scene_starts(scene)
+    self._workspace = find_workspace(scene) if protocol == BALL else None
+    self._recorder = None if record is None else Recorder(record)
+    self._environment = real.load(
+      TASKS[protocol],
+      robot=connection,
+      camera=camera,
+      scene=scene,
+      image_size=image_size,
+      time_limit=time_limit,
+      recorder=self._recorder,
+      offsets=offsets,
+      lens=lens,
+      dry_run=dry_run,
+    )
+    if isinstance(self._environment.bus.clock, RealClock):
+      prefer_this_thread(acting=True)
+    self._dry_run = dry_run
+    self._steps = 0
+
+  @property
+  def environment(self) -> dm_env.Environment:
+    return self._environment
+
+  @property
+  def goal(self) -> np.ndarray:
+    return self._environment.goal
+
+  @property
+  def time_limit(self) -> float:
+    return float(self._environment.time_limit)
+
+  def start(self, trial: Trial) -> dm_env.TimeStep:
+    if isinstance(trial, BallTrial):
+      assert self._workspace is not None
+      pose, ball = starts.ball_start(self.scene, self._workspace, trial)
+      self._say(f"Put the ball at x = {ball[0]:.2f} m, y = {ball[1]:.2f} m.")
+    else:
+      x, y = (float(value) for value in self._starts[trial.position])
+      pose = Pose(x, y, trial.yaw)
+      self._environment.set_goal(trial.goal)
+      self._say(f"Goal {trial.goal + 1} at x = {self.goal[0]:.2f} m, y = {self.goal[1]:.2f} m.")
+      self._set_gain(trial.camera_gain * DEFAULT_GAIN)
+    if self.perturbation in perturbations.INSTRUCTIONS:
+      self._say(perturbations.INSTRUCTIONS[self.perturbation])
+    self._ask(
+      f"Place the robot at x = {pose.x:.2f} m, y = {pose.y:.2f} m, heading "
+      f"{np.rad2deg(pose.yaw):.0f} degrees from the x axis; Enter when it is there: "
+    )
+    self._start_pose = pose
+    self._steps = 0
+    return self._environment.reset()
+
+  def _set_gain(self, gain: float) -> None:
+    camera: Any = self._environment.camera
+    if not hasattr(camera, "set_controls"):
+      return
+    found = camera.set_controls(Controls(gain=gain))["gain"]
+    if not found.holds:
+      self._say(f"The camera does not take the gain {gain:g}, found {found.found}: set it by hand.")
+
+  def step(self, action: np.ndarray) -> dm_env.TimeStep:
+    self._steps += 1
+    return self._environment.step(action)
+
+  def sight(self) -> Sight:
+    if self._observer is not None:
+      return self._observer()
+    stop = self._environment.stop
+    fallen = stop is not None and stop.reason == Reason.FALL
+    pose = self._start_pose if self._steps == 0 else None
+    return Sight(pose, None, False, fallen)
+
+  def stopped(self) -> str:
+    stop = self._environment.stop
+    return "" if stop is None else f"{stop.reason}: {stop.detail}"
+
+  def judge(self) -> tuple[str, float | None, str] | None:
+    if self._dry_run:
+      return episodes.STOPPED, None, f"dry run; {self._environment.timing.line()}"
+    if self._observer is not None:
+      return None
+    time = self._steps * constants.CONTROL_TIMESTEP
+    while True:
+      answer = self._ask(_QUESTION).strip().lower()[:1]
+      if answer == "r":
+        raise RepeatError
+      if answer in _VERDICTS:
+        break
+      self._say("Expected one of the letters s, c, f, l, r.")
+    outcome = _VERDICTS[answer]
+    return outcome, time if outcome == episodes.SUCCESS else None, self.stopped()
+
+  def close(self) -> None:
+    self._environment.close()
+    if self._recorder is not None:
+      with contextlib.suppress(OSError):
+        self._recorder.close()

@@ -1,0 +1,85 @@
+"""What an evaluation asks of a policy, and the scripted walker as one."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from nerf2real.evaluation.plants import BALL, Sight
+from nerf2real.suite.gaits.walk import GaitSettings
+from nerf2real.suite.gaits.walker import Walker
+from nerf2real.suite.op3 import constants
+
+
+class Belief(NamedTuple):
+  """A mixture of M Gaussians over x [m], y [m], yaw [rad]."""
+
+  logits: np.ndarray  # [M]
+  means: np.ndarray  # [M, 3]
+  stddevs: np.ndarray  # [M, 3]
+
+  @property
+  def position(self) -> np.ndarray:
+    """Mean x, y [2] [m]."""
+    share = np.exp(self.logits - self.logits.max())
+    return (share / share.sum()) @ self.means[:, :2]
+
+
+class EvaluatedPolicy(Protocol):
+  """A policy in an evaluation."""
+
+  name: str
+  policy_id: str  # digest of what it is made of
+  image_size: tuple[int, int] | None  # of the pictures that it needs
+
+  def reset(self, sight: Sight) -> None:
+    """Begins an episode."""
+
+  def act(
+    self, observation: Mapping[str, np.ndarray], *, goal: np.ndarray, sight: Sight
+  ) -> np.ndarray:
+    """Returns the action [20]; learned policies look at the observation alone."""
+
+  @property
+  def belief(self) -> Belief | None:
+    """Where it believes to be since the last action; None if it says nothing."""
+
+
+def resolution(policy: EvaluatedPolicy) -> str:
+  """Returns the paper's name of a policy's resolution."""
+  size = policy.image_size
+  return "no camera" if size is None else f"{size[0]} x {size[1]}"
+
+
+class GaitPolicy:
+  """The scripted walker; it is told where it is, or reckons where nobody sees it."""
+
+  name = "gait"
+  image_size: tuple[int, int] | None = None
+  belief: Belief | None = None
+
+  def __init__(self, scene: Any, protocol: str, *, settings: GaitSettings | None = None):
+    """Creates the policy.
+
+    Args:
+      scene: An opened bundle.
+      protocol: One of `plants.PROTOCOLS`.
+      settings: Parameters of the gait.
+    """
+    head_pan = constants.BALL_PUSHING_HEAD_PAN if protocol == BALL else None
+    self._walker = Walker(scene, gait=settings, head_pan_limit=head_pan)
+    text = json.dumps(dataclasses.asdict(settings or GaitSettings()), sort_keys=True)
+    self.policy_id = hashlib.sha256(text.encode()).hexdigest()[:12]
+
+  def reset(self, sight: Sight) -> None:
+    if sight.pose is None:
+      raise ValueError("The gait must know where it starts: place the robot at the trial's start.")
+    self._walker.reset(sight.pose)
+
+  def act(
+    self, observation: Mapping[str, np.ndarray], *, goal: np.ndarray, sight: Sight
+  ) -> np.ndarray:
+    return self._walker.act(observation, goal=goal, pose=sight.pose, ball=sight.ball)

@@ -1,0 +1,182 @@
+"""The virtual robot as a plant: reached over its wires, placed and watched as by an observer."""
+
+from pathlib import Path
+from typing import Any
+
+import dm_env
+import numpy as np
+
+from nerf2real import real
+from nerf2real.evaluation import perturbations, starts
+from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial, make_intruder
+from nerf2real.real.loading import Connection
+from nerf2real.real.recorder.recorder import Recorder
+from nerf2real.real.safety.monitor import Reason
+from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.suite import protocols
+from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.protocols import BallTrial, NavigationTrial
+from nerf2real.suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT
+from nerf2real.suite.tasks.workspace import find_workspace
+
+
+class CoveredCamera:
+  """A camera that somebody may cover with a hand."""
+
+  def __init__(self, camera: Any):
+    self._camera = camera
+    self.covered = False
+
+  def read(self) -> tuple[np.ndarray, float]:
+    """Returns the newest picture and its age [s]; black while covered."""
+    picture, age = self._camera.read()
+    return (np.zeros_like(picture) if self.covered else picture), age
+
+  def close(self) -> None:
+    """Closes the camera."""
+    self._camera.close()
+
+
+class RehearsedPlant(Plant):
+  """Episodes on a virtual robot in the true room, faster than real time."""
+
+  name = "virtual"
+
+  def __init__(
+    self,
+    scene: Any,
+    protocol: str,
+    perturbation: str = perturbations.NONE,
+    *,
+    image_size: tuple[int, int] | None,
+    robot_seed: int | None = 1,
+    world: str = "room",
+    time_limit: float | None = None,
+    record: Path | None = None,
+  ):
+    """Builds the robot and connects to it.
+
+    Args:
+      scene: An opened bundle of the room that the robot stands in.
+      protocol: One of `plants.PROTOCOLS`.
+      perturbation: One of `perturbations.PERTURBATIONS`.
+      image_size: Height and width of the policy's picture; None for no camera.
+      robot_seed: Which robot: the seed of what is hidden in it; None: as in the data sheets.
+      world: "room" or "floor", see `VirtualRobot`.
+      time_limit: Length of an episode [s]; the task's own if None.
+      record: Where the run is recorded; not recorded if None.
+    """
+    super().__init__(scene, protocol, perturbation)
+    self.plant_id = "data sheet" if robot_seed is None else f"robot {robot_seed}"
+    self._starts = protocols.scene_starts(scene)
+    self._workspace = find_workspace(scene) if protocol == BALL else None
+    self._intruder = make_intruder(self, self._starts)
+    self.robot = VirtualRobot(
+      world=world,
+      seed=robot_seed,
+      stepped=True,
+      camera=image_size is not None,
+      ball=protocol == BALL,
+      furnish=None if self._intruder is None else self._intruder.add_to_spec,
+    )
+    if self._intruder is not None:
+      self._intruder.bind(self.robot.body.model)
+    self._camera: CoveredCamera | None = None
+    self._recorder = None if record is None else Recorder(record)
+    try:
+      self._environment = self._connect(image_size, time_limit)
+    except BaseException:
+      self.robot.close()
+      raise
+
+  def _connect(self, image_size: tuple[int, int] | None, time_limit: float | None) -> Any:
+    connection = self.robot.connection()
+    if image_size is not None:
+      self._camera = CoveredCamera(connection.camera)
+      connection = Connection(
+        port=connection.port,
+        camera=self._camera,
+        operator=connection.operator,
+        clock=connection.clock,
+      )
+    return real.load(
+      TASKS[self.protocol],
+      robot=connection,
+      scene=self.scene,
+      image_size=image_size,
+      time_limit=time_limit,
+      recorder=self._recorder,
+    )
+
+  @property
+  def environment(self) -> dm_env.Environment:
+    return self._environment
+
+  @property
+  def goal(self) -> np.ndarray:
+    return self._environment.goal
+
+  @property
+  def time_limit(self) -> float:
+    return float(self._environment.time_limit)
+
+  def start(self, trial: Trial) -> dm_env.TimeStep:
+    self._begin = self.robot.clock.now()
+    self._hit = False
+    self._disturb(0.0)
+    if isinstance(trial, BallTrial):
+      assert self._workspace is not None
+      pose, ball = starts.ball_start(self.scene, self._workspace, trial)
+      self.robot.place_ball(*ball)
+    else:
+      x, y = (float(value) for value in self._starts[trial.position])
+      pose = Pose(x, y, trial.yaw)
+      self._environment.set_goal(trial.goal)
+      self._set_gain(trial)
+    self.robot.place(*pose)
+    timestep = self._environment.reset()
+    self._begin = self.robot.clock.now()
+    return timestep
+
+  def _set_gain(self, trial: NavigationTrial) -> None:
+    if self.robot.camera is not None:
+      self.robot.camera.sensor.gain = trial.camera_gain
+
+  def step(self, action: np.ndarray) -> dm_env.TimeStep:
+    self._disturb(self.robot.clock.now() - self._begin)
+    timestep = self._environment.step(action)
+    if self._intruder is not None:
+      self._hit |= self._intruder.touched(self.robot.body.data)
+    return timestep
+
+  def _disturb(self, time: float) -> None:
+    if self._camera is not None:
+      self._camera.covered = perturbations.is_blocked(self.perturbation, time)
+    if self._intruder is not None:
+      with self.robot.body.lock:
+        self._intruder.move(self.robot.body.data, time)
+
+  def sight(self) -> Sight:
+    truth = self.robot.truth()
+    stop = self._environment.stop
+    fallen = (
+      truth.touches_floor
+      or truth.rotation[2, 2] < MIN_UPRIGHT
+      or truth.position[2] < MIN_HEIGHT
+      or (stop is not None and stop.reason == Reason.FALL)
+    )
+    pose = Pose(float(truth.position[0]), float(truth.position[1]), truth.yaw)
+    ball = None if truth.ball is None else truth.ball[:2]
+    # Touching the room is a failure of navigation alone (paper, "Tasks").
+    touched = truth.touches_room and self.protocol != BALL
+    return Sight(pose, ball, touched or self._hit, bool(fallen))
+
+  def stopped(self) -> str:
+    stop = self._environment.stop
+    return "" if stop is None else f"{stop.reason}: {stop.detail}"
+
+  def close(self) -> None:
+    self._environment.close()
+    self.robot.close()
+    if self._recorder is not None:
+      self._recorder.close()

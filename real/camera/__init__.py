@@ -1,0 +1,1 @@
+"""The robot's camera: newest picture, the policy's picture, lens calibration."""

@@ -1,0 +1,189 @@
+"""A recorded log as one page for the browser: plots over time, and what the camera saw.
+
+Shapes: N messages of a topic, J joints.
+"""
+
+import base64
+import dataclasses
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plotly.offline
+
+from nerf2real.core.robot_logs import messages
+from nerf2real.core.robot_logs import playback as recording
+
+_MAX_POINTS = 4000  # of a plotted line: more than a screen has pixels
+_JOINT_TOPICS = {
+  messages.COMMANDS: ("position", "command", "rad"),
+  messages.STATES: ("position", "position", "rad"),
+  messages.CURRENTS: ("effort", "current", "A"),
+  messages.VOLTAGES: ("effort", "voltage", "V"),
+  messages.PWM: ("effort", "duty", ""),
+  messages.STAMPS: ("effort", "time of reading after the stamp", "s"),
+}
+
+
+@dataclasses.dataclass
+class Series:
+  """Numbers over time."""
+
+  unit: str
+  names: tuple[str, ...]  # of the columns
+  times: np.ndarray  # [N] s from the log's start
+  values: np.ndarray  # [N, J]
+
+
+@dataclasses.dataclass
+class Replay:
+  """What a log holds, ready to be shown."""
+
+  name: str
+  complete: bool  # the recorder closed it properly
+  start: float  # s since 1970
+  duration: float  # s
+  series: dict[str, Series]
+  frames: list[tuple[float, bytes]]  # time [s from the start] and JPEG
+
+
+def load(path: Path | str) -> Replay:
+  """Reads a log, also one that was cut off.
+
+  Raises:
+    ValueError: No MCAP, or without a message that can be shown.
+  """
+  path = Path(path)
+  collected: dict[str, tuple[str, tuple[str, ...], list[float], list[Any]]] = {}
+  frames: list[tuple[float, bytes]] = []
+
+  def add(name: str, unit: str, names: tuple[str, ...], time: float, values: Any) -> None:
+    _, known, times, rows = collected.setdefault(name, (unit, names, [], []))
+    if known == names:
+      times.append(time)
+      rows.append(values)
+
+  for topic, time, message in recording.read_messages(path):
+    if topic in _JOINT_TOPICS:
+      field, name, unit = _JOINT_TOPICS[topic]
+      names = tuple(message.name)
+      if len(getattr(message, field)) == len(names):
+        add(name, unit, names, time, getattr(message, field))
+      elif topic == messages.COMMANDS and len(message.effort) == len(names):
+        add("commanded effort", "N m", names, time, message.effort)
+      if topic == messages.STATES and len(message.velocity) == len(names):
+        add("velocity", "rad/s", names, time, message.velocity)
+    elif topic == messages.IMU:
+      rate, force = message.angular_velocity, message.linear_acceleration
+      add("turning rate", "rad/s", tuple("xyz"), time, (rate.x, rate.y, rate.z))
+      add("specific force", "m/s^2", tuple("xyz"), time, (force.x, force.y, force.z))
+    elif topic == messages.GRAVITY:
+      down = message.vector
+      add("direction of gravity", "", tuple("xyz"), time, (down.x, down.y, down.z))
+    elif topic == messages.BATTERY:
+      add("battery", "V", ("battery",), time, (message.voltage,))
+    elif topic == messages.IMAGE and message.format == "jpeg":
+      frames.append((time, bytes(message.data)))
+    elif topic == messages.TEMPERATURE:
+      joint = message.header.frame_id
+      add(f"temperature {joint}", "degrees C", (joint,), time, (message.temperature,))
+  if not collected and not frames:
+    raise ValueError(f"{path} holds no message that can be shown: record joints, IMU or pictures.")
+  begins = [times[0] for _, _, times, _ in collected.values()] + [t for t, _ in frames[:1]]
+  ends = [times[-1] for _, _, times, _ in collected.values()] + [t for t, _ in frames[-1:]]
+  start = min(begins)
+  return Replay(
+    name=path.name,
+    complete=recording.is_complete(path),
+    start=start,
+    duration=max(ends) - start,
+    series={
+      name: Series(unit, names, np.array(times) - start, np.array(rows, np.float64))
+      for name, (unit, names, times, rows) in collected.items()
+    },
+    frames=[(time - start, data) for time, data in frames],
+  )
+
+
+def thin(series: Series) -> tuple[np.ndarray, np.ndarray]:
+  """Returns times [M] and values [M, J] of at most `_MAX_POINTS` points, extremes kept.
+
+  Of each stretch the smallest and the largest value of the first column that moves most are kept,
+  so that a short peak does not vanish from the plot.
+  """
+  count = len(series.times)
+  if count <= _MAX_POINTS:
+    return series.times, series.values
+  edges = np.linspace(0, count, _MAX_POINTS // 2 + 1).astype(int)
+  column = int(np.argmax(np.ptp(series.values, axis=0)))
+  kept = set()
+  for first, last in itertools.pairwise(edges):
+    stretch = series.values[first:last, column]
+    kept |= {first + int(np.argmin(stretch)), first + int(np.argmax(stretch))}
+  index = np.array(sorted(kept))
+  return series.times[index], series.values[index]
+
+
+def _plots(replay: Replay) -> dict[str, Any]:
+  """Returns the data of all plots for the page's script."""
+  joints = dict.fromkeys(
+    name
+    for key in ("position", "command")
+    if key in replay.series
+    for name in replay.series[key].names
+  )
+  data: dict[str, Any] = {"joints": list(joints), "duration": replay.duration, "series": {}}
+  hottest = {name: found for name, found in replay.series.items() if name.startswith("temperature")}
+  for name, found in replay.series.items():
+    if name in hottest:
+      continue
+    times, values = thin(found)
+    data["series"][name] = {
+      "unit": found.unit,
+      "names": list(found.names),
+      "t": np.round(times, 4).tolist(),
+      "y": [np.round(column, 5).tolist() for column in values.T],
+    }
+  data["temperatures"] = {
+    name.removeprefix("temperature "): {
+      "t": np.round(found.times, 2).tolist(),
+      "y": found.values[:, 0].tolist(),
+    }
+    for name, found in hottest.items()
+  }
+  data["moving"] = _most_moving(replay) or next(iter(joints), "")
+  data["frames"] = [round(time, 4) for time, _ in replay.frames]
+  return data
+
+
+def _most_moving(replay: Replay) -> str:
+  """Returns the joint that moves most, the one to look at first."""
+  found = replay.series.get("position")
+  return "" if found is None else found.names[int(np.argmax(np.ptp(found.values, axis=0)))]
+
+
+def page(replay: Replay, *, embed: bool) -> str:
+  """Returns the page.
+
+  Args:
+    replay: The log.
+    embed: Puts the pictures into the page, so that it works without a server; otherwise they are
+      asked for at `frame/<number>`.
+  """
+  data = _plots(replay)
+  if embed:
+    data["pictures"] = [base64.b64encode(jpeg).decode() for _, jpeg in replay.frames]
+  lead = f"{replay.duration:.1f} s, {len(data['joints'])} joints, {len(replay.frames)} pictures"
+  if not replay.complete:
+    lead += "; cut off: this is what was written until then"
+  template = Path(__file__).with_name("replay.html").read_text()
+  for key, value in {
+    "__NAME__": replay.name,
+    "__LEAD__": lead,
+    "__PLOTLY__": plotly.offline.get_plotlyjs(),
+    "__DATA__": json.dumps(data).replace("</", "<\\/"),
+  }.items():
+    template = template.replace(key, value)
+  return template

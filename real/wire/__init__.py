@@ -1,0 +1,1 @@
+"""The robot's wire: serial port, bus, servos, IMU board."""

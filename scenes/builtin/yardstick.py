@@ -1,0 +1,155 @@
+"""Measures a reconstruction of the built-in room against its truth.
+
+The truth's frame and the reconstruction's world differ by a turn about the vertical and a shift,
+which nothing in a video fixes; they are taken from the camera positions. Scale is not: its error
+counts.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nerf2real.core.cameras import Camera
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.assembly import Reconstruction, TruthFigures
+from nerf2real.scenes.builtin import filming, furniture, room
+from nerf2real.scenes.geometry import convex
+from nerf2real.scenes.quality import collision_error, image_quality
+from nerf2real.scenes.quality import held_out as evaluate
+
+VIDEO = filming.SHIPPED_VIDEO
+TRUTH = VIDEO.with_name("room_truth.json")
+ROBOT_VIEWS = VIDEO.with_name("robot_views.npz")
+MARKER_SIDE = furniture.MARKER_SIZE
+
+_EYE_HEIGHT = 0.44  # of the standing OP3's camera [m]; facts of its links
+_VERTICAL_FOV = np.radians(43.3)  # Logitech C920 as mounted; public OP3 descriptions
+_ROBOT_VIEWS = 24
+_CLEARANCE = 0.35  # of a robot view from everything [m]
+_SURFACE_POINTS = 60_000
+
+
+def robot_camera(height: int, width: int) -> Camera:
+  """The OP3's camera at a picture size."""
+  return Camera.from_vertical_fov(_VERTICAL_FOV, width, height)
+
+
+def robot_poses(count: int = _ROBOT_VIEWS, *, seed: int = 0) -> np.ndarray:
+  """Poses [N, 4, 4] of the robot's camera, uniform over the open floor, looking ahead and down."""
+  rng = np.random.default_rng([seed, 7])
+  half = np.array(furniture.ROOM_SIZE[:2]) / 2
+  poses: list[np.ndarray] = []
+  while len(poses) < count:
+    position = np.array([*rng.uniform(-half, half), _EYE_HEIGHT])
+    if room.collision_truth(position[None], seed=seed)[0] < _CLEARANCE:
+      continue
+    yaw, tilt = (
+      rng.uniform(-np.pi, np.pi),
+      rng.uniform(0.16, 0.5),
+    )  # the paper's head tilt, downwards
+    forward = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), -np.sin(tilt)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = position
+    poses.append(pose)
+  return np.stack(poses)
+
+
+def write_robot_views(path: Path, *, seed: int = 0) -> None:
+  """Films what the robot's camera truly sees at the policies' picture sizes (needs EGL)."""
+  poses = robot_poses(seed=seed)
+  arrays: dict[str, np.ndarray] = {"world_from_camera": poses}
+  with room.room_eye(seed) as eye:
+    for height, width in evaluate.ROBOT_SIZES:
+      camera = robot_camera(height, width)
+      pictures = [room.true_view(camera, pose, seed=seed, eye=eye)[0] for pose in poses]
+      arrays[f"images_{height}x{width}"] = np.stack(pictures)
+  np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+
+
+def measure(result: Reconstruction) -> TruthFigures:
+  """Measures poses, scale, floor, robot views and contact geometry against the truth."""
+  truth = filming.read_truth(TRUTH)
+  frames = np.round(np.asarray(result.frame_times) * truth["frame_rate"]).astype(int)
+  true_poses = truth["world_from_camera"][np.clip(frames, 0, len(truth["world_from_camera"]) - 1)]
+  world = result.alignment.world_from_unit.apply_pose(result.localisation.world_from_camera)
+  found, true = world[:, :3, 3], true_poses[:, :3, 3]
+  free = Similarity.fit(found, true)  # poses may differ by any similarity
+  rigid = Similarity.fit(found, true, with_scale=False)  # everything else is metric
+  turned = free.rotation @ world[:, :3, :3]
+  # rotation angle from the trace: 1 + 2 cos(angle)
+  cosine = (np.einsum("nij,nij->n", turned, true_poses[:, :3, :3]) - 1) / 2
+  angles = np.arccos(np.clip(cosine, -1, 1))
+  figures = {
+    "camera_rmse_m": float(np.sqrt(np.mean(np.sum((free.apply(found) - true) ** 2, -1)))),
+    "camera_rotation_deg": float(np.degrees(np.sqrt(np.mean(angles**2)))),
+    "scale_error": float(abs(1 / free.scale - 1)),
+    "floor_tilt_deg": float(np.degrees(np.arccos(np.clip(free.rotation[2, 2], -1, 1)))),
+    "floor_height_error_m": float(abs(rigid.translation[2])),
+  }
+  views: list[evaluate.ViewScore] = []
+  to_unit = result.alignment.world_from_unit.inverse() @ rigid.inverse()
+  for height, width in evaluate.ROBOT_SIZES:
+    scores = _robot_scores(result, to_unit, height, width)
+    size = "" if (height, width) == evaluate.ROBOT_SIZES[0] else f"_{height}x{width}"
+    figures[f"robot_psnr{size}_db"] = float(np.mean([score.psnr_db for score in scores]))
+    views = views or scores
+  figures |= _contact_figures(result, rigid)
+  # Where the truth's frame lies: benchmarks compare other pictures of the bundle with the truth.
+  return TruthFigures({**figures, "room_from_world": rigid.to_dict()}, views)
+
+
+def _robot_scores(
+  result: Reconstruction, to_unit: Similarity, height: int, width: int
+) -> list[evaluate.ViewScore]:
+  arrays = np.load(ROBOT_VIEWS)
+  camera = robot_camera(height, width)
+  scores = []
+  for number, (pose, true) in enumerate(
+    zip(arrays["world_from_camera"], arrays[f"images_{height}x{width}"], strict=True)
+  ):
+    image, depth = result.renderer.render(camera, to_unit.apply_pose(pose))
+    scores.append(
+      evaluate.ViewScore(
+        f"robot view {number}",
+        true,
+        image,
+        depth,
+        image_quality.psnr(image, true),
+        image_quality.ssim(image, true),
+      )
+    )
+  return scores
+
+
+def _moved(parts: Sequence[convex.Part], transform: Similarity) -> list[convex.Part]:
+  moved = []
+  for part in parts:
+    vertices = transform.apply(part.vertices)
+    planes = part.planes.copy()
+    planes[:, :3] = part.planes[:, :3] @ transform.rotation.T
+    planes[:, 3] = part.planes[:, 3] - planes[:, :3] @ transform.translation
+    moved.append(part._replace(vertices=vertices, planes=planes))
+  return moved
+
+
+def _contact_figures(result: Reconstruction, rigid: Similarity) -> dict[str, float]:
+  """Distances between the convex parts and the true surfaces, in the truth's frame."""
+  half = np.array(furniture.ROOM_SIZE[:2]) / 2
+  error = collision_error.collision_error(
+    _moved(result.parts, rigid),
+    room.sample_surface(_SURFACE_POINTS)[0],
+    eyes=rigid.apply(result.depth.positions),
+    lower=np.array([*(-half - 0.1), 0.0]),
+    upper=np.array([*(half + 0.1), result.collision_top]),
+    floor_threshold=result.alignment.floor_threshold,
+    distance_to_surface=lambda points: np.abs(room.collision_truth(points)),
+  )
+  return {
+    "collision_true_p95_m": error.parts_to_surface_p95,
+    "collision_true_within_5cm": error.parts_within_5cm,
+    "surface_true_p95_m": error.surface_to_parts_p95,
+    "surface_true_within_5cm": error.surface_within_5cm,
+  }

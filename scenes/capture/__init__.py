@@ -1,0 +1,1 @@
+"""Captures: a video, pictures or a posed data set becomes a folder of sharp keyframes."""

@@ -1,0 +1,283 @@
+"""Capture: a video, pictures or a posed data set becomes a folder of sharp keyframes."""
+
+import dataclasses
+import itertools
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from nerf2real.core.cameras import Camera
+from nerf2real.scenes.capture.sources import (
+  KnownPoses,
+  find_colmap_model,
+  find_transforms,
+  list_images,
+  read_colmap,
+  read_transforms,
+)
+from nerf2real.scenes.capture.video import (
+  CaptureError,
+  Frame,
+  Progress,
+  inspect_video,
+  limit_size,
+  sharpest_frames,
+  sharpness,
+)
+
+__all__ = ["Capture", "CaptureError", "CaptureSettings", "read_capture"]
+
+MIN_IMAGES = 8  # fewer pictures do not make a room; ours
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CaptureSettings:
+  """What is kept of a capture and when it is doubted. Sources: ours, where not said otherwise."""
+
+  num_keyframes: int = 150  # parts of the capture; the sharpest frame of each is kept
+  max_size: int = 1920  # long side of a keyframe; larger pictures are reduced [pixel]
+  jpeg_quality: int = 95  # of written keyframes
+  min_images: int = MIN_IMAGES  # fewer pictures are an error
+  warn_duration: float = 15.0  # a shorter walk does not see a room from enough places [s]
+  warn_short_side: int = 480  # a smaller picture has too few features [pixel]
+  warn_sharpness: float = 30.0  # variance of the Laplacian below which a picture is blurred;
+  # sharp indoor phone pictures have 100 to 1000, motion-blurred ones under 30
+  warn_blurred_fraction: float = 0.3  # of the keyframes that may be blurred without a warning
+  warn_brightness_range: float = 3.0  # 95th to 5th percentile of the keyframes' mean brightness
+
+
+@dataclasses.dataclass(frozen=True)
+class Capture:
+  """Keyframes on disk and what is known about them. Shape: N keyframes."""
+
+  kind: str  # "video", "images", "colmap" or "transforms"
+  folder: Path  # where the keyframes lie
+  images: list[Path]  # keyframes, sorted by name
+  width: int  # of every keyframe [pixel]
+  height: int  # of every keyframe [pixel]
+  sharpness: np.ndarray  # variance of the Laplacian at the standard size [N]
+  brightness: np.ndarray  # mean grey level [N], 0 to 255
+  times: np.ndarray | None  # in the video [N] [s]; None for pictures
+  warnings: list[str]  # what may ruin the reconstruction, one line each
+  known: KnownPoses | None = None  # cameras that came with the pictures
+
+
+def source_kind(source: Path) -> str:
+  """Says what a source is: "video", "images", "colmap" or "transforms".
+
+  Raises:
+    CaptureError: If it does not exist or is none of these.
+  """
+  if not source.exists():
+    raise CaptureError(f"{source} does not exist.")
+  if find_transforms(source) is not None:
+    return "transforms"
+  if source.is_dir():
+    if find_colmap_model(source) is not None:
+      return "colmap"
+    if list_images(source) or list_images_below(source):
+      return "images"
+    raise CaptureError(
+      f"{source} holds no pictures, no COLMAP model and no transforms.json: give a video, or a "
+      "folder with one of these."
+    )
+  return "video"
+
+
+def list_images_below(source: Path) -> list[Path]:
+  """Lists the pictures in source/images, the usual place beside a model."""
+  return list_images(source / "images") if (source / "images").is_dir() else []
+
+
+def read_capture(
+  source: Path,
+  folder: Path,
+  *,
+  settings: CaptureSettings | None = None,
+  progress: Progress | None = None,
+) -> Capture:
+  """Reads a source and writes its keyframes.
+
+  Args:
+    source: A video, a folder of pictures, a folder with a COLMAP model, or a transforms.json.
+    folder: Where the keyframes are written; replaced as a whole and only when all went well.
+    settings: What to keep and when to warn.
+    progress: Called with (fraction, text).
+
+  Raises:
+    CaptureError: If the source cannot become a capture; the message is one line.
+  """
+  settings = settings or CaptureSettings()
+  source, folder = Path(source), Path(folder)
+  if settings.num_keyframes < settings.min_images:
+    raise CaptureError(
+      f"num_keyframes is {settings.num_keyframes}, expected at least {settings.min_images}."
+    )
+  kind = source_kind(source)
+  partial = folder.with_name(folder.name + ".partial")
+  shutil.rmtree(partial, ignore_errors=True)
+  partial.mkdir(parents=True)
+  try:
+    if kind == "video":
+      capture = _read_video(source, partial, settings, progress)
+    else:
+      capture = _read_pictures(source, kind, partial, settings, progress)
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(partial, folder)
+  finally:
+    shutil.rmtree(partial, ignore_errors=True)
+  images = [folder / path.name for path in capture.images]
+  return dataclasses.replace(capture, folder=folder, images=images)
+
+
+def _read_video(
+  source: Path, folder: Path, settings: CaptureSettings, progress: Progress | None
+) -> Capture:
+  info = inspect_video(source)
+  if info.num_frames < settings.min_images:
+    raise CaptureError(
+      f"{source} has {info.num_frames} frames, expected a walk through the room "
+      f"(at least {settings.min_images} frames, better a minute)."
+    )
+  warnings: list[str] = []
+  if 0 < info.duration < settings.warn_duration:
+    warnings.append(
+      f"Too short: the video lasts {info.duration:.1f} s, expected {settings.warn_duration:.0f} s "
+      "or more; walk slowly through the whole room."
+    )
+  frames = sharpest_frames(
+    source,
+    settings.num_keyframes,
+    max_size=settings.max_size,
+    info=info,
+    warnings=warnings,
+    progress=progress,
+  )
+  return _write("video", frames, folder, settings, warnings)
+
+
+def _read_pictures(
+  source: Path, kind: str, folder: Path, settings: CaptureSettings, progress: Progress | None
+) -> Capture:
+  known = None
+  if kind == "colmap":
+    known = read_colmap(source)
+  elif kind == "transforms":
+    known = read_transforms(source)
+  files = list(known.files) if known else list_images(source) or list_images_below(source)
+  if len(files) < settings.min_images:
+    raise CaptureError(
+      f"{source} holds {len(files)} pictures, expected at least {settings.min_images} that "
+      "overlap: take more, from different places in the room."
+    )
+  frames = _sharpest_pictures(files, settings, progress)
+  capture = _write(kind, frames, folder, settings, [])
+  if known is None:
+    return dataclasses.replace(capture, times=None)
+  indices = [int(path.stem.split("_")[-1]) for path in capture.images]
+  known = known.selected(indices, _written_camera(known.camera, capture))
+  return dataclasses.replace(capture, times=None, known=known)
+
+
+def _written_camera(camera: Camera, capture: Capture) -> Camera:
+  """Scales the source's camera to the keyframes as written, and checks that it is theirs."""
+  ratio = (capture.width / camera.width) / (capture.height / camera.height)
+  if abs(ratio - 1) > 0.01:
+    raise CaptureError(
+      f"The pictures are {capture.width}x{capture.height}, but the known camera is for "
+      f"{camera.width}x{camera.height}: expected the same aspect."
+    )
+  return camera.resized(capture.width, capture.height)
+
+
+def _read_picture(path: Path) -> np.ndarray:
+  """Reads a picture upright (EXIF) as BGR; transparent parts become black."""
+  image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+  if image is None:
+    raise CaptureError(f"{path} cannot be read as a picture: remove it or copy it again.")
+  return image
+
+
+def _sharpest_pictures(
+  files: list[Path], settings: CaptureSettings, progress: Progress | None
+) -> Iterator[Frame]:
+  """Yields the sharpest picture of each of equal parts of a list of files."""
+  parts = min(settings.num_keyframes, len(files))
+  edges = np.linspace(0, len(files), parts + 1).astype(int)
+  for first, last in itertools.pairwise(edges):
+    best: Frame | None = None
+    for index in range(first, last):
+      image = _read_picture(files[index])
+      value = sharpness(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+      if best is None or value > best.sharpness:
+        best = Frame(index, 0.0, value, limit_size(image, settings.max_size))
+    if progress is not None:
+      progress(last / len(files), f"picture {last} of {len(files)}")
+    if best is not None:
+      yield best
+
+
+def _write(
+  kind: str, frames: Iterator[Frame], folder: Path, settings: CaptureSettings, warnings: list[str]
+) -> Capture:
+  """Writes keyframes as they come and gathers what the warnings need."""
+  images, values, brightness, times = [], [], [], []
+  size: tuple[int, int] | None = None
+  for frame in frames:
+    height, width = frame.image.shape[:2]
+    if size is None:
+      size = (width, height)
+    elif size != (width, height):
+      raise CaptureError(
+        f"Picture {frame.index} is {width}x{height}, the ones before it {size[0]}x{size[1]}: "
+        "expected one camera, one zoom and one orientation for the whole capture."
+      )
+    path = folder / f"frame_{frame.index:06d}.jpg"
+    if not cv2.imwrite(str(path), frame.image, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]):
+      raise OSError(f"{path} could not be written: is the disk full?")
+    images.append(path)
+    values.append(frame.sharpness)
+    brightness.append(float(frame.image.mean()))
+    times.append(frame.time)
+  if size is None:
+    raise CaptureError("The capture holds no picture.")
+  capture = Capture(
+    kind=kind,
+    folder=folder,
+    images=images,
+    width=size[0],
+    height=size[1],
+    sharpness=np.array(values),
+    brightness=np.array(brightness),
+    times=np.array(times),
+    warnings=warnings,
+  )
+  warnings.extend(_quality_warnings(capture, settings))
+  return capture
+
+
+def _quality_warnings(capture: Capture, settings: CaptureSettings) -> list[str]:
+  """Says what the keyframes themselves lack; parallax is judged after matching."""
+  found = []
+  if min(capture.width, capture.height) < settings.warn_short_side:
+    found.append(
+      f"Low resolution: {capture.width}x{capture.height}, expected a short side of "
+      f"{settings.warn_short_side} or more."
+    )
+  blurred = float(np.mean(capture.sharpness < settings.warn_sharpness))
+  if blurred > settings.warn_blurred_fraction:
+    found.append(
+      f"Blur: {blurred:.0%} of the keyframes are blurred; move slower, add light, or lock the "
+      "focus."
+    )
+  low, high = np.percentile(capture.brightness, [5, 95])
+  if high > settings.warn_brightness_range * max(low, 1.0):
+    found.append(
+      f"Changing exposure or light: keyframes' mean brightness goes from {low:.0f} to {high:.0f}; "
+      "lock the phone's exposure."
+    )
+  return found

@@ -1,0 +1,1 @@
+"""The radiance field: its definition, training data, losses and training."""

@@ -1,0 +1,105 @@
+"""What localised points tell of the geometry: distances along pixels' rays, and empty space.
+
+Source of the first idea: Deng et al. 2022, "Depth-supervised NeRF"; the second is space carving.
+Shapes: N pictures, A anchors.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+from scipy import ndimage
+
+from nerf2real.core.cameras import Camera
+
+if TYPE_CHECKING:
+  from nerf2real.scenes.field.views import Views
+
+_MOST_ERROR = 2.0  # ours: points with a larger reprojection error are left out [pixel]
+_FEWEST_VIEWS = 3  # ours: so are points that fewer pictures see
+EMPTY_CELLS = 80  # ours: cells along the unit cube, 6 cm in a room of 5 m
+_CROSSINGS = 4  # ours: a cell is empty when so many sight lines cross it; fewer may be mistakes
+_CLEARANCE = 0.4  # ours: nor is there matter this near a camera, of the nearest points' distance
+_MARGIN = 0.04  # ours: a sight line counts up to this distance before its point [unit]
+
+
+def known_points(
+  model: pycolmap.Reconstruction,
+  names: tuple[str, ...],
+  world_from_camera: np.ndarray,
+  *,
+  camera: Camera,
+) -> np.ndarray:
+  """Lists the points that the pictures see, each with its distance from the camera.
+
+  Args:
+    model: A localised model in the unit frame.
+    names: The pictures' names [N].
+    world_from_camera: Their poses [N, 4, 4].
+    camera: The pictures' camera; its pictures may be smaller than the model's.
+
+  Returns:
+    float32 [A, 4]: index of the picture, pixel x and y, distance along the pixel's ray [unit].
+  """
+  index = {name: k for k, name in enumerate(names)}
+  good = {
+    identity: point.xyz
+    for identity, point in model.points3D.items()
+    if point.error < _MOST_ERROR and point.track.length() >= _FEWEST_VIEWS
+  }
+  found = []
+  for image in model.images.values():
+    seen = [(p.xy, good[p.point3D_id]) for p in image.points2D if p.point3D_id in good]
+    if image.name not in index or not seen:
+      continue
+    k = index[image.name]
+    source = model.cameras[image.camera_id]
+    place = np.stack([xy for xy, _ in seen])
+    place *= np.array([camera.width / source.width, camera.height / source.height])
+    distance = np.linalg.norm(np.stack([x for _, x in seen]) - world_from_camera[k, :3, 3], axis=-1)
+    inside = ((place >= 0) & (place < [camera.width, camera.height])).all(-1)
+    rows = np.concatenate([np.full((len(seen), 1), k), np.floor(place), distance[:, None]], -1)
+    found.append(rows[inside])
+  return np.concatenate(found).astype(np.float32) if found else np.zeros((0, 4), np.float32)
+
+
+def empty_cells(views: Views) -> np.ndarray:
+  """Cells of the unit cube that sight lines from cameras to their points cross.
+
+  Returns:
+    Sorted indices int64 [E] into a grid of `EMPTY_CELLS` cells an axis, in order x, y, z.
+  """
+  anchors = views.anchors
+  if not len(anchors):
+    return np.zeros(0, np.int64)
+  rays = views.camera.rays()
+  pictures, x, y = anchors[:, :3].astype(np.int64).T
+  rotations = views.world_from_camera[pictures, :3, :3]
+  directions = np.einsum("aij,aj->ai", rotations, rays[y, x])
+  directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+  origins = views.world_from_camera[pictures, :3, 3]
+  step = 2 / EMPTY_CELLS  # every cell that is crossed through its middle is met once
+  counts = np.zeros(EMPTY_CELLS**3, np.int64)
+  for index in range(int(anchors[:, 3].max() / step) + 1):
+    reached = (index + 0.5) * step < anchors[:, 3] - _MARGIN
+    points = origins[reached] + (index + 0.5) * step * directions[reached]
+    cells = np.floor((points + 1) / step).astype(np.int64)
+    cells = cells[((cells >= 0) & (cells < EMPTY_CELLS)).all(-1)]
+    flat = (cells[:, 0] * EMPTY_CELLS + cells[:, 1]) * EMPTY_CELLS + cells[:, 2]
+    counts += np.bincount(flat, minlength=len(counts))
+  crossed = (counts >= _CROSSINGS).reshape((EMPTY_CELLS,) * 3)
+  # Lines graze floors and walls: cells beside a point or beside an uncrossed cell do not count.
+  ends = np.floor((origins + anchors[:, 3:] * directions + 1) / step).astype(np.int64)
+  ends = ends[((ends >= 0) & (ends < EMPTY_CELLS)).all(-1)]
+  crossed[tuple(ends.T)] = False
+  empty = ndimage.binary_erosion(crossed, np.ones((3, 3, 3)))
+  radius = _CLEARANCE * float(np.percentile(anchors[:, 3], 1))
+  axis = (np.arange(EMPTY_CELLS) + 0.5) * step - 1
+  for eye in views.world_from_camera[:, :3, 3]:
+    window = [np.flatnonzero(np.abs(axis - center) < radius) for center in eye]
+    squares = [np.square(axis[line] - center) for line, center in zip(window, eye, strict=True)]
+    near = squares[0][:, None, None] + squares[1][:, None] + squares[2] < radius**2
+    empty[np.ix_(*window)] |= near
+  return np.flatnonzero(empty)

@@ -1,0 +1,1 @@
+"""Field training on CPU cores with fused numba kernels."""

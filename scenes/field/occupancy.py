@@ -1,0 +1,115 @@
+"""Where a field holds matter: a grid over the squashed space, and how far the next matter is.
+
+The grid covers the contracted cube [-2, 2]^3 of `scenes.field.contraction`, index
+x + G (y + G z). It is not stored: building it takes a second.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+import warp as wp
+
+from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.field.render import kernels as render_kernels
+from nerf2real.scenes.field.render import weights as render_weights
+
+_MAX_DISTANCE = 255  # cells; a byte
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OccupancySettings:
+  """How finely and how carefully matter is looked for."""
+
+  cells: int = 128
+  """Cells along an axis, divisible by 4: 8 cm in a room of 5 m. Ours: 256 renders as fast, but
+  takes eight times as long to fill."""
+  density: float = 2.0
+  """Density [1/unit] from which a cell counts as matter. Ours: a cell of it hides 3 %."""
+  coarse_density: float = 0.5
+  """The same for the coarser grids of the search; lower, because they are sampled more sparsely."""
+  fine_deviation: float = 0.002
+  """Standard deviation [unit] of the smallest sample looked at (a pixel near the camera). Ours."""
+  coarse_deviation: float = 0.012
+  """Standard deviation [unit] of the largest one (a pixel of 30x40 pictures in the room). Ours."""
+
+  def __post_init__(self):
+    if self.cells % 4 or self.cells < 16:
+      raise ValueError(f"cells must be a multiple of 4 and at least 16, found {self.cells}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Occupancy:
+  """Distance to the nearest cell with matter in cells (maximum norm), 0 in matter."""
+
+  distance: np.ndarray  # uint8 [G, G, G], axes z, y, x
+
+  @property
+  def cells(self) -> int:
+    """Cells along an axis, G."""
+    return self.distance.shape[0]
+
+  @property
+  def occupied(self) -> np.ndarray:
+    """Cells with matter, bool [G, G, G], axes z, y, x."""
+    return self.distance == 0
+
+  @classmethod
+  def from_occupied(cls, occupied: np.ndarray) -> "Occupancy":
+    """Builds the distance from a grid of cells with matter, bool [G, G, G], axes z, y, x."""
+    occupied = np.asarray(occupied, bool)
+    if occupied.ndim != 3 or len(set(occupied.shape)) != 1:
+      raise ValueError(f"Expected a cube of cells [G, G, G], found shape {occupied.shape}.")
+    if not occupied.any():
+      return cls(np.full(occupied.shape, _MAX_DISTANCE, np.uint8))
+    cells = scipy.ndimage.distance_transform_cdt(~occupied, metric="chessboard")
+    return cls(np.minimum(cells, _MAX_DISTANCE).astype(np.uint8))
+
+  def is_occupied(self, coordinates: np.ndarray) -> np.ndarray:
+    """Looks up points of the grid's cube [0, 1]^3, [..., 3]: bool [...]."""
+    x, y, z = np.moveaxis(
+      np.clip((coordinates * self.cells).astype(np.int32), 0, self.cells - 1), -1, 0
+    )
+    return self.distance[z, y, x] == 0
+
+
+def build(
+  field: Field, *, settings: OccupancySettings | None = None, device: str = "cpu"
+) -> Occupancy:
+  """Finds a field's matter, from coarse cells to fine ones.
+
+  Of the coarse cells only those at the border of matter, and their neighbours, are looked into:
+  what lies deep in matter stays matter, what lies far from it stays empty.
+
+  Args:
+    field: A trained field.
+    settings: How finely to look.
+    device: Warp's name of the device.
+
+  Returns:
+    The occupancy over the squashed space.
+  """
+  settings = settings or OccupancySettings()
+  packed = render_weights.pack(field.settings, field.params)
+  kernel = render_kernels.build(packed.layout).density
+  data = render_kernels.upload(packed, field.settings.march_step, device)
+  deviations = wp.vec2(settings.fine_deviation, settings.coarse_deviation)
+  candidates = np.ones((settings.cells // 4,) * 3, bool)
+  occupied = np.zeros_like(candidates)
+  for shrink in (4, 2, 1):
+    side = settings.cells // shrink
+    chosen = np.flatnonzero(candidates).astype(np.int32)
+    largest = wp.empty(len(chosen), dtype=wp.float32, device=device)
+    cells: Any = wp.array(chosen, dtype=wp.int32, device=device)
+    inputs = [data, cells, side, deviations, largest]
+    wp.launch(kernel, dim=len(chosen), inputs=inputs, device=device)
+    least = settings.density if shrink == 1 else settings.coarse_density
+    occupied.ravel()[chosen] = largest.numpy() > least
+    if shrink > 1:
+      inner = scipy.ndimage.minimum_filter(occupied, 3)
+      border = scipy.ndimage.maximum_filter(occupied, 3) & ~inner
+      occupied, candidates = (
+        grid.repeat(2, 0).repeat(2, 1).repeat(2, 2) for grid in (occupied, border)
+      )
+  return Occupancy.from_occupied(occupied)

@@ -1,0 +1,1 @@
+"""Field rendering with fused Warp kernels, on CPU and CUDA."""

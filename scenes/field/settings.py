@@ -1,0 +1,163 @@
+"""How a field is trained: every number with its source, and the two presets."""
+
+import dataclasses
+
+from nerf2real.scenes.field.field import FieldSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainSettings:
+  """Settings of the training. They are stored in the bundle."""
+
+  field: FieldSettings = FieldSettings()
+  """The field's shape."""
+  engine: str = "fused"
+  """"fused": numba kernels for a CPU. "jax": the reference, on a GPU where there is one."""
+  max_steps: int = 30_000
+  """Steps after which training ends."""
+  max_seconds: float | None = 290.0
+  """Seconds after which training ends, or None. The schedule runs over whichever ends first."""
+  learning_rate: float = 1e-2
+  """Learning rate after the warm-up. Mueller et al. 2022, section 4; the paper's table: 2e-3."""
+  final_learning_rate: float = 3e-4
+  """Learning rate at the end; the decay is exponential. Ours."""
+  variance_rate: float = 0.1
+  """Factor on the rate of the weights that see the variance. Ours: it gives away the direction and
+  the distance of the camera, and a field that learns those first finds no geometry."""
+  warmup_steps: int = 64
+  """Steps over which the learning rate rises from a hundredth. Ours; the paper's table: 2048."""
+  weight_decay: float = 5e-5
+  """Decoupled weight decay (AdamW). Paper, NeRF table."""
+  adam_beta1: float = 0.9
+  """Decay of Adam's first moment. Kingma and Ba 2015."""
+  adam_beta2: float = 0.99
+  """Decay of Adam's second moment. Mueller et al. 2022, section 4."""
+  adam_epsilon: float = 1e-15
+  """Adam's constant against division by zero. Mueller et al. 2022, section 4."""
+  charbonnier_padding: float = 1e-3
+  """Padding of the Charbonnier loss, in colours of [0, 1]. Paper, NeRF table."""
+  distortion_weight: float = 1e-2
+  """Weight of the distortion loss. Paper, NeRF table."""
+  distortion_start: int = 1000
+  """Step at which the distortion loss sets in; it has its weight at twice this step. Ours: from the
+  start it favours fog before the camera. The paper's table has no such value."""
+  blur_max: float = 12.0
+  """Largest blur of a training ray [training pixel]; 0 turns the augmentation off. Paper."""
+  blur_sharp_fraction: float = 0.5
+  """Fraction of the rays without blur. Ours: keeps the detail at full resolution."""
+  blur_power: float = 1.5
+  """Blurred rays draw blur_max * uniform^power. Ours: most robot cameras lie below half of it."""
+  near: float = 0.03
+  """Distance where a ray's first sample may lie [unit]. Ours: no matter within 8 cm of a phone."""
+  random_background: bool = True
+  """Composite over a random colour, so that dark surfaces cannot be empty. Mueller et al. 2022."""
+
+  known_steps: int = 1200
+  """Steps after which localised points take no part: fog forms early, and later their errors of a
+  pixel cost 1 dB and more. Ours."""
+  known_steps_uneven: int = 30_000
+  """The same for pictures of changing exposure, which alone never clear the fog: a living room's
+  held-out views lost 2 dB when its points went after 1,200 steps. Ours."""
+  anchor_fraction: float = 0.15
+  """Fraction of the rays that go to a localised point, where there are any. Ours."""
+  anchor_weight: float = 0.3
+  """Weight of those rays' distance to their point [normalised distance]: Deng et al. 2022 (depth
+  supervision from the sparse points), as a mean absolute error."""
+
+  # Engine "fused".
+  empty_samples: int = 1024
+  """Points a step in cells that sight lines to localised points cross; at most 768 a thread. Ours:
+  walls without texture are explained as well by fog before the cameras."""
+  empty_weight: float = 0.01
+  """Weight of the mean of log(1 + density) there. Ours."""
+  batch_samples: int = 1 << 15
+  """Samples a step that are evaluated; the number of rays follows. Ours."""
+  ray_samples: int = 256
+  """Most samples of a ray. Ours."""
+  transmittance_threshold: float = 1e-3
+  """Samples behind this much light take no part. Ours; Mueller et al. 2022: 1e-4."""
+  depth_limit: float = 10.0
+  """A march ends where the occupancy grid's optical depth passes this. Ours."""
+  refine_samples: float = 24.0
+  """The march starts coarse and its step is halved when a ray has fewer samples than this. Ours."""
+  inner_cells: int = 128
+  """Occupancy cells along the unit cube: 4 cm in a room of 5 m. Mueller et al. 2022."""
+  outer_cells: int = 64
+  """Occupancy cells along the squashed space. Ours."""
+  occupancy_interval: int = 16
+  """Steps between updates of the occupancy. Mueller et al. 2022, appendix C."""
+  occupancy_start: int = 192
+  """Step of the first update; until then nothing counts as empty. Mueller et al. 2022."""
+  occupancy_sweep_steps: int = 448
+  """Until this step every second update looks at all cells. Ours."""
+  occupancy_samples: int = 1 << 17
+  """Cells looked at in an update after that. Ours."""
+  occupancy_decay: float = 0.8
+  """Factor on a cell's density when it is looked at again. Ours."""
+  occupancy_threshold: float = 0.01
+  """A cell is occupied when a step through it absorbs this fraction. Mueller et al. 2022."""
+
+  # Engine "jax".
+  batch_rays: int = 16_384
+  """Rays a step. Paper, NeRF table."""
+  proposal_samples: int = 64
+  """Samples of the proposal network a ray. Paper, NeRF table: 64 x 64."""
+  final_samples: int = 64
+  """Samples of the field a ray. Paper, NeRF table: 64 x 64."""
+  proposal_levels: int = 5
+  """Levels of the proposal network's hash grid. Ours; nerfstudio's nerfacto."""
+  proposal_log2_table_size: int = 17
+  """Binary logarithm of its entries a level. Ours; nerfstudio's nerfacto."""
+  proposal_finest_resolution: int = 256
+  """Cells along an axis of its finest level. Ours; nerfstudio's nerfacto."""
+  proposal_width: int = 64
+  """Width of the proposal network. Paper, NeRF table."""
+  proposal_depth: int = 2
+  """Layers of the proposal network, the last included. Paper, NeRF table."""
+  interlevel_weight: float = 1.0
+  """Weight of the loss that pulls the proposal over the field. Barron et al. 2022, section 4."""
+  sample_dilation: float = 1e-3
+  """Proposal weights are spread by this normalised distance. Paper, NeRF table."""
+
+  def last_known_step(self, *, uneven: bool) -> int:
+    """Step after which localised points take no part."""
+    return self.known_steps_uneven if uneven else self.known_steps
+
+  def distortion_ramp(self, step: int) -> float:
+    """Factor on the distortion loss's weight at a step."""
+    if self.distortion_start == 0:
+      return 1.0
+    return min(max(step / self.distortion_start - 1.0, 0.0), 1.0)
+
+  def __post_init__(self):
+    if self.engine not in ("fused", "jax"):
+      raise ValueError(f"Unknown engine {self.engine!r}; expected 'fused' or 'jax'.")
+    if self.max_steps < 1 or (self.max_seconds is not None and self.max_seconds <= 0):
+      raise ValueError(
+        f"Found max_steps={self.max_steps}, max_seconds={self.max_seconds}; expected at least one "
+        "step and a positive time (or None)."
+      )
+
+
+def preset(name: str) -> TrainSettings:
+  """Returns the settings "fast" (two CPU cores, 5 minutes) or "paper" (the paper's NeRF table)."""
+  if name == "fast":
+    return TrainSettings()
+  if name == "paper":
+    return TrainSettings(
+      field=FieldSettings(
+        levels=12, log2_table_size=20, growth=(2048 / 16) ** (1 / 11), density_gain=1.0
+      ),
+      engine="jax",
+      max_steps=40_000,
+      max_seconds=None,
+      learning_rate=2e-3,
+      final_learning_rate=4e-5,
+      warmup_steps=2048,
+      distortion_start=0,
+      blur_sharp_fraction=0.0,
+      blur_power=1.0,
+      anchor_fraction=0.0,
+      empty_samples=0,
+    )
+  raise ValueError(f"Unknown preset {name!r}; expected 'fast' or 'paper'.")

@@ -1,0 +1,205 @@
+"""Trains a radiance field on posed pictures; can be interrupted and continued.
+
+Two engines do the steps: the fused kernels for CPU cores, and JAX as the reference and for GPUs.
+Both train the same field and write the same file.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+import time
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import safetensors.numpy
+
+from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.field.fused.trainer import FusedTrainer
+from nerf2real.scenes.field.reference_training import ReferenceTrainer
+from nerf2real.scenes.field.settings import TrainSettings, preset
+from nerf2real.scenes.field.views import Views
+from nerf2real.scenes.stages import Progress, no_progress, to_plain
+
+__all__ = ["TrainError", "TrainReport", "TrainSettings", "learning_rate", "preset", "train"]
+
+CHECKPOINT_SECONDS = 60.0  # ours: a checkpoint takes about 0.2 s
+_RECORD_SECONDS = 2.0  # ours: distance of the points of the report's curve
+_WARMUP_START = 0.01  # the warm-up starts at this fraction of the learning rate, as in multinerf
+_CHECKPOINT = "training.safetensors"
+
+
+class TrainError(ValueError):
+  """Training cannot start or go on; the message is one line for the user."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainReport:
+  """What a training run did. Curves have one entry for every point in `curve_seconds`."""
+
+  steps: int  # steps made, interrupted runs included
+  seconds: float  # time spent, interrupted runs included, compilation not
+  rays: int  # rays seen
+  samples: int  # samples of the field evaluated
+  samples_per_second: float
+  engine: str
+  curve_seconds: list[float]
+  curve_psnr_db: list[float]  # of training rays, blurred ones included
+  curve_samples_per_ray: list[float]
+  resumed_at_step: int | None  # step of the checkpoint that the run continued, or None
+
+
+class Trainer(Protocol):
+  """An engine."""
+
+  rays_done: int
+  samples_done: int
+
+  @property
+  def steps_done(self) -> int: ...
+  def prepare(self) -> None: ...
+  def step(self, learning_rate: float) -> dict[str, float]: ...
+  def field(self) -> Field: ...
+  def state(self) -> dict[str, np.ndarray]: ...
+  def restore(self, arrays: dict[str, np.ndarray]) -> None: ...
+
+
+def learning_rate(settings: TrainSettings, fraction: float, step: int) -> float:
+  """Learning rate after `fraction` of the training: linear warm-up, then exponential decay.
+
+  Source: NeRF2Real, NeRF table (2e-3 to 4e-5, warm-up 2048 steps); form as in multinerf.
+  """
+  ratio = settings.final_learning_rate / settings.learning_rate
+  rate = settings.learning_rate * ratio ** min(max(fraction, 0.0), 1.0)
+  if step < settings.warmup_steps:
+    rise = (step + 1) / settings.warmup_steps
+    rate *= _WARMUP_START + (1 - _WARMUP_START) * rise
+  return rate
+
+
+def train(
+  views: Views,
+  settings: TrainSettings | None = None,
+  *,
+  progress: Progress = no_progress,
+  seed: int = 0,
+  checkpoint_dir: str | Path | None = None,
+  initial: Field | None = None,
+) -> tuple[Field, TrainReport]:
+  """Trains a field.
+
+  Args:
+    views: Training pictures with poses in the unit frame; no held-out ones.
+    settings: How to train; the preset "fast" if None.
+    progress: Called with the fraction done and a text.
+    seed: Of the parameters and of the rays. With the same number of threads and steps the fused
+      engine repeats a run exactly; a limit in seconds makes the number of steps vary.
+    checkpoint_dir: Folder for a checkpoint a minute; training continues from one that is there.
+    initial: A field to start from.
+
+  Returns:
+    The trained field and a report.
+
+  Raises:
+    TrainError: Too few pictures, a loss that is not finite, or a field that stays empty.
+  """
+  settings = settings or preset("fast")
+  if len(views) < 3:
+    raise TrainError(
+      f"Found {len(views)} training pictures; a field needs at least 3, and a room about 100."
+    )
+  make = FusedTrainer if settings.engine == "fused" else ReferenceTrainer
+  trainer: Trainer = make(views, settings, seed=seed, initial=initial)
+  checkpoint = Path(checkpoint_dir) / _CHECKPOINT if checkpoint_dir is not None else None
+  key = _run_key(views, settings, seed)
+  spent, resumed = 0.0, None
+  if checkpoint is not None:
+    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    found = _load_checkpoint(checkpoint, key)
+    if found is not None:
+      spent, arrays = found
+      trainer.restore(arrays)
+      resumed = trainer.steps_done
+  progress(0.0, "compiling the training kernels")
+  trainer.prepare()
+
+  curve: list[tuple[float, float, float]] = []
+  start = last_checkpoint = time.monotonic()
+  last_record = -math.inf
+  while True:
+    seconds = spent + time.monotonic() - start
+    fraction = trainer.steps_done / settings.max_steps
+    if settings.max_seconds is not None:
+      fraction = max(fraction, seconds / settings.max_seconds)
+    if fraction >= 1.0 and trainer.steps_done > 0:
+      break
+    rate = learning_rate(settings, fraction, trainer.steps_done)
+    metrics = trainer.step(rate)
+    _check(metrics, trainer.steps_done, rate)
+    now = time.monotonic()
+    if now - last_record >= _RECORD_SECONDS:
+      last_record = now
+      per_ray = metrics["samples"] / max(metrics["rays"], 1)
+      curve.append((spent + now - start, metrics["psnr_db"], per_ray))
+      progress(fraction, f"step {trainer.steps_done}, {metrics['psnr_db']:.1f} dB on training rays")
+    if checkpoint is not None and now - last_checkpoint >= CHECKPOINT_SECONDS:
+      last_checkpoint = now
+      _save_checkpoint(checkpoint, key, spent + now - start, trainer.state())
+
+  field = trainer.field()
+  if not all(np.isfinite(value).all() for value in field.params.values()):
+    raise TrainError(_not_finite("a parameter", trainer.steps_done, 0.0))
+  seconds = spent + time.monotonic() - start
+  return field, TrainReport(
+    steps=trainer.steps_done,
+    seconds=seconds,
+    rays=trainer.rays_done,
+    samples=trainer.samples_done,
+    samples_per_second=trainer.samples_done / max(seconds, 1e-9),
+    engine=settings.engine,
+    curve_seconds=[round(point[0], 2) for point in curve],
+    curve_psnr_db=[round(point[1], 3) for point in curve],
+    curve_samples_per_ray=[round(point[2], 2) for point in curve],
+    resumed_at_step=resumed,
+  )
+
+
+def _check(metrics: dict[str, float], step: int, rate: float) -> None:
+  for name in ("charbonnier", "distortion"):
+    if not math.isfinite(metrics[name]):
+      raise TrainError(_not_finite(f"the {name} loss", step, rate))
+
+
+def _not_finite(what: str, step: int, rate: float) -> str:
+  return (
+    f"Training failed at step {step}: {what} is not finite (learning rate {rate:.2g}). Look for "
+    "wrong poses among the pictures, or lower learning_rate and start again without the checkpoint."
+  )
+
+
+def _run_key(views: Views, settings: TrainSettings, seed: int) -> str:
+  """Hash of all that a checkpoint depends on."""
+  digest = hashlib.sha256(json.dumps(to_plain(settings), sort_keys=True).encode())
+  digest.update(json.dumps([views.camera.to_dict(), list(views.names), seed]).encode())
+  digest.update(np.ascontiguousarray(views.world_from_camera).tobytes())
+  digest.update(np.ascontiguousarray(views.images).tobytes())
+  return digest.hexdigest()
+
+
+def _save_checkpoint(path: Path, key: str, seconds: float, arrays: dict[str, np.ndarray]) -> None:
+  metadata = {"key": key, "seconds": repr(seconds)}
+  partial = path.with_name(path.name + ".partial")
+  safetensors.numpy.save_file(arrays, partial, metadata=metadata)
+  partial.replace(path)
+
+
+def _load_checkpoint(path: Path, key: str) -> tuple[float, dict[str, np.ndarray]] | None:
+  """Returns the seconds and arrays of a checkpoint of this very run, or None."""
+  if not path.exists():
+    return None
+  with safetensors.safe_open(path, "numpy") as file:
+    metadata = file.metadata() or {}
+    if metadata.get("key") != key:
+      return None
+    return float(metadata["seconds"]), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

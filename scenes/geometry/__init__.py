@@ -1,0 +1,1 @@
+"""Geometry: depth fusion, surface mesh, world frame, contact geometry, free floor."""

@@ -1,0 +1,194 @@
+"""The scene's surface as a triangle mesh: marching cubes, without floaters, coloured, as glTF.
+
+Two sources give the same `Grid`: depth pictures fused (`scenes.geometry.fusion`) or the field's
+density at a threshold, as the paper does (section "Collision mesh extraction"). Fusion needs no
+threshold and keeps out of space that no ray reached; a density needs one that depends on how long
+the field was trained, and `density_to_grid` carves its floaters with fused depth.
+Shapes: V vertices, F faces, X, Y, Z voxels.
+"""
+
+import dataclasses
+import pathlib
+from typing import NamedTuple
+
+import fast_simplification
+import numpy as np
+import trimesh
+from scipy import ndimage, sparse
+from skimage import measure
+
+from nerf2real.scenes.geometry import fusion
+
+_FIELD_OF_VIEW = 1.5  # tangent; farther out a lens polynomial may fold back into the picture
+_SAME_DEPTH = 0.04  # relative; a vertex this far behind the seen depth is hidden
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MeshSettings:
+  """Settings of the surface and of the mesh shown to people."""
+
+  voxel: float = 0.025  # edge of a voxel [m]; half of what the collision may be wrong by
+  truncation: float = 0.075  # band in which views are averaged [m]; 3 voxels
+  source: str = "fusion"  # "fusion" of depth pictures or a "density" threshold
+  density_threshold: float = 25.0  # of the field [1/unit], where source is "density"
+  min_component: float = 0.3  # smaller floating pieces are dropped [m], diagonal of their box
+  visual_faces: int = 60_000  # faces of visual.glb after decimation
+
+  def __post_init__(self):
+    if self.source not in ("fusion", "density"):
+      raise ValueError(f'Mesh source must be "fusion" or "density", found "{self.source}".')
+
+
+class Mesh(NamedTuple):
+  """A triangle mesh."""
+
+  vertices: np.ndarray  # float64 [V, 3]
+  faces: np.ndarray  # int [F, 3]
+  colors: np.ndarray | None = None  # uint8 [V, 3]
+
+  @property
+  def normals(self) -> np.ndarray:
+    """Unit normals of the vertices [V, 3], weighted by the faces' areas."""
+    a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+    face = np.cross(b - a, c - a)
+    total = np.zeros_like(self.vertices)
+    for i in range(3):
+      np.add.at(total, self.faces[:, i], face)
+    return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-12)
+
+
+def surface(grid: fusion.Grid) -> Mesh:
+  """Marching cubes over the observed cells of a grid: only surface that was seen.
+
+  Source: Lorensen and Cline 1987, Marching cubes.
+
+  Raises:
+    ValueError: the grid holds no surface.
+  """
+  known = grid.observed
+  # A cell counts where its eight corners are known; skimage looks it up at its last corner.
+  cell = np.ones_like(known)
+  for offset in np.ndindex(2, 2, 2):
+    shifted = np.zeros_like(known)
+    target = tuple(slice(o, n) for n, o in zip(known.shape, offset, strict=True))
+    source = tuple(slice(0, n - o) for n, o in zip(known.shape, offset, strict=True))
+    shifted[target] = known[source]
+    cell &= shifted
+  if not (cell.any() and grid.values[known].min() < 0 < grid.values[known].max()):
+    raise ValueError(
+      "Found no surface in the grid: the depth pictures show nothing inside the extent, or the "
+      "density never crosses the threshold. Check the extent, the scale and the field."
+    )
+  vertices, faces, _, _ = measure.marching_cubes(grid.values, 0.0, mask=cell)
+  return Mesh(vertices * grid.voxel + grid.lower, faces.astype(np.int64))
+
+
+def density_to_grid(
+  density: np.ndarray,
+  *,
+  lower: np.ndarray,
+  voxel: float,
+  threshold: float,
+  carved: fusion.Grid | None = None,
+) -> fusion.Grid:
+  """Makes a grid of a voxelised density: negative where it exceeds the threshold.
+
+  Args:
+    density: Density [X, Y, Z] at voxel centres.
+    lower: Centre of voxel (0, 0, 0) [3].
+    voxel: Edge of a voxel.
+    threshold: Density of the surface.
+    carved: Fused depth over the same voxels. Where rays passed through, density is a floater and
+      counts as free; where none came, as unknown.
+  """
+  values = np.clip(1 - density / threshold, -1, 1).astype(np.float32)
+  weights = np.ones_like(values)
+  if carved is not None:
+    if carved.values.shape != values.shape:
+      raise ValueError(f"Carving has {carved.values.shape} voxels, density {values.shape}.")
+    free = carved.observed & (carved.values > 0.99)
+    values = np.where(free, np.maximum(values, 1), values)
+    weights = carved.observed.astype(np.float32)
+    values[~carved.observed] = 1
+  return fusion.Grid(values, weights, np.asarray(lower, np.float64), voxel, voxel)
+
+
+def drop_floaters(grid: fusion.Grid, *, min_component: float) -> fusion.Grid:
+  """Sets free every connected piece of matter whose box has a shorter diagonal."""
+  labels, count = ndimage.label(grid.solid, structure=np.ones((3, 3, 3)))
+  if count == 0:
+    return grid
+  small = np.zeros(count + 1, bool)
+  for i, box in enumerate(ndimage.find_objects(labels)):
+    diagonal = np.linalg.norm([s.stop - s.start for s in box]) * grid.voxel
+    small[i + 1] = diagonal < min_component
+  return grid._replace(values=np.where(small[labels], np.float32(1), grid.values))
+
+
+def drop_small_pieces(mesh: Mesh, *, min_component: float) -> Mesh:
+  """Removes connected pieces of a mesh whose bounding box has a shorter diagonal."""
+  count = len(mesh.vertices)
+  edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
+  links = sparse.coo_matrix((np.ones(len(edges), bool), edges.T), shape=(count, count))
+  pieces, label = sparse.csgraph.connected_components(links, directed=False)
+  low, high = np.full((pieces, 3), np.inf), np.full((pieces, 3), -np.inf)
+  np.minimum.at(low, label, mesh.vertices)
+  np.maximum.at(high, label, mesh.vertices)
+  keep = (np.linalg.norm(high - low, axis=-1) >= min_component)[label]
+  index = np.cumsum(keep) - 1
+  return Mesh(
+    mesh.vertices[keep],
+    index[mesh.faces[keep[mesh.faces[:, 0]]]],
+    None if mesh.colors is None else mesh.colors[keep],
+  )
+
+
+def simplify(mesh: Mesh, *, faces: int) -> Mesh:
+  """Decimates to about this many faces (quadric error); colours are lost, paint afterwards."""
+  if len(mesh.faces) <= faces:
+    return mesh
+  vertices, triangles = fast_simplification.simplify(
+    mesh.vertices.astype(np.float32),
+    mesh.faces.astype(np.int32),
+    target_reduction=1 - faces / len(mesh.faces),
+  )
+  return Mesh(vertices.astype(np.float64), triangles.astype(np.int64))
+
+
+def paint(mesh: Mesh, views: fusion.DepthViews) -> Mesh:
+  """Colours every vertex with the mean of the views that see it.
+
+  A view sees a vertex if its depth picture agrees within 4 % of the depth. Vertices that no view
+  sees take mid grey.
+  """
+  if views.color is None:
+    raise ValueError("Painting a mesh needs views with colour pictures, found depth only.")
+  normals, camera = mesh.normals, views.camera
+  total = np.zeros((len(mesh.vertices), 4))
+  for pose, depth, color in zip(views.frame_from_camera, views.depth, views.color, strict=True):
+    away = pose[:3, 3] - mesh.vertices
+    local = -away @ pose[:3, :3]
+    distance = np.linalg.norm(away, axis=-1)
+    facing = (away * normals).sum(-1) / distance
+    index = np.flatnonzero((facing > 0.1) & (local[:, 2] > 1e-6))
+    index = index[(np.abs(local[index, :2]) < _FIELD_OF_VIEW * local[index, 2:]).all(-1)]
+    column, row = np.floor(camera.project(local[index])).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    index, column, row = index[inside], column[inside], row[inside]
+    seen = np.abs(depth[row, column] - local[index, 2]) < _SAME_DEPTH * local[index, 2]
+    index, column, row = index[seen], column[seen], row[seen]
+    weight = facing[index] / distance[index] ** 2
+    total[index] += weight[:, None] * np.c_[color[row, column], np.ones(len(index))]
+  known = total[:, 3] > 0
+  colors = np.full((len(mesh.vertices), 3), 128, np.uint8)
+  colors[known] = np.round(total[known, :3] / total[known, 3:])
+  return mesh._replace(colors=colors)
+
+
+def save_glb(mesh: Mesh, path: pathlib.Path) -> None:
+  """Writes a glTF binary with vertex colours; y up, as glTF prescribes."""
+  y_up = mesh.vertices @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
+  shown = trimesh.Trimesh(y_up, mesh.faces, vertex_colors=mesh.colors, process=False)
+  content = shown.export(file_type="glb")
+  assert isinstance(content, bytes)  # other formats give text or a mapping
+  path.write_bytes(content)

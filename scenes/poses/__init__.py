@@ -1,0 +1,1 @@
+"""Camera poses: structure from motion turns keyframes into one camera, poses and points."""

@@ -1,0 +1,110 @@
+"""The result of localising, and its folder: a COLMAP model with its figures beside it.
+
+Shapes: N registered keyframes, P points.
+"""
+
+import dataclasses
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from nerf2real.core.cameras import Camera
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.capture.sources import to_opencv
+from nerf2real.scenes.poses import mapping
+
+_FIGURES = "localisation.json"
+
+
+class LocalisationError(ValueError):
+  """The keyframes do not connect; the message says how many did, why, and what to film."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Localisation:
+  """Where the keyframes were taken, in the unit frame."""
+
+  camera: Camera  # the one camera of all keyframes
+  names: tuple[str, ...]  # registered keyframes, sorted
+  world_from_camera: np.ndarray  # float64 [N, 4, 4], unit frame, OpenCV camera axes
+  points: np.ndarray  # float64 [P, 3], unit frame
+  point_colors: np.ndarray  # uint8 [P, 3]
+  point_errors: np.ndarray  # mean reprojection error of each point [P] [pixel]
+  reprojection_error_px: float  # mean over the observations [pixel]; NaN where none are known
+  registered_fraction: float  # registered keyframes of all given
+  strategy: str  # which pairs were matched and which mapper was used
+  unit_from_source: Similarity  # from the source's frame (COLMAP's, or that of the known poses)
+  warnings: tuple[str, ...] = ()  # what may ruin the reconstruction
+  seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # wall time of each step
+
+
+def reprojection_error(model: pycolmap.Reconstruction) -> float:
+  """Mean over the observations [pixel]; over the points where there are no observations."""
+  points = list(model.points3D.values())
+  if not points:
+    return float("nan")
+  weights = np.array([max(p.track.length(), 1) for p in points])
+  return float(np.average([p.error for p in points], weights=weights))
+
+
+def poses_of(images: list[pycolmap.Image]) -> np.ndarray:
+  """World-from-camera poses [N, 4, 4]."""
+  poses = np.tile(np.eye(4), (len(images), 1, 1))
+  for row, image in enumerate(images):
+    poses[row, :3] = image.cam_from_world().inverse().matrix()
+  return poses
+
+
+def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Localisation:
+  images = mapping.registered(model)
+  points = list(model.points3D.values())
+  return Localisation(
+    camera=to_opencv(next(iter(model.cameras.values()))),
+    names=tuple(image.name for image in images),
+    world_from_camera=poses_of(images),
+    points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
+    point_colors=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+    point_errors=np.array([p.error for p in points], np.float64),
+    **values,
+  )
+
+
+def save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Path) -> None:
+  """Writes the model and its figures; the folder appears whole or not at all."""
+  partial = folder.with_name(folder.name + ".partial")
+  shutil.rmtree(partial, ignore_errors=True)
+  partial.mkdir(parents=True)
+  model.write(str(partial))
+  figures = {
+    "registered_fraction": localisation.registered_fraction,
+    "reprojection_error_px": localisation.reprojection_error_px,
+    "strategy": localisation.strategy,
+    "unit_from_source": localisation.unit_from_source.to_dict(),
+    "warnings": list(localisation.warnings),
+    "seconds": localisation.seconds,
+  }
+  (partial / _FIGURES).write_text(json.dumps(figures, indent=2))
+  shutil.rmtree(folder, ignore_errors=True)
+  os.replace(partial, folder)
+
+
+def load(folder: Path) -> Localisation:
+  """Reads what `localise` wrote into `sfm/`.
+
+  Raises:
+    LocalisationError: If the folder holds no localisation.
+  """
+  folder = Path(folder)
+  try:
+    values = json.loads((folder / _FIGURES).read_text())
+    model = pycolmap.Reconstruction(str(folder))
+  except (OSError, ValueError, RuntimeError) as error:
+    raise LocalisationError(f"{folder} holds no localisation: {error}") from error
+  values["unit_from_source"] = Similarity.from_dict(values["unit_from_source"])
+  values["warnings"] = tuple(values["warnings"])
+  return from_model(model, values)

@@ -1,0 +1,320 @@
+"""Localise: keyframes become one camera, poses and sparse points in the unit frame.
+
+`localise` leaves `sfm/` (a COLMAP model in the unit frame, and `localisation.json`); features and
+matches stay in `work/database.db`, so that an interrupted run continues. Shapes: N registered
+keyframes, P points.
+"""
+
+import dataclasses
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap
+from nerf2real.scenes.poses import mapping, matching
+from nerf2real.scenes.poses.localisation import (
+  Localisation,
+  LocalisationError,
+  from_model,
+  load,
+  poses_of,
+  reprojection_error,
+  save,
+)
+from nerf2real.scenes.poses.matching import FeatureSettings, quiet
+from nerf2real.scenes.poses.pairs import PairSettings, repair_pairs
+from nerf2real.scenes.poses.parallax import parallax_share
+from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
+
+__all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "localise"]
+
+Progress = Callable[[float, str], None]
+
+_MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
+_STAGE_SHARES = {"features": 0.25, "matching": 0.4, "mapping": 0.25, "refining": 0.1}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocaliseSettings:
+  """How keyframes are localised. Sources: ours, where not said otherwise."""
+
+  features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
+  pairs: PairSettings = dataclasses.field(default_factory=PairSettings)
+  mapper: str = (
+    "auto"  # "global", "incremental", or "auto": incremental for stills (few keyframes),
+  )
+  # else global; the other one where the first leaves too many keyframes out
+  few_keyframes: int = 40  # up to this many are mapped incrementally
+  repair_below: float = 0.95  # fraction of registered keyframes under which more pairs are matched
+  min_fraction: float = 0.5  # fewer registered keyframes are an error
+  min_registered: int = 10  # fewer are an error, unless there are fewer keyframes
+  min_parallax: float = 0.08  # share of matches off a homography below which a warning is given
+  seed: int = 0  # of RANSAC and of the mappers
+
+
+def localise(
+  images_folder: Path,
+  out_folder: Path,
+  *,
+  settings: LocaliseSettings | None = None,
+  known: KnownPoses | None = None,
+  progress: Progress | None = None,
+) -> Localisation:
+  """Localises the pictures of a folder.
+
+  Args:
+    images_folder: Keyframes of one camera.
+    out_folder: Receives `sfm/` and `work/`.
+    settings: How.
+    known: Poses that came with the pictures, in the order of their sorted names; they are kept.
+    progress: Called with (fraction, text).
+
+  Raises:
+    LocalisationError: If too few keyframes can be localised.
+  """
+  settings = settings or LocaliseSettings()
+  images_folder, out_folder = Path(images_folder), Path(out_folder)
+  names = [path.name for path in list_images(images_folder)]
+  if not names:
+    raise LocalisationError(f"{images_folder} holds no pictures.")
+  if known is not None and len(known.world_from_camera) != len(names):
+    raise LocalisationError(
+      f"{len(known.world_from_camera)} known poses for {len(names)} pictures: expected one each."
+    )
+  steps = _Steps(progress)
+  if known is not None and len(known.points):
+    model = mapping.model_from_poses(known, names)
+    for point, error in zip(model.points3D.values(), known.point_errors, strict=True):
+      point.error = error
+    result = _Mapped(model, f"poses and points of the {known.kind} source", ())
+  else:
+    database = _prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
+    result = _map(database, images_folder, names, settings, known, steps)
+  localisation = _describe(result, len(names), known, images_folder, steps)
+  save(result.model, localisation, out_folder / _MODEL_FOLDER)
+  return localisation
+
+
+@dataclasses.dataclass(frozen=True)
+class _Mapped:
+  model: pycolmap.Reconstruction  # in the source's frame
+  strategy: str
+  warnings: tuple[str, ...]
+
+
+class _Steps:
+  """Times the steps and turns their progress into one fraction."""
+
+  def __init__(self, progress: Progress | None):
+    self._progress = progress
+    self._name, self._start = "", time.perf_counter()
+    self.seconds: dict[str, float] = {}
+
+  def begin(self, name: str) -> None:
+    self.end()
+    self._name, self._start = name, time.perf_counter()
+
+  def end(self) -> None:
+    if self._name:
+      spent = time.perf_counter() - self._start
+      self.seconds[self._name] = self.seconds.get(self._name, 0.0) + spent
+    self._name = ""
+
+  def report(self, fraction: float, text: str) -> None:
+    if self._progress is None:
+      return
+    done = 0.0
+    for name, share in _STAGE_SHARES.items():
+      if name == self._name:
+        self._progress(done + share * min(max(fraction, 0.0), 1.0), text)
+        return
+      done += share
+
+
+def _prepare_work(
+  images_folder: Path,
+  work: Path,
+  names: list[str],
+  settings: LocaliseSettings,
+  known: KnownPoses | None,
+) -> Path:
+  """Returns the database, after removing one that was made of other pictures or settings."""
+  digest = hashlib.sha256()
+  described: dict[str, Any] = dataclasses.asdict(settings.features)
+  described["camera"] = None if known is None else known.camera.to_dict()
+  described["seed"] = settings.seed
+  digest.update(json.dumps(described, sort_keys=True).encode())
+  for name in names:
+    digest.update(name.encode())
+    digest.update(hashlib.sha256((images_folder / name).read_bytes()).digest())
+  stamp = work / "inputs.sha256"
+  if not stamp.is_file() or stamp.read_text() != digest.hexdigest():
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    stamp.write_text(digest.hexdigest())
+  return work / _DATABASE
+
+
+def _map(
+  database: Path,
+  images_folder: Path,
+  names: list[str],
+  settings: LocaliseSettings,
+  known: KnownPoses | None,
+  steps: _Steps,
+) -> _Mapped:
+  """Features, pairs, matches, a model, repairs, refinement."""
+  steps.begin("features")
+  matching.extract_features(
+    database,
+    images_folder,
+    names,
+    settings=settings.features,
+    report=steps.report,
+    camera=None if known is None else to_colmap(known.camera),
+  )
+  steps.begin("matching")
+  pairs, words = matching.find_pairs(database, settings.pairs, report=steps.report)
+
+  def match(chosen: list[tuple[int, int]]) -> int:
+    return matching.match_pairs(
+      database, chosen, settings=settings.features, seed=settings.seed, report=steps.report
+    )
+
+  match(pairs)
+  warnings = []
+  width = _picture_width(database)
+  share = parallax_share(database, width=width, seed=settings.seed)
+  if share is not None and share < settings.min_parallax:
+    warnings.append(
+      f"Hardly any parallax: {1 - share:.0%} of the matches fit a camera that only turns; walk "
+      "sideways and through the room instead of turning on the spot."
+    )
+  steps.begin("mapping")
+  if known is not None:
+    fixed = mapping.triangulate(database, images_folder, known, names)
+    return _Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
+  model, mapper = _best_model(database, images_folder, len(names), settings, steps)
+  if model is None or model.num_reg_images() < settings.repair_below * len(names):
+    placed = {i.name for i in mapping.registered(model)} if model else set()
+    missing = [row for row, name in enumerate(names) if name not in placed]
+    steps.begin("matching")
+    added = match(
+      repair_pairs(
+        missing,
+        len(names),
+        overlap=settings.pairs.overlap,
+        loop_keyframes=settings.pairs.loop_keyframes,
+      )
+    )
+    if added:
+      steps.begin("mapping")
+      again, mapper_again = _best_model(database, images_folder, len(names), settings, steps)
+      if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
+        model, mapper = again, mapper_again
+        words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
+  _check_registered(model, names, settings, share)
+  assert model is not None  # for the type checker: _check_registered has raised
+  steps.begin("refining")
+  model, lens = mapping.refine(model, report=steps.report)
+  if mapping.drop_weak_images(model):
+    _check_registered(model, names, settings, share)
+  if lens != "all OPENCV parameters":
+    warnings.append(f"Lens: estimated {lens}.")
+  return _Mapped(model, f"{words}, {mapper} mapper; lens: {lens}", tuple(warnings))
+
+
+def _picture_width(database: Path) -> int:
+  with pycolmap.Database.open(str(database)) as db:
+    return db.read_all_cameras()[0].width
+
+
+def _best_model(
+  database: Path, images_folder: Path, count: int, settings: LocaliseSettings, steps: _Steps
+) -> tuple[pycolmap.Reconstruction | None, str]:
+  """Runs the mapper of the settings, and the other one if that leaves too many keyframes out."""
+  mappers = {"global": mapping.map_globally, "incremental": mapping.map_incrementally}
+  if settings.mapper == "auto":
+    order = ["incremental", "global"]
+    if count > settings.few_keyframes:
+      order.reverse()
+  elif settings.mapper in mappers:
+    order = [settings.mapper]
+  else:
+    raise ValueError(f"mapper is {settings.mapper!r}, expected 'auto', 'global' or 'incremental'.")
+  best, chosen = None, order[0]
+  for name in order:
+    models = mappers[name](database, images_folder, seed=settings.seed, report=steps.report)
+    if models:
+      with quiet():
+        pycolmap.ObservationManager(models[0]).filter_all_points3D(
+          mapping.MAX_ERROR, mapping.MIN_ANGLE
+        )
+      mapping.drop_weak_images(models[0])
+      if best is None or models[0].num_reg_images() > best.num_reg_images():
+        best, chosen = models[0], name
+    if best is not None and best.num_reg_images() >= settings.repair_below * count:
+      break
+  return best, chosen
+
+
+def _check_registered(
+  model: pycolmap.Reconstruction | None,
+  names: list[str],
+  settings: LocaliseSettings,
+  share: float | None,
+) -> None:
+  """Raises LocalisationError if too few keyframes have a place."""
+  number = 0 if model is None else model.num_reg_images()
+  needed = max(
+    int(np.ceil(settings.min_fraction * len(names))), min(settings.min_registered, len(names))
+  )
+  if number >= needed:
+    return
+  if share is None:
+    why = "hardly any two pictures show the same textured surface (blur, plain walls, fast turns)"
+    advice = "film slower, with more light, and keep textured things in view while turning"
+  elif share < settings.min_parallax:
+    why = "the camera hardly moved sideways, so depth cannot be seen"
+    advice = "walk through the room instead of turning on the spot"
+  else:
+    why = "the walk has gaps where successive pictures share too little (blur, plain walls, cuts)"
+    advice = "film slower and in one go, and come back to places that were seen before"
+  raise LocalisationError(
+    f"{number} of {len(names)} keyframes were localised, expected at least {needed}: probably "
+    f"{why}; {advice}."
+  )
+
+
+def _describe(
+  result: _Mapped, total: int, known: KnownPoses | None, images_folder: Path, steps: _Steps
+) -> Localisation:
+  """Moves the model into the unit frame (in place) and gathers the figures."""
+  steps.end()
+  model = result.model
+  if known is None or not len(known.points):
+    model.update_point_3d_errors()
+    model.extract_colors_for_all_images(str(images_folder))
+  poses = poses_of(mapping.registered(model))
+  solid = [p.xyz for p in model.points3D.values() if p.track.length() >= 3]
+  if not solid:
+    solid = [p.xyz for p in model.points3D.values()]
+  unit = choose_unit_frame(poses, np.array(solid).reshape(-1, 3))
+  matrix = np.hstack([unit.scale * unit.rotation, unit.translation[:, None]])
+  model.transform(pycolmap.Sim3d(matrix))
+  values = {
+    "registered_fraction": model.num_reg_images() / total,
+    "reprojection_error_px": reprojection_error(model),
+    "strategy": result.strategy,
+    "unit_from_source": unit,
+    "warnings": result.warnings,
+    "seconds": dict(steps.seconds),
+  }
+  return from_model(model, values)

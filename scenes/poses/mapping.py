@@ -1,0 +1,219 @@
+"""From verified matches to one refined COLMAP model."""
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from nerf2real.core.cameras import Camera
+from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
+from nerf2real.scenes.poses.matching import Report, image_ids, quiet
+
+MIN_OBSERVATIONS = 20  # points a picture must see to count as registered; ours
+MAX_ERROR = 4.0  # observations further off are dropped [pixel]; COLMAP
+MIN_ANGLE = 1.5  # points seen under a smaller angle are dropped [degree]; COLMAP
+_LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]; ours
+_MAX_PRINCIPAL_SHIFT = (
+  0.08  # of the principal point from the middle, times the picture's size; ours
+)
+_MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative; ours
+_MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels; ours
+_NOTHING = (ValueError, RuntimeError)  # what pycolmap raises
+
+
+def map_globally(
+  database: Path, images_folder: Path, *, seed: int, report: Report | None = None
+) -> list[pycolmap.Reconstruction]:
+  """Solves for all rotations, then all positions, then adjusts; the largest model first.
+
+  Source: Pan et al. 2024, Global structure-from-motion revisited (GLOMAP). It does not fall into
+  pieces at weak links as the incremental mapper does.
+  """
+  options = pycolmap.GlobalPipelineOptions()
+  options.num_threads = os.cpu_count() or 1
+  options.random_seed = seed
+  if report is not None:
+    report(0.0, "solving for all poses at once")
+  with tempfile.TemporaryDirectory(dir=database.parent) as folder:
+    # The global mapper writes calibrated focal lengths into its database: it gets its own copy.
+    copy = Path(folder) / "database.db"
+    shutil.copyfile(database, copy)
+    models = Path(folder) / "models"
+    models.mkdir()
+    try:
+      with quiet():
+        found = pycolmap.global_mapping(str(copy), str(images_folder), str(models), options=options)
+    except _NOTHING:  # no connected pictures: the other mapper is tried, then the count is reported
+      found = {}
+  return _largest_first(found)
+
+
+def map_incrementally(
+  database: Path, images_folder: Path, *, seed: int, report: Report | None = None
+) -> list[pycolmap.Reconstruction]:
+  """Adds picture after picture; the largest model first.
+
+  Thresholds are softer than COLMAP's: a blurred keyframe between two halves of a room has few
+  matches, and refusing it splits the model (living room: 82 + 69 keyframes, with these 151).
+  """
+  options = pycolmap.IncrementalPipelineOptions()
+  options.num_threads = os.cpu_count() or 1
+  options.random_seed = seed
+  options.extract_colors = False
+  options.triangulation.ignore_two_view_tracks = False
+  options.mapper.abs_pose_min_num_inliers = 15
+  options.mapper.abs_pose_min_inlier_ratio = 0.15
+  options.ba_global_max_refinements = 2
+  options.ba_global_max_num_iterations = 30
+  options.ba_local_max_num_iterations = 15
+  total, seen = len(image_ids(database)), 0
+
+  def next_image() -> None:
+    nonlocal seen
+    seen += 1
+    if report is not None:
+      report(min(1.0, seen / total), f"placed {min(seen, total)} of {total} pictures")
+
+  with tempfile.TemporaryDirectory(dir=database.parent) as folder:
+    try:
+      with quiet():
+        found = pycolmap.incremental_mapping(
+          str(database), str(images_folder), folder, options=options, next_image_callback=next_image
+        )
+    except _NOTHING:
+      found = {}
+  return _largest_first(found)
+
+
+def _largest_first(models: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+  return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
+def registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+  """Pictures with a pose, sorted by name."""
+  return sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name)
+
+
+def drop_weak_images(model: pycolmap.Reconstruction) -> int:
+  """Takes the pose from pictures that see too few points to be trusted; returns their number."""
+  weak = [i for i in registered(model) if i.num_points3D < MIN_OBSERVATIONS]
+  for image in weak:
+    model.deregister_frame(image.frame_id)
+  return len(weak)
+
+
+def _adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool) -> None:
+  options = pycolmap.BundleAdjustmentOptions()
+  options.refine_principal_point = principal
+  options.refine_extra_params = distortion
+  options.print_summary = False
+  options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+  options.ceres.loss_function_scale = _LOSS_SCALE
+  options.ceres.solver_options.num_threads = os.cpu_count() or 1
+  options.ceres.solver_options.max_num_iterations = 50
+  options.ceres.solver_options.function_tolerance = 1e-6
+  config = pycolmap.BundleAdjustmentConfig()
+  for image in registered(model):
+    config.add_image(image.image_id)
+  config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+  with quiet():  # pycolmap.bundle_adjustment writes to the terminal whatever the log level
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+
+
+def camera_fault(camera: Camera) -> str | None:
+  """Says what is impossible about an estimated camera, None if nothing is.
+
+  The radial polynomial r (1 + k1 r^2 + k2 r^4) must grow up to the farthest corner: where parallax
+  is low, distortion trades against depth and folds the picture.
+  """
+  x = max(camera.cx, camera.width - camera.cx) / camera.fx
+  y = max(camera.cy, camera.height - camera.cy) / camera.fy
+  radius = np.linspace(0, np.hypot(x, y), 100)
+  slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
+  if slope.min() < 0.2:
+    return f"distortion k1={camera.k1:.2f}, k2={camera.k2:.2f} folds the picture's corners"
+  shift_x = abs(camera.cx / camera.width - 0.5)
+  shift_y = abs(camera.cy / camera.height - 0.5)
+  if max(shift_x, shift_y) > _MAX_PRINCIPAL_SHIFT:
+    return f"principal point ({camera.cx:.0f}, {camera.cy:.0f}) is far from the middle"
+  if abs(camera.fx / camera.fy - 1) > _MAX_ASPECT:
+    return f"focal lengths {camera.fx:.0f} and {camera.fy:.0f} differ"
+  return None
+
+
+def refine(
+  model: pycolmap.Reconstruction, *, report: Report | None = None
+) -> tuple[pycolmap.Reconstruction, str]:
+  """Adjusts poses, points and all parameters of the lens; frees fewer where the result is absurd.
+
+  Parameters are freed in the order focal lengths, distortion, principal point. When an estimate is
+  impossible (`camera_fault`), or the principal point moves the focal length by more than 5 %, the
+  adjustment is repeated with fewer free parameters; distortion that stays absurd is set to zero.
+
+  Returns:
+    The refined model and a sentence on the lens: which parameters are free and why not all.
+  """
+  if report is not None:
+    report(0.0, "adjusting poses and lens")
+  base = pycolmap.Reconstruction(model)
+  _adjust(base, principal=False, distortion=True)
+  fault = camera_fault(_camera(base))
+  if fault is not None:
+    base = pycolmap.Reconstruction(model)
+    for camera in base.cameras.values():
+      camera.params = np.concatenate([camera.params[:4], np.zeros(4)])
+    _adjust(base, principal=False, distortion=False)
+    return base, f"focal lengths only, no distortion, because {fault}"
+  if report is not None:
+    report(0.5, "adjusting poses and lens, principal point free")
+  full = pycolmap.Reconstruction(base)
+  _adjust(full, principal=True, distortion=True)
+  fault = camera_fault(_camera(full))
+  change = _camera(full).fx / _camera(base).fx - 1
+  if fault is None and abs(change) > _MAX_FOCAL_CHANGE:
+    fault = f"it moves the focal length by {change:+.1%}"
+  if fault is not None:
+    return base, f"all OPENCV parameters but the principal point, because {fault}"
+  return full, "all OPENCV parameters"
+
+
+def _camera(model: pycolmap.Reconstruction) -> Camera:
+  return to_opencv(next(iter(model.cameras.values())))
+
+
+def model_from_poses(known: KnownPoses, names: list[str], ids: dict[str, int] | None = None):
+  """Builds a COLMAP model of known poses with the known points, which get no observations.
+
+  Args:
+    known: Poses and camera of the pictures as written.
+    names: Of the pictures, in the order of the poses.
+    ids: Ids of the pictures in a database; counted from 1 if None.
+  """
+  model = pycolmap.Reconstruction()
+  model.add_camera_with_trivial_rig(to_colmap(known.camera))
+  for number, (name, pose) in enumerate(zip(names, known.world_from_camera, strict=True), start=1):
+    image = pycolmap.Image(name=name, camera_id=1, image_id=number if ids is None else ids[name])
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
+  for xyz, color in zip(known.points, known.point_colors, strict=True):
+    model.add_point3D(xyz, pycolmap.Track(), color)
+  return model
+
+
+def triangulate(
+  database: Path, images_folder: Path, known: KnownPoses, names: list[str]
+) -> pycolmap.Reconstruction:
+  """Triangulates verified matches with poses and camera held fixed."""
+  model = model_from_poses(known, names, image_ids(database))
+  options = pycolmap.IncrementalPipelineOptions()
+  options.num_threads = os.cpu_count() or 1
+  options.extract_colors = False
+  options.ba_refine_focal_length = False
+  options.ba_refine_extra_params = False
+  with tempfile.TemporaryDirectory(dir=database.parent) as folder, quiet():
+    return pycolmap.triangulate_points(
+      model, str(database), str(images_folder), folder, options=options
+    )

@@ -1,0 +1,219 @@
+"""Features and matches in a COLMAP database that survives interruption.
+
+Every call does only what the database does not hold yet.
+"""
+
+import contextlib
+import dataclasses
+import os
+import sqlite3
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from nerf2real.scenes.poses.pairs import Pair, PairSettings, choose_pairs, overlap_scores
+
+Report = Callable[[float, str], None]
+
+_EXTRACTION_CHUNK = 8  # pictures between two progress reports
+_MATCHING_CHUNK = 300  # pairs between two progress reports
+_FATAL_ONLY = 3  # glog level
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeatureSettings:
+  """Features and their matching."""
+
+  max_num_features: int = 1536  # of a picture, the largest first; time grows with the square; ours
+  few_num_features: int = 4096  # the same for captures of few pictures; ours
+  few_pictures: int = 40  # so many are few; ours
+  max_image_size: int = 1600  # long side at which features are sought [pixel]; ours
+  affine_shape: bool = True  # paper, appendix A
+  guided_matching: bool = True  # paper, appendix A
+  focal_factor: float = 1.2  # first guess of the focal length, times the long side; COLMAP
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+  """Silences COLMAP's log on the terminal; its errors still arrive as exceptions."""
+  log = pycolmap.logging
+  before = log.minloglevel, log.stderrthreshold, log.logtostderr, log.alsologtostderr
+  log.minloglevel, log.stderrthreshold = _FATAL_ONLY, _FATAL_ONLY
+  log.logtostderr = log.alsologtostderr = False
+  try:
+    yield
+  finally:
+    log.minloglevel, log.stderrthreshold, log.logtostderr, log.alsologtostderr = before
+
+
+def image_ids(database: Path) -> dict[str, int]:
+  """Returns the database's picture ids by name, in order of the names."""
+  with pycolmap.Database.open(str(database)) as db:
+    return {i.name: i.image_id for i in sorted(db.read_all_images(), key=lambda i: i.name)}
+
+
+def _with_features(database: Path) -> set[str]:
+  """Names of the pictures whose features are complete."""
+  if not database.is_file():
+    return set()
+  with contextlib.closing(sqlite3.connect(database)) as db:
+    rows = db.execute(
+      "SELECT name FROM images JOIN keypoints USING (image_id) JOIN descriptors USING (image_id)"
+    )
+    return {row[0] for row in rows}
+
+
+def extract_features(
+  database: Path,
+  images_folder: Path,
+  names: list[str],
+  *,
+  settings: FeatureSettings,
+  camera: pycolmap.Camera | None = None,
+  report: Report | None = None,
+) -> None:
+  """Finds affine-shape SIFT features of pictures that share one OPENCV camera.
+
+  Args:
+    database: Created if absent.
+    images_folder: Where the pictures lie.
+    names: The pictures.
+    settings: Of the features.
+    camera: Known intrinsics; a first guess from the picture size if None.
+    report: Called with (fraction, text).
+  """
+  reader = pycolmap.ImageReaderOptions()
+  reader.camera_model = "OPENCV"
+  reader.default_focal_length_factor = settings.focal_factor
+  if camera is not None:
+    reader.camera_params = ",".join(repr(float(value)) for value in camera.params)
+  options = pycolmap.FeatureExtractionOptions()
+  options.max_image_size = settings.max_image_size
+  options.num_threads = os.cpu_count() or 1
+  options.sift.estimate_affine_shape = settings.affine_shape
+  few = len(names) <= settings.few_pictures
+  options.sift.max_num_features = settings.few_num_features if few else settings.max_num_features
+  done = _with_features(database)
+  missing = [name for name in names if name not in done]
+  for first in range(0, len(missing), _EXTRACTION_CHUNK):
+    if database.is_file():
+      with pycolmap.Database.open(str(database)) as db:
+        cameras = db.read_all_cameras()
+      if cameras:  # a later call would make a second camera
+        reader.existing_camera_id = cameras[0].camera_id
+    with quiet():
+      pycolmap.extract_features(
+        str(database),
+        str(images_folder),
+        missing[first : first + _EXTRACTION_CHUNK],
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+      )
+    if report is not None:
+      found = min(first + _EXTRACTION_CHUNK, len(missing))
+      report(found / len(missing), f"features of {found + len(done)} of {len(names)} pictures")
+
+
+def feature_counts(database: Path) -> np.ndarray:
+  """Number of features of every picture [N], in order of the names."""
+  with contextlib.closing(sqlite3.connect(database)) as db:
+    rows = db.execute(
+      "SELECT COALESCE(keypoints.rows, 0) FROM images LEFT JOIN keypoints USING (image_id) "
+      "ORDER BY name"
+    )
+    return np.array([row[0] for row in rows], np.int64)
+
+
+def largest_descriptors(database: Path, ids: list[int], count: int) -> np.ndarray:
+  """Descriptors of the features of the largest area, of length 1: float32 [N, count, 128]."""
+  result = np.zeros((len(ids), count, 128), np.float32)
+  with pycolmap.Database.open(str(database)) as db:
+    for row, image_id in enumerate(ids):
+      keypoints = db.read_keypoints(image_id)  # x, y and the affine shape a11, a12, a21, a22
+      if len(keypoints) == 0:
+        continue
+      descriptors = db.read_descriptors(image_id).data.astype(np.float32)
+      area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+      kept = descriptors[np.argsort(-area, kind="stable")[:count]]
+      result[row, : len(kept)] = kept / np.linalg.norm(kept, axis=1, keepdims=True)
+  return result
+
+
+def find_pairs(
+  database: Path, settings: PairSettings, *, report: Report | None = None
+) -> tuple[list[Pair], str]:
+  """Chooses which pictures of the database to match: see `scenes.poses.pairs`."""
+  ids = list(image_ids(database).values())
+
+  def score(keyframes: np.ndarray) -> np.ndarray:
+    descriptors = largest_descriptors(
+      database, [ids[i] for i in keyframes], settings.score_features
+    )
+    return overlap_scores(
+      descriptors,
+      ratio=settings.score_ratio,
+      progress=None if report is None else lambda f: report(f, "looking for loop closures"),
+    )
+
+  return choose_pairs(feature_counts(database), settings, score=score)
+
+
+def matched_pairs(database: Path) -> set[Pair]:
+  """Pairs of picture ids that were matched and verified, found overlapping or not."""
+  with contextlib.closing(sqlite3.connect(database)) as db:
+    rows = db.execute("SELECT pair_id FROM two_view_geometries").fetchall()
+  pairs = (pycolmap.pair_id_to_image_pair(row[0]) for row in rows)
+  return {(min(a, b), max(a, b)) for a, b in pairs}
+
+
+def match_pairs(
+  database: Path,
+  pairs: list[Pair],
+  *,
+  settings: FeatureSettings,
+  seed: int,
+  report: Report | None = None,
+) -> int:
+  """Matches and verifies pairs, given as indices into the sorted names.
+
+  Returns:
+    The number of pairs that were not in the database before.
+  """
+  ids = image_ids(database)
+  names = list(ids)
+  done = matched_pairs(database)
+  numbers = list(ids.values())
+  missing = [
+    (i, j)
+    for i, j in sorted(pairs)
+    if (min(numbers[i], numbers[j]), max(numbers[i], numbers[j])) not in done
+  ]
+  options = pycolmap.FeatureMatchingOptions()
+  options.guided_matching = settings.guided_matching
+  options.num_threads = os.cpu_count() or 1
+  verification = pycolmap.TwoViewGeometryOptions()
+  verification.ransac.random_seed = seed
+  with tempfile.TemporaryDirectory() as folder:
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = os.path.join(folder, "pairs.txt")
+    for first in range(0, len(missing), _MATCHING_CHUNK):
+      chunk = missing[first : first + _MATCHING_CHUNK]
+      lines = (f"{names[i]} {names[j]}\n" for i, j in chunk)
+      Path(pairing.match_list_path).write_text("".join(lines))
+      with quiet():
+        pycolmap.match_image_pairs(
+          str(database),
+          matching_options=options,
+          pairing_options=pairing,
+          verification_options=verification,
+          device=pycolmap.Device.cpu,
+        )
+      if report is not None:
+        found = min(first + _MATCHING_CHUNK, len(missing))
+        report(found / len(missing), f"matched {found} of {len(missing)} pairs")
+  return len(missing)

@@ -1,0 +1,87 @@
+"""The unit frame: upright, centred, and as large as the sparse points and the cameras need.
+
+Shapes: N cameras, P points.
+"""
+
+import numpy as np
+
+from nerf2real.core.similarity import Similarity
+
+POINT_FRACTION = 0.98  # of the points inside [-1, 1]^3; the rest are outliers and far views
+CAMERA_MARGIN = 1.05  # cameras stay this factor away from the cube's faces; ours
+_BOX_PERCENTILES = (1.0, 99.0)  # of the points, for the robust centre; ours
+_YAW_STEPS = 180  # half degrees of a quarter turn that are tried
+_UPRIGHT = 0.1  # length of the mean up vector below which up is unknown; ours
+
+
+def mean_up(world_from_camera: np.ndarray) -> np.ndarray:
+  """Mean up direction of cameras [N, 4, 4]: a unit vector [3], against the cameras' y axes.
+
+  A camera carried by hand is level on average. Where the ups cancel (a camera that rolls over),
+  the direction in which the positions spread least is up.
+  """
+  poses = np.asarray(world_from_camera, np.float64)
+  up = -poses[:, :3, 1].mean(axis=0)
+  if np.linalg.norm(up) < _UPRIGHT:
+    centred = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    least = np.linalg.svd(centred, full_matrices=False)[2][-1]
+    up = least if least @ up >= 0 else -least
+  return up / np.linalg.norm(up)
+
+
+def _rotation_to_z(up: np.ndarray) -> np.ndarray:
+  """Shortest rotation [3, 3] that takes a unit vector to +z."""
+  axis = np.cross(up, [0.0, 0.0, 1.0])
+  cosine = up[2]
+  if cosine < -1 + 1e-12:
+    return np.diag([1.0, -1.0, -1.0])
+  cross = np.array(
+    [[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]], np.float64
+  )
+  return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def _yaw_of_smallest_box(points: np.ndarray) -> np.ndarray:
+  """Rotation [3, 3] about z after which the points' box, robustly, covers the smallest area."""
+  best, result = np.inf, np.eye(3)
+  for angle in np.linspace(0, np.pi / 2, _YAW_STEPS, endpoint=False):
+    cosine, sine = np.cos(angle), np.sin(angle)
+    x = cosine * points[:, 0] - sine * points[:, 1]
+    y = sine * points[:, 0] + cosine * points[:, 1]
+    low_x, high_x = np.percentile(x, _BOX_PERCENTILES)
+    low_y, high_y = np.percentile(y, _BOX_PERCENTILES)
+    area = (high_x - low_x) * (high_y - low_y)
+    if area < best:
+      best = area
+      result = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+  return result
+
+
+def unit_from_source(world_from_camera: np.ndarray, points: np.ndarray) -> Similarity:
+  """Chooses the unit frame.
+
+  Up is the mean up direction of the cameras, yaw makes the room's box small (walls along the axes),
+  the origin is the middle of that box, and the unit is such that 98 % of the points and all cameras
+  lie in [-1, 1]^3.
+
+  Args:
+    world_from_camera: Poses in the source's frame [N, 4, 4].
+    points: Sparse points in the source's frame [P, 3]; without any, the cameras span the box and
+      half of it is left around them.
+  """
+  poses = np.asarray(world_from_camera, np.float64)
+  centres = poses[:, :3, 3]
+  everything = np.concatenate([np.asarray(points, np.float64).reshape(-1, 3), centres])
+  rotation = _rotation_to_z(mean_up(poses))
+  rotation = _yaw_of_smallest_box(everything @ rotation.T) @ rotation
+  turned, cameras = everything @ rotation.T, centres @ rotation.T
+  low, high = np.percentile(turned, _BOX_PERCENTILES, axis=0)
+  centre = 0.5 * (low + high)
+  radius = CAMERA_MARGIN * np.abs(cameras - centre).max()
+  if len(points):
+    distances = np.abs(turned[: len(points)] - centre).max(axis=1)
+    radius = max(radius, float(np.quantile(distances, POINT_FRACTION)))
+  else:
+    radius *= 2
+  scale = 1 / max(radius, 1e-9)
+  return Similarity(float(scale), rotation, -scale * centre)

@@ -1,0 +1,1 @@
+"""Quality: figures on held-out pictures, geometry errors, the report."""

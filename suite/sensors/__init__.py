@@ -1,0 +1,1 @@
+"""Proprioceptive sensors: filters, gravity estimate, delays and histories."""

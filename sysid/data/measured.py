@@ -1,0 +1,96 @@
+"""What a log says of one joint: its readings, its commands, and which readings are new.
+
+Shapes: N samples of a log.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.sysid.model.reduction import Motion
+
+Array = np.ndarray
+
+_SAME = 1e-6
+"""Share of a range below which two readings differ by rounding of floating point alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+  """What one log says about one joint."""
+
+  name: str
+  time: Array
+  """[N] s, stamps of the states."""
+  position: Array
+  """[N]."""
+  velocity: Array
+  """[N], smoothed from positions."""
+  acceleration: Array
+  """[N], smoothed from positions."""
+  effort: Array | None
+  """[N] N m."""
+  command_time: Array
+  command: Array
+  valid: Array
+  """[N] bool: False for repeated (stale) readings."""
+  voltage: Array | None
+  """[N] V."""
+  temperature: Array | None
+  """[N] degrees Celsius."""
+  duty: Array | None
+  """[N], -1 to 1."""
+
+
+def measured(log: Log, motion: Motion, joint: str) -> Measured:
+  """Returns one joint's part of a log."""
+  states, commands = log.states, log.commands
+  column = states.column(joint)
+  assert states.position is not None
+  position = states.position[:, column]
+  if joint in commands.joints:
+    source = commands.position if commands.position is not None else commands.effort
+    assert source is not None
+    command_time, command = commands.stamp, source[:, commands.column(joint)]
+  else:
+    command_time, command = np.zeros(1), np.zeros(1)
+  series = log.temperatures.get(joint)
+  duty = None
+  if log.pwm is not None and log.pwm.effort is not None and joint in log.pwm.joints:
+    duty = np.interp(states.stamp, log.pwm.stamp, log.pwm.effort[:, log.pwm.column(joint)])
+  battery = log.battery
+  return Measured(
+    name=log.name,
+    time=states.stamp,
+    position=position,
+    velocity=motion.velocity[:, column],
+    acceleration=motion.acceleration[:, column],
+    effort=None if states.effort is None else states.effort[:, column],
+    command_time=np.ascontiguousarray(command_time),
+    command=np.ascontiguousarray(command),
+    valid=fresh(states.stamp, position, motion.velocity[:, column]),
+    voltage=None if battery is None else np.interp(states.stamp, battery.stamp, battery.value),
+    temperature=None if series is None else np.interp(states.stamp, series.stamp, series.value),
+    duty=duty,
+  )
+
+
+def fresh(time: Array, position: Array, velocity: Array) -> Array:
+  """Returns which readings [N] are not repeats of an earlier one while the joint was moving.
+
+  A reading is a repeat when it equals the one before although the joint moved by more than
+  three times the sensor's resolution.
+  """
+  resolution = quantum(position)
+  repeated = np.zeros(len(position), bool)
+  moved = np.abs(velocity[1:]) * np.diff(time)
+  repeated[1:] = (np.diff(position) == 0) & (moved > 3.0 * resolution)
+  return ~repeated
+
+
+def quantum(values: Array) -> float:
+  """Returns the smallest step between different readings: the resolution of a sensor."""
+  steps = np.diff(np.unique(values))
+  steps = steps[steps > _SAME * max(float(np.ptp(values)), 1e-12)]
+  return float(steps.min()) if len(steps) else 0.0

@@ -1,0 +1,1 @@
+"""Experiment design: what to record next."""

@@ -1,0 +1,1 @@
+"""Fits of hypotheses to logs, and the intervals of their values."""

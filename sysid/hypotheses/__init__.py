@@ -1,0 +1,1 @@
+"""Effect hypotheses: candidates, their parameters, and signatures in the residual."""

@@ -1,0 +1,319 @@
+"""The candidates of a race: every kind of effect that one joint's logs can show.
+
+Bounds are wide of the kinds' plausible ranges (`suite.effects`), so that a fit that ends on one is
+a sign of a wrong kind. Starts are several where the error has several valleys.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.model.plant import JointPlant
+
+_SKEW = 0.003
+"""s; ours: reading a bus of servos takes up to this, so stamps are off by it."""
+
+LATENCY = 0.004
+"""s; ours: a firmware cycle and a bus cycle take up to this, which is no effect."""
+
+_INF = float("inf")
+
+_FEWEST_WAVES = 3.0
+"""1/rad; ours: teeth and magnets repeat twenty times a turn or more."""
+
+_WIND_UP = 0.004
+"""rad; ours: about what a gear of metal gives way under the torque that it works at."""
+
+_BOUNCY = 0.15
+"""Damping ratio of teeth that meet; ours: they bounce."""
+
+_GAIN_SPREAD = 0.3
+"""Of the other constants' spread; ours: a servo's law is set by registers and a data sheet, while
+its friction and inertia are estimates."""
+
+
+def calibration(plant: JointPlant, *, prior: float = 0.06) -> Term:
+  """Returns the null model: declared constants off by factors, and small latencies.
+
+  Relative errors are fitted: within about 10-15 % constants are mis-declared, beyond
+  that something is missing.
+  """
+  p = plant.declared
+  inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
+  names: list[str] = []
+  bound: list[float] = []
+  sigma: list[float] = []
+  for name, present, limit, spread in (
+    ("damping", p[INDEX["damping"]] > 0, 0.2, prior),
+    ("armature", p[INDEX["armature"]] > 0.2 * inertia, 0.2, prior),
+    ("mass", p[INDEX["armature"]] <= 0.2 * inertia, 0.2, prior),
+    ("friction", p[INDEX["friction"]] > 0, 0.4, 2.5 * prior),
+    ("gain", True, 0.15, _GAIN_SPREAD * prior),
+  ):
+    if present:
+      names.append(name)
+      bound.append(limit)
+      sigma.append(spread)
+  names += ["skew", "latency"]
+  bound += [_SKEW, LATENCY]
+  sigma += [0.4 * _SKEW, 0.5 * LATENCY]
+  clocks = ("skew", "latency")
+  return Term(
+    "calibration",
+    plant.joint,
+    tuple(names),
+    tuple(0.0 if n == "latency" else -b for n, b in zip(names, bound, strict=True)),
+    tuple(bound),
+    tuple(1e-3 if n in clocks else 0.1 for n in names),
+    (tuple(0.0 for _ in names),),
+    tuple(sigma),
+  )
+
+
+def library(plant: JointPlant) -> list[Term]:
+  """Returns the candidates for a joint."""
+  joint = plant.joint
+  top = plant.declared[INDEX["highest"]]
+  reach = _reach(plant)
+  torque = _typical_torque(plant)
+  speed = _typical_speed(plant)
+  terms = [
+    _one("command_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)),
+    _one("clock_drift", None, "rate", -0.05, 0.05, 0.003, (0.003, -0.003)),
+    _one("coulomb_friction", joint, "torque", 0.0, torque, 0.1 * torque, (0.05 * torque,)),
+    _one(
+      "viscous_friction",
+      joint,
+      "coefficient",
+      0.0,
+      2 * torque / speed,
+      0.1 * torque / speed,
+      (0.1 * torque / speed,),
+    ),
+    Term(
+      "stribeck_friction",
+      joint,
+      ("breakaway", "velocity"),
+      (0.0, 0.002 * speed),
+      (0.5 * torque, 0.5 * speed),
+      (0.05 * torque, 0.03 * speed),
+      ((0.05 * torque, 0.02 * speed), (0.05 * torque, 0.15 * speed)),
+    ),
+    *(
+      dataclasses.replace(
+        _one("load_friction", joint, "coefficient", 0.0, 0.8, 0.1, (0.1, 0.3)),
+        fixed=(("carried", float(kind)),),
+      )
+      for kind in (0, 1, 2)  # the actuator's torque, less its damping, what the link takes
+    ),
+    Term(
+      "asymmetric_friction",
+      joint,
+      ("positive", "negative"),
+      (0.0, 0.0),
+      (torque, torque),
+      (0.1 * torque, 0.1 * torque),
+      ((0.06 * torque, 0.01 * torque), (0.01 * torque, 0.06 * torque)),
+    ),
+    _one(
+      "quadratic_drag",
+      joint,
+      "coefficient",
+      0.0,
+      2 * torque / speed**2,
+      0.1 * torque / speed**2,
+      (0.1 * torque / speed**2,),
+    ),
+    _play(plant, encoder_on_motor=False),
+    _one("motor_gain", joint, "gain", 0.15, 3.0, 0.1, (0.75, 1.25)),
+    Term(
+      "supply_sag",
+      None,
+      ("droop", "fade"),
+      (0.0, 0.0),
+      (0.5 / torque, 0.04),
+      (0.03 / torque, 0.003),
+      ((0.05 / torque, 0.001), (0.01 / torque, 0.01)),
+    ),
+    Term(
+      "thermal_derating",
+      joint,
+      ("heating", "time_constant"),
+      (0.0, 3.0),
+      (60.0, 1000.0),
+      (1.0, 30.0),
+      ((1.0, 60.0), (5.0, 10.0)),
+      fixed=(("derating", 0.004),),
+    ),
+    Term(
+      "spring",
+      joint,
+      ("stiffness", "reference"),
+      (0.0, -2.0 * reach),
+      (3 * torque / reach, 2.0 * reach),
+      (0.1 * torque / reach, 0.1 * reach),
+      (
+        (0.1 * torque / reach, 0.0),
+        (0.1 * torque / reach, 0.7 * reach),
+        (0.1 * torque / reach, -0.7 * reach),
+      ),
+    ),
+  ]
+  weaker = {"motor_gain", "supply_sag", "thermal_derating"}
+  terms = [v for t in terms for v in (_weakenings(plant, t) if t.kind in weaker else [t])]
+  if plant.holds:
+    terms += [
+      _one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)),
+      _one("encoder_offset", joint, "offset", -0.4, 0.4, 0.03, (0.03, -0.03)),
+    ]
+    terms.append(_play(plant, encoder_on_motor=True))
+  if plant.hinge:
+    terms.append(_payload(plant))
+    terms.append(
+      Term(
+        "gravity_tilt",
+        None,
+        ("x", "y"),
+        (-0.5, -0.5),
+        (0.5, 0.5),
+        (0.03, 0.03),
+        ((0.03, 0.03), (-0.03, -0.03)),
+        (0.3, 0.3),
+      )
+    )
+  else:
+    terms.append(_payload(plant))
+  strongest = _strongest(plant)
+  limit = strongest if not np.isfinite(top) else min(top, strongest)
+  terms.append(
+    Term(
+      "torque_limit",
+      joint,
+      ("limit",),
+      (0.05 * limit,),
+      (limit,),
+      (0.05 * limit,),
+      ((0.9 * limit,), (0.7 * limit,), (0.45 * limit,)),
+    )
+  )
+  return [t for t in terms if t.kind not in plant.absorbed]
+
+
+def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
+  """Returns a weakened actuator in its forms: whether its limit falls too, whether efforts tell."""
+  limited = np.isfinite(plant.declared[INDEX["highest"]])
+  told = all(log.effort is not None or log.duty is not None for log in plant.logs)
+  told = told and term.kind != "motor_gain"
+  return [
+    dataclasses.replace(
+      term, fixed=(*term.fixed, ("scales_limit", float(scales)), ("effort_tells", float(tells)))
+    )
+    for scales in ((0, 1) if limited else (0,))
+    for tells in ((1, 0) if told else (1,))
+  ]
+
+
+def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
+  """Returns the candidate of a torque that repeats with position, from (amplitude, periods, phase).
+
+  Its error has a valley every fraction of a wave: the starts come from the residual torque's
+  spectrum over position (`signatures.waves`). Waves as long as a turn are gravity's or a spring's.
+  """
+  torque = _typical_torque(plant)
+  return Term(
+    "cogging",
+    plant.joint,
+    ("amplitude", "periods", "phase"),
+    (0.0, _FEWEST_WAVES, -10.0),
+    (0.5 * torque, 300.0, 10.0),
+    (0.03 * torque, 0.05, 0.3),
+    tuple(waves),
+  )
+
+
+def _play(plant: JointPlant, *, encoder_on_motor: bool) -> Term:
+  """Returns play in the gear, with how stiff its teeth are and how far they bounce.
+
+  They are fitted beside the gap, which a soft gear widens.
+  """
+  reach = _reach(plant)
+  stiffness = _typical_torque(plant) / _WIND_UP
+  inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
+  armature = plant.declared[INDEX["armature"]]
+  smaller = 1.0 / (1.0 / armature + 1.0 / inertia) if armature > 0 else 0.05 * inertia
+  damping = 2.0 * _BOUNCY * float(np.sqrt(stiffness * smaller))
+  return Term(
+    "backlash",
+    plant.joint,
+    ("gap", "stiffness", "damping"),
+    (0.0, 0.1 * stiffness, 0.02 * damping),
+    (0.3 * reach, 10 * stiffness, 20 * damping),
+    (0.03 * reach, 0.3 * stiffness, 0.3 * damping),
+    tuple(
+      (gap * reach, stiffness, times * damping)
+      for gap, times in ((0.01, 1.0), (0.04, 1.0), (0.04, 3.0))
+    ),
+    fixed=(("encoder_on_motor", float(encoder_on_motor)),),
+  )
+
+
+def _payload(plant: JointPlant) -> Term:
+  body = plant.model.jnt_bodyid[plant.model.joint(plant.joint).id]
+  name = plant.model.body(int(body)).name or plant.joint
+  mass = max(float(plant.model.body_mass[body]), 0.05)
+  place = np.array(plant.model.body_ipos[body])
+  size = max(float(np.linalg.norm(place)), 0.05)
+  if not plant.hinge:
+    return Term(
+      "payload",
+      name,
+      ("mass", "x", "y", "z"),
+      (0.0, 0, 0, 0),
+      (3 * mass, 1e-9, 1e-9, 1e-9),
+      (0.1 * mass, 1.0, 1.0, 1.0),
+      ((0.1 * mass, 0.0, 0.0, 0.0),),
+    )
+  reach = 2.5 * size
+  return Term(
+    "payload",
+    name,
+    ("mass", "x", "y", "z"),
+    (0.0, -reach, -reach, -reach),
+    (8 * mass, reach, reach, reach),
+    (0.2 * mass, 0.3 * size, 0.3 * size, 0.3 * size),
+    ((0.3 * mass, *place), (0.3 * mass, *(1.7 * place)), (0.3 * mass, *(-0.5 * place))),
+    (_INF, size, size, size),
+  )
+
+
+def _one(
+  kind: str,
+  target: str | None,
+  name: str,
+  low: float,
+  high: float,
+  scale: float,
+  starts: tuple[float, ...],
+) -> Term:
+  return Term(kind, target, (name,), (low,), (high,), (scale,), tuple((s,) for s in starts))
+
+
+def _reach(plant: JointPlant) -> float:
+  return max(float(np.ptp(np.concatenate([log.position for log in plant.logs]))) / 2, 1e-6)
+
+
+def _typical_speed(plant: JointPlant) -> float:
+  speeds = np.concatenate([np.abs(log.velocity) for log in plant.logs])
+  return max(float(np.quantile(speeds, 0.98)), 1e-6)
+
+
+def _typical_torque(plant: JointPlant) -> float:
+  torques = np.abs(np.concatenate([o[2] for o in plant.simulate(plant.declared)[0]]))
+  return max(float(np.quantile(torques, 0.95)), 1e-6)
+
+
+def _strongest(plant: JointPlant) -> float:
+  torques = np.abs(np.concatenate([o[2] for o in plant.simulate(plant.declared)[0]]))
+  return max(float(torques.max()), 1e-6)

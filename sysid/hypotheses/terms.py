@@ -1,0 +1,240 @@
+"""A term: one effect (or the calibration of declared constants) as something that can be fitted.
+
+A hypothesis is a sequence of terms. Each maps its own values to changes of the kernel's parameters
+and of the joint's surroundings; the names are those of `suite.effects`, so that a fitted term is an
+`Effect`.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from nerf2real.suite.effects import Effect, kind_of
+from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.plant import JointPlant
+from nerf2real.sysid.model.reduction import Surroundings
+
+Array = np.ndarray
+I = kernel.INDEX  # noqa: E741
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+  """What is fitted of one kind."""
+
+  kind: str
+  target: str | None
+  names: tuple[str, ...]
+  low: tuple[float, ...]
+  high: tuple[float, ...]
+  scale: tuple[float, ...]
+  """Typical sizes: steps of finite differences are a small fraction of them."""
+  starts: tuple[tuple[float, ...], ...]
+  prior: tuple[float, ...] = ()
+  """Standard deviations of a normal prior, infinite for none; empty for none at all."""
+  centre: tuple[float, ...] = ()
+  """Means of the prior; empty for zeros."""
+  fixed: tuple[tuple[str, float], ...] = ()
+  """Parameters that are a choice between models and not fitted."""
+
+  def apply(self, plant: JointPlant, p: Array, x: Array) -> None:
+    """Changes the kernel's parameters [P] in place."""
+    values = dict(zip(self.names, x, strict=True)) | dict(self.fixed)
+    _APPLY.get(self.kind, _nothing)(plant, p, values)
+
+  def surroundings(self, plant: JointPlant, x: Array) -> list[Surroundings] | None:
+    """Returns what is added to the surroundings, one a log; None for nothing."""
+    value = dict(zip(self.names, map(float, x), strict=True)) | dict(self.fixed)
+    if self.kind == "payload":
+      return plant.payload(str(self.target), *(value[n] for n in ("mass", "x", "y", "z")))
+    if self.kind == "gravity_tilt":
+      return plant.tilt(value["x"], value["y"])
+    if self.kind == "calibration" and "mass" in value:
+      return plant.scaled(value["mass"])
+    return None
+
+  def held_at(self, x: Array) -> "Term":
+    """Returns a term with these values, of which none is fitted."""
+    values = tuple(zip(self.names, map(float, x), strict=True))
+    return dataclasses.replace(
+      self,
+      names=(),
+      low=(),
+      high=(),
+      scale=(),
+      starts=((),),
+      prior=(),
+      centre=(),
+      fixed=(*self.fixed, *values),
+    )
+
+  def effect(self, x: Array, intervals: Mapping[str, tuple[float, float]] | None = None) -> Effect:
+    """Returns the fitted effect."""
+    values = {n: float(v) for n, v in zip(self.names, x, strict=True)} | dict(self.fixed)
+    if self.kind == "calibration":
+      factors = {n: 1.0 + values[n] for n in values if n not in ("skew", "latency")}
+      bounds = {n: (1.0 + a, 1.0 + b) for n, (a, b) in (intervals or {}).items() if n in factors}
+      return Effect("parameter_error", self.target, factors, bounds)
+    known = {p.name for p in kind_of(self.kind).parameters}
+    values = {n: v for n, v in values.items() if n in known}
+    return Effect(self.kind, self.target, values, dict(intervals or {}))
+
+  def unit(self, name: str, *, slide: bool = False) -> str:
+    """Returns the unit of a parameter."""
+    if self.kind == "calibration":
+      return "1"
+    units = kind_of(self.kind).parameter(name).units()
+    return units[-1] if slide else units[0]
+
+
+_STIFF = 1e-3 / 0.999  # as suite.effects.friction: impedance 0.999 where an effect adds friction
+
+
+def _stick(plant: JointPlant, p: Array) -> None:
+  """Makes a joint with added dry friction stick, as `suite.effects` does."""
+  p[I["softness"]] = _STIFF * plant.inverse_weight
+  p[I["stopping_rate"]] *= plant.impedance / 0.999
+
+
+def _nothing(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  """Terms that act on the surroundings alone."""
+
+
+def _calibration(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["damping"]] *= 1.0 + v.get("damping", 0.0)
+  p[I["armature"]] *= 1.0 + v.get("armature", 0.0)
+  p[I["friction"]] *= 1.0 + v.get("friction", 0.0)
+  for name in ("input", "constant", "position", "velocity"):  # limits stay
+    p[I[name]] *= 1.0 + v.get("gain", 0.0)
+  p[I["measurement_delay"]] += v.get("skew", 0.0)
+  p[I["effort_delay"]] += v.get("skew", 0.0)
+  p[I["command_delay"]] += v.get("latency", 0.0)
+
+
+def _adder(*pairs: tuple[str, str]):
+  def apply(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+    for name, slot in pairs:
+      p[I[slot]] += v[name]
+
+  return apply
+
+
+def _setter(*pairs: tuple[str, str]):
+  def apply(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+    for name, slot in pairs:
+      p[I[slot]] = v[name]
+
+  return apply
+
+
+def _asymmetric(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+  p[I["friction"]] += 0.5 * (v["positive"] + v["negative"])
+  p[I["offset_force"]] += 0.5 * (v["negative"] - v["positive"])
+
+
+def _spring(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  own, added = p[I["stiffness"]], v["stiffness"]
+  total = own + added
+  if total > 0:
+    p[I["reference"]] = (own * p[I["reference"]] + added * v["reference"]) / total
+  p[I["stiffness"]] = total
+
+
+def _gain(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["gain"]] *= v["gain"]
+  _weakened(plant, p, v)
+
+
+def _weakened(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["scales_limit"]] = v.get("scales_limit", 0.0)
+  p[I["effort_tells"]] = v.get("effort_tells", 1.0)
+
+
+def _sag(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["droop"]], p[I["fade"]] = v["droop"], v["fade"]
+  _weakened(plant, p, v)
+
+
+def _heat(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["heating"]], p[I["time_constant"]] = v["heating"], v["time_constant"]
+  p[I["derating"]] = v["derating"]
+  _weakened(plant, p, v)
+
+
+def _limit(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["lowest"]] = max(p[I["lowest"]], -v["limit"])
+  p[I["highest"]] = min(p[I["highest"]], v["limit"])
+
+
+def _coulomb(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+  p[I["friction"]] += v["torque"]
+
+
+def _stribeck(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+  p[I["breakaway"]] = v["breakaway"]
+  p[I["stribeck_velocity"]] = v["velocity"]
+
+
+def _load(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+  p[I["load_coefficient"]] = v["coefficient"]
+  p[I["load_kind"]] = v.get("carried", 0.0)
+  p[I["load_square"]] = v.get("quadratic", 0.0)
+  p[I["load_at_rest"]] = v.get("rest", 0.0)
+  p[I["load_velocity"]] = v.get("velocity", kernel.NEUTRAL["load_velocity"])
+
+
+def _backlash(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["gap"]] = v["gap"]
+  p[I["encoder_on_motor"]] = v["encoder_on_motor"]
+  p[I["tooth_stiffness"]] = v.get("stiffness", kernel.NEUTRAL["tooth_stiffness"])
+  p[I["tooth_damping"]] = v.get("damping", kernel.NEUTRAL["tooth_damping"])
+  p[I["friction_on_link"]] = v.get("friction_on_link", 0.0)
+
+
+def _late(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  p[I["measurement_delay"]] += v["delay"]
+
+
+_APPLY = {
+  "calibration": _calibration,
+  "command_delay": _adder(("delay", "command_delay")),
+  "measurement_delay": _late,
+  "clock_drift": _setter(("rate", "clock_rate")),
+  "coulomb_friction": _coulomb,
+  "viscous_friction": _adder(("coefficient", "damping")),
+  "stribeck_friction": _stribeck,
+  "load_friction": _load,
+  "asymmetric_friction": _asymmetric,
+  "quadratic_drag": _adder(("coefficient", "drag")),
+  "backlash": _backlash,
+  "encoder_offset": _setter(("offset", "encoder_offset")),
+  "motor_gain": _gain,
+  "torque_limit": _limit,
+  "supply_sag": _sag,
+  "thermal_derating": _heat,
+  "spring": _spring,
+  "cogging": _setter(("amplitude", "amplitude"), ("periods", "periods"), ("phase", "phase")),
+}
+
+
+def compose(
+  plant: JointPlant, terms: Sequence[Term], x: Array
+) -> tuple[Array, list[Surroundings] | None]:
+  """Returns kernel parameters [P] and surroundings (None: declared) of terms with values [n]."""
+  p = plant.declared.copy()
+  changed: list[Surroundings] | None = None
+  at = 0
+  for term in terms:
+    part = x[at : at + len(term.names)]
+    at += len(term.names)
+    term.apply(plant, p, part)
+    added = term.surroundings(plant, part)
+    if added is not None:
+      base = plant.surroundings if changed is None else changed
+      changed = [b.plus(a, 1.0) for b, a in zip(base, added, strict=True)]
+  return p, changed

@@ -1,0 +1,1 @@
+"""The declared model: reduction to one joint, compiled simulation, the extended model."""

@@ -1,0 +1,170 @@
+"""model_extended.xml: the declared model with what MuJoCo itself can express put in.
+
+Constants are corrected; friction, drag, springs, gains, limits, offsets, payloads and tilts are
+written as attributes, a sloping floor is turned. Delays, Stribeck and load friction, play, cogging,
+learned forces and what is wrong with sensors have no MJCF: those stay in effects.json.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerf2real.suite.effects import Effect
+from nerf2real.suite.effects.passive import rotation_matrix
+
+_POINT = 1e-4  # m, radius of a payload: no inertia of its own
+
+EXPRESSED = (
+  *("parameter_error", "coulomb_friction", "viscous_friction", "quadratic_drag", "motor_gain"),
+  *("torque_limit", "encoder_offset", "payload", "spring", "gravity_tilt"),
+  "floor_slope",
+)
+"""Kinds that MJCF can hold."""
+
+
+def write(source: Path, target: Path, effects: Sequence[Effect]) -> list[Effect]:
+  """Writes the extended model.
+
+  Args:
+    source: declared model.
+    target: file to write.
+    effects: corrections of constants and effects.
+
+  Returns:
+    The effects that MJCF cannot hold.
+  """
+  spec = mujoco.MjSpec.from_file(str(source))
+  left = []
+  for effect in effects:
+    if effect.kind not in EXPRESSED:
+      left.append(effect)
+      continue
+    _put(spec, effect)
+  spec.compile()
+  _absolute(spec, source.resolve().parent)
+  target.write_text(spec.to_xml())
+  return left
+
+
+def _absolute(spec: mujoco.MjSpec, folder: Path) -> None:
+  """Lets a model find its meshes and textures from any folder."""
+  if spec.meshes or spec.hfields or spec.skins:
+    spec.meshdir = str(folder / spec.meshdir)
+  if spec.textures:
+    spec.texturedir = str(folder / spec.texturedir)
+
+
+def _put(spec: mujoco.MjSpec, effect: Effect) -> None:
+  value = {n: float(v) for n, v in effect.parameters.items() if isinstance(v, (int, float))}
+  if effect.kind == "gravity_tilt":
+    turn = rotation_matrix([value["x"], value["y"], 0.0])
+    if turn is not None:
+      spec.option.gravity = turn @ np.array(spec.option.gravity)
+    return
+  if effect.kind == "floor_slope":
+    turn = Rotation.from_rotvec([value["x"], value["y"], 0.0])
+    for geom in spec.worldbody.geoms:
+      named = geom.name == effect.target
+      if named or (effect.target is None and geom.type == mujoco.mjtGeom.mjGEOM_PLANE):
+        _turn(spec, geom, turn)
+    return
+  if effect.kind == "payload":
+    body = spec.body(effect.target) or _joint(spec, effect).parent
+    carrier = body.add_body(name=f"payload_on_{body.name}", pos=[value[a] for a in "xyz"])
+    carrier.add_geom(
+      type=mujoco.mjtGeom.mjGEOM_SPHERE,
+      size=[_POINT, 0, 0],
+      mass=value["mass"],
+      contype=0,
+      conaffinity=0,
+    )
+    return
+  joints = [_joint(spec, effect)] if effect.target is not None else list(spec.joints)
+  for joint in joints:
+    _on_joint(spec, effect, joint, value)
+
+
+def _turn(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, turn: Rotation) -> None:
+  """Turns a geom of the world about its origin, however its orientation is written."""
+  model = spec.compile()
+  before = Rotation.from_quat(model.geom_quat[geom.id], scalar_first=True)
+  geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+  geom.quat = (turn * before).as_quat(scalar_first=True)
+
+
+def _joint(spec: mujoco.MjSpec, effect: Effect):
+  joint = spec.joint(effect.target)
+  if joint is None:
+    raise ValueError(f"Found no joint {effect.target!r} in the model for {effect.kind}.")
+  return joint
+
+
+def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float]) -> None:
+  actuators = [a for a in spec.actuators if a.target == joint.name]
+  match effect.kind:
+    case "parameter_error":
+      joint.damping = np.array(joint.damping) * value.get("damping", 1.0)
+      joint.armature *= value.get("armature", 1.0)
+      joint.frictionloss *= value.get("friction", 1.0)
+      for actuator in actuators:
+        _scale(actuator, value.get("gain", 1.0))
+      if value.get("mass", 1.0) != 1.0:
+        joint.parent.mass *= value["mass"]
+        joint.parent.inertia = np.array(joint.parent.inertia) * value["mass"]
+        for geom in joint.parent.geoms:
+          geom.mass *= value["mass"]
+          geom.density *= value["mass"]
+    case "coulomb_friction":
+      joint.frictionloss += value["torque"]
+      joint.solimp_friction[:2] = 0.999
+    case "viscous_friction":
+      joint.damping = _first_plus(joint.damping, value["coefficient"], 0)
+    case "quadratic_drag":
+      joint.damping = _first_plus(joint.damping, value["coefficient"], 1)
+    case "motor_gain":
+      for actuator in actuators:
+        _scale(actuator, value["gain"])
+        if value.get("scales_limit"):
+          actuator.forcerange = np.array(actuator.forcerange) * value["gain"]
+    case "torque_limit":
+      for actuator in actuators:
+        limit = value["limit"] / max(abs(actuator.gear[0]), 1e-9)
+        low, high = actuator.forcerange
+        if low >= high:  # unlimited so far
+          low, high = -limit, limit
+        actuator.forcerange = [max(low, -limit), min(high, limit)]
+        actuator.forcelimited = True
+    case "encoder_offset":
+      for actuator in actuators:
+        bias = np.array(actuator.biasprm)
+        bias[0] += bias[1] * actuator.gear[0] * value["offset"]
+        actuator.biasprm = bias
+    case "spring":
+      own = float(np.ravel(joint.stiffness)[0])
+      total = own + value["stiffness"]
+      if total > 0:
+        turned = joint.type == mujoco.mjtJoint.mjJNT_HINGE and spec.compiler.degree
+        unit = np.degrees(1.0) if turned else 1.0  # a spec keeps the file's unit of angle
+        added = value["stiffness"] * value["reference"] * unit
+        joint.springref = (own * joint.springref + added) / total
+      joint.stiffness = _first_plus(joint.stiffness, value["stiffness"], 0)
+
+
+def _scale(actuator, factor: float) -> None:
+  """Multiplies gain and affine bias."""
+  gain, bias = np.array(actuator.gainprm), np.array(actuator.biasprm)
+  gain[0] *= factor
+  bias[:3] *= factor
+  actuator.gainprm, actuator.biasprm = gain, bias
+
+
+def _first_plus(values, added: float, index: int):
+  """Returns a coefficient, or polynomial of coefficients, with one raised."""
+  array = np.atleast_1d(np.array(values, float)).copy()
+  if len(array) == 1:
+    return float(array[0] + added)
+  array[index] += added
+  return array

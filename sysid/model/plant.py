@@ -1,0 +1,332 @@
+"""One joint of a declared model, ready to be simulated along measured logs by the compiled kernel.
+
+Shapes: N samples of a log, B parameter sets, P parameters (`kernel.NAMES`).
+"""
+
+import copy
+import dataclasses
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.suite.effects.passive import rotation_matrix
+from nerf2real.sysid.data.measured import Measured, measured
+from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.reduction import Reduction, Surroundings, start_velocity
+
+Array = np.ndarray
+
+LONGEST_STEP = 2e-3
+"""s; ours: a model with a longer step than this is simulated in parts of it."""
+
+
+FOLLOWED_S = 0.02
+"""s; ours: time in which a state that follows the readings makes up for a difference."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Windows:
+  """Samples at which the simulation is set to the measured state."""
+
+  start: Array
+  position: Array
+  velocity: Array
+
+
+class Output(NamedTuple):
+  """A simulated log at its samples."""
+
+  position: Array
+  """[N]."""
+  velocity: Array
+  """[N]."""
+  torque: Array
+  """[N] the actuator's."""
+  jump: Array
+  """[N] how much the torque jumps within two steps of the sample."""
+
+
+def holds_position(model: mujoco.MjModel, actuator: int) -> bool:
+  """Tells whether an actuator has a position loop, so that errors do not accumulate."""
+  return float(model.actuator_biasprm[actuator, 1]) < 0.0
+
+
+def actuator_of(model: mujoco.MjModel, joint: str) -> int:
+  """Returns the actuator that drives a joint, -1 if none does."""
+  index = model.joint(joint).id
+  for u in range(model.nu):
+    on_joint = model.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    if on_joint and model.actuator_trnid[u, 0] == index:
+      return u
+  return -1
+
+
+def declared_parameters(model: mujoco.MjModel, joint: str) -> Array:
+  """Returns the kernel's parameters [P] of a joint as the model declares it."""
+  values = dict.fromkeys(kernel.NAMES, 0.0) | kernel.NEUTRAL
+  index = model.joint(joint).id
+  dof = int(model.jnt_dofadr[index])
+  values["armature"] = float(model.dof_armature[dof])
+  values["damping"] = float(model.dof_damping[dof])
+  values["friction"] = float(model.dof_frictionloss[dof])
+  poly = np.ravel(model.dof_dampingpoly[dof])
+  values["drag"] = float(poly[0]) if poly.size else 0.0
+  values["stiffness"] = float(model.jnt_stiffness[index])
+  values["reference"] = float(model.qpos_spring[model.jnt_qposadr[index]])
+  impedance, rate = float(model.dof_solimp[dof, 0]), friction_rate(model, dof)
+  values["softness"] = (1.0 - impedance) / impedance * float(model.dof_invweight0[dof])
+  values["stopping_rate"] = rate
+  values["lowest"], values["highest"] = -np.inf, np.inf
+  u = actuator_of(model, joint)
+  if u >= 0:
+    gear = float(model.actuator_gear[u, 0])
+    values["input"] = gear * float(model.actuator_gainprm[u, 0])
+    if int(model.actuator_biastype[u]) != int(mujoco.mjtBias.mjBIAS_NONE):
+      values["constant"] = gear * float(model.actuator_biasprm[u, 0])
+      values["position"] = gear * gear * float(model.actuator_biasprm[u, 1])
+      values["velocity"] = gear * gear * float(model.actuator_biasprm[u, 2])
+    if model.actuator_forcelimited[u]:
+      low, high = sorted(gear * model.actuator_forcerange[u])
+      values["lowest"], values["highest"] = float(low), float(high)
+  return np.array([values[name] for name in kernel.NAMES])
+
+
+def friction_rate(model: mujoco.MjModel, dof: int) -> float:
+  """Returns the rate [1/s] at which MuJoCo's friction constraint takes speed away.
+
+  From solref, as in MuJoCo's documentation, "Solver parameters": b = 2 / (dmax timeconst), or the
+  damping itself where solref is negative; a time constant is at least two steps.
+  """
+  time_constant, ratio = model.dof_solref[dof]
+  limit = float(model.dof_solimp[dof, 1])
+  if time_constant <= 0:
+    return float(-ratio / limit)
+  return float(2.0 / (limit * max(time_constant, 2 * model.opt.timestep)))
+
+
+class JointPlant:
+  """A joint of the declared model and what was measured of it in several logs."""
+
+  def __init__(
+    self,
+    model: mujoco.MjModel,
+    joint: str,
+    logs: Sequence[Log],
+    *,
+    reductions: Sequence[Reduction] | None = None,
+    window_s: float = 0.5,
+  ):
+    """Reduces the model along every log.
+
+    Args:
+      model: declared model.
+      joint: name of a hinge or slide joint with an actuator.
+      logs: measured logs.
+      reductions: of the same logs, to share their work between joints.
+      window_s: length of the windows that restart from the measured state where the actuator does
+        not hold position.
+    """
+    self.model, self.joint = model, joint
+    own = float(model.opt.timestep)
+    self.step = own / np.ceil(own / LONGEST_STEP)
+    self.reductions = list(reductions or [Reduction(model, log) for log in logs])
+    self.declared = declared_parameters(model, joint)
+    self.holds = holds_position(model, actuator_of(model, joint))
+    index = model.joint(joint).id
+    self.impedance = float(model.dof_solimp[model.jnt_dofadr[index], 1])
+    self.inverse_weight = float(model.dof_invweight0[model.jnt_dofadr[index]])
+    self.hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    self.logs = [
+      measured(log, reduction.motion, joint)
+      for log, reduction in zip(logs, self.reductions, strict=True)
+    ]
+    self.surroundings = [reduction.of_joint(joint) for reduction in self.reductions]
+    self.windows = [
+      self._windows(log, window_s, float(start_velocity(source)[source.states.column(joint)]))
+      for log, source in zip(self.logs, logs, strict=True)
+    ]
+    self._grids = [np.arange(0.0, log.time[-1] + 0.05, self.step) for log in self.logs]
+    self._loads = [
+      np.interp(grid, log.time, _other_load(source, joint, log.time))
+      for grid, log, source in zip(self._grids, self.logs, logs, strict=True)
+    ]
+    self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
+    self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
+    self.absorbed: set[str] = set()
+    self._moments: dict[str, list[list[Surroundings]]] = {}
+    self._gravity: list[list[Surroundings]] | None = None
+    self._pool = ThreadPoolExecutor(max_workers=len(os.sched_getaffinity(0)))
+
+  def _windows(self, log: Measured, window_s: float, first_velocity: float) -> Windows:
+    if self.holds:
+      return Windows(np.array([0]), log.position[:1].astype(float), np.array([first_velocity]))
+    _, start = np.unique(np.floor((log.time - log.time[0]) / window_s), return_index=True)
+    start = np.array([0, *[s for s in start[1:] if len(log.time) - s > 3]], np.int64)
+    return Windows(start, log.position[start].astype(float), log.velocity[start])
+
+  def _on_grid(self, index: int, s: Surroundings) -> tuple[Array, ...]:
+    grid, time = self._grids[index], self.logs[index].time
+    fields = (s.inertia, s.here, s.across, s.at, s.bias)
+    return tuple(np.interp(grid, time, field) for field in fields)
+
+  def grids(self, surroundings: Sequence[Surroundings] | None) -> list[tuple[Array, ...]]:
+    """Returns surroundings on the step grid, the declared ones for None."""
+    if surroundings is None:
+      return self._nominal
+    return [self._on_grid(i, s) for i, s in enumerate(surroundings)]
+
+  def payload(self, body: str, mass: float, x: float, y: float, z: float) -> list[Surroundings]:
+    """Returns what a point mass on a body adds, one a log.
+
+    Everything is linear in the mass, its first and its second moments: ten passes with a unit mass
+    at ten places give the coefficients.
+    """
+    if body not in self._moments:
+      index = self._body(body)
+      self._moments[body] = [r.moments(self.joint, index) for r in self.reductions]
+    factors = mass * np.array([1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z])
+    return [_combine(parts, factors) for parts in self._moments[body]]
+
+  def _body(self, name: str) -> int:
+    """Returns a body by its name, or by that of its joint."""
+    index = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
+    return index if index >= 0 else int(self.model.jnt_bodyid[self.model.joint(name).id])
+
+  def tilt(self, x: float, y: float) -> list[Surroundings]:
+    """Returns what turning gravity by the rotation vector (x, y, 0) adds, one a log."""
+    if self._gravity is None:
+      self._gravity = [r.gravity(self.joint) for r in self.reductions]
+    before = self.model.opt.gravity
+    turn = rotation_matrix([x, y, 0.0])
+    after = before if turn is None else turn @ before
+    return [_combine(parts, after - before) for parts in self._gravity]
+
+  def absorb(
+    self, kind: str, parameters: Array, surroundings: Sequence[Surroundings] | None
+  ) -> None:
+    """Declares what was found to hold for all joints, so that what is left can be looked at.
+
+    Args:
+      kind: of the effect; it is no candidate any more.
+      parameters: the kernel's [P].
+      surroundings: one a log; None where they stay.
+    """
+    self.absorbed.add(kind)
+    self.declared = parameters.copy()
+    if surroundings is not None:
+      self.surroundings = list(surroundings)
+      self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
+
+  def following(self) -> "JointPlant":
+    """Returns the same joint with its simulated state pulled towards the readings.
+
+    Which way teeth bounce depends on microradians: the course of a joint with play does not repeat,
+    and a right model strays from it as a wrong one does. A state that follows the readings shows
+    what a model predicts from each on, by an alpha-beta filter (Benedict and Bordner 1962).
+    """
+    period = float(np.median(np.concatenate([np.diff(log.time) for log in self.logs])))
+    share = 1.0 - float(np.exp(-period / FOLLOWED_S))
+    clone = copy.copy(self)
+    speed = share**2 / (2.0 - share) / period
+    clone.declared = with_values(self.declared, {"follow": share, "follow_speed": speed})
+    return clone
+
+  @property
+  def follows(self) -> bool:
+    """Whether the simulated state is pulled towards the readings."""
+    return bool(self.declared[kernel.INDEX["follow"]] > 0)
+
+  def scaled(self, factor: float) -> list[Surroundings]:
+    """Returns `factor` times the surroundings: all masses changed by that share."""
+    return [_combine([s], np.array([factor])) for s in self.surroundings]
+
+  def simulate(
+    self,
+    parameters: Array,
+    *,
+    surroundings: Sequence[Sequence[Surroundings] | None] | None = None,
+    table: tuple[Array, Array] | None = None,
+    logs: Sequence[int] | None = None,
+  ) -> list[list[Output]]:
+    """Simulates parameter sets along logs.
+
+    Args:
+      parameters: [B, P].
+      surroundings: for each set what replaces the declared surroundings (one a log), or None.
+      table: weights [Q, V] and bounds [4] of a learned force.
+      logs: indices of the logs, all for None.
+
+    Returns:
+      [B][logs] of outputs.
+    """
+    chosen = range(len(self.logs)) if logs is None else logs
+    parameters = np.atleast_2d(parameters)
+    grids = [self._nominal] * len(parameters)
+    if surroundings is not None:
+      grids = [self.grids(s) for s in surroundings]
+    jobs = [
+      self._pool.submit(self._run, p, index, grid[index], table)
+      for p, grid in zip(parameters, grids, strict=True)
+      for index in chosen
+    ]
+    results = [job.result() for job in jobs]
+    count = len(chosen)
+    return [results[i * count : (i + 1) * count] for i in range(len(parameters))]
+
+  def _run(
+    self, p: Array, index: int, grid: tuple[Array, ...], table: tuple[Array, Array] | None
+  ) -> Output:
+    log, windows = self.logs[index], self.windows[index]
+    out = np.zeros((4, len(log.time)))
+    weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
+    kernel.simulate(  # type: ignore
+      np.ascontiguousarray(p, float),
+      self.step,
+      log.command_time,
+      log.command,
+      log.time,
+      *grid,  # type: ignore
+      self._loads[index],
+      self.hinge,
+      windows.start,
+      windows.position,  # type: ignore
+      windows.velocity,
+      self._readings[index],
+      weights,
+      bounds,
+      out[0],
+      out[1],
+      out[2],
+      out[3],
+    )
+    return Output(out[0], out[1], out[2], out[3])
+
+
+def _combine(parts: Sequence[Surroundings], factors: Array) -> Surroundings:
+  """Returns the linear combination of surroundings, at the position of the first."""
+  zero = np.zeros_like(parts[0].at)
+  total = Surroundings(zero, zero, zero, parts[0].at, zero)
+  for part, factor in zip(parts, factors, strict=True):
+    total = total.plus(part, float(factor))
+  return total
+
+
+def with_values(parameters: Array, values: Mapping[str, float]) -> Array:
+  """Returns a copy of the parameters [P] with some set by name."""
+  result = parameters.copy()
+  for name, value in values.items():
+    result[kernel.INDEX[name]] = value
+  return result
+
+
+def _other_load(log: Log, joint: str, time: Array) -> Array:
+  """Returns the sum of the other joints' |effort| [N] where efforts were measured, else zeros."""
+  if log.states.effort is None or len(log.states.joints) == 1:
+    return np.zeros(len(time))
+  others = [i for i, name in enumerate(log.states.joints) if name != joint]
+  return np.abs(log.states.effort[:, others]).sum(axis=1)

@@ -1,0 +1,116 @@
+"""The report's pictures of what is left: against time and its causes, and on logs not fitted."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerf2real.core.pages import parts
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.fitting import Fit
+from nerf2real.sysid.hypotheses import balance, signatures
+from nerf2real.sysid.model import simulation as evaluation
+from nerf2real.sysid.report import charts
+from nerf2real.sysid.selection.identification import Found, Identified
+
+_WARMER = 1.0  # K by which a joint's temperature must change to be drawn
+_NOTHING = Fit((), np.zeros(0), 0.0, 1.0, 0)
+
+
+def unit_of(item: Found) -> str:
+  """Returns the unit of a joint's small errors."""
+  return "mrad" if item.screened.problem.plant.hinge else "mm"
+
+
+def residuals(item: Found) -> str:
+  """Returns residuals, before and after, against what they may depend on."""
+  problem, unit = item.screened.problem, unit_of(item)
+  after = item.finding.chosen.fit
+  hypotheses = ((_NOTHING, "declared", charts.BEFORE), (after, "extended", charts.AFTER))
+  figures = []
+  simulated = [problem.simulate(fit.terms, fit.x)[0] for fit, _, _ in hypotheses]
+  for index, log in enumerate(problem.plant.logs):
+    curves = [
+      (name, color, log.time, 1e3 * (log.position - outputs[index].position))
+      for (_, name, color), outputs in zip(hypotheses, simulated, strict=True)
+    ]
+    title = f"{log.name}: residual against time"
+    figures.append(charts.lines(title, "time [s]", f"position residual [{unit}]", curves))
+  for name in ("position", "velocity", "load", "temperature"):
+    figures.append(_against(item, hypotheses, name))
+  note = "" if any(figures[-1:]) else " These logs hold no temperatures of this joint that change."
+  return parts.section(
+    f"Residual of {item.screened.joint}, before and after",
+    "Against time: measured minus simulated position. Against the others: the torque that the"
+    " model lacks (what the measured motion demands by inverse dynamics, less what actuator and"
+    " friction give), medians and quartiles; a flat line at zero is a model that lacks nothing, a"
+    " step at zero velocity is dry friction, a slope over velocity is damping. Against temperature"
+    f" it counts along the actuator's: below zero is an actuator that weakens.{note}",
+    parts.grid([f for f in figures if f], 2),
+  )
+
+
+def _against(item: Found, hypotheses, name: str) -> str:
+  problem = item.screened.problem
+  curves = []
+  for fit, label, color in hypotheses:
+    x, y = [], []
+    for index, log in enumerate(problem.plant.logs):
+      r, missing = balance.missing_torque(problem, fit, index)
+      if name == "temperature":
+        if log.temperature is None:
+          return ""
+        x.append(log.temperature[signatures.EDGES : -signatures.EDGES])
+        missing = missing * np.sign(r.torque)
+      else:
+        x.append({"position": r.position, "velocity": r.velocity, "load": r.torque}[name])
+      y.append(missing)
+    if name == "temperature" and np.ptp(np.concatenate(x)) < _WARMER:
+      return ""
+    curves.append((label, color, np.concatenate(x), np.concatenate(y)))
+  hinge = problem.plant.hinge
+  torque = "N m" if hinge else "N"
+  length = "rad" if hinge else "m"
+  unit = {"position": length, "velocity": f"{length}/s", "load": torque, "temperature": "C"}[name]
+  what = "torque" if hinge else "force"
+  along = " along the actuator's" if name == "temperature" else ""
+  return charts.binned(
+    f"missing {what}{along} against {name}", f"{name} [{unit}]", f"{what} [{torque}]", curves
+  )
+
+
+def held_out(
+  found: Identified,
+  held: Sequence[Log],
+  effects: Sequence[Effect],
+  items: Sequence[Found],
+  window_s: float,
+) -> str:
+  """Returns measured and simulated positions, and their residuals, of logs that were not fitted."""
+  figures = []
+  for log in held:
+    measured, time = log.states.position, log.states.stamp
+    assert measured is not None
+    before = evaluation.simulate(found.model, log, window_s=window_s)
+    after = evaluation.simulate(found.model, log, effects, clocks=found.clocks, window_s=window_s)
+    for item in items:
+      joint, unit = item.screened.joint, unit_of(item)
+      column = log.states.column(joint)
+      pair = (
+        ("declared", charts.BEFORE, before[:, column]),
+        ("extended", charts.AFTER, after[:, column]),
+      )
+      curves = [(n, c, time, y) for n, c, y in pair]
+      curves = [("measured", charts.MEASURED, time, measured[:, column]), *curves]
+      length = "rad" if unit == "mrad" else "m"
+      figures.append(
+        charts.lines(f"{log.name}: {joint}", "time [s]", f"position [{length}]", curves)
+      )
+      errors = [(n, c, time, 1e3 * (measured[:, column] - y)) for n, c, y in pair]
+      title = f"{log.name}: {joint}, residual"
+      figures.append(charts.lines(title, "time [s]", f"residual [{unit}]", errors))
+  return parts.section(
+    "Logs that were not fitted",
+    "Measured and simulated positions; the commands alone drive the simulation.",
+    parts.grid(figures, 2),
+  )

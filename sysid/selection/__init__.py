@@ -1,0 +1,1 @@
+"""Model selection: from fitted hypotheses to a verdict."""

@@ -1,0 +1,204 @@
+"""Measured logs: what is written comes back, and bad files are refused with one clear line."""
+
+import pathlib
+
+import mujoco
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from nerf2real.core.robot_logs import reading as logs
+from nerf2real.core.robot_logs import writer as log_writer
+
+START = 1_700_000_000_000_000_000
+SAMPLES = pathlib.Path("../shared/data")
+PENDULUM = """
+  <mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size=".1" pos="0 0 -.2"/>
+  <body><joint name="{second}" type="{type}"/><geom size=".1" pos="0 0 -.4"/></body></body>
+  </worldbody><actuator>{actuators}</actuator></mujoco>"""
+POSITIONS = '<position joint="elbow" kp="5"/><position joint="wrist" kp="5"/>'
+
+
+def _write(path, *, duration=2.0, commands=True, joints=("elbow", "wrist"), change=None, lag=0):
+  """Writes two joints at 50 Hz commands and 100 Hz states; `change(kind, index, fields)` spoils."""
+  change = change or (lambda kind, index, fields: fields)
+  with log_writer.open_log(path, joints) as log:
+    for index in range(round(duration * 100)):
+      t = START + index * 10_000_000
+      if commands and index % 2 == 0:
+        fields = {"stamp_ns": t, "position": [0.1 * index, -0.5], "log_ns": t + lag}
+        log.command(**change("command", index, fields))
+      fields = {
+        "stamp_ns": t + 1_000_000,
+        "position": [np.sin(index), 2.0],
+        "velocity": [np.cos(index), 0.0],
+        "effort": [0.25, -0.25],
+        "log_ns": t + 1_000_000 + lag,
+      }
+      log.state(**change("state", index, fields))
+  return path
+
+
+def _spoil(kind, at, **changes):
+  return lambda k, index, fields: {**fields, **(changes if (k, index) == (kind, at) else {})}
+
+
+def test_what_is_written_comes_back(tmp_path):
+  path = tmp_path / "log.mcap"
+  with log_writer.open_log(path, ["elbow", "wrist"]) as log:
+    for index in range(200):
+      t = START + index * 10_000_000
+      log.command(t, effort=[index, 2.0])
+      log.state(t + 2_000_000, position=[0.5, index], log_ns=t + 3_000_000)
+      log.pwm(t, [0.1, -1.0])
+      log.imu(t, angular_velocity=[1, 2, 3], linear_acceleration=[4, 5, 6], frame="chip")
+      log.battery(t, 12.5 if index else np.nan)
+      log.temperature(t, "wrist", 40.5)
+  log = logs.read_log(path)
+  assert log.joints == log.commands.joints == ("elbow", "wrist")
+  assert log.start_ns == START and not log.recovered
+  np.testing.assert_array_equal(log.commands.effort[:, 0], np.arange(200))
+  assert log.commands.position is None and log.states.velocity is None
+  np.testing.assert_array_equal(log.states.position[:, 1], np.arange(200))
+  np.testing.assert_allclose(log.states.stamp, np.arange(200) * 0.01 + 0.002, atol=1e-9)
+  np.testing.assert_allclose(log.states.log_time - log.states.stamp, 0.001, atol=1e-9)
+  np.testing.assert_array_equal(log.pwm.effort[5], [0.1, -1.0])
+  np.testing.assert_array_equal(log.imu.angular_velocity[7], [1, 2, 3])
+  np.testing.assert_array_equal(log.imu.linear_acceleration[7], [4, 5, 6])
+  assert log.imu.frame == "chip"
+  np.testing.assert_array_equal(log.battery.value, np.full(199, 12.5))  # NaN: not measured
+  assert list(log.temperatures) == ["wrist"]
+  np.testing.assert_array_equal(log.temperatures["wrist"].value, np.full(200, 40.5))
+
+
+def test_the_file_opens_with_the_ordinary_reader(tmp_path):
+  path = _write(tmp_path / "log.mcap")
+  with path.open("rb") as stream:
+    reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+    messages = list(reader.iter_decoded_messages(topics=[logs.STATES]))
+    assert reader.get_header().profile == "ros2"
+  schema, _, record, message = messages[3]
+  assert schema.name == "sensor_msgs/msg/JointState" and len(messages) == 200
+  assert record.log_time == START + 31_000_000 and message.header.stamp.nanosec == 31_000_000
+  assert message.name == ["elbow", "wrist"]
+
+
+def test_columns_follow_names_not_places(tmp_path):
+  path = tmp_path / "log.mcap"
+  _write(path)
+  with log_writer.open_log(path, ["elbow", "wrist"]) as log:
+    for index in range(200):
+      log._joints[:] = ["wrist", "elbow"] if index % 3 else ["elbow", "wrist"]
+      values = [2.0, 1.0] if index % 3 else [1.0, 2.0]
+      log.command(START + index * 10_000_000, position=values)
+      log.state(START + index * 10_000_000, position=values)
+  log = logs.read_log(path)
+  np.testing.assert_array_equal(log.states.position, np.tile([1.0, 2.0], (200, 1)))
+
+
+@pytest.mark.parametrize(
+  ("spoiled", "words"),
+  [
+    ({"commands": False}, "no commands"),
+    ({"duration": 0.1}, "lasts 0.079 s"),
+    ({"change": _spoil("state", 40, position=[np.nan, 0.0])}, "NaN or infinite positions"),
+    ({"change": _spoil("state", 40, effort=[np.inf, 0.0])}, "NaN or infinite efforts"),
+    ({"change": _spoil("command", 40, position=[np.nan, 0.0])}, "first at 0.400 s"),
+    ({"change": _spoil("state", 40, stamp_ns=START)}, "header stamps"),
+    ({"change": _spoil("command", 40, log_ns=START)}, "log times"),
+    ({"change": _spoil("state", 40, position=[1.0])}, "lengths [1, 2]"),
+    ({"change": lambda k, i, f: {**f, "position": []} if k == "command" else f}, "no commands"),
+    ({"change": lambda k, i, f: {**f, "position": []} if k == "state" else f}, "no positions"),
+    ({"joints": ("elbow", "elbow")}, "unique names"),
+  ],
+)
+def test_bad_logs_are_refused_in_one_line(tmp_path, spoiled, words):
+  path = _write(tmp_path / "bad.mcap", **spoiled)
+  with pytest.raises(logs.LogError) as caught:
+    logs.read_log(path)
+  assert words in str(caught.value) and "\n" not in str(caught.value)
+  assert "bad.mcap" in str(caught.value)
+
+
+def test_fields_never_measured_are_none(tmp_path):
+  """ros2_control reports NaN throughout for what a servo cannot measure."""
+  nothing = [np.nan, np.nan]
+  path = _write(
+    tmp_path / "log.mcap", change=lambda k, i, f: {**f, "effort": nothing} if k == "state" else f
+  )
+  log = logs.read_log(path)
+  assert log.states.effort is None and log.states.velocity is not None
+
+
+def test_a_truncated_file_is_refused_and_recovered_when_asked(tmp_path):
+  path = _write(tmp_path / "log.mcap", duration=20.0)
+  whole = logs.read_log(path)
+  content = path.read_bytes()
+  path.write_bytes(content[: int(0.6 * len(content))])
+  with pytest.raises(logs.LogError, match="truncated or damaged") as caught:
+    logs.read_log(path)
+  assert "\n" not in str(caught.value)
+  part = logs.read_log(path, recover=True)
+  count = len(part.states.stamp)
+  assert part.recovered and 200 < count < 2000
+  np.testing.assert_array_equal(part.states.position, whole.states.position[:count])
+
+
+@pytest.mark.parametrize("cut", [0, 3, 8, 20])
+def test_a_file_cut_at_its_start_is_refused(tmp_path, cut):
+  path = _write(tmp_path / "log.mcap")
+  path.write_bytes(path.read_bytes()[:cut])
+  with pytest.raises(logs.LogError) as caught:
+    logs.read_log(path)
+  assert "\n" not in str(caught.value)
+
+
+def test_a_flipped_byte_is_refused(tmp_path):
+  path = _write(tmp_path / "log.mcap")
+  content = bytearray(path.read_bytes())
+  content[len(content) // 3] ^= 0xFF
+  path.write_bytes(content)
+  with pytest.raises(logs.LogError, match="truncated or damaged"):
+    logs.read_log(path)
+
+
+def test_other_files_are_refused(tmp_path):
+  path = tmp_path / "log.mcap"
+  path.write_text("time,position\n0,1\n")
+  with pytest.raises(logs.LogError, match="is not an MCAP file"):
+    logs.read_log(path)
+  with pytest.raises(FileNotFoundError, match=r"nowhere\.mcap"):
+    logs.read_log(tmp_path / "nowhere.mcap")
+
+
+@pytest.mark.parametrize(
+  ("second", "joint_type", "actuators", "words"),
+  [
+    ("wrist", "slide", POSITIONS, None),
+    ("knee", "hinge", '<position joint="elbow" kp="5"/>', "['wrist'] that the model lacks"),
+    ("wrist", "ball", '<position joint="elbow" kp="5"/>', "neither a hinge nor a slide"),
+    ("wrist", "hinge", '<position joint="elbow" kp="5"/>', "no actuator"),
+    ("wrist", "hinge", '<motor joint="wrist"/><position joint="elbow" kp="5"/>', "no efforts"),
+  ],
+)
+def test_models_that_do_not_fit_are_refused(tmp_path, second, joint_type, actuators, words):
+  log = logs.read_log(_write(tmp_path / "log.mcap"))
+  xml = PENDULUM.format(second=second, type=joint_type, actuators=actuators)
+  model = mujoco.MjModel.from_xml_string(xml)
+  if words is None:
+    logs.check_against_model(log, model)
+    return
+  with pytest.raises(logs.LogError) as caught:
+    logs.check_against_model(log, model)
+  assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(not SAMPLES.is_dir(), reason=f"needs the shared samples in {SAMPLES}")
+def test_the_shared_samples_are_read():
+  paths = sorted(SAMPLES.glob("*/*/*.mcap"))
+  assert len(paths) >= 31
+  for path in paths[::6]:
+    log = logs.read_log(path)
+    logs.check_against_model(log, mujoco.MjModel.from_xml_path(str(path.parent / "model.xml")))
+    assert log.duration > 5 and np.ptp(log.states.position) > 0

@@ -1,0 +1,198 @@
+"""Simulation, virtual robot and robot as plants of an evaluation, and what disturbs them."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real import suite
+from nerf2real.evaluation import operated, perturbations, plants, runner, starts
+from nerf2real.evaluation.policies import GaitPolicy
+from nerf2real.evaluation.rehearsed import RehearsedPlant
+from nerf2real.evaluation.simulated import SimulatedPlant
+from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.suite import loading, protocols
+from nerf2real.suite.tasks.workspace import find_workspace
+
+NEAREST = 46  # a trial of navigation that starts 1.3 m from its goal
+
+
+@pytest.fixture(scope="module")
+def scene():
+  return loading.open_scene(None)
+
+
+@pytest.fixture(scope="module")
+def simulated(scene):
+  plant = SimulatedPlant(scene, "navigation", image_size=None)
+  yield plant
+  plant.close()
+
+
+def test_trials_start_where_the_simulations_tasks_have_them(scene, simulated):
+  xy = protocols.scene_starts(scene)
+  for index in (0, 46):
+    trial = protocols.navigation()[index]
+    simulated.task.set_trial(trial)
+    assert simulated.task.start.xy == pytest.approx(xy[trial.position])
+  # At least as much room as at the scene's goals: the robot's radius and 15 cm.
+  cells = scene.free_space.cell_of(xy)
+  assert (scene.free_space.clearance[cells[:, 0], cells[:, 1]] >= 0.33).all()
+  ball = suite.load("ball_push", scene=scene, image_size=None, random=0)
+  workspace = find_workspace(scene)
+  assert workspace.center == pytest.approx(ball.task.workspace.center)
+  for trial in (protocols.ball_center()[3], protocols.ball_wall()[-1], protocols.ball_center()[-1]):
+    ball.task.set_trial(trial)
+    pose, place = starts.ball_start(scene, workspace, trial)
+    assert pose == pytest.approx((*ball.task.start.xy, ball.task.start.yaw))
+    assert place == pytest.approx(ball.task.ball_start)
+
+
+def test_the_gait_reaches_a_goal_in_simulation(scene, simulated):
+  group, trial = plants.trials("navigation")[NEAREST]
+  policy = GaitPolicy(scene, "navigation")
+  found = runner.run_trial(simulated, policy, trial, group=group, index=NEAREST)
+  assert found.outcome == "success" and 3 < found.time < 30
+  assert found.goal == pytest.approx(scene.goals[2]) and found.setting.plant == "sim"
+  start = protocols.scene_starts(scene)[trial.position]
+  assert found.path[0][1:3] == pytest.approx(start, abs=0.02)
+  distance = np.linalg.norm(np.array(found.path[-1][1:3]) - scene.goals[2])
+  assert distance < 0.35  # a point every 0.2 s
+  again = runner.run_trial(simulated, policy, trial, group=group, index=NEAREST)
+  assert again == found  # the same trial is the same episode
+
+
+def test_the_gait_reaches_a_goal_on_the_virtual_robot(scene):
+  group, trial = plants.trials("navigation")[NEAREST]
+  plant = RehearsedPlant(scene, "navigation", image_size=None, robot_seed=2, world="floor")
+  try:
+    policy = GaitPolicy(scene, "navigation")
+    found = runner.run_trial(plant, policy, trial, group=group, index=NEAREST)
+  finally:
+    plant.close()
+  assert found.outcome == "success" and found.setting.plant_id == "robot 2"
+  start = protocols.scene_starts(scene)[trial.position]
+  assert found.path[0][1:3] == pytest.approx(start, abs=0.06)
+
+
+def _standing_in(intruder, time):
+  spec = mujoco.MjSpec()
+  intruder.add_to_spec(spec)
+  model = spec.compile()
+  intruder.bind(model)
+  data = mujoco.MjData(model)
+  intruder.move(data, time)
+  mujoco.mj_kinematics(model, data)
+  return data.geom_xpos[:, :2].mean(axis=0)
+
+
+@pytest.mark.parametrize("name", ["moved_object", "person"])
+def test_intruders_stand_in_free_space_away_from_starts_and_goals(scene, name):
+  clear = plants.keep_clear(scene, protocols.scene_starts(scene))
+  intruder = perturbations.make_intruder(name, scene, keep_clear=clear)
+  places = np.array([_standing_in(intruder, time) for time in (0.0, 2.0, 5.0)])
+  assert scene.free_space.is_reachable(places).all()
+  moved = np.linalg.norm(np.diff(places, axis=0), axis=1)
+  if name == "person":  # 0.4 m/s, unless it turned round
+    assert 0.05 < moved[0] <= 0.81 and 0.05 < moved[1] <= 1.21
+  else:
+    assert moved.max() == 0
+    assert np.linalg.norm(clear - places[0], axis=1).min() > 0.5
+
+
+def test_person_walks_back_and_forth():
+  path = np.array([[0.0, 0.0], [1.0, 0.0]])
+  person = perturbations.Intruder((), path, speed=0.5)
+  assert person.place(1.0)[0] == pytest.approx([0.5, 0]) and person.place(1.0)[1] == 0
+  assert person.place(3.0)[0] == pytest.approx([0.5, 0])
+  assert abs(person.place(3.0)[1]) == pytest.approx(np.pi)
+  assert person.place(4.2)[0] == pytest.approx([0.1, 0])
+
+
+def test_walking_into_a_moved_object_is_a_collision(scene):
+  plant = SimulatedPlant(scene, "navigation", "moved_object", image_size=None)
+  try:
+    plant.start(plants.trials("navigation")[NEAREST][1])
+    pose = plant.sight().pose
+    ahead = pose.xy + 0.09 * np.array([np.cos(pose.yaw), np.sin(pose.yaw)])
+    plant._intruder._path = (ahead + 0.14)[None]  # a leg of the stool stands in front of the chest
+    for _ in range(20):
+      plant.step(plant.task.standing_action)
+    assert plant.sight().collided
+  finally:
+    plant.close()
+
+
+def test_covered_camera_is_black_for_three_seconds(scene):
+  assert [perturbations.is_blocked("blocked_camera", t) for t in (2.9, 3.0, 5.9, 6.0)] == [
+    False,
+    True,
+    True,
+    False,
+  ]
+  assert not perturbations.is_blocked("person", 4.0)
+  with pytest.raises(ValueError, match="Unknown perturbation 'rain'"):
+    perturbations.make_intruder("rain", scene, keep_clear=np.zeros((0, 2)))
+
+
+def _nearest_trial(plant, scene):
+  """Returns what comes of one trial on a plant, which is closed then."""
+  group, trial = plants.trials("navigation")[NEAREST]
+  try:
+    return runner.run_trial(
+      plant, GaitPolicy(scene, "navigation"), trial, group=group, index=NEAREST
+    )
+  finally:
+    plant.close()
+
+
+def test_robot_prompts_for_placement_and_verdict(scene):
+  """The robot is a virtual one here; the plant only sees its port and asks a person."""
+  asked, said = [], []
+  answers = iter(["", "x", "l"])
+
+  def ask(question):
+    asked.append(question)
+    return next(answers)
+
+  with VirtualRobot(world="floor", seed=1, stepped=True) as robot:
+    plant = operated.OperatedPlant(
+      scene,
+      "navigation",
+      "person",
+      robot=robot.connection(),
+      camera=None,
+      image_size=None,
+      time_limit=0.5,
+      ask=ask,
+      say=said.append,
+    )
+    found = _nearest_trial(plant, scene)
+  _, trial = plants.trials("navigation")[NEAREST]
+  start = protocols.scene_starts(scene)[trial.position]
+  assert f"x = {start[0]:.2f} m" in asked[0] and "Goal 3" in said[0]
+  assert "Walk slowly around" in said[1] and "Expected one of" in said[2]
+  assert len(asked) == 3 and found.outcome == "lost" and found.setting.plant == "robot"
+
+
+def test_a_dry_run_moves_nothing_and_asks_for_no_verdict(scene):
+  asked = []
+  with VirtualRobot(world="floor", seed=1, stepped=True) as robot:
+    servos = robot.devices.servos.values()
+    before = [servo.table["goal_position"] for servo in servos]
+    plant = operated.OperatedPlant(
+      scene,
+      "navigation",
+      robot=robot.connection(),
+      camera=None,
+      image_size=None,
+      time_limit=0.5,
+      dry_run=True,
+      ask=lambda question: asked.append(question) or "",
+      say=lambda text: None,
+    )
+    found = _nearest_trial(plant, scene)
+    assert not any(servo.table["torque_enable"] for servo in servos)
+    assert [servo.table["goal_position"] for servo in servos] == before
+  assert len(asked) == 1 and "Place the robot" in asked[0]
+  assert found.outcome == "stopped" and found.detail.startswith("dry run; ")
+  assert "observation to goal" in found.detail  # what it would have taken

@@ -1,0 +1,349 @@
+"""Tests of reading captures: videos, pictures, posed data sets."""
+
+import json
+
+import av
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from nerf2real.scenes.capture import capture as capture_module
+from nerf2real.scenes.capture.capture import CaptureError, CaptureSettings, read_capture
+from nerf2real.scenes.capture.sources import (
+  KnownPoses,
+  read_colmap,
+  read_transforms,
+  to_colmap,
+  to_opencv,
+)
+from nerf2real.scenes.capture.video import inspect_video, sharpest_frames, sharpness
+from tests.scenes import synthetic_capture as synthetic
+
+SETTINGS = CaptureSettings(num_keyframes=8)
+
+
+@pytest.fixture(scope="module")
+def frames():
+  """Twenty-four views of the synthetic corner, blurred by different amounts."""
+  poses = synthetic.walk(24)
+  generator = np.random.default_rng(3)
+  views = []
+  for pose in poses:
+    image = synthetic.render(pose)
+    views.append(cv2.GaussianBlur(image, (0, 0), generator.uniform(0.3, 3)))
+  return views
+
+
+@pytest.mark.parametrize(
+  ("codec", "suffix"),
+  [("libx264", "mp4"), ("mpeg4", "mov"), ("libvpx-vp9", "webm"), ("mjpeg", "avi")],
+)
+def test_keeps_the_sharpest_frame_of_each_part(frames, tmp_path, codec, suffix):
+  path = tmp_path / f"film.{suffix}"
+  synthetic.write_video(path, frames, codec=codec)
+  result = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  with av.open(str(path)) as container:
+    values = [sharpness(f.to_ndarray(format="gray")) for f in container.decode(video=0)]
+  expected = [3 * part + int(np.argmax(values[3 * part : 3 * part + 3])) for part in range(8)]
+  assert [int(p.stem.split("_")[1]) for p in result.images] == expected
+  np.testing.assert_allclose(result.sharpness, np.array(values)[expected])
+  np.testing.assert_allclose(result.times, np.array(expected) / 10, atol=2e-3)
+  assert all(path.is_file() for path in result.images)
+
+
+@pytest.mark.parametrize("rotation", [90, 180, -90])
+def test_rotation_metadata_is_honoured(frames, tmp_path, rotation):
+  path = tmp_path / "film.mp4"
+  synthetic.write_video(path, frames, rotation=rotation)
+  result = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  image = cv2.imread(str(result.images[0]))
+  index = int(result.images[0].stem.split("_")[1])
+  with av.open(str(path)) as container:
+    stored, side = next(
+      (f.to_ndarray(format="bgr24"), [bytes(d) for d in f.side_data])
+      for number, f in enumerate(container.decode(video=0))
+      if number == index
+    )
+  # FFmpeg's display matrix itself: its angle is minus atan2 of the first row, counter-clockwise.
+  matrix = np.frombuffer(next(d for d in side if len(d) == 36), "<i4")
+  angle = -np.degrees(np.arctan2(matrix[1], matrix[0]))
+  assert round(angle) % 360 == rotation % 360
+  upright = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, -90: cv2.ROTATE_90_CLOCKWISE}
+  expected = cv2.rotate(stored, upright[rotation])
+  assert image.shape == expected.shape
+  assert np.abs(image.astype(int) - expected).mean() < 8  # JPEG of a noisy texture
+
+
+def test_large_pictures_are_reduced(frames, tmp_path):
+  path = tmp_path / "film.mp4"
+  synthetic.write_video(path, frames)
+  settings = CaptureSettings(num_keyframes=8, max_size=160)
+  result = read_capture(path, tmp_path / "keyframes", settings=settings)
+  assert (result.width, result.height) == (160, 120)
+  assert any("Low resolution" in line for line in result.warnings)
+
+
+def test_holds_one_frame_at_a_time(frames, tmp_path):
+  path = tmp_path / "film.mp4"
+  synthetic.write_video(path, frames)
+  chosen = sharpest_frames(
+    path, 8, max_size=1920, info=inspect_video(path), warnings=[], progress=None
+  )
+  assert next(chosen).index < 3  # the first part is out before the others are decoded
+
+
+def test_warnings(frames, tmp_path):
+  path = tmp_path / "film.mp4"
+  synthetic.write_video(path, [cv2.GaussianBlur(f, (0, 0), 8) for f in frames])
+  result = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  text = "\n".join(result.warnings)
+  assert "Too short: the video lasts 2.4 s" in text
+  assert "Low resolution: 320x240" in text
+  assert "Blur: 100%" in text
+  assert "exposure" not in text
+  dark = [np.uint8(f * (0.1 if row < 12 else 1.0)) for row, f in enumerate(frames)]
+  synthetic.write_video(path, dark)
+  result = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  assert any("Changing exposure" in line for line in result.warnings)
+
+
+def test_sharp_frames_give_no_blur_warning(tmp_path):
+  path = tmp_path / "film.mp4"
+  synthetic.write_video(path, [synthetic.render(pose) for pose in synthetic.walk(16)])
+  result = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  assert not any("Blur" in line for line in result.warnings)
+
+
+def test_sharpness_is_comparable_between_resolutions(frames):
+  grey = cv2.cvtColor(synthetic.texture(0, 1920), cv2.COLOR_BGR2GRAY)
+  small = cv2.resize(grey, (960, 960), interpolation=cv2.INTER_AREA)
+  assert sharpness(grey) == pytest.approx(sharpness(small), rel=0.1)
+
+
+def test_damaged_video_says_until_where(frames, tmp_path):
+  path = tmp_path / "film.avi"
+  synthetic.write_video(path, frames, codec="mjpeg")
+  data = path.read_bytes()
+  path.write_bytes(data[: len(data) // 2])
+  with pytest.raises(CaptureError, match=r"damaged: \d+ of 24 frames decoded, until \d\.\d s"):
+    read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  assert not (tmp_path / "keyframes").exists()
+  assert not (tmp_path / "keyframes.partial").exists()
+
+
+def test_overwritten_middle_is_damage(frames, tmp_path):
+  path = tmp_path / "film.mp4"
+  synthetic.write_video(path, frames)
+  data = bytearray(path.read_bytes())
+  start, length = len(data) // 4, len(data) // 3
+  data[start : start + length] = np.random.default_rng(0).bytes(length)
+  path.write_bytes(bytes(data))
+  with pytest.raises(CaptureError, match="damaged"):
+    read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+
+
+def test_unusable_inputs_are_one_clear_line(frames, tmp_path):
+  def message(source):
+    with pytest.raises(CaptureError) as error:
+      read_capture(source, tmp_path / "keyframes", settings=SETTINGS)
+    text = str(error.value)
+    assert "\n" not in text
+    assert not (tmp_path / "keyframes").exists()
+    return text
+
+  assert "does not exist" in message(tmp_path / "nothing.mp4")
+  (tmp_path / "empty.mp4").touch()
+  assert "is empty (0 bytes)" in message(tmp_path / "empty.mp4")
+  (tmp_path / "text.mp4").write_text("not a film at all, only words\n" * 20)
+  assert "cannot be read as a video" in message(tmp_path / "text.mp4")
+  synthetic.write_video(tmp_path / "short.mp4", frames[:4])
+  assert "has 4 frames" in message(tmp_path / "short.mp4")
+  (tmp_path / "void").mkdir()
+  assert "holds no pictures" in message(tmp_path / "void")
+  folder = tmp_path / "three"
+  folder.mkdir()
+  for number in range(3):
+    cv2.imwrite(str(folder / f"{number}.jpg"), frames[number])
+  assert "holds 3 pictures, expected at least 8" in message(folder)
+  for number in range(3, 9):
+    cv2.imwrite(str(folder / f"{number}.jpg"), frames[number][:100])
+  assert "expected one camera" in message(folder)
+  (folder / "3.jpg").write_bytes(b"broken")
+  assert "cannot be read as a picture" in message(folder)
+
+
+def test_folder_of_images(frames, tmp_path):
+  folder = tmp_path / "pictures"
+  folder.mkdir()
+  for number, frame in enumerate(frames):
+    cv2.imwrite(str(folder / f"{number:02d}.png"), frame)
+  reports = []
+  result = read_capture(
+    folder, tmp_path / "keyframes", settings=SETTINGS, progress=lambda f, t: reports.append((f, t))
+  )
+  values = [sharpness(cv2.cvtColor(f, cv2.COLOR_BGR2GRAY)) for f in frames]
+  expected = [3 * part + int(np.argmax(values[3 * part : 3 * part + 3])) for part in range(8)]
+  assert [int(p.stem.split("_")[1]) for p in result.images] == expected
+  assert result.kind == "images"
+  assert result.times is None
+  fractions = [fraction for fraction, _ in reports]
+  assert fractions == sorted(fractions)
+  assert fractions[-1] == 1.0
+
+
+def test_an_error_leaves_the_last_good_keyframes(frames, tmp_path, monkeypatch):
+  path = tmp_path / "film.mp4"
+  synthetic.write_video(path, frames)
+  first = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  monkeypatch.setattr(capture_module.cv2, "imwrite", lambda *_: False)
+  with pytest.raises(OSError, match="disk full"):
+    read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  assert all(path.is_file() for path in first.images)
+  assert not (tmp_path / "keyframes.partial").exists()
+
+
+def write_transforms(folder, poses, camera, **extra):
+  """Writes pictures and a transforms.json with OpenGL axes, as nerfstudio does."""
+  names = synthetic.write_images(folder / "images", poses)
+  flip = np.diag([1.0, -1, -1, 1])
+  values = {
+    "w": camera.width,
+    "h": camera.height,
+    "fl_x": camera.fx,
+    "fl_y": camera.fy,
+    "cx": camera.cx,
+    "cy": camera.cy,
+    "k1": camera.k1,
+    "k2": camera.k2,
+    "p1": camera.p1,
+    "p2": camera.p2,
+    "camera_model": "OPENCV",
+    "frames": [
+      {"file_path": f"images/{name}", "transform_matrix": (pose @ flip).tolist()}
+      for name, pose in zip(names, poses, strict=True)
+    ],
+    **extra,
+  }
+  (folder / "transforms.json").write_text(json.dumps(values))
+  return names
+
+
+def test_transforms_json(tmp_path):
+  poses = synthetic.walk(9)
+  source = tmp_path / "source"
+  write_transforms(source, poses, synthetic.CAMERA, k1=0.01, k2=-0.02, p1=0.001, p2=-0.002)
+  result = read_capture(source, tmp_path / "keyframes", settings=CaptureSettings(num_keyframes=9))
+  assert result.kind == "transforms"
+  np.testing.assert_allclose(result.known.world_from_camera, poses, atol=1e-12)
+  np.testing.assert_allclose(result.known.camera.distortion, [0.01, -0.02, 0.001, -0.002])
+  half = CaptureSettings(num_keyframes=9, max_size=160)
+  result = read_capture(source / "transforms.json", tmp_path / "keyframes", settings=half)
+  assert result.known.camera.width == 160
+  assert result.known.camera.fx == pytest.approx(synthetic.CAMERA.fx / 2)
+
+
+def test_instant_ngp_angles_and_missing_suffix(tmp_path):
+  poses = synthetic.walk(8)
+  write_transforms(tmp_path, poses, synthetic.CAMERA)
+  values = json.loads((tmp_path / "transforms.json").read_text())
+  for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model"):
+    del values[name]
+  values["camera_angle_x"] = 2 * np.arctan(0.5 * 320 / 280)
+  for frame in values["frames"]:
+    frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+  (tmp_path / "transforms.json").write_text(json.dumps(values))
+  known = read_transforms(tmp_path)
+  assert known.camera.fx == pytest.approx(280)
+  assert known.camera.fy == pytest.approx(280)
+  assert (known.camera.cx, known.camera.cy) == (160, 120)
+  np.testing.assert_allclose(known.world_from_camera, poses, atol=1e-12)
+
+
+def test_transforms_errors(tmp_path):
+  poses = synthetic.walk(8)
+  write_transforms(tmp_path, poses, synthetic.CAMERA, camera_model="OPENCV_FISHEYE")
+  with pytest.raises(CaptureError, match="OPENCV_FISHEYE found, expected OPENCV"):
+    read_transforms(tmp_path)
+  sheared = poses.copy()
+  sheared[2, 0, 1] += 0.5
+  write_transforms(tmp_path, sheared, synthetic.CAMERA)
+  with pytest.raises(CaptureError, match=r"view_002.png is no rigid pose"):
+    read_transforms(tmp_path)
+  write_transforms(tmp_path, poses, synthetic.CAMERA)
+  (tmp_path / "images" / "view_003.png").unlink()
+  with pytest.raises(CaptureError, match="view_003.png .* was not found"):
+    read_transforms(tmp_path)
+  (tmp_path / "transforms.json").write_text('{"frames": 3}')
+  with pytest.raises(CaptureError, match="no transforms file"):
+    read_transforms(tmp_path)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_model(tmp_path, text):
+  poses = synthetic.walk(9)
+  names = synthetic.write_images(tmp_path / "images", poses)
+  points = np.random.default_rng(0).uniform(0, 3, (50, 3))
+  model = pycolmap.Reconstruction()
+  model.add_camera_with_trivial_rig(to_colmap(synthetic.CAMERA))
+  for number, (name, pose) in enumerate(zip(names, poses, strict=True), start=1):
+    image = pycolmap.Image(name=name, camera_id=1, image_id=number)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
+  for point in points:
+    model.add_point3D(point, pycolmap.Track(), np.array([10, 20, 30], np.uint8))
+  folder = tmp_path / "sparse" / "0"
+  folder.mkdir(parents=True)
+  (model.write_text if text else model.write_binary)(str(folder))
+  result = read_capture(tmp_path, tmp_path / "keyframes", settings=CaptureSettings(num_keyframes=9))
+  assert result.kind == "colmap"
+  assert result.known.camera == synthetic.CAMERA
+  np.testing.assert_allclose(result.known.world_from_camera, poses, atol=1e-9)
+  np.testing.assert_allclose(np.sort(result.known.points, axis=0), np.sort(points, axis=0))
+  (tmp_path / "images" / names[4]).unlink()
+  with pytest.raises(CaptureError, match="1 pictures of the COLMAP model are missing"):
+    read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+  ("model", "params", "expected"),
+  [
+    ("SIMPLE_PINHOLE", [200, 160, 120], (200, 200, 0, 0)),
+    ("PINHOLE", [200, 210, 160, 120], (200, 210, 0, 0)),
+    ("SIMPLE_RADIAL", [200, 160, 120, 0.1], (200, 200, 0.1, 0)),
+    ("RADIAL", [200, 160, 120, 0.1, -0.2], (200, 200, 0.1, -0.2)),
+    ("OPENCV", [200, 210, 160, 120, 0.1, -0.2, 0.01, 0.02], (200, 210, 0.1, -0.2)),
+  ],
+)
+def test_colmap_cameras_project_alike(model, params, expected):
+  theirs = pycolmap.Camera(camera_id=1, model=model, width=320, height=240, params=params)
+  ours = to_opencv(theirs)
+  assert (ours.fx, ours.fy, ours.k1, ours.k2) == expected
+  point = np.array([0.2, -0.1, 1.5])
+  np.testing.assert_allclose(ours.project(point), theirs.img_from_cam(point), atol=1e-9)
+
+
+def test_fisheye_is_refused():
+  camera = pycolmap.Camera(
+    camera_id=1,
+    model="OPENCV_FISHEYE",
+    width=320,
+    height=240,
+    params=[200, 200, 160, 120, 0, 0, 0, 0],
+  )
+  with pytest.raises(CaptureError, match="OPENCV_FISHEYE"):
+    to_opencv(camera)
+
+
+def test_known_poses_selection_keeps_order():
+  known = KnownPoses(
+    kind="colmap",
+    camera=synthetic.CAMERA,
+    files=tuple("abcd"),
+    world_from_camera=np.arange(4)[:, None, None] * np.ones((4, 4)),
+    points=np.zeros((0, 3)),
+    point_colors=np.zeros((0, 3), np.uint8),
+    point_errors=np.zeros(0),
+  )
+  chosen = known.selected([1, 3], synthetic.CAMERA)
+  assert chosen.files == ("b", "d")
+  np.testing.assert_array_equal(chosen.world_from_camera[:, 0, 0], [1, 3])

@@ -1,0 +1,23 @@
+import numpy as np
+
+from nerf2real.scenes.field import contraction
+
+
+def test_identity_inside_and_known_values_outside():
+  points = np.array([[0.3, -1.0, 0.9], [2.0, 0.0, 0.0], [-1.0, 4.0, 2.0]], np.float32)
+  squashed = np.asarray(contraction.contract(points))
+  np.testing.assert_allclose(squashed[0], points[0], atol=1e-7)
+  np.testing.assert_allclose(squashed[1], [1.5, 0, 0], atol=1e-6)
+  np.testing.assert_allclose(squashed[2], [-0.4375, 1.75, 0.875], atol=1e-6)
+
+
+def test_inverse_and_range():
+  rng = np.random.default_rng(0)
+  points = (rng.normal(size=(500, 3)) * 10.0 ** rng.uniform(-2, 1.5, (500, 1))).astype(np.float32)
+  squashed = np.asarray(contraction.contract(points))
+  assert np.abs(squashed).max() < 2
+  np.testing.assert_allclose(contraction.uncontract(squashed), points, rtol=1e-4, atol=1e-6)
+  coordinates = np.asarray(contraction.grid_coordinates(points))
+  assert coordinates.min() > 0 and coordinates.max() < 1
+  back = contraction.from_grid_coordinates(coordinates)
+  np.testing.assert_allclose(back, points, rtol=2e-4, atol=1e-5)

@@ -1,0 +1,68 @@
+"""The occupancy grid against shapes known in closed form and brute force."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerf2real.scenes.field import occupancy
+from nerf2real.scenes.field.contraction import from_grid_coordinates, grid_coordinates
+from nerf2real.scenes.field.field import FieldSettings
+from tests.scenes import analytic_fields
+
+SETTINGS = occupancy.OccupancySettings(cells=128)
+CENTRES = np.array([[0.3, -0.2, 0.1], [2.5, 0.4, 0.3]])  # the second lies in squashed space
+RADII = np.array([0.2, 0.9])
+
+
+def _distance(points: np.ndarray) -> np.ndarray:
+  return (np.linalg.norm(points[..., None, :] - CENTRES, axis=-1) - RADII).min(-1)
+
+
+@pytest.fixture(scope="module")
+def found() -> occupancy.Occupancy:
+  field = analytic_fields.from_signed_distance(
+    _distance, settings=FieldSettings(levels=1, log2_table_size=18, base_resolution=62)
+  )
+  return occupancy.build(field, settings=SETTINGS)
+
+
+def test_distance_is_the_maximum_norm_to_the_nearest_matter():
+  occupied = np.zeros((20, 20, 20), bool)
+  occupied[3, 4, 5] = occupied[15, 2, 9] = occupied[10, 19, 0] = True
+  grid = occupancy.Occupancy.from_occupied(occupied)
+  matter = np.argwhere(occupied)
+  cells = np.argwhere(np.ones_like(occupied))
+  expected = np.abs(cells[:, None] - matter).max(-1).min(-1).reshape(occupied.shape)
+  np.testing.assert_array_equal(grid.distance, expected)
+  np.testing.assert_array_equal(grid.occupied, occupied)
+
+
+def test_matter_is_found_inside_and_outside_the_unit_cube(found):
+  random = np.random.default_rng(0)
+  # Outside the cube the field's cells are long: only the middle of that ball is sure.
+  for centre, radius, part in zip(CENTRES, RADII, (0.9, 0.7), strict=True):
+    offset = random.normal(size=(2000, 3))
+    offset *= (radius * random.random((2000, 1)) ** (1 / 3)) / np.linalg.norm(
+      offset, axis=-1, keepdims=True
+    )
+    inside = centre + part * offset
+    assert found.is_occupied(np.asarray(grid_coordinates(jnp.asarray(inside)))).all()
+
+
+def test_free_space_is_empty(found):
+  z, y, x = np.meshgrid(*[(np.arange(128) + 0.5) / 128] * 3, indexing="ij")
+  points = np.asarray(from_grid_coordinates(jnp.asarray(np.stack([x, y, z], -1))), np.float64)
+  near = np.abs(points).max(-1) < 1.0
+  # The field itself is trilinear between vertices 0.065 apart; one cell is 0.031.
+  assert not found.occupied[near & (_distance(points) > 0.08)].any()
+  assert found.occupied[near & (_distance(points) < -0.04)].all()
+  assert found.distance[near].max() > 10
+
+
+def test_empty_grids_and_wrong_shapes():
+  nothing = occupancy.Occupancy.from_occupied(np.zeros((8, 8, 8), bool))
+  assert nothing.distance.min() == 255
+  with pytest.raises(ValueError, match="cube of cells"):
+    occupancy.Occupancy.from_occupied(np.zeros((8, 8, 4), bool))
+  with pytest.raises(ValueError, match="multiple of 4"):
+    occupancy.OccupancySettings(cells=50)

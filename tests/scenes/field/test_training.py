@@ -1,0 +1,156 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nerf2real.scenes.field import training as train
+from nerf2real.scenes.field.field import Field, FieldSettings
+from nerf2real.scenes.field.fused import trainer as fused
+from nerf2real.scenes.quality import image_quality
+from tests.scenes import box_views
+
+FAST = train.TrainSettings(
+  field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
+  max_steps=300,
+  max_seconds=None,
+  batch_samples=1 << 14,
+  inner_cells=32,
+  outer_cells=16,
+  occupancy_samples=1 << 13,
+  occupancy_start=96,
+  occupancy_sweep_steps=160,
+  blur_max=1.0,
+  warmup_steps=16,
+)
+REFERENCE = dataclasses.replace(
+  FAST,
+  engine="jax",
+  batch_rays=256,
+  proposal_samples=24,
+  final_samples=16,
+  proposal_levels=2,
+  proposal_log2_table_size=8,
+  proposal_finest_resolution=32,
+  max_steps=60,
+  field=FieldSettings(levels=4, log2_table_size=10, growth=1.5),
+)
+
+
+@pytest.fixture(scope="module")
+def views():
+  return box_views.make_views(60, width=64, height=48)
+
+
+@pytest.fixture(scope="module")
+def trained(views):
+  return train.train(views, FAST)
+
+
+def test_fused_training_reproduces_views_it_has_not_seen(trained):
+  field, report = trained
+  held_out = box_views.make_views(3, width=64, height=48, seed=100)
+  evaluator = fused.FusedField(field, settings=FAST)
+  figures = []
+  for index in range(3):
+    picture, depth, opacity = evaluator.render(held_out.camera, held_out.world_from_camera[index])
+    figures.append(image_quality.psnr(picture, held_out.images[index]))
+    assert opacity.mean() > 0.95
+    origin, directions = held_out.rays(index)
+    z = held_out.camera.rays()
+    truth = box_views.wall_distance(origin, directions) / np.linalg.norm(z, axis=-1)
+    assert np.median(np.abs(depth - truth)) < 0.1
+  assert np.mean(figures) > 25
+  assert report.steps == 300 and report.resumed_at_step is None
+  assert report.samples > report.rays > 300 and report.samples_per_second > 0
+
+
+def test_same_seed_gives_the_same_field(views, trained):
+  again, _ = train.train(views, FAST)
+  for name, value in trained[0].params.items():
+    np.testing.assert_array_equal(again.params[name], value)
+
+
+def test_interrupted_training_ends_where_the_uninterrupted_one_does(
+  views, trained, tmp_path, monkeypatch
+):
+  monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
+  seen = []
+
+  def interrupt(fraction, text):
+    seen.append(fraction)
+    if fraction > 0.4:
+      raise KeyboardInterrupt
+
+  monkeypatch.setattr(train, "_RECORD_SECONDS", 0.0)
+  with pytest.raises(KeyboardInterrupt):
+    train.train(views, FAST, progress=interrupt, checkpoint_dir=tmp_path)
+  field, report = train.train(views, FAST, checkpoint_dir=tmp_path)
+  assert report.resumed_at_step is not None and 100 < report.resumed_at_step < 130
+  assert report.steps == 300
+  for name, value in trained[0].params.items():
+    np.testing.assert_array_equal(field.params[name], value)
+
+
+def test_a_checkpoint_of_other_settings_is_not_used(views, tmp_path, monkeypatch):
+  monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
+  short = dataclasses.replace(FAST, max_steps=4)
+  train.train(views, short, checkpoint_dir=tmp_path)
+  _, report = train.train(views, dataclasses.replace(short, blur_max=0.5), checkpoint_dir=tmp_path)
+  assert report.resumed_at_step is None
+
+
+def test_known_points_make_the_geometry_better(trained):
+  """With as many steps, the field with anchors comes nearer to the walls."""
+  anchored = box_views.make_views(60, width=64, height=48, anchors=40)
+  field, _ = train.train(anchored, dataclasses.replace(FAST, max_steps=300))
+  held_out = box_views.make_views(4, width=64, height=48, seed=100)
+  errors = []
+  for candidate in (trained[0], field):
+    evaluator = fused.FusedField(candidate, settings=FAST)
+    off = []
+    for index in range(4):
+      _, depth, _ = evaluator.render(held_out.camera, held_out.world_from_camera[index])
+      origin, directions = held_out.rays(index)
+      norms = np.linalg.norm(held_out.camera.rays(), axis=-1)
+      off.append(np.abs(depth - box_views.wall_distance(origin, directions) / norms))
+    errors.append(np.mean(off))
+  assert errors[1] < errors[0], errors
+
+
+def test_reference_training_lowers_the_loss_and_the_file_is_the_same(tmp_path, monkeypatch):
+  monkeypatch.setattr(train, "_RECORD_SECONDS", 0.0)
+  views = box_views.make_views(60, width=64, height=48, anchors=20)
+  field, report = train.train(views, REFERENCE)
+  assert report.engine == "jax" and report.steps == 60
+  first, last = report.curve_psnr_db[0], report.curve_psnr_db[-1]
+  assert last > first + 2
+  field.save(tmp_path / "field.safetensors")
+  assert Field.load(tmp_path / "field.safetensors").settings == field.settings
+
+
+def test_training_that_diverges_says_so_in_one_line(views):
+  initial = fused.FusedTrainer(views, FAST, seed=0).field()
+  initial.params["base_b2"][:] = np.nan
+  with pytest.raises(train.TrainError, match=r"^Training failed at step 1: .* is not finite") as e:
+    train.train(views, FAST, initial=initial)
+  assert "\n" not in str(e.value)
+
+
+def test_too_few_pictures_are_refused(views):
+  with pytest.raises(train.TrainError, match="Found 2 training pictures"):
+    train.train(views.select([0, 1]), FAST)
+
+
+def test_learning_rate_warms_up_and_decays():
+  settings = train.preset("paper")
+  assert train.learning_rate(settings, 0.0, 0) < 3e-5
+  assert train.learning_rate(settings, 0.0, 2048) == pytest.approx(2e-3)
+  assert train.learning_rate(settings, 0.5, 20000) == pytest.approx((2e-3 * 4e-5) ** 0.5)
+  assert train.learning_rate(settings, 1.0, 40000) == pytest.approx(4e-5)
+
+
+def test_unknown_presets_and_engines_are_refused():
+  with pytest.raises(ValueError, match="expected 'fast' or 'paper'"):
+    train.preset("slow")
+  with pytest.raises(ValueError, match="expected 'fused' or 'jax'"):
+    train.TrainSettings(engine="torch")

@@ -1,0 +1,157 @@
+"""The compiled joint against MuJoCo with `suite.effects`, kind by kind."""
+
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.terms import Term, compose
+from nerf2real.sysid.model import simulation as evaluation
+from nerf2real.sysid.model.plant import JointPlant
+from tests.sysid.synthetic import ARM, PENDULUM, log_of
+
+# kind, values by name, how far [rad rms] the two may differ: rounding where the arithmetic is the
+# same, more where a force enters a step earlier or later.
+CASES = [
+  # Within a step in which a command arrives, the kernel mixes torques, MuJoCo's side commands.
+  ("command_delay", {"delay": 0.0237}, 5e-4),
+  ("coulomb_friction", {"torque": 0.2}, 1e-6),
+  ("viscous_friction", {"coefficient": 0.4}, 1e-6),
+  ("stribeck_friction", {"breakaway": 0.2, "velocity": 0.1}, 1e-5),
+  ("load_friction", {"coefficient": 0.15, "carried": 0.0}, 3e-4),
+  ("load_friction", {"coefficient": 0.4, "carried": 1.0}, 3e-4),
+  ("load_friction", {"coefficient": 0.4, "carried": 2.0}, 3e-4),
+  ("load_friction", {"coefficient": 0.3, "carried": 3.0}, 3e-4),
+  ("load_friction", {"coefficient": 0.3, "carried": 4.0}, 3e-4),
+  (
+    "load_friction",
+    {"coefficient": 0.05, "quadratic": 0.1, "rest": 0.5, "velocity": 0.4, "carried": 2.0},
+    3e-4,
+  ),
+  ("asymmetric_friction", {"positive": 0.2, "negative": 0.05}, 1e-6),
+  ("quadratic_drag", {"coefficient": 0.1}, 1e-6),
+  ("encoder_offset", {"offset": 0.05}, 1e-6),
+  ("motor_gain", {"gain": 0.7}, 1e-6),
+  ("motor_gain", {"gain": 0.7, "scales_limit": 1.0}, 1e-6),
+  ("supply_sag", {"droop": 0.05, "fade": 0.01, "scales_limit": 1.0}, 3e-4),
+  (
+    "thermal_derating",
+    {"heating": 2.0, "time_constant": 20.0, "derating": 0.004, "scales_limit": 1.0},
+    3e-4,
+  ),
+  ("torque_limit", {"limit": 1.2}, 1e-6),
+  ("supply_sag", {"droop": 0.05, "fade": 0.01}, 3e-4),
+  ("thermal_derating", {"heating": 2.0, "time_constant": 20.0, "derating": 0.004}, 3e-4),
+  ("spring", {"stiffness": 1.0, "reference": 0.3}, 1e-6),
+  ("cogging", {"amplitude": 0.2, "periods": 12.0, "phase": 0.4}, 1e-6),
+  ("backlash", {"gap": 0.03, "encoder_on_motor": 0.0}, 1e-6),
+  ("backlash", {"gap": 0.03, "encoder_on_motor": 0.0, "friction_on_link": 0.4}, 1e-6),
+  ("backlash", {"gap": 0.02, "encoder_on_motor": 0.0, "stiffness": 400.0, "damping": 1.5}, 1e-6),
+  ("payload", {"mass": 0.2, "x": 0.02, "y": 0.0, "z": -0.1}, 1e-6),
+  ("gravity_tilt", {"x": 0.05, "y": 0.1}, 1e-6),
+  ("measurement_delay", {"delay": 0.0123}, 1e-6),
+]
+
+
+@pytest.mark.parametrize(("kind", "values", "tolerance"), CASES, ids=[c[0] for c in CASES])
+def test_kind_moves_the_joint_as_mujoco_does(kind: str, values: dict, tolerance: float) -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=4.0)
+  plant = JointPlant(model, "joint", [log])
+  target = "arm" if kind == "payload" else ("joint" if kind not in _COMMON else None)
+  names = tuple(values)
+  zeros = (0.0,) * len(names)
+  term = Term(kind, target, names, zeros, zeros, zeros, (zeros,))
+  p, changed = compose(plant, [term], np.array([values[n] for n in names]))
+  got = plant.simulate(p, surroundings=[changed])[0][0].position
+  want = evaluation.simulate(model, log, [Effect(kind, target, values)])[:, 0]
+  bare = plant.simulate(plant.declared)[0][0].position
+  difference = float(np.sqrt(np.mean((got - want) ** 2)))
+  effect = float(np.sqrt(np.mean((bare - want) ** 2)))
+  assert effect > 5 * tolerance, "the case must move the joint"
+  assert difference < tolerance
+
+
+_COMMON = ("supply_sag", "gravity_tilt", "clock_drift")
+
+
+def test_every_candidate_is_checked() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  plant = JointPlant(model, "joint", [log_of(PENDULUM, "sweep", duration=2.0)])
+  kinds = {t.kind for t in candidates.library(plant)}
+  assert kinds - {case[0] for case in CASES} == {"clock_drift"}  # checked below
+
+
+def test_clock_drift_stretches_time() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "slow", rounding=0.0, duration=4.0)
+  plant = JointPlant(model, "joint", [log])
+  term = Term("clock_drift", None, ("rate",), (0.0,), (0.1,), (0.01,), ((0.0,),))
+  p, _ = compose(plant, [term], np.array([0.02]))
+  got = plant.simulate(p)[0][0].position
+  declared = plant.simulate(plant.declared)[0][0].position
+  want = np.interp(log.states.stamp / 1.02, log.states.stamp, declared)
+  inner = slice(20, -20)
+  assert np.abs(got - want)[inner].max() < 3e-4
+
+
+def test_joint_among_moving_others_follows_the_whole_model() -> None:
+  model = mujoco.MjModel.from_xml_string(ARM)
+  log = log_of(ARM, "sweep", rounding=0.0, duration=6.0)
+  for joint in ("shoulder", "elbow"):
+    plant = JointPlant(model, joint, [log])
+    got = plant.simulate(plant.declared)[0][0].position
+    want = log.states.position[:, log.states.column(joint)]
+    assert np.sqrt(np.mean((got - want) ** 2)) < 1.5e-3
+
+
+def test_surroundings_of_a_payload_are_those_of_a_heavier_model() -> None:
+  heavier = ARM.replace(
+    '<inertial pos="0 0.01 -0.08" mass="0.3" diaginertia="8e-4 8e-4 1e-4"/>',
+    '<inertial pos="0 0.01 -0.08" mass="0.3" diaginertia="8e-4 8e-4 1e-4"/>'
+    '<body pos="0.02 0.1 -0.05"><inertial pos="0 0 0" mass="0.2" diaginertia="1e-9 1e-9 1e-9"/>'
+    "</body>",
+  )
+  log = log_of(ARM, "sweep", rounding=0.0, duration=3.0)
+  plain = JointPlant(mujoco.MjModel.from_xml_string(ARM), "shoulder", [log])
+  loaded = JointPlant(mujoco.MjModel.from_xml_string(heavier), "shoulder", [log])
+  added = plain.payload("lower", 0.2, 0.02, 0.1, -0.05)[0]
+  want, base = loaded.surroundings[0], plain.surroundings[0]
+  for name in ("inertia", "here", "across", "bias"):
+    np.testing.assert_allclose(
+      getattr(added, name), getattr(want, name) - getattr(base, name), atol=2e-7, err_msg=name
+    )
+
+
+def test_pairs_move_the_joint_as_mujoco_does() -> None:
+  # A kind may use what another one changes: the torque that acts, the friction, the strength.
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=3.0)
+  plant = JointPlant(model, "joint", [log])
+  cases = [*{case[0]: case for case in reversed(CASES)}.values()]  # the first of a kind
+  cases.append(("backlash", {"gap": 0.01, "encoder_on_motor": 1.0}, 2e-3))
+  weaker = {"motor_gain", "supply_sag", "thermal_derating"}  # one flag tells what their limits do
+  wrong = []
+  for first, second in itertools.combinations(cases, 2):
+    kinds = {first[0], second[0]}
+    if len(kinds) == 1 or kinds <= weaker:
+      continue
+    values = [*first[1].values(), *second[1].values()]
+    terms, effects = zip(*(_case(kind, v) for kind, v, _ in (first, second)), strict=True)
+    p, changed = compose(plant, terms, np.array(values))
+    got = plant.simulate(p, surroundings=[changed])[0][0].position
+    want = evaluation.simulate(model, log, list(effects))[:, 0]
+    if float(np.sqrt(np.mean((got - want) ** 2))) > 4e-3:
+      wrong.append(kinds)
+  assert not wrong
+
+
+def _case(kind: str, values: dict) -> tuple[Term, Effect]:
+  target = "arm" if kind == "payload" else (None if kind in _COMMON else "joint")
+  zeros = (0.0,) * len(values)
+  return Term(kind, target, tuple(values), zeros, zeros, zeros, (zeros,)), Effect(
+    kind, target, values
+  )

@@ -1,0 +1,77 @@
+"""Play in a gear: a course that does not repeat is judged by a state that follows the readings."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.terms import compose
+from nerf2real.sysid.model.plant import JointPlant
+from nerf2real.sysid.selection import decision, screening
+from nerf2real.sysid.selection.decision import Thresholds
+from nerf2real.sysid.selection.explanation import Effort
+from nerf2real.sysid.selection.joint import polished, race_joint
+from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
+
+_PLAY = {"gap": 0.03, "stiffness": 800.0, "damping": 0.3, "encoder_on_motor": 0.0}
+
+
+def _play(plant: JointPlant):
+  return next(t for t in candidates.library(plant) if t.kind == "backlash")
+
+
+def test_a_state_that_follows_comes_back_to_a_course_that_does_not_repeat() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  bouncing = _PLAY | {"gap": 0.05, "stiffness": 1000.0, "damping": 0.2}
+  log = log_of(PENDULUM, "sweep", [Effect("backlash", "joint", bouncing)], duration=12.0)
+  plant = JointPlant(model, "joint", [log])
+  late = log.states.stamp > 6.0
+
+  def error(plant: JointPlant) -> float:
+    term = _play(plant)
+    p, _ = compose(plant, [term], np.array([bouncing[name] for name in term.names]))
+    plant.windows[0].position[0] = log.states.position[0, 0] + 1e-4
+    apart = plant.simulate(p)[0][0].position - log.states.position[:, 0]
+    return float(np.sqrt(np.mean(apart[late] ** 2)))
+
+  assert not plant.follows and plant.following().follows
+  strayed = error(plant)
+  assert strayed > 5 * COUNT
+  assert error(plant.following()) < 0.5 * strayed
+
+
+def test_stale_readings_are_not_followed() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "sweep", duration=4.0)
+  moved = np.abs(np.gradient(log.states.position[:, 0])) > 4 * COUNT
+  kept = np.flatnonzero(moved)[:-1:2]
+  log.states.position[kept + 1] = log.states.position[kept]
+  plant = JointPlant(model, "joint", [log])
+  stale = ~plant.logs[0].valid
+  assert stale.sum() > 10
+  truth = JointPlant(model, "joint", [log_of(PENDULUM, "sweep", duration=4.0)])
+  got = plant.following().simulate(plant.following().declared)[0][0].position
+  want = truth.logs[0].position
+  assert np.abs(got - want)[1:].max() < 5 * COUNT  # and not the steps of stale readings
+
+
+def test_play_is_named_with_its_gap() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  logs = logs_of(PENDULUM, [Effect("backlash", "joint", _PLAY)], duration=6.0)
+  (screened,) = screening.screen(model, logs)
+  found = race_joint(screened, Thresholds(), Effort(), seed=0)
+  assert found.ladder.problem.plant.follows
+  assert found.finding.verdict == "effects"
+  assert decision.names(found.finding.chosen) == {"backlash"}
+  values = polished(found, 0.06).fit.values("backlash")
+  assert values["gap"] == pytest.approx(_PLAY["gap"], rel=0.1)
+
+
+def test_what_is_no_play_is_not_judged_by_following() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  logs = logs_of(PENDULUM, [Effect("command_delay", "joint", {"delay": 0.03})], duration=6.0)
+  (screened,) = screening.screen(model, logs)
+  found = race_joint(screened, Thresholds(), Effort(), seed=0)
+  assert not found.ladder.problem.plant.follows
+  assert decision.names(found.finding.chosen) == {"command_delay"}
