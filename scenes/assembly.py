@@ -13,7 +13,7 @@ import trimesh
 
 from nerf2real.scenes import bundle
 from nerf2real.scenes.field.render.renderer import Renderer
-from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion
+from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion, map_server
 from nerf2real.scenes.poses import localise
 from nerf2real.scenes.quality import held_out as evaluate
 from nerf2real.scenes.quality import report
@@ -106,7 +106,7 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
   transform = job.alignment.world_from_unit
   path = transform.apply(job.localisation.world_from_camera[:, :3, 3])
   goals = np.array(contact["goals"])
-  space = free_space.read(out / "free_space.yaml")
+  space = map_server.read(out / "free_space.yaml")
   report.write(
     out / "report.html",
     report.ReportData(
@@ -185,7 +185,7 @@ def _robot_views(job: Job) -> list[evaluate.ViewScore]:
   return [evaluate.compare(job.renderer, held_out, k, *evaluate.ROBOT_SIZES[0]) for k in shown]
 
 
-def _map_picture(space: free_space.FreeSpace, goals: np.ndarray, path: np.ndarray) -> np.ndarray:
+def _map_picture(space: free_space.FreeSpaceMap, goals: np.ndarray, path: np.ndarray) -> np.ndarray:
   """Draws the map with goals [G, 2] and camera path [N, 3]: uint8 [H, W, 3], y upwards."""
   gray = np.full(space.cells.shape, 120, np.uint8)
   gray[space.cells == free_space.FREE] = 195

@@ -29,9 +29,9 @@ from nerf2real.scenes.field.training import train
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.geometry import align as aligning
 from nerf2real.scenes.geometry import collision as contact
-from nerf2real.scenes.geometry import convex, fusion, markers, overrides, poisson
+from nerf2real.scenes.geometry import convex, fusion, map_server, markers, overrides, poisson
 from nerf2real.scenes.geometry import mesh as meshing
-from nerf2real.scenes.geometry.free_space import FreeSpaceSettings, free_space
+from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings, floor_plan
 from nerf2real.scenes.poses import localise as localising
 from nerf2real.scenes.quality import collision_error, image_quality
 from nerf2real.scenes.quality import held_out as evaluate
@@ -399,14 +399,14 @@ class Job:
       )
       contact.write_parts(parts, folder / "collision")
       progress(0.8, "free space")
-      space = free_space(
+      space = floor_plan(
         parts,
         lower=place.extent_lower,
         upper=place.extent_upper,
         seen=grid,
         settings=settings.free_space,
       )
-      space.write(folder / "free_space.pgm")
+      map_server.write(space, folder / "free_space.pgm")
       goals = space.default_goals(
         count=settings.free_space.goals, clearance=settings.free_space.goal_clearance
       )
@@ -422,7 +422,7 @@ class Job:
       )
       values = {
         "goals": goals.tolist(),
-        "free_area_m2": float(space.reachable.sum() * space.resolution**2),
+        "free_area_m2": space.area,
         "collision_parts": len(parts),
         "collision_error_m": error.p95,
         "collision_error": error.to_dict(),
