@@ -13,7 +13,7 @@ import trimesh
 
 from nerf2real.scenes import bundle
 from nerf2real.scenes.field.render.renderer import Renderer
-from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion, map_server
+from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion, map_server, mesh
 from nerf2real.scenes.poses import localise
 from nerf2real.scenes.quality import held_out as evaluate
 from nerf2real.scenes.quality import report
@@ -122,7 +122,7 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
       views=evaluate.load_scores(job.folder("figures")),
       robot_views=robot_views,
       baseline=baseline,
-      visual=trimesh.load_mesh(out / "visual.glb"),
+      visual=mesh.load_glb(out / "visual.glb"),
       collision=[trimesh.Trimesh(part.vertices, part.faces) for part in parts],
       free_space_picture=_map_picture(space, goals, path),
     ),

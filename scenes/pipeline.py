@@ -21,7 +21,6 @@ from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
 from nerf2real.scenes.field import anchors, photometry
 from nerf2real.scenes.field.field import Field
-from nerf2real.scenes.field.fused.trainer import FusedField
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.field.settings import preset as train_preset
@@ -351,14 +350,6 @@ class Job:
         truncation=settings.truncation,
         progress=lambda fraction, text: progress(0.5 * fraction, text),
       )
-      if settings.source == "density":
-        grid = meshing.density_to_grid(
-          self._densities(grid),
-          lower=grid.lower,
-          voxel=grid.voxel,
-          threshold=settings.density_threshold,
-          carved=grid,
-        )
       grid = meshing.drop_floaters(grid, min_component=settings.min_component)
       found = meshing.drop_small_pieces(meshing.surface(grid), min_component=settings.min_component)
       progress(0.7, "fewer faces")
@@ -367,17 +358,6 @@ class Job:
       meshing.save_glb(meshing.paint(found, self.world_depth), folder / "visual.glb")
 
     self.stages.run("surface", run, settings=settings, inputs=self._keys("world"))
-
-  def _densities(self, grid: fusion.Grid) -> np.ndarray:
-    """The field's density [X, Y, Z] at the voxels of a grid in the world frame."""
-    axes = [grid.centres(axis) for axis in range(3)]
-    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    place = self.alignment.world_from_unit.inverse()
-    sigma = 0.5 * grid.voxel * place.scale
-    field = FusedField(self.renderer.field)
-    return field.densities(place.apply(centres.reshape(-1, 3)), sigma=sigma).reshape(
-      grid.values.shape
-    )
 
   def contact(self) -> None:
     """Makes the convex parts and the map of the free floor, and measures them."""
