@@ -11,7 +11,7 @@ POINT_FRACTION = 0.98  # of the points inside [-1, 1]^3; the rest are outliers a
 CAMERA_MARGIN = 1.05  # cameras stay this factor away from the cube's faces; ours
 _BOX_PERCENTILES = (1.0, 99.0)  # of the points, for the robust centre; ours
 _YAW_STEPS = 180  # half degrees of a quarter turn that are tried
-# The first camera's heading, after the turn, lies from here to a quarter turn more. People film along
+# The first camera's heading, once turned, lies from here to a quarter turn more. People film along
 # walls and into corners: both ends keep away from multiples of 45 degrees.
 _QUARTER_START = -np.pi / 8
 _LEVEL = 0.5  # length of a level axis' horizontal part
