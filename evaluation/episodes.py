@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from nerf2real.core import files
+
 SUCCESS, COLLISION, FALL, LOST, STOPPED = "success", "collision", "fall", "lost", "stopped"
 OUTCOMES = (SUCCESS, COLLISION, FALL, LOST, STOPPED)
 FILE = "episodes.jsonl"
@@ -99,14 +101,14 @@ class Store:
       except (ValueError, KeyError, TypeError) as error:
         if number == len(lines) - 1:  # the run was cut off while it wrote: that episode is rerun
           kept = "".join(f"{whole}\n" for whole in lines[:-1])
-          self.path.write_text(kept)
+          files.write_atomically(self.path, kept)
           return
         raise ValueError(
           f"{self.path}, line {number + 1} is damaged ({error}): remove that line, its episode is "
           "run again."
         ) from error
     if text and not text.endswith("\n"):
-      self.path.write_text(text + "\n")
+      files.write_atomically(self.path, text + "\n")
 
   def done(self) -> set[tuple[Any, ...]]:
     """Returns the keys of the episodes that are there."""

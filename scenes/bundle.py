@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.core import files
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes import stages
 from nerf2real.scenes.geometry import map_server
@@ -137,4 +138,4 @@ class Bundle:
 def write_scene(folder: Path, scene: Mapping[str, Any]) -> None:
   """Writes scene.json, the last file of a bundle."""
   content = {"format": FORMAT, "format_version": FORMAT_VERSION, **stages.to_plain(scene)}
-  stages.write_atomically(Path(folder) / "scene.json", json.dumps(content, indent=1))
+  files.write_atomically(Path(folder) / "scene.json", json.dumps(content, indent=1))

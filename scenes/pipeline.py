@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 import pycolmap
 
+from nerf2real.core import files
+from nerf2real.core.progress import Progress, part
 from nerf2real.scenes import assembly, bundle, stages
 from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
@@ -121,8 +123,8 @@ def make_scene(
   """
   out = Path(out)
   fixed = overrides.read(override) if override else None
-  source_key = stages.hash_path(Path(source))
-  override_key = stages.hash_path(override) if override else ""
+  source_key = files.hash_path(Path(source))
+  override_key = files.hash_path(override) if override else ""
   cache = stages.Stages(out / STAGES, show_progress=show_progress)
   job = Job(Path(source), source_key, settings, cache, override=fixed, override_key=override_key)
   job.keyframes()
@@ -168,7 +170,7 @@ class Job:
   def keyframes(self) -> None:
     """Writes the sharpest frames."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       taken = read_capture(
         self.source, folder / "images", settings=self.settings.capture, progress=progress
       )
@@ -183,7 +185,7 @@ class Job:
   def poses(self) -> None:
     """Finds the camera and its poses."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       localising.localise(
         self.capture.folder,
         folder,
@@ -226,7 +228,7 @@ class Job:
       "train_width": self.settings.train_width,
     }
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       training, _ = self.views().split(self.settings.held_out_every)
       field, outcome = train(
         training.evened(),
@@ -251,7 +253,7 @@ class Job:
   def figures(self) -> None:
     """Scores the held-out views."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       _, held_out = self.views().split(self.settings.held_out_every)
       scores, figures = evaluate.evaluate(self.renderer, held_out, progress=progress)
       figures["exposure_ratio"] = photometry.exposure_ratio(held_out.gains)
@@ -265,7 +267,7 @@ class Job:
   def depth(self) -> None:
     """Renders depth where the capture's cameras stood."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       camera = self.localisation.camera
       width = min(self.settings.depth_width, camera.width)
       camera = camera.resized(width, round(camera.height * width / camera.width))
@@ -298,14 +300,14 @@ class Job:
       "override": self._override_key,
     }
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       found = self.localisation
       marker = None
       if self.settings.marker_side is not None:
         images = self.folder("keyframes") / "images"
         detections = markers.detect(
           [images / image for image in found.names],
-          progress=lambda fraction, text: progress(0.6 * fraction, text),
+          progress=part(progress, 0.0, 0.6),
         )
         marker = markers.marker_scale(
           detections,
@@ -322,7 +324,7 @@ class Job:
         marker=marker,
         settings=self.settings.align,
         override=self._override,
-        progress=lambda fraction, text: progress(0.6 + 0.4 * fraction, text),
+        progress=part(progress, 0.6, 1.0),
       )
       values = result.to_dict()
       if self.settings.marker_side is not None and marker is None:
@@ -340,7 +342,7 @@ class Job:
     """Makes the coloured surface mesh."""
     settings = self.settings.mesh
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       place = self.alignment
       grid = fusion.fuse(
         self.world_depth,
@@ -348,7 +350,7 @@ class Job:
         upper=place.extent_upper,
         voxel=settings.voxel,
         truncation=settings.truncation,
-        progress=lambda fraction, text: progress(0.5 * fraction, text),
+        progress=part(progress, 0.0, 0.5),
       )
       grid = meshing.drop_floaters(grid, min_component=settings.min_component)
       found = meshing.drop_small_pieces(meshing.surface(grid), min_component=settings.min_component)
@@ -363,7 +365,7 @@ class Job:
     """Makes the convex parts and the map of the free floor, and measures them."""
     settings = self.settings
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       place = self.alignment
       shape = dataclasses.replace(settings.collision, floor_threshold=place.floor_threshold)
       top = np.minimum(place.extent_upper, [np.inf, np.inf, shape.top])
@@ -372,11 +374,9 @@ class Job:
         lower=place.extent_lower,
         upper=place.extent_upper,
         settings=shape,
-        progress=lambda fraction, text: progress(0.2 * fraction, text),
+        progress=part(progress, 0.0, 0.2),
       )
-      parts = convex.decompose(
-        grid, settings=shape.parts, progress=lambda f, text: progress(0.2 + 0.6 * f, text)
-      )
+      parts = convex.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
       contact.write_parts(parts, folder / "collision")
       progress(0.8, "free space")
       space = floor_plan(
@@ -416,7 +416,7 @@ class Job:
   def poisson(self) -> None:
     """Renders the paper's baseline, the Poisson mesh of the COLMAP points, at held-out views."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       found = self.localisation
       _, held_out = self.views().split(self.settings.held_out_every)
       progress(0.0, "Poisson mesh")

@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 
 from nerf2real.agents.dmpo.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.core import files
 
 FORMAT_VERSION = 1
 _ARRAYS, _RECORD = "policy.npz", "policy.json"
@@ -66,8 +66,8 @@ def export_policy(
     "info": dict(info),
     "sha256": hashlib.sha256(data).hexdigest(),
   }
-  replace_file(folder / _ARRAYS, data)
-  replace_file(folder / _RECORD, json.dumps(record, indent=1).encode())
+  files.write_atomically(folder / _ARRAYS, data)
+  files.write_atomically(folder / _RECORD, json.dumps(record, indent=1))
 
 
 def load_policy(folder: Path | str) -> ExportedPolicy:
@@ -99,16 +99,3 @@ def load_policy(folder: Path | str) -> ExportedPolicy:
     history=record["settings"]["history"],
     info=record["info"],
   )
-
-
-def replace_file(path: Path, data: bytes) -> None:
-  """Writes a file as a whole: another process sees the old content or the new."""
-  temporary = path.with_name(f".{path.name}.{os.getpid()}")
-  try:
-    with temporary.open("wb") as stream:
-      stream.write(data)
-      stream.flush()
-      os.fsync(stream.fileno())
-    temporary.replace(path)
-  finally:
-    temporary.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
+from nerf2real.core import files
 from nerf2real.scenes.field import encoding
 from nerf2real.scenes.field.contraction import grid_coordinates
 
@@ -196,10 +197,7 @@ class Field:
       "settings": json.dumps(dataclasses.asdict(self.settings)),
       "training_pixel_angle": repr(float(self.training_pixel_angle)),
     }
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(safetensors.numpy.save(tensors, metadata=metadata))
-    partial.replace(path)
+    files.write_atomically(path, safetensors.numpy.save(tensors, metadata=metadata))
 
   @classmethod
   def load(cls, path: str | Path) -> "Field":

@@ -15,12 +15,14 @@ from typing import Protocol
 import numpy as np
 import safetensors.numpy
 
+from nerf2real.core import files
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.fused.trainer import FusedTrainer
 from nerf2real.scenes.field.reference_training import ReferenceTrainer
 from nerf2real.scenes.field.settings import TrainSettings, preset
 from nerf2real.scenes.field.views import Views
-from nerf2real.scenes.stages import Progress, no_progress, to_plain
+from nerf2real.scenes.stages import to_plain
 
 __all__ = ["TrainError", "TrainReport", "TrainSettings", "learning_rate", "preset", "train"]
 
@@ -189,9 +191,7 @@ def _run_key(views: Views, settings: TrainSettings, seed: int) -> str:
 
 def _save_checkpoint(path: Path, key: str, seconds: float, arrays: dict[str, np.ndarray]) -> None:
   metadata = {"key": key, "seconds": repr(seconds)}
-  partial = path.with_name(path.name + ".partial")
-  safetensors.numpy.save_file(arrays, partial, metadata=metadata)
-  partial.replace(path)
+  files.write_atomically(path, safetensors.numpy.save(arrays, metadata=metadata))
 
 
 def _load_checkpoint(path: Path, key: str) -> tuple[float, dict[str, np.ndarray]] | None:

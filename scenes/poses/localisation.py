@@ -5,14 +5,13 @@ Shapes: N registered keyframes, P points.
 
 import dataclasses
 import json
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
+from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.sources import to_opencv
@@ -76,10 +75,6 @@ def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Locali
 
 def save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Path) -> None:
   """Writes the model and its figures; the folder appears whole or not at all."""
-  partial = folder.with_name(folder.name + ".partial")
-  shutil.rmtree(partial, ignore_errors=True)
-  partial.mkdir(parents=True)
-  model.write(str(partial))
   figures = {
     "registered_fraction": localisation.registered_fraction,
     "reprojection_error_px": localisation.reprojection_error_px,
@@ -88,9 +83,9 @@ def save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Pat
     "warnings": list(localisation.warnings),
     "seconds": localisation.seconds,
   }
-  (partial / _FIGURES).write_text(json.dumps(figures, indent=2))
-  shutil.rmtree(folder, ignore_errors=True)
-  os.replace(partial, folder)
+  with files.atomic_folder(folder) as partial:
+    model.write(str(partial))
+    (partial / _FIGURES).write_text(json.dumps(figures, indent=2))
 
 
 def load(folder: Path) -> Localisation:
