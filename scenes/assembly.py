@@ -13,7 +13,15 @@ import trimesh
 from nerf2real.core import files
 from nerf2real.scenes import bundle
 from nerf2real.scenes.field.render.renderer import Renderer
-from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion, map_server, mesh
+from nerf2real.scenes.geometry import (
+  collision,
+  convex,
+  free_space,
+  fusion,
+  map_server,
+  mesh,
+  world_frame,
+)
 from nerf2real.scenes.poses import localise
 from nerf2real.scenes.quality import held_out as evaluate
 from nerf2real.scenes.quality import report
@@ -41,7 +49,7 @@ class Reconstruction(NamedTuple):
 
   localisation: localise.Localisation
   renderer: Renderer
-  alignment: align.Alignment
+  alignment: world_frame.Alignment
   parts: list[convex.Part]
   depth: fusion.DepthViews  # in the world frame
   frame_times: np.ndarray  # of the registered keyframes in the video [N] [s]

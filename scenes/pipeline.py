@@ -28,10 +28,18 @@ from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.field.settings import preset as train_preset
 from nerf2real.scenes.field.training import train
 from nerf2real.scenes.field.views import Views
-from nerf2real.scenes.geometry import align as aligning
 from nerf2real.scenes.geometry import collision as contact
-from nerf2real.scenes.geometry import convex, fusion, map_server, markers, overrides, poisson
+from nerf2real.scenes.geometry import (
+  convex,
+  fusion,
+  map_server,
+  markers,
+  overrides,
+  poisson,
+  world_frame,
+)
 from nerf2real.scenes.geometry import mesh as meshing
+from nerf2real.scenes.geometry.evidence import Evidence
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings, floor_plan
 from nerf2real.scenes.poses import localise as localising
 from nerf2real.scenes.quality import collision_error, image_quality
@@ -56,7 +64,7 @@ class SceneSettings:
   """Every so many keyframes one is kept from training. Mip-NeRF 360's convention."""
   depth_width: int = 320
   """Width of the depth pictures that geometry is made from [pixel]. Ours."""
-  align: aligning.AlignSettings = aligning.AlignSettings()
+  align: world_frame.AlignSettings = world_frame.AlignSettings()
   """World frame."""
   marker_side: float | None = None
   """Side of the black square of ArUco or AprilTag markers in the room [m]; None: no marker."""
@@ -316,12 +324,8 @@ class Job:
           side=self.settings.marker_side,
         )
       points, normals = self.unit_depth.surface_points(stride=2)
-      result = aligning.align(
-        points=found.points,
-        frame_from_camera=found.world_from_camera,
-        surface_points=points,
-        surface_normals=normals,
-        marker=marker,
+      result = world_frame.align(
+        Evidence(found.points, found.world_from_camera, points, normals, marker),
         settings=self.settings.align,
         override=self._override,
         progress=part(progress, 0.6, 1.0),
@@ -335,7 +339,7 @@ class Job:
       (folder / "alignment.json").write_text(json.dumps(values, indent=1))
 
     self.stages.run("world", run, settings=settings, inputs=self._keys("depth"))
-    self.alignment = aligning.Alignment.from_dict(self.load("world", "alignment.json"))
+    self.alignment = world_frame.Alignment.from_dict(self.load("world", "alignment.json"))
     self.world_depth = self.unit_depth.transformed(self.alignment.world_from_unit)
 
   def surface(self) -> None:
