@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain
 
 SUCCESS, COLLISION, FALL, LOST, STOPPED = "success", "collision", "fall", "lost", "stopped"
 OUTCOMES = (SUCCESS, COLLISION, FALL, LOST, STOPPED)
@@ -66,17 +67,6 @@ class Episode:
     return (*dataclasses.astuple(self.setting), self.index)
 
 
-def _decode(line: str) -> Episode:
-  fields = json.loads(line)
-  fields["setting"] = Setting(**fields["setting"])
-  fields["moments"] = [
-    Moment(**{**m, "position": None if m["position"] is None else tuple(m["position"])})
-    for m in fields.get("moments", [])
-  ]
-  fields["goal"] = tuple(fields["goal"])
-  return Episode(**fields)
-
-
 class Store:
   """The episodes of an evaluation's folder."""
 
@@ -97,8 +87,8 @@ class Store:
     lines = text.splitlines()
     for number, line in enumerate(lines):
       try:
-        self.episodes.append(_decode(line))
-      except (ValueError, KeyError, TypeError) as error:
+        self.episodes.append(from_plain(json.loads(line), Episode))
+      except ValueError as error:
         if number == len(lines) - 1:  # the run was cut off while it wrote: that episode is rerun
           kept = "".join(f"{whole}\n" for whole in lines[:-1])
           files.write_atomically(self.path, kept)
@@ -117,7 +107,7 @@ class Store:
   def add(self, episode: Episode) -> None:
     """Keeps an episode."""
     with self.path.open("a") as stream:
-      stream.write(json.dumps(dataclasses.asdict(episode)) + "\n")
+      stream.write(json.dumps(to_plain(episode)) + "\n")
     self.episodes.append(episode)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 
 from nerf2real.core import files
+from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.geometry import (
@@ -25,7 +26,6 @@ from nerf2real.scenes.geometry import (
 from nerf2real.scenes.poses import localise
 from nerf2real.scenes.quality import held_out as evaluate
 from nerf2real.scenes.quality import report
-from nerf2real.scenes.stages import to_plain
 
 if TYPE_CHECKING:
   from nerf2real.scenes.pipeline import Job
@@ -140,15 +140,15 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
     "source": {"name": job.source.name, "kind": job.capture.kind, "sha256": job.source_key},
     "settings": settings,
     "hashes": {stage: result.key for stage, result in results.items()},
-    "world_from_unit": transform.to_dict(),
+    "world_from_unit": to_plain(transform),
     "scale": job.alignment.scale_source,
-    "alignment": job.alignment.to_dict(),
+    "alignment": to_plain(job.alignment),
     "extent": {
       "lower": job.alignment.extent_lower.tolist(),
       "upper": job.alignment.extent_upper.tolist(),
     },
     "goals": contact["goals"],
-    "camera": job.localisation.camera.to_dict(),
+    "camera": to_plain(job.localisation.camera),
     "collision_parts": sorted(path.name for path in (out / "collision").glob("part_*.obj")),
     "figures": figures,
     "seconds": seconds,

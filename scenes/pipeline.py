@@ -18,9 +18,10 @@ import pycolmap
 
 from nerf2real.core import files
 from nerf2real.core.progress import Progress, part
+from nerf2real.core.serialization import read_json, write_json
 from nerf2real.scenes import assembly, bundle, stages
 from nerf2real.scenes.capture import keyframes
-from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
+from nerf2real.scenes.capture.capture import CaptureSettings, read_capture, source_kind
 from nerf2real.scenes.field import anchors, photometry
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render.renderer import Renderer
@@ -131,7 +132,8 @@ def make_scene(
   """
   out = Path(out)
   fixed = overrides.read(override) if override else None
-  source_key = files.hash_path(Path(source))
+  source_kind(Path(source))  # raises where it cannot be used
+  source_key = files.hash_path(source)
   override_key = files.hash_path(override) if override else ""
   cache = stages.Stages(out / STAGES, show_progress=show_progress)
   job = Job(Path(source), source_key, settings, cache, override=fixed, override_key=override_key)
@@ -245,7 +247,7 @@ class Job:
         checkpoint_dir=folder / "checkpoints",
       )
       field.save(folder / "field.safetensors")
-      (folder / "training.json").write_text(json.dumps(stages.to_plain(outcome), indent=1))
+      write_json(folder / "training.json", outcome)
       shutil.rmtree(folder / "checkpoints", ignore_errors=True)
 
     self.stages.run("field", run, settings=settings, inputs=self._keys("poses"))
@@ -266,7 +268,7 @@ class Job:
       scores, figures = evaluate.evaluate(self.renderer, held_out, progress=progress)
       figures["exposure_ratio"] = photometry.exposure_ratio(held_out.gains)
       evaluate.save_scores(scores, folder)
-      (folder / "figures.json").write_text(json.dumps(figures, indent=1))
+      write_json(folder / "figures.json", figures)
 
     self.stages.run(
       "figures", run, settings=self.settings.held_out_every, inputs=self._keys("field")
@@ -330,16 +332,16 @@ class Job:
         override=self._override,
         progress=part(progress, 0.6, 1.0),
       )
-      values = result.to_dict()
       if self.settings.marker_side is not None and marker is None:
-        values["warnings"].append(
+        missing = (
           f"No marker of side {self.settings.marker_side} m was read consistently in three "
           "pictures or more: print it larger, lay it flat, film it from nearer."
         )
-      (folder / "alignment.json").write_text(json.dumps(values, indent=1))
+        result = dataclasses.replace(result, warnings=(*result.warnings, missing))
+      write_json(folder / "alignment.json", result)
 
     self.stages.run("world", run, settings=settings, inputs=self._keys("depth"))
-    self.alignment = world_frame.Alignment.from_dict(self.load("world", "alignment.json"))
+    self.alignment = read_json(self.folder("world") / "alignment.json", world_frame.Alignment)
     self.world_depth = self.unit_depth.transformed(self.alignment.world_from_unit)
 
   def surface(self) -> None:
@@ -409,9 +411,9 @@ class Job:
         "free_area_m2": space.area,
         "collision_parts": len(parts),
         "collision_error_m": error.p95,
-        "collision_error": error.to_dict(),
+        "collision_error": error,
       }
-      (folder / "contact.json").write_text(json.dumps(values, indent=1))
+      write_json(folder / "contact.json", values)
 
     self.stages.run(
       "contact", run, settings=[settings.collision, settings.free_space], inputs=self._keys("world")
@@ -440,9 +442,7 @@ class Job:
         image_quality.psnr(pictures[name], held_out.images[index])
         for index, name in enumerate(held_out.names)
       ]
-      (folder / "figures.json").write_text(
-        json.dumps({"baseline_psnr_db": float(np.mean(quality))})
-      )
+      write_json(folder / "figures.json", {"baseline_psnr_db": float(np.mean(quality))})
 
     self.stages.run(
       "baseline", run, settings=self.settings.held_out_every, inputs=self._keys("poses")

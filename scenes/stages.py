@@ -18,6 +18,7 @@ from typing import Any
 
 from nerf2real.core import files
 from nerf2real.core.progress import Progress, progress_bar
+from nerf2real.core.serialization import to_plain
 
 _RECORD = "stage.json"
 _KEY_LENGTH = 16  # hexadecimal digits of the key in a folder's name
@@ -25,19 +26,6 @@ _KEY_LENGTH = 16  # hexadecimal digits of the key in a folder's name
 
 class StageError(ValueError):
   """A stage could not be run; the message is one line for the user."""
-
-
-def to_plain(value: Any) -> Any:
-  """Turns settings (dataclasses, paths, tuples) into what JSON can hold."""
-  if dataclasses.is_dataclass(value) and not isinstance(value, type):
-    return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-  if isinstance(value, Mapping):
-    return {str(k): to_plain(v) for k, v in value.items()}
-  if isinstance(value, (list, tuple)):
-    return [to_plain(v) for v in value]
-  if isinstance(value, Path):
-    return str(value)
-  return value
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 from nerf2real.agents.dmpo.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain
 
 FORMAT_VERSION = 1
 _ARRAYS, _RECORD = "policy.npz", "policy.json"
@@ -49,7 +50,7 @@ def export_policy(
     parameters: flat named arrays, `learning.served_parameters`.
     layout: the environment's layout.
     environment: the environment's name.
-    settings: the agent's settings, `config.to_dict`.
+    settings: the agent's settings as plain values, `to_plain(config)`.
     info: counters such as steps and updates, and the return where it is known.
   """
   folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +62,7 @@ def export_policy(
   record = {
     "format_version": FORMAT_VERSION,
     "environment": environment,
-    "layout": layout.to_dict(),
+    "layout": to_plain(layout),
     "settings": dict(settings),
     "info": dict(info),
     "sha256": hashlib.sha256(data).hexdigest(),
@@ -94,7 +95,7 @@ def load_policy(folder: Path | str) -> ExportedPolicy:
   policy = Policy(parameters, init_stddev=network["init_stddev"], min_stddev=network["min_stddev"])
   return ExportedPolicy(
     policy=policy,
-    layout=Layout.from_dict(record["layout"]),
+    layout=from_plain(record["layout"], Layout),
     environment=record["environment"],
     history=record["settings"]["history"],
     info=record["info"],

@@ -13,6 +13,7 @@ import numpy as np
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.serialization import from_plain, to_plain, write_json
 from nerf2real.scenes.builtin import furniture, room, walk
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
@@ -144,22 +145,19 @@ def film(
         done = index + 1
         progress(done / settings.frames, f"picture {done} of {settings.frames}")
       container.mux(stream.encode())
-    partial_truth.write_text(json.dumps(truth(seed, settings, np.array(poses))))
+    write_json(partial_truth, truth(seed, settings, np.array(poses)), indent=None)
 
 
 def truth(seed: int, settings: FilmSettings, world_from_camera: np.ndarray) -> dict:
   """Returns what is known of the film as plain numbers; poses are [T, 4, 4]."""
+  plain = to_plain(settings)
   return {
     "version": TRUTH_VERSION,
     "seed": seed,
     "frame": "world: z up, floor z = 0, metres; camera axes of OpenCV; pose in mid exposure",
     "frame_rate": settings.frame_rate,
-    "settings": {
-      field.name: getattr(settings, field.name)
-      for field in dataclasses.fields(settings)
-      if field.name != "camera"
-    },
-    "camera": settings.camera.to_dict(),
+    "settings": {name: value for name, value in plain.items() if name != "camera"},
+    "camera": plain["camera"],
     "marker": {
       "dictionary": "DICT_4X4_50",
       "id": furniture.MARKER_ID,
@@ -182,6 +180,6 @@ def read_truth(path: Path) -> dict:
   poses = np.tile(np.eye(4), (len(values["world_from_camera"]), 1, 1))
   poses[:, :3] = values["world_from_camera"]
   values["world_from_camera"] = poses
-  values["camera"] = Camera(**values["camera"])
+  values["camera"] = from_plain(values["camera"], Camera, source=path)
   values["marker"]["corners"] = np.array(values["marker"]["corners"])
   return values

@@ -5,7 +5,6 @@ every choice can be overridden (`scenes.geometry.overrides`). Shapes: N cameras,
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -67,25 +66,6 @@ class Alignment:
     """Angle between the world's z axis and a true up direction [3] of the unit frame."""
     up = self.world_from_unit.rotation @ (true_up / np.linalg.norm(true_up))
     return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
-
-  def to_dict(self) -> dict[str, Any]:
-    """Returns plain numbers, lists and strings, for JSON."""
-    values = dataclasses.asdict(self)
-    values["world_from_unit"] = self.world_from_unit.to_dict()
-    values["extent_lower"] = self.extent_lower.tolist()
-    values["extent_upper"] = self.extent_upper.tolist()
-    values["warnings"] = list(self.warnings)
-    return values
-
-  @classmethod
-  def from_dict(cls, values: dict[str, Any]) -> "Alignment":
-    """Inverts `to_dict`."""
-    values = dict(values)
-    values["world_from_unit"] = similarity.Similarity.from_dict(values["world_from_unit"])
-    values["extent_lower"] = np.array(values["extent_lower"])
-    values["extent_upper"] = np.array(values["extent_upper"])
-    values["warnings"] = tuple(values["warnings"])
-    return cls(**values)
 
 
 def rotation_to_up(normal: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import pycolmap
 
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
+from nerf2real.core.serialization import from_plain, write_json
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.sources import to_opencv
 from nerf2real.scenes.poses import mapping
@@ -79,13 +80,13 @@ def save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Pat
     "registered_fraction": localisation.registered_fraction,
     "reprojection_error_px": localisation.reprojection_error_px,
     "strategy": localisation.strategy,
-    "unit_from_source": localisation.unit_from_source.to_dict(),
-    "warnings": list(localisation.warnings),
+    "unit_from_source": localisation.unit_from_source,
+    "warnings": localisation.warnings,
     "seconds": localisation.seconds,
   }
   with files.atomic_folder(folder) as partial:
     model.write(str(partial))
-    (partial / _FIGURES).write_text(json.dumps(figures, indent=2))
+    write_json(partial / _FIGURES, figures, indent=2)
 
 
 def load(folder: Path) -> Localisation:
@@ -100,6 +101,6 @@ def load(folder: Path) -> Localisation:
     model = pycolmap.Reconstruction(str(folder))
   except (OSError, ValueError, RuntimeError) as error:
     raise LocalisationError(f"{folder} holds no localisation: {error}") from error
-  values["unit_from_source"] = Similarity.from_dict(values["unit_from_source"])
+  values["unit_from_source"] = from_plain(values["unit_from_source"], Similarity)
   values["warnings"] = tuple(values["warnings"])
   return from_model(model, values)

@@ -11,12 +11,12 @@ import json
 import shutil
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 
 from nerf2real.core.progress import Progress, no_progress, part
+from nerf2real.core.serialization import to_plain
 from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap
 from nerf2real.scenes.poses import mapping, matching
 from nerf2real.scenes.poses.localisation import (
@@ -144,8 +144,8 @@ def _prepare_work(
 ) -> Path:
   """Returns the database, after removing one that was made of other pictures or settings."""
   digest = hashlib.sha256()
-  described: dict[str, Any] = dataclasses.asdict(settings.features)
-  described["camera"] = None if known is None else known.camera.to_dict()
+  described = to_plain(settings.features)
+  described["camera"] = None if known is None else to_plain(known.camera)
   described["seed"] = settings.seed
   digest.update(json.dumps(described, sort_keys=True).encode())
   for name in names:

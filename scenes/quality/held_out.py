@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.serialization import write_json
 from nerf2real.scenes.field import photometry
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.views import Views
@@ -100,7 +101,7 @@ def save_scores(scores: Sequence[ViewScore], folder: Path) -> None:
     depth=np.stack([score.depth for score in scores]).astype(np.float16),
   )
   rows = [{"name": s.name, "psnr_db": s.psnr_db, "ssim": s.ssim} for s in scores]
-  (folder / "views.json").write_text(json.dumps(rows, indent=1))
+  write_json(folder / "views.json", rows)
 
 
 def load_scores(folder: Path) -> list[ViewScore]:
