@@ -18,6 +18,7 @@ from rich.table import Table
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.builtin import yardstick
 from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.settings import SceneSettings, preset
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,9 +48,9 @@ class Arguments:
   """The scene's name; the output folder's if not given."""
 
 
-def settings_of(arguments: Arguments) -> pipeline.SceneSettings:
+def settings_of(arguments: Arguments) -> SceneSettings:
   """Applies the arguments to their preset."""
-  settings = pipeline.preset(arguments.preset)
+  settings = preset(arguments.preset)
   if arguments.keyframes is not None:
     taken = dataclasses.replace(settings.capture, num_keyframes=arguments.keyframes)
     settings = dataclasses.replace(settings, capture=taken)
