@@ -10,19 +10,11 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, part
 from nerf2real.core.serialization import read_json, write_json
+from nerf2real.scenes.alignment import markers, world_frame
+from nerf2real.scenes.alignment.evidence import Evidence
+from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.capture.capture import Capture
-from nerf2real.scenes.geometry import (
-  collision,
-  convex,
-  floor_plan,
-  fusion,
-  map_server,
-  markers,
-  mesh,
-  world_frame,
-)
-from nerf2real.scenes.geometry.evidence import Evidence
-from nerf2real.scenes.geometry.overrides import Overrides
+from nerf2real.scenes.geometry import collision, convex, floor_plan, fusion, map_server, mesh
 from nerf2real.scenes.poses.localise import Localisation
 from nerf2real.scenes.quality import collision_error
 from nerf2real.scenes.results import Contact

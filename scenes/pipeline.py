@@ -8,8 +8,8 @@ from pathlib import Path
 
 from nerf2real.core import files
 from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages
+from nerf2real.scenes.alignment import overrides
 from nerf2real.scenes.capture.capture import source_kind
-from nerf2real.scenes.geometry import overrides
 from nerf2real.scenes.results import Measure, SceneResults, Source
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import Stages
@@ -33,7 +33,7 @@ def make_scene(
     source: A video, a folder of pictures, a COLMAP model or a transforms.json.
     out: The bundle's folder; stages are cached in it.
     settings: Settings of all stages.
-    override: File that fixes what would be found automatically, see `scenes.geometry.overrides`.
+    override: File that fixes what would be found automatically, see `scenes.alignment.overrides`.
     name: The scene's name; that of the output folder if None.
     measure: Adds figures against a known truth.
     show_progress: Whether to draw progress bars.

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.geometry.convex import Part
 from nerf2real.scenes.geometry.fusion import DepthViews
-from nerf2real.scenes.geometry.world_frame import Alignment
 from nerf2real.scenes.pictures import PosedPictures
 from nerf2real.scenes.poses.localise import Localisation
 from nerf2real.scenes.quality.collision_error import CollisionError

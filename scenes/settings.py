@@ -2,13 +2,13 @@
 
 import dataclasses
 
+from nerf2real.scenes.alignment.world_frame import AlignSettings
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.field import settings as training
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.geometry.collision import CollisionSettings
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.geometry.mesh import MeshSettings
-from nerf2real.scenes.geometry.world_frame import AlignSettings
 from nerf2real.scenes.poses.localise import LocaliseSettings
 
 

@@ -1,7 +1,7 @@
 """Aligns the model with the world frame: metres, z up, floor at z = 0, walls along the axes.
 
 Does automatically what the paper does by hand in Blender (section "Collision mesh extraction");
-every choice can be overridden (`scenes.geometry.overrides`). Shapes: N cameras, P points.
+every choice can be overridden (`scenes.alignment.overrides`). Shapes: N cameras, P points.
 """
 
 import dataclasses
@@ -10,18 +10,18 @@ import numpy as np
 
 from nerf2real.core import similarity
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.geometry.evidence import Choice, Evidence
-from nerf2real.scenes.geometry.extent import choose_extent
-from nerf2real.scenes.geometry.floor import (
+from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.extent import choose_extent
+from nerf2real.scenes.alignment.floor import (
   Floor,
   FloorSettings,
   choose_floor,
   refine_floor,
   rough_up,
 )
-from nerf2real.scenes.geometry.overrides import Overrides
-from nerf2real.scenes.geometry.scale import Scale, choose_scale
-from nerf2real.scenes.geometry.yaw import choose_yaw
+from nerf2real.scenes.alignment.overrides import Overrides
+from nerf2real.scenes.alignment.scale import Scale, choose_scale
+from nerf2real.scenes.alignment.yaw import choose_yaw
 
 _ABOVE_FLOOR = 0.1  # m: points above belong to the room, not to its floor
 _MAX_TILT_DEG = 15.0  # of the floor against the cameras' mean up direction, without a warning

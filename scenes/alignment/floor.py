@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.scenes.geometry.evidence import Choice, Evidence
-from nerf2real.scenes.geometry.overrides import Overrides
+from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.overrides import Overrides
 
 _MIN_POINTS = 30
 _PLANES = 12  # candidate planes that are peeled off one after another

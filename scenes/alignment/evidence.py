@@ -7,7 +7,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from nerf2real.scenes.geometry.markers import MarkerScale
+from nerf2real.scenes.alignment.markers import MarkerScale
 
 T = TypeVar("T")
 

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.scenes.geometry.evidence import Choice, Evidence
-from nerf2real.scenes.geometry.floor import Floor
-from nerf2real.scenes.geometry.overrides import Overrides
+from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.floor import Floor
+from nerf2real.scenes.alignment.overrides import Overrides
 
 
 class Scale(NamedTuple):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nerf2real.scenes.geometry.evidence import Choice, Evidence
-from nerf2real.scenes.geometry.overrides import Overrides
+from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.overrides import Overrides
 
 # Of the unit frame's angles about z, the one that the world's x axis is nearest to. Walls lie along
 # the unit frame's axes or at 45 degrees to them: neither has two quarter turns equally near.

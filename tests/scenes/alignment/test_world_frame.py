@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core import cameras, similarity
 from nerf2real.core.serialization import from_plain, to_plain
+from nerf2real.scenes.alignment import markers, overrides, world_frame, yaw
+from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.bundle import Bundle
-from nerf2real.scenes.geometry import markers, overrides, world_frame, yaw
-from nerf2real.scenes.geometry.evidence import Evidence
 from tests.scenes import furnished_room
 
 CAMERA = cameras.Camera.from_vertical_fov(0.9, 96, 72)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.geometry.evidence import Choice, Evidence
-from nerf2real.scenes.geometry.overrides import Overrides
+from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.overrides import Overrides
 
 _CELL = 0.1  # m: surface counts by area, not by pixels
 _MIN_POINTS = 100
