@@ -1,4 +1,4 @@
-"""Puts a bundle together from finished stages: files, figures, report, and scene.json last."""
+"""Assembles a scene bundle from finished stages: files, figures, report, scene.json last."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -146,7 +146,7 @@ def _figures(results: SceneResults) -> dict[str, Any]:
 def _reconstruction(
   results: SceneResults, parts: list[convex.Part], *, collision_top: float
 ) -> Reconstruction:
-  """What is measured against a truth; frame times are empty where the capture was no video."""
+  """Gathers what is measured against a truth; no frame times where the capture was no video."""
   capture, poses = results.capture.value, results.poses.value
   times = np.zeros(0)
   if capture.times is not None:

@@ -1,4 +1,4 @@
-"""Keyframes with their poses, as training and scoring take them."""
+"""Reads the keyframes with their poses, for training and scoring."""
 
 import dataclasses
 

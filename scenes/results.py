@@ -1,4 +1,4 @@
-"""What the stages make, as plain types that every later step may name."""
+"""Types of the stages' results."""
 
 import dataclasses
 import functools
@@ -53,7 +53,7 @@ class Contact:
 
 
 class SceneResults(NamedTuple):
-  """All that a bundle is put together from."""
+  """All that a bundle is assembled from."""
 
   source: Source
   capture: Made[Capture]
@@ -69,7 +69,7 @@ class SceneResults(NamedTuple):
 
 
 class Reconstruction(NamedTuple):
-  """What was made of a capture, for measurements against a truth."""
+  """A reconstructed scene, for measurements against a truth."""
 
   localisation: Localisation
   renderer: Renderer
@@ -81,7 +81,7 @@ class Reconstruction(NamedTuple):
 
 
 class TruthFigures(NamedTuple):
-  """What a measurement against a known truth returns."""
+  """Figures against a known truth."""
 
   figures: Mapping[str, Any]
   robot_views: list[ViewScore]

@@ -1,4 +1,4 @@
-"""Stages of a long job: cached by the hash of what went in, resumed after an interruption.
+"""Caches the stages of a long job by the hash of their inputs; resumes interrupted ones.
 
 A stage writes into a work folder that carries its key. When it ends, the folder is renamed to its
 final name, so that a folder with that name is always whole. A second run with the same inputs and
@@ -49,7 +49,7 @@ class Made(NamedTuple, Generic[T]):
 
   @property
   def stamp(self) -> str:
-    """What a stage that depends on this one takes as its input's hash."""
+    """Hash of this result as the input of other stages."""
     return self.stage.made
 
 

@@ -1,4 +1,4 @@
-"""What the world frame is found from: sparse points, cameras, dense surface, a marker.
+"""Evidence for the world frame: sparse points, cameras, dense surface, marker.
 
 Shapes: N cameras, P sparse points, Q dense points, all in the unit frame.
 """
@@ -34,7 +34,7 @@ class Evidence(NamedTuple):
     return self.points if self.surface_points is None else self.surface_points
 
   def thinned(self) -> "Evidence":
-    """With a random choice of dense points where there are very many; always the same one."""
+    """Returns a random subset of the dense points where there are very many; always the same."""
     points, normals = self.surface_points, self.surface_normals
     if points is None or len(points) <= _MAX_DENSE:
       return self
@@ -44,12 +44,12 @@ class Evidence(NamedTuple):
     )
 
   def sparse(self) -> "Evidence":
-    """Without the dense points."""
+    """Returns the evidence without its dense points."""
     return self._replace(surface_points=None, surface_normals=None)
 
 
 class Choice(NamedTuple, Generic[T]):
-  """One choice of the alignment."""
+  """A value that the alignment chose, with its source."""
 
   value: T
   source: str  # what it rests on

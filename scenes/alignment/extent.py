@@ -1,4 +1,4 @@
-"""The scene's extent: an upright box around the room, with the world's origin in its middle."""
+"""Finds the scene's bounding box along the world's axes; its middle is the world's origin."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Finds the floor: the lowest large plane near the cameras' mean up direction.
+"""Detects the floor plane by RANSAC: the lowest large plane across the cameras' mean up direction.
 
 The plane with the most points can be a table top, and the lowest plane a reflection or a few stray
 points. So planes are measured by the ground they cover, not by their points, and of those that
@@ -199,7 +199,7 @@ def refine_floor(floor: Floor, points: np.ndarray, *, tolerance: float) -> Floor
 
 
 class FoundFloor(NamedTuple):
-  """The floor and what it says about the dense points."""
+  """The floor plane, and whether the dense points agree with the sparse ones."""
 
   floor: Floor
   dense_trusted: bool  # False where the dense points show a floor well above the sparse ones'
@@ -218,14 +218,14 @@ def rough_up(evidence: Evidence, override: Overrides) -> np.ndarray:
 def choose_floor(
   evidence: Evidence, override: Overrides, *, settings: FloorSettings, max_gap: float
 ) -> Choice[FoundFloor]:
-  """Finds the floor, from what a person fixed or from dense and sparse points.
+  """Finds the floor plane from the override or from dense and sparse points.
 
   Dense depth shows the textureless floor that sparse points miss; sparse points are right even
   where the field is a fog.
 
   Args:
     evidence: Points and cameras.
-    override: Points on the floor, or the up direction.
+    override: May hold points on the floor, or the up direction.
     settings: Of the search.
     max_gap: Dense above sparse floor, as a share of the cameras' height, from which the dense
       points are not trusted.

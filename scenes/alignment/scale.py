@@ -1,4 +1,4 @@
-"""Metres per unit of the model: from a person, a marker, the cameras' height, or a guess."""
+"""Finds the metric scale: by hand, from a marker, from the cameras' height, or guessed."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ def choose_scale(
 
   Args:
     evidence: Cameras and marker.
-    override: What a person fixed.
+    override: Values given by hand.
     floor: The floor, from which the cameras' median height is counted.
     camera_height: That height where it is known [m].
     guessed_camera_height: That height where nothing is known [m].

@@ -46,7 +46,7 @@ class AlignSettings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Alignment:
-  """The world frame and what it rests on."""
+  """The world frame and the sources of its parts."""
 
   world_from_unit: similarity.Similarity
   extent_lower: np.ndarray  # [3] m, world frame; z is the floor, 0
@@ -89,7 +89,7 @@ def align(
   Args:
     evidence: Points, cameras and marker in the unit frame.
     settings: Settings.
-    override: What a person fixed.
+    override: Values given by hand.
     progress: Called with the fraction done and a text.
 
   Raises:

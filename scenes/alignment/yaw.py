@@ -1,4 +1,4 @@
-"""The world's x axis: along the walls, the longer side of the room along x. Shapes: P points."""
+"""Finds the walls' direction and puts the longer side of the room along x. Shapes: P points."""
 
 import numpy as np
 
@@ -65,7 +65,7 @@ def choose_yaw(
 
   Args:
     evidence: The points; dense ones have normals.
-    override: What a person fixed.
+    override: Values given by hand.
     upright: Rotation [3, 3] that turns the floor's normal to z.
     in_room: Which of the densest points stand on the floor, bool [P].
   """

@@ -1,4 +1,4 @@
-"""Contact geometry of a scene: crop, floor taken out, convex parts, files.
+"""Makes the contact geometry of a scene: cropped, without floor, as convex parts in files.
 
 The floor itself is not among the parts: the arena adds a plane at z = 0 (paper, section "Collision
 mesh extraction": "we also replace the floor vertices in the mesh with a flat plane").

@@ -1,4 +1,4 @@
-"""Cuts the solid voxels of a grid into convex parts that leave the seen free space free.
+"""Decomposes the solid voxels of a grid into convex parts that leave seen free space free.
 
 MuJoCo collides convex hulls only, and the hull of a room is a filled block. So the solid is cut
 into cells first; a cell whose hull covers no seen free space is a part as it is, the others are
@@ -164,7 +164,7 @@ def _piece_points(piece: np.ndarray, start: np.ndarray, matter: _Matter) -> np.n
 
 
 def _cuts(piece: np.ndarray, count: int) -> list[tuple[int, int]]:
-  """Where to try cutting a piece: the middle of each axis and the jumps of its profile."""
+  """Candidate cuts of a piece: the middle of each axis and the jumps of its profile."""
   result = []
   for axis in range(3):
     length = piece.shape[axis]

@@ -1,7 +1,7 @@
-"""The free floor: where the centre of a robot can be, and the questions that are put to it.
+"""Free space of a floor: reachability, clearance, sampling, grids and paths for a robot's centre.
 
-`FreeSpace` derives grids, paths, nearest places and room around a place from one question, whether
-a place is reachable; `FreeSpaceMap` answers it from an occupancy map of the convex parts.
+`FreeSpace` derives grids, nearest places and room around a place from the reachability of points;
+`FreeSpaceMap` takes that from an occupancy map of the convex parts.
 Shapes: H rows along y, W columns along x (row 0 is the smallest y in memory); X, Y cells of a grid.
 """
 
@@ -55,7 +55,7 @@ class FloorGrid:
 
 
 class FreeSpace(abc.ABC):
-  """Where the centre of a robot can be on a floor."""
+  """The places on a floor where the centre of a robot can be."""
 
   @abc.abstractmethod
   def is_reachable(self, points: np.ndarray) -> np.ndarray:

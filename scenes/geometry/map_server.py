@@ -1,4 +1,4 @@
-"""Free-space maps as files of ROS map_server: a PGM picture and a YAML with its frame.
+"""Reads and writes free-space maps in ROS map_server's format: a PGM picture and a YAML.
 
 The picture's first row is the largest y; the YAML holds resolution and lower left corner.
 """

@@ -1,4 +1,4 @@
-"""The scene's surface as a triangle mesh: marching cubes, without floaters, coloured, as glTF.
+"""Extracts the scene's surface mesh: marching cubes, without floaters, coloured, as glTF.
 
 The surface is that of fused depth pictures (`scenes.geometry.fusion`). The paper takes the field's
 density at a threshold (section "Collision mesh extraction"); fusion needs no threshold, which

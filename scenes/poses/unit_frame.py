@@ -1,4 +1,4 @@
-"""The unit frame: upright, centred, and as large as the sparse points and the cameras need.
+"""Finds the unit frame: upright, centred, as large as the sparse points and the cameras need.
 
 Shapes: N cameras, P points.
 """
@@ -8,14 +8,14 @@ import numpy as np
 from nerf2real.core.similarity import Similarity
 
 POINT_FRACTION = 0.98  # of the points inside [-1, 1]^3; the rest are outliers and far views
-CAMERA_MARGIN = 1.05  # cameras stay this factor away from the cube's faces; ours
-_BOX_PERCENTILES = (1.0, 99.0)  # of the points, for the robust centre; ours
+CAMERA_MARGIN = 1.05  # cameras stay this factor away from the cube's faces
+_BOX_PERCENTILES = (1.0, 99.0)  # of the points, for the robust centre
 _YAW_STEPS = 180  # half degrees of a quarter turn that are tried
 # The first camera's heading, once turned, lies from here to a quarter turn more. People film along
 # walls and into corners: both ends keep away from multiples of 45 degrees.
 _QUARTER_START = -np.pi / 8
 _LEVEL = 0.5  # length of a level axis' horizontal part
-_UPRIGHT = 0.1  # length of the mean up vector below which up is unknown; ours
+_UPRIGHT = 0.1  # length of the mean up vector below which up is unknown
 
 
 def mean_up(world_from_camera: np.ndarray) -> np.ndarray:

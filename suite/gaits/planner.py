@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-_CELL = 0.05  # m of the planner's grid: ours
+_CELL = 0.05  # edge of a cell of the planner's grid [m]
 _BLOCKED = 60.0  # cost of a cell where the robot does not fit, against 1 far from everything
 _NEAR = 4.0  # cost added beside an obstacle; it falls off over `_COMFORT`
 _COMFORT = 0.25  # m
