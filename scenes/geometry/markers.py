@@ -96,7 +96,7 @@ def detect(
       corners, ids, _, which = detector.detectMarkersMultiDict(_read(image))
       if ids is not None:
         for quad, marker, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
-          quad = np.asarray(quad, np.float64).reshape(4, 2) + 0.5  # OpenCV's first pixel is at 0, 0
+          quad = np.asarray(quad, np.float64).reshape(4, 2) + cameras.PIXEL_CENTRE
           if np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=-1).min() >= _MIN_SIDE_PX:
             found.append(Detection(names[int(index)], int(marker), view, quad))
       done = (number + (view + 1) / len(images)) / len(dictionaries)

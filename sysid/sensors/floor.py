@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core import rotations
 from nerf2real.core.robot_logs.reading import ImuSeries, Log
 from nerf2real.sysid.model.reduction import smooth_motion
 from nerf2real.sysid.sensors import standing
@@ -143,8 +144,7 @@ def _stops(model: mujoco.MjModel, log: Log, root: int, site: int) -> _Stops:
     ahead, left = _level(first[0])
     now = (first[1].inv() * turned).apply(_level(up)[0])
     headings.append(np.arctan2(now @ left, now @ ahead))
-  w, x, y, z = model.qpos0[start + 3 : start + 7]
-  faced = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+  faced = rotations.yaw_of(rotations.matrix_from_quaternion(model.qpos0[start + 3 : start + 7]))
   return _Stops(np.array(headings) + faced, np.array(tilts).reshape(-1, 2), sensor)
 
 

@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import Effect, kind_of
-from nerf2real.suite.effects.passive import rotation_matrix
 from nerf2real.sysid.model.reduction import smooth_motion
 
 Array = np.ndarray
@@ -212,13 +212,12 @@ def _noise(read: Array) -> Array:
 def _predict(part: _Readings, kinds: Sequence[str], x: Array) -> Array:
   """Returns what an IMU with effects reads [N, 6]."""
   value = {n: v for k, v in _unpack(kinds, x).items() for n, v in zip(_LAYOUT[k], v, strict=True)}
-  tilt = rotation_matrix([value.get(a, 0.0) for a in _AXES])
+  tilt = matrix_from_rotvec([value.get(a, 0.0) for a in _AXES])
   delay = value.get("delay", 0.0)
   seen = np.stack([np.interp(part.stamp - delay, part.time, c) for c in part.truth.T], axis=1)
   scale = np.repeat([value.get(c, 1.0) for c in _CHANNELS], 3)
   bias = np.array([value.get(f"{c}_{a}", 0.0) for c in _CHANNELS for a in _AXES])
-  if tilt is not None:
-    seen = np.hstack([seen[:, :3] @ tilt, seen[:, 3:] @ tilt])
+  seen = np.hstack([seen[:, :3] @ tilt, seen[:, 3:] @ tilt])
   return seen * scale + bias
 
 
