@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy import optimize
 
-from nerf2real.core import cameras
+from nerf2real.core import cameras, least_squares
 from nerf2real.core.progress import Progress, no_progress
 
 # Groups are tried in this order until one is read; the time grows with the number of codes:
@@ -172,8 +172,8 @@ def _fit_marker(
     return None
   # The corners of one picture share its pose error: a picture counts as one observation.
   variance = 2 * np.mean(error**2) * 4
-  covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * variance
-  return float(fit.x[6]), float(np.sqrt(covariance[6, 6])), _square(fit.x), len(kept), rms
+  spread = least_squares.standard_deviations(least_squares.covariance(fit.jac.T, variance=variance))
+  return float(fit.x[6]), float(spread[6]), _square(fit.x), len(kept), rms
 
 
 def marker_scale(

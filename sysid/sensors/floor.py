@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core import rotations
+from nerf2real.core import least_squares, rotations
 from nerf2real.core.robot_logs.reading import ImuSeries, Log
 from nerf2real.sysid.model.reduction import smooth_motion
 from nerf2real.sysid.sensors import standing
@@ -188,7 +188,7 @@ def _fit(stops: _Stops, slope: bool, chosen: Array) -> tuple[Array, Array]:
   """Returns s and b [4] and their covariance per square rad; s is 0 without slope."""
   design = _design(stops)[chosen].reshape(-1, 4)
   free = [0, 1, 2, 3] if slope else [2, 3]
-  inverse = np.linalg.pinv(design[:, free].T @ design[:, free], rcond=1e-6)
+  inverse = least_squares.covariance(design[:, free].T, rcond=1e-6)
   x, covariance = np.zeros(4), np.zeros((4, 4))
   x[free] = inverse @ design[:, free].T @ stops.tilt[chosen].ravel()
   covariance[np.ix_(free, free)] = inverse
@@ -224,7 +224,7 @@ def _judge(stops: _Stops, plane: str) -> Part:
     x, covariance = _fit(stops, True, every)
     left = stops.tilt - _design(stops) @ x
     noise = np.sqrt(_NOISE**2 + np.sum(left**2) / max(2 * count - 4, 1))
-    half = _SIGMAS * noise * np.sqrt(np.diag(covariance)[:2])
+    half = _SIGMAS * noise * least_squares.standard_deviations(covariance)[:2]
     gain = _left_out(stops, False) - _left_out(stops, True)
     well = np.linalg.norm(x[:2]) - half.max() > _USUAL and half.max() < np.linalg.norm(x[:2])
     told = np.linalg.matrix_rank(_design(stops).reshape(-1, 4), tol=0.3) == 4

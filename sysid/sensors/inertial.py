@@ -19,6 +19,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nerf2real.core import least_squares
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import Effect, kind_of
@@ -247,10 +248,8 @@ def _fit(
   for _ in range(_STEPS if len(x) else 0):
     base = _residuals(parts, noise, kinds, x)[chosen]
     jacobian = _jacobian(parts, noise, kinds, x)[:, chosen]
-    weight = 1.0 / np.sqrt(1.0 + np.square(base / _SOFT))
-    flat = (jacobian * weight).reshape(len(x), -1)
-    step = np.linalg.pinv(flat @ flat.T, rcond=1e-9) @ (flat @ (base * weight).ravel())
-    x = x - step
+    weight = least_squares.cauchy_weights(base, _SOFT)
+    x = x - least_squares.gauss_newton_step(jacobian * weight, base * weight, rcond=1e-9)
     if "imu_lag" in kinds:
       place = sum(len(_LAYOUT[k]) for k in kinds[: kinds.index("imu_lag")])
       x[place] = np.clip(x[place], -_LATEST, _LATEST)
@@ -304,16 +303,10 @@ def _intervals(
 ) -> dict[str, dict[str, tuple[float, float]]]:
   """Returns intervals of all values, from the scatter of the residual over whole seconds."""
   base = _residuals(parts, noise, kinds, x)
-  jacobian = _jacobian(parts, noise, kinds, x)
-  flat = jacobian.reshape(len(x), -1)
-  inverse = np.linalg.pinv(flat @ flat.T, rcond=1e-9)
-  labels = _blocks(parts)
-  meat = np.zeros((len(x), len(x)))
-  for block in np.unique(labels):
-    inside = labels == block
-    gradient = np.einsum("nij,ij->n", jacobian[:, inside], base[inside])
-    meat += np.outer(gradient, gradient)
-  spread = _SIGMAS * np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
+  found = least_squares.block_covariance(
+    _jacobian(parts, noise, kinds, x), base, _blocks(parts), rcond=1e-9
+  )
+  spread = _SIGMAS * least_squares.standard_deviations(found)
   low, high = _unpack(kinds, x - spread), _unpack(kinds, x + spread)
   return {
     k: {n: (float(low[k][i]), float(high[k][i])) for i, n in enumerate(_LAYOUT[k])} for k in kinds

@@ -37,6 +37,8 @@ def test_resized_camera_sees_the_same_field():
 
 def test_vertical_field_of_view():
   camera = Camera.from_vertical_fov(np.radians(43.3), 40, 30)
+  assert camera.vertical_fov == pytest.approx(np.radians(43.3))
+  assert camera.fx == camera.fy == focal_length(np.radians(43.3), 30)
   top, bottom = camera.rays(np.array([[20.0, 0.0], [20.0, 30.0]]))
   cosine = top @ bottom / np.linalg.norm(top) / np.linalg.norm(bottom)
   assert np.degrees(np.arccos(cosine)) == pytest.approx(43.3)
@@ -58,9 +60,3 @@ def test_opencv_and_ros_count_pixels_from_the_first_centre():
     points, np.zeros(3), np.zeros(3), CAMERA.opencv_matrix, CAMERA.distortion
   )
   np.testing.assert_allclose(CAMERA.project(points), expected[:, 0] + 0.5, atol=1e-9)
-
-
-def test_vertical_field_of_view():
-  camera = Camera.from_vertical_fov(0.8, 40, 30)
-  assert camera.vertical_fov == pytest.approx(0.8)
-  assert camera.fy == pytest.approx(focal_length(0.8, 30))
