@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from nerf2real.core import similarity
+from nerf2real.core import rotations, similarity
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.extent import choose_extent
@@ -68,15 +68,6 @@ class Alignment:
     return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
 
 
-def rotation_to_up(normal: np.ndarray) -> np.ndarray:
-  """The smallest rotation [3, 3] that turns a unit normal [3] to +z."""
-  x, y, z = normal
-  if z < -1 + 1e-9:
-    return np.diag([1.0, -1.0, -1.0])
-  a, b = 1 / (1 + z), -x * y / (1 + z)
-  return np.array([[1 - x * x * a, b, -x], [b, 1 - y * y * a, -y], [x, y, z]])
-
-
 def align(
   evidence: Evidence,
   *,
@@ -126,7 +117,7 @@ def align(
   rotation = choose_yaw(
     evidence,
     override,
-    upright=rotation_to_up(floor.normal),
+    upright=rotations.rotation_to_up(floor.normal),
     in_room=(heights > _ABOVE_FLOOR) & (heights < settings.max_height),
   )
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from nerf2real.core.rotations import yaw_matrix
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.overrides import Overrides
 
@@ -70,7 +71,7 @@ def choose_yaw(
     in_room: Which of the densest points stand on the floor, bool [P].
   """
   if override.yaw_deg is not None:
-    return Choice(_turn(-np.radians(override.yaw_deg)) @ upright, "manual")
+    return Choice(yaw_matrix(-np.radians(override.yaw_deg)) @ upright, "manual")
   yaw, source = None, "walls"
   if evidence.surface_normals is not None:
     yaw = wall_yaw(evidence.surface_normals[in_room] @ upright.T)
@@ -78,7 +79,7 @@ def choose_yaw(
   if yaw is None:
     chosen = points[in_room] if in_room.sum() > 100 else points
     yaw, source = point_yaw(chosen @ upright.T), "points"
-  along_walls = _turn(-yaw) @ upright
+  along_walls = yaw_matrix(-yaw) @ upright
   return Choice(
     longer_side_along_x(along_walls, points[in_room] if in_room.any() else points), source
   )
@@ -94,11 +95,6 @@ def longer_side_along_x(rotation: np.ndarray, points: np.ndarray) -> np.ndarray:
   quarters = [0, 1, 2, 3]
   if max(spans) > _LONGER * min(spans):
     quarters = [0, 2] if spans[0] > spans[1] else [1, 3]
-  turned = [_turn(quarter * np.pi / 2) @ rotation for quarter in quarters]
+  turned = [yaw_matrix(quarter * np.pi / 2) @ rotation for quarter in quarters]
   reference = np.array([np.cos(_REFERENCE), np.sin(_REFERENCE), 0.0])
   return max(turned, key=lambda candidate: float(candidate[0] @ reference))
-
-
-def _turn(angle: float) -> np.ndarray:
-  c, s = np.cos(angle), np.sin(angle)
-  return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
