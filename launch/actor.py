@@ -78,8 +78,12 @@ def run(arguments: Arguments) -> None:
       )
   except (sessions.LinkError, MessageError, ValueError) as error:
     raise command.CommandError(error, status=REFUSED) from error
-  process.run()
-  link.close()
+  try:
+    process.run()
+  except MessageError as error:
+    raise command.CommandError(error) from error
+  finally:
+    link.close()
 
 
 def main() -> int:

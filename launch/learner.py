@@ -122,7 +122,7 @@ def run(arguments: Arguments) -> None:
       resume=arguments.resume,
       join=arguments.connect is not None,
     )
-  except (ValueError, sessions.LinkError, CheckpointError) as error:
+  except (ValueError, OSError, sessions.LinkError, CheckpointError) as error:
     raise command.CommandError(error, status=REFUSED) from error
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())

@@ -9,7 +9,6 @@ import dataclasses
 import logging
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +116,7 @@ class Learner:
     self._rates = _Rates(limiter.steps, limiter.updates)
     self._last_save = time.monotonic()
     self._evaluated: float | None = None
-    self._problems: dict[str, str] = {}  # by what could not be written
+    self._problem = ""
     if join:
       self._session = sessions.connect(endpoint, link, timeout=_ROUTER_TIMEOUT)
     else:
@@ -165,6 +164,11 @@ class Learner:
   def stop(self) -> None:
     """Ends `run` after the present update; safe in a signal handler."""
     self._stop.set()
+
+  @property
+  def problem(self) -> str:
+    """What could not be written when it was last tried; empty if all could."""
+    return self._problem
 
   @property
   def limiter(self) -> RateLimiter:
@@ -232,14 +236,13 @@ class Learner:
       return
     self._best = float(result)
     self._attempt(
-      "best checkpoint",
       lambda: self._checkpoints.save(
         self._state, self._info() | {"best_version": version}, kind=BEST
-      ),
+      )
     )
     parameters = self.link.held_parameters(version)
     if parameters is not None:
-      self._attempt("best policy", lambda: self._export("best", parameters, {"version": version}))
+      self._attempt(lambda: self._export("best", parameters, {"version": version}))
 
   def _export(self, name: str, parameters: Any, info: dict[str, Any]) -> None:
     export.export_policy(
@@ -254,23 +257,16 @@ class Learner:
   def save(self) -> None:
     """Writes a checkpoint and exports the policy; a failure is reported, and training goes on."""
     self._last_save = time.monotonic()
-    self._attempt("checkpoint", lambda: self._checkpoints.save(self._state, self._info()))
-    self._attempt(
-      "policy", lambda: self._export("newest", learning.served_parameters(self._state), {})
-    )
-    self._attempt("replay", self.replay.flush)
+    self._problem = ""
+    self._attempt(lambda: self._checkpoints.save(self._state, self._info()))
+    self._attempt(lambda: self._export("newest", learning.served_parameters(self._state), {}))
+    self._attempt(self.replay.flush)
 
-  @property
-  def problem(self) -> str:
-    """What could not be written the last time that it was tried; empty if all could."""
-    return " ".join(self._problems.values())
-
-  def _attempt(self, what: str, write: Callable[[], object]) -> None:
-    self._problems.pop(what, None)
+  def _attempt(self, write: Any) -> None:
     try:
       write()
     except (CheckpointError, OSError) as error:
-      self._problems[what] = str(error)
+      self._problem = str(error)
       _log.error("%s", error)
 
   def _info(self) -> dict[str, Any]:
@@ -295,7 +291,7 @@ class Learner:
       "updates": updates,
       "filled": ready,
       "replay_steps": self.replay.steps,
-      "problem": self.problem,
+      "problem": self._problem,
       "evaluation": self._evaluated,
       "best": self._best if np.isfinite(self._best) else None,
     }

@@ -21,7 +21,7 @@ _OTHERS_END_TIMEOUT = 10.0  # s for actors to deliver what they have
 _BEFORE_LEARNING = (-signal.SIGTERM, 128 + signal.SIGTERM)  # ended while it was starting
 _MEANINGS = {
   REFUSED: " (it cannot start with its arguments)",
-  NOT_SAVED: " (what it learned last is not saved)",
+  NOT_SAVED: " (what it learned last is not saved: make room where the run is, then --resume)",
   -signal.SIGKILL: " (killed)",
 }
 

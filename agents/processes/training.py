@@ -166,6 +166,8 @@ def supervise(supervisor: Supervisor, view: StatusView, console: Console) -> str
           say(console, view.line(waiting=supervisor.waiting))
         time.sleep(_POLL)
   finally:
+    if not console.is_terminal:  # where the table ends without a new line
+      console.line()
     if stopped:
       say(console, "Ending: the learner writes a checkpoint.")
     failure = supervisor.end()
