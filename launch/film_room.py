@@ -30,26 +30,14 @@ class Arguments:
 def run(arguments: Arguments) -> None:
   """Films, with a bar of progress."""
   import rich.console
-  import rich.progress
 
+  from nerf2real.core.progress import progress_bar
   from nerf2real.scenes.builtin.eye import EglMissingError
 
   console = rich.console.Console(stderr=True)
-  columns = (
-    rich.progress.TextColumn("filming"),
-    rich.progress.BarColumn(),
-    rich.progress.MofNCompleteColumn(),
-    rich.progress.TimeRemainingColumn(),
-  )
   try:
-    with rich.progress.Progress(*columns, console=console) as bar:
-      task = bar.add_task("filming", total=arguments.film.frames)
-      filming.film(
-        arguments.out,
-        seed=arguments.seed,
-        settings=arguments.film,
-        progress=lambda done, total: bar.update(task, completed=done, total=total),
-      )
+    with progress_bar("filming", console=console) as progress:
+      filming.film(arguments.out, seed=arguments.seed, settings=arguments.film, progress=progress)
   except EglMissingError as error:
     raise command.CommandError(error) from error
   console.print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB")

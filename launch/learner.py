@@ -20,6 +20,7 @@ import tyro
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link import sessions
 from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
+from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -74,7 +75,7 @@ def agent_settings(arguments: Arguments) -> tuple[str, configs.DmpoConfig]:
 
   info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
   if info is not None:
-    environment, config = info["environment"], configs.from_dict(info["config"])
+    environment, config = info["environment"], from_plain(info["config"], configs.DmpoConfig)
     if arguments.env not in (None, environment):
       raise ValueError(
         f"{arguments.run} was trained on {environment}, found --env {arguments.env}."

@@ -36,7 +36,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> None:
   """Runs the episodes and prints how they ended."""
-  from nerf2real.suite.pictures.rollout import run_episodes
+  from nerf2real.suite.views.rollout import run_episodes
 
   lines = run_episodes(
     arguments.task,

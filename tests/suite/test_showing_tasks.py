@@ -6,9 +6,9 @@ import pytest
 import viser
 
 from nerf2real import suite
-from nerf2real.suite.pictures.rollout import run_episodes
 from nerf2real.suite.viewer.elements import bars
 from nerf2real.suite.viewer.task_viewer import TaskViewer
+from nerf2real.suite.views.rollout import run_episodes
 from tests.suite.synthetic import FlatRenderer, make_room
 
 
