@@ -13,7 +13,7 @@ import logging
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -41,8 +41,9 @@ class Arguments:
   """Where to listen, such as tcp/0.0.0.0:7447."""
   connect: Annotated[str | None, _WHERE] = None
   """A router to join instead, such as tcp/head:7447."""
-  preset: Literal["paper", "state", "vision_small"] | None = None
-  """Settings of the agent to start from; "paper" if not given."""
+  preset: str | None = None
+  """Settings of the agent to start from: paper, state, ... (a wrong name lists all); "paper" if not
+  given."""
   set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], _ASSIGNMENT] = ()
   """Changes a setting of the agent, such as network.vmax=10; may be repeated."""
   seed: int = 0
