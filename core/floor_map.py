@@ -19,7 +19,6 @@ REACHABLE, FREE, UNKNOWN, OCCUPIED = (
   (163, 168, 176),
   (96, 102, 112),
 )
-TRUTH, TARGET = (255, 255, 255), (0, 200, 0)  # marks on a heat map
 _FINE = 4  # OpenCV draws at fractions of a pixel: 4 bits
 _MARKER_SIZE = 0.025  # half a marker's width, of the picture's longer side
 _DIMMED = 0.6  # of a floor's brightness below a heat map

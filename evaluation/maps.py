@@ -20,12 +20,11 @@ COLORS = {
   STOPPED: "#828282",
 }
 _START = (40, 40, 40)
-_HEIGHT = 420  # of a map [pixel]
 
 
-def draw_floor(scene: Any) -> FloorMap:
-  """Draws the free floor of a scene, by its extent and free space."""
-  return floor_picture.draw(scene.free_space, scene.extent, height=_HEIGHT)
+def draw_floor(scene: Any, *, height: int) -> FloorMap:
+  """Draws the free floor of a scene, by its extent and free space; height in pixels."""
+  return floor_picture.draw(scene.free_space, scene.extent, height=height)
 
 
 def draw_paths(floor: FloorMap, found: Sequence[Episode]) -> np.ndarray:

@@ -3,13 +3,14 @@
 import base64
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from nerf2real.agents.dmpo import belief_plot
 from nerf2real.core.floor_map import FloorMap
 from nerf2real.core.pages import page
 from nerf2real.core.pages.blocks import (
@@ -28,10 +29,8 @@ from nerf2real.evaluation.episodes import OUTCOMES, Episode, Moment
 
 _MOMENTS = 5  # shown of an episode's belief
 _BELIEF_EPISODES = 4  # shown of a setting
+_PATHS_HEIGHT, _BELIEF_HEIGHT = 420, 240  # of maps [pixel]
 _WIDE = 8  # columns of a table that is set smaller
-
-# Draws a belief: (moment, goal, map) -> picture uint8 [H, W, 3].
-DrawBelief = Callable[[Moment, tuple[float, float], FloorMap], np.ndarray]
 
 
 def write(
@@ -39,7 +38,6 @@ def write(
   found: Sequence[Episode],
   *,
   scene: Any,
-  draw_belief: DrawBelief | None = None,
   settings: Mapping[str, Any] | None = None,
 ) -> None:
   """Writes the page.
@@ -48,15 +46,12 @@ def write(
     path: The file.
     found: All episodes.
     scene: The bundle, for the map.
-    draw_belief: Draws a heat map; without it none are shown.
     settings: Of the run, shown at the end.
   """
-  floor = maps.draw_floor(scene)
   sections = [_table(table) for table in tables.paper_tables(found)]
   sections.append(_table(tables.outcome_table(found), _OUTCOME_TEXT))
-  sections += _paths(found, floor)
-  if draw_belief is not None:
-    sections += _beliefs(found, floor, draw_belief)
+  sections += _paths(found, maps.draw_floor(scene, height=_PATHS_HEIGHT))
+  sections += _beliefs(found, maps.draw_floor(scene, height=_BELIEF_HEIGHT))
   sections.append(_episodes(found))
   if settings is not None:
     text = json.dumps(dict(settings), indent=1, default=str)
@@ -111,15 +106,15 @@ def _paths(found: Sequence[Episode], floor: FloorMap) -> list[Section]:
   return [
     Section(
       "Where the robot went",
-      "Seen from above: light is floor where the robot fits, dark is matter. Black dots are starts, "
-      "circles and squares are goals, a coloured dot is where a failure ended, a thin orange line "
-      "is the ball.",
+      "Seen from above: light is floor where the robot fits, dark is matter. Black dots are "
+      "starts, circles and squares are goals, a coloured dot is where a failure ended, a thin orange "
+      "line is the ball.",
       [Legend({name: maps.COLORS[name] for name in OUTCOMES}), Grid(pictures, 2)],
     )
   ]
 
 
-def _beliefs(found: Sequence[Episode], floor: FloorMap, draw_belief: DrawBelief) -> list[Section]:
+def _beliefs(found: Sequence[Episode], floor: FloorMap) -> list[Section]:
   blocks: list[Block] = []
   for title, chosen in _groups(found).items():
     believing = [episode for episode in chosen if episode.moments]
@@ -131,7 +126,7 @@ def _beliefs(found: Sequence[Episode], floor: FloorMap, draw_belief: DrawBelief)
       shown = np.unique(np.linspace(0, count - 1, min(_MOMENTS, count)).astype(int))
       for index in shown:
         moment = episode.moments[index]
-        heat = draw_belief(moment, episode.goal, floor)
+        heat = _draw_belief(moment, episode.goal, floor)
         seen = _decode(moment.picture, heat.shape[1])
         picture = heat if seen is None else np.concatenate([seen, heat])
         text = f"episode {episode.index + 1} ({episode.outcome}), {moment.time:.1f} s"
@@ -148,6 +143,12 @@ def _beliefs(found: Sequence[Episode], floor: FloorMap, draw_belief: DrawBelief)
       blocks,
     )
   ]
+
+
+def _draw_belief(moment: Moment, goal: tuple[float, float], floor: FloorMap) -> np.ndarray:
+  mixture = (np.array(part) for part in (moment.logits, moment.means, moment.stddevs))
+  truth = None if moment.position is None else np.array(moment.position)
+  return belief_plot.draw(floor, *mixture, truth=truth, target=np.array(goal))
 
 
 def _telling(found: Sequence[Episode]) -> list[Episode]:

@@ -50,7 +50,7 @@ class Warnings(Block):
 
 @dataclasses.dataclass(frozen=True)
 class Picture(Block):
-  """A picture, RGB uint8 [H, W, 3] or grey [H, W]; lossless with sharp pixels where those matter."""
+  """A picture, RGB uint8 [H, W, 3] or grey [H, W]; where pixels matter lossless and sharp."""
 
   kind = "picture"
   image: np.ndarray
