@@ -107,8 +107,8 @@ def _paths(found: Sequence[Episode], floor: FloorMap) -> list[Section]:
     Section(
       "Where the robot went",
       "Seen from above: light is floor where the robot fits, dark is matter. Black dots are "
-      "starts, circles and squares are goals, a coloured dot is where a failure ended, a thin orange "
-      "line is the ball.",
+      "starts, circles and squares are goals, a coloured dot is where a failure ended, a thin "
+      "orange line is the ball.",
       [Legend({name: maps.COLORS[name] for name in OUTCOMES}), Grid(pictures, 2)],
     )
   ]

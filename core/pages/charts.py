@@ -197,7 +197,7 @@ def figure_3d(traces: Sequence[Any], *, height: int = 560) -> Chart:
       "aspectmode": "data",
       "dragmode": "turntable",
       **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
-      "camera": {"eye": {"x": -0.9, "y": -1.1, "z": 1.3}},
+      "camera": {"eye": {"x": -1.1, "y": -1.35, "z": 1.5}, "center": {"x": 0, "y": 0, "z": -0.25}},
     },
   )
   return Chart(figure, tools=True)

@@ -98,9 +98,7 @@ FIGURES: Mapping[str, Meaning] = {
     "", "share of the true surface within 5 cm of the parts", "near 1"
   ),
   "free_area_m2": Meaning("m^2", "floor area that the robot can stand on"),
-  "baseline_psnr_db": Meaning(
-    "dB", "PSNR of the COLMAP Poisson mesh on the same held-out views", "to compare with"
-  ),
+  "baseline_psnr_db": Meaning("dB", "PSNR of the COLMAP Poisson mesh on the same held-out views"),
 }
 
 
