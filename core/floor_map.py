@@ -161,15 +161,22 @@ class FloorMap:
 
   def scale_bar(self, length: float = 1.0) -> Self:
     """Draws a bar of a length [m] with its name into the lower left corner, on a pale ground."""
-    height, (ink, size) = (
-      self.picture.shape[0],
-      (palette.rgb(palette.INK), round(length * self._scale)),
+    height, ink = self.picture.shape[0], palette.rgb(palette.INK)
+    size, font = round(length * self._scale), max(0.4, height / 900)
+    text_height = round(25 * font)
+    cv2.rectangle(
+      self.picture, (6, height - 22 - text_height), (size + 22, height - 6), REACHABLE, -1
     )
-    cv2.rectangle(self.picture, (6, height - 30), (size + 22, height - 6), REACHABLE, -1)
     cv2.line(self.picture, (14, height - 12), (14 + size, height - 12), ink, 2)
-    at = (14, height - 17)
     cv2.putText(
-      self.picture, f"{length:g} m", at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, ink, 1, cv2.LINE_AA
+      self.picture,
+      f"{length:g} m",
+      (14, height - 19),
+      cv2.FONT_HERSHEY_SIMPLEX,
+      font,
+      ink,
+      1,
+      cv2.LINE_AA,
     )
     return self
 

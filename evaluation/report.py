@@ -60,7 +60,8 @@ def write(
     f"{len(found)} episodes. What is called virtual robot is a program behind the robot's wires, "
     "with physics, pictures and faults of its own; no figure marked so is of hardware."
   )
-  page.write(path, page.Page("Evaluation", lead, sections))
+  origin = page.Origin.of_process()
+  page.write(path, page.Page("Evaluation", lead, sections, origin=origin))
 
 
 _OUTCOME_TEXT = (

@@ -5,9 +5,12 @@ Pages are rendered by jinja2 with autoescaping and written whole.
 
 import dataclasses
 import functools
+import importlib.metadata
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import jinja2
 import numpy as np
@@ -36,6 +39,18 @@ class Origin:
   command: str = ""
   commit: str = ""
   version: str = ""
+
+  @classmethod
+  def of_process(cls) -> Self:
+    """Returns the command line of this process and the version that is installed."""
+    program, *arguments = sys.argv
+    if Path(program).is_absolute():
+      program = Path(program).name
+    try:
+      version = importlib.metadata.version("nerf2real")
+    except importlib.metadata.PackageNotFoundError:
+      version = ""
+    return cls(command=shlex.join([program, *arguments]), version=version)
 
 
 @dataclasses.dataclass(frozen=True)

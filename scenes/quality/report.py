@@ -140,7 +140,8 @@ def write(path: Path, data: ReportData) -> None:
       [Details("all settings", [Preformatted(json.dumps(data.settings, indent=1))])],
     ),
   ]
-  page.write(path, page.Page(data.title, data.lead, sections, warnings=data.warnings))
+  origin = page.Origin.of_process()
+  page.write(path, page.Page(data.title, data.lead, sections, data.warnings, origin))
 
 
 def _figures(values: Mapping[str, Any]) -> Figures:

@@ -8,7 +8,7 @@ import numpy as np
 from nerf2real.core.pages import charts
 from nerf2real.core.pages.blocks import Block, Heading, Table, Text, Warnings
 from nerf2real.core.pages.charts import Bars, Interval
-from nerf2real.core.pages.page import Page, Section
+from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.model import simulation as evaluation
@@ -66,6 +66,7 @@ def page(
     f"Verdict: {content['verdict']}{': ' + names if names else ''}. Model:"
     f" {details['model'].rsplit('/', 1)[-1]}. Residuals are measured minus simulated.",
     sections,
+    origin=Origin.of_process(),
   )
 
 

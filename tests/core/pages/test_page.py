@@ -78,6 +78,13 @@ def test_origin_is_shown_where_it_is_given(tmp_path):
   assert "<code>make demo</code>" in text and "0.1" in text and "commit" not in text
 
 
+def test_origin_of_a_process_is_its_command(monkeypatch):
+  monkeypatch.setattr("sys.argv", ["launch/evaluate.py", "--out", "a b"])
+  assert Origin.of_process().command == "launch/evaluate.py --out 'a b'"
+  monkeypatch.setattr("sys.argv", ["/opt/bin/nerf2real", "evaluate"])
+  assert Origin.of_process().command == "nerf2real evaluate"
+
+
 def test_times_are_bars_with_their_total(tmp_path):
   text = written(tmp_path, blocks.Times({"poses": 2.0, "field": 6.0}))
   assert "width: 33.3%" in text and "width: 100.0%" in text and "8.0 s" in text
