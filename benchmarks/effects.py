@@ -64,15 +64,16 @@ def strong(name: str) -> Effect:
 class Stepping:
   """The chain with effects of some kinds on it."""
 
-  def __init__(self, names: list[str]):
+  def __init__(self, names: list[str], steps: int):
     self._model = chain()
     self._stack = EffectStack([strong(name) for name in names]).bind(self._model)
     self._data = mujoco.MjData(self._model)
-    self._phase = np.arange(self._model.nu)
+    phase = np.arange(self._model.nu)
+    self._controls = [0.3 * np.sin(0.02 * index + phase) for index in range(steps)]
 
   def before_step(self, index: int) -> None:
     """Applies the effects."""
-    self._stack.before_step(self._data, 0.3 * np.sin(0.02 * index + self._phase))
+    self._stack.before_step(self._data, self._controls[index])
 
   def step(self, _: int) -> None:
     """Steps the physics."""
@@ -81,7 +82,7 @@ class Stepping:
 
 def measure(names: list[str], steps: int) -> dict[str, harness.Value]:
   """Returns the median times of before_step and mj_step [us]."""
-  stepping = Stepping(names)
+  stepping = Stepping(names, steps)
   calls = {"before_step_us": stepping.before_step, "mj_step_us": stepping.step}
   times = harness.interleave(calls, rounds=steps)
   return {name: 1e6 * harness.percentile(t.elapsed, 50) for name, t in times.items()}

@@ -50,11 +50,24 @@ class Options:
   """With --other: runs in each checkout."""
 
 
-def run(main: Callable[[T], Any], settings: type[T], description: str | None) -> None:
-  """Runs a script; with --other, the comparison of two checkouts instead."""
+def run(
+  main: Callable[[T], Any],
+  settings: type[T],
+  description: str | None,
+  *,
+  compares: bool = True,
+) -> None:
+  """Runs a script; with --other, the comparison of two checkouts instead.
+
+  Args:
+    main: Takes the settings; what it returns is the exit status.
+    settings: Their class.
+    description: Of the script.
+    compares: Whether two checkouts are compared here; if not, `main` does.
+  """
   chosen = tyro.cli(settings, description=description)
   other = getattr(chosen, "other", None)
-  if other is not None:
+  if compares and other is not None:
     from benchmarks import compare
 
     command = compare.own_command(sys.argv, other)

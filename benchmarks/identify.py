@@ -109,6 +109,12 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, dict[str, harness.Value]
     if "%" in figure.target:
       value = harness.Rate(round(figure.value * figure.of), figure.of)
     figures[figure.question] = {"value": value, "of": figure.of}
+    if "relative" in figure.question:
+      figures[figure.question]["percent"] = 100 * figure.value
+  for plant in sorted({row["plant"] for row in rows}):
+    used = [row["used"]["wall_s"] for row in rows if row["plant"] == plant]
+    times = {"median_s": harness.percentile(used, 50), "longest_s": max(used), "sets": len(used)}
+    figures[f"seconds {plant}"] = dict(times)
   return figures
 
 

@@ -49,7 +49,7 @@ def main(settings: Settings) -> None:
       "verdict": content["verdict"],
       **{
         f"{name}_{side}": 1e3 * error[name][side]
-        for name in ("fitted", "held")
+        for name in ("train", "held")
         if name in error
         for side in ("before", "after")
       },

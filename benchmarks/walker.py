@@ -171,7 +171,7 @@ def main(settings: Settings) -> None:
     results = []
     for name, result in runs:
       results.append(result)
-      walks[name] = {key: str(value) for key, value in result._asdict().items()}
+      walks[name] = result._asdict()
       print(name, *(f"{key} {value}" for key, value in walks[name].items()), flush=True)
     figures[plant] = summary(results)
   harness.finish("walker", figures, settings, seed=0, words=harness.table(walks, first="plant"))
