@@ -94,6 +94,8 @@ def main(settings: Settings) -> None:
   acting = [name for name in kinds if KINDS[name].acts in ("command", "force", "actuator")]
   rows = {"none": [], **{name: [name] for name in acting}, "all_kinds": kinds}
   figures = {name: measure(kinds_of, settings.steps) for name, kinds_of in rows.items()}
+  single = [float(figures[name]["before_step_us"]) for name in acting if name != "backlash"]  # type: ignore[arg-type]
+  figures["one_kind"] = {"smallest_us": min(single), "largest_us": max(single)}
   harness.finish("effects", figures, settings)
 
 

@@ -115,6 +115,10 @@ def main(settings: Settings) -> None:
   for episode in range(settings.episodes):
     errors = _walk(environment, lambda: -task.state.rotation[2])
     figures[f"simulation_episode_{episode}"] = errors.figures()
+  for plant in ("virtual_robot", "simulation"):
+    names = [n for n in figures if n.startswith(plant) and "range" not in n and "zero" not in n]
+    rms = [float(figures[name]["rms_degrees"]) for name in names]  # type: ignore[arg-type]
+    figures[f"{plant}s"] = {"smallest_rms_degrees": min(rms), "largest_rms_degrees": max(rms)}
   harness.finish("gravity", figures, settings, seed=0)
 
 

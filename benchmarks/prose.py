@@ -1,8 +1,8 @@
 """Finds figures in the prose of a README, and says which of them have no record.
 
 A figure is a number with a unit, or "N of M". It is recorded if it stands in a block that
-`benchmarks/tables.py` generates, or in a paragraph that ends in `<!-- record: id, id -->` and equals
-a value of one of these records at the precision that it is written with. Settings, sizes and the
+`benchmarks/tables.py` generates, or in a paragraph with `<!-- record: id, id -->` and equals a
+value of one of these records at the precision that it is written with. Settings, sizes and the
 paper's values are listed in `benchmarks/settings.toml`, each with what it is.
 """
 
@@ -58,7 +58,7 @@ def figures(words: str) -> Iterator[str]:
 
 
 def matches(figure: str, record: Record) -> bool:
-  """Returns whether a figure equals a value of a record at the precision that it is written with."""
+  """Returns whether a figure equals a value of a record at the precision that it has."""
   number, unit = figure.split(" ", 1)
   wanted = number.replace(",", "")
   if unit.startswith("of "):
@@ -77,13 +77,7 @@ def matches(figure: str, record: Record) -> bool:
 
 
 def _same_unit(written: str, known: str) -> bool:
-  short = {
-    "degree": "degrees",
-    "deg": "degrees",
-    "second": "s",
-    "seconds": "s",
-    "minute": "minutes",
-  }
+  short = {"degree": "degrees", "deg": "degrees", "seconds": "s", "minute": "minutes"}
   return short.get(written, written) == short.get(known, known)
 
 
