@@ -24,10 +24,13 @@ from typing import Any
 
 import tyro
 
-from benchmarks.harness import ROOT, percentile
+from benchmarks.harness import ROOT, last_error, percentile
 
 # Words of the path to a number that say nothing about what it is.
-_CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs", "field"}
+_CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs"}
+_MOST_ALONE = 6  # names that only one checkout has and that are listed
+# Words that older files had for the same.
+_SYNONYMS = {"second": "s", "cpu": "processor", "max": "longest"}
 # Values that name the dict they stand in.
 _NAMES = ("name", "picture", "size")
 # Numbers that are no measurements.
@@ -69,7 +72,7 @@ def numbers(content: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[st
 def key(path: tuple[str, ...]) -> tuple[str, ...]:
   """Returns what two layouts of a file have in common: the words of a path, sorted."""
   words = re.findall(r"[a-z0-9]+", " ".join(path).lower())
-  return tuple(sorted(set(words) - _CONTAINERS))
+  return tuple(sorted({_SYNONYMS.get(word, word) for word in words} - _CONTAINERS))
 
 
 def run_once(checkout: Path, command: list[str]) -> dict[tuple[str, ...], tuple[str, float]]:
@@ -91,8 +94,7 @@ def run_once(checkout: Path, command: list[str]) -> dict[tuple[str, ...], tuple[
     )
     seconds = time.perf_counter() - begin
     if done.returncode:
-      last = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
-      raise RuntimeError(f"{shlex.join(words)} failed in {checkout}: {last}")
+      raise RuntimeError(f"{shlex.join(words)} failed in {checkout}: {last_error(done)}")
     found: dict[tuple[str, ...], tuple[str, float]] = {
       ("command", "s"): ("the whole command, s", seconds)
     }
@@ -179,7 +181,8 @@ def main(settings: Settings) -> int:
   print(f"`{shlex.join(command)}`, {settings.turns} turns; here {ROOT}, other {settings.other}\n")
   print(markdown(rows))
   if alone:
-    print(f"\nonly in one of the two: {'; '.join(alone)}")
+    more = f" and {len(alone) - _MOST_ALONE} more" if len(alone) > _MOST_ALONE else ""
+    print(f"\nonly in one of the two: {'; '.join(alone[:_MOST_ALONE])}{more}")
   return 0
 
 

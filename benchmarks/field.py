@@ -81,8 +81,7 @@ def train(
     timeout=timeout,
   )
   if done.returncode:
-    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-    raise RuntimeError(f"training in {checkout} failed: {last}")
+    raise RuntimeError(f"training in {checkout} failed: {harness.last_error(done)}")
   return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -175,8 +175,7 @@ def run_check(name: str, command: list[str], out: Path, *, limit: float, device:
   except subprocess.TimeoutExpired:
     raise RuntimeError(f"took longer than {limit:g} s") from None
   if done.returncode:
-    lines = done.stderr.strip().splitlines() or done.stdout.strip().splitlines() or ["no message"]
-    raise RuntimeError(lines[-1])
+    raise RuntimeError(harness.last_error(done))
   figures = json.loads((out / f"{name}.json").read_text())["figures"]
   prefix = "" if name != "learner" else "learner_paper_"
   return {f"{prefix}{row}": values for row, values in figures.items()}

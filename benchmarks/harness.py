@@ -19,6 +19,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -129,6 +130,13 @@ def _output(*command: str) -> str:
   except (OSError, subprocess.SubprocessError):
     return ""
   return next(iter(done.stdout.splitlines()), "")
+
+
+def last_error(done: subprocess.CompletedProcess[str]) -> str:
+  """Returns the line in which a program that failed says why."""
+  lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
+  errors = [line for line in lines if re.match(r"(\w+\.)*\w*(Error|Exception|error)\b", line)]
+  return (errors or lines)[-1]
 
 
 def command_line() -> str:
