@@ -22,7 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from benchmarks import harness, ledger
 from benchmarks.ledger import ROOT, Value
@@ -56,19 +56,22 @@ def check_render(settings: Settings) -> Figures:
   import numpy as np
 
   from nerf2real.core.cameras import Camera
+  from nerf2real.core.serialization import from_plain
+  from nerf2real.core.similarity import Similarity
   from nerf2real.scenes.builtin import yardstick
   from nerf2real.scenes.bundle import Bundle
   from nerf2real.scenes.field.field import Field
   from nerf2real.scenes.field.render.renderer import Renderer
   from nerf2real.scenes.quality.image_quality import psnr
 
-  field = Field.load(Bundle.load().field_path)
+  bundle = Bundle.load()
+  field = Field.load(bundle.field_path)
   cpu = Renderer(field)
   device = Renderer(field, device=settings.device, occupancy=cpu.occupancy)
   views, rounds, batches = (2, 2, (2,)) if settings.tiny else (24, 100, (16, 64, 256))
   arrays = np.load(yardstick.ROBOT_VIEWS)
-  bundle = Bundle.load()
-  room_from_unit = _room_from_unit(bundle)
+  room_from_world = from_plain(bundle.figures["room_from_world"], Similarity)
+  room_from_unit = room_from_world @ bundle.world_from_unit
   poses = room_from_unit.inverse().apply_pose(arrays["world_from_camera"][:views])
   figures: Figures = {}
   for height, width in SIZES[: 1 if settings.tiny else None]:
@@ -100,18 +103,11 @@ def check_render(settings: Settings) -> Figures:
   return figures
 
 
-def _room_from_unit(bundle):
-  from nerf2real.core.similarity import Similarity
-
-  placed = Similarity.from_dict(bundle.figures["room_from_world"])
-  return placed @ bundle.world_from_unit
-
-
-def _render_one(renderer, camera, poses, index: int) -> None:
+def _render_one(renderer: Any, camera: Any, poses: Any, index: int) -> None:
   renderer.render(camera, poses[index % len(poses)])
 
 
-def _render_batch(renderer, camera, poses, _: int) -> None:
+def _render_batch(renderer: Any, camera: Any, poses: Any, _: int) -> None:
   renderer.render_batch(camera, poses)
 
 

@@ -22,6 +22,7 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.geometry.mesh import load_glb
 from nerf2real.scenes.poses import localise
 
 _CAMERA_STEP = 3  # every third camera is drawn
@@ -43,7 +44,7 @@ class Arguments:
 
 def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
   """Adds meshes, parts, cameras and the free-space map, each with a switch."""
-  visual = trimesh.load_mesh(bundle.visual_path)
+  visual = load_glb(bundle.visual_path)
   shown = server.scene.add_mesh_trimesh("/visual", visual)
   shown.visible = False
   parts = []
@@ -63,13 +64,12 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
     parts[-1].visible = False
   frusta = []
   sfm = localise.load(bundle.folder / "sfm")
-  fov = 2 * np.arctan(0.5 * sfm.camera.height / sfm.camera.fy)
   for name, pose in list(zip(sfm.names, sfm.world_from_camera, strict=True))[::_CAMERA_STEP]:
     world = bundle.world_from_unit.apply_pose(pose)
     frusta.append(
       server.scene.add_camera_frustum(
         f"/cameras/{name}",
-        fov=float(fov),
+        fov=sfm.camera.vertical_fov,
         aspect=sfm.camera.width / sfm.camera.height,
         scale=0.08,
         wxyz=transforms.SO3.from_matrix(world[:3, :3]).wxyz,

@@ -19,6 +19,7 @@ from nerf2real.scenes.bundle import Bundle, BundleError
 from nerf2real.scenes.field.settings import preset as train_preset
 from nerf2real.scenes.geometry import collision as contact
 from nerf2real.scenes.geometry import convex
+from nerf2real.scenes.settings import preset
 
 _FRAMES = 40
 _SIZE = (160, 120)  # width, height
@@ -60,7 +61,7 @@ def source(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def settings():
-  base = pipeline.preset("fast")
+  base = preset("fast")
   field = dataclasses.replace(base.train.field, levels=8, log2_table_size=15)
   return dataclasses.replace(
     base,

@@ -7,14 +7,15 @@ metres is the scale. Shapes: K detections of one marker.
 
 import collections
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from scipy import optimize
 
-from nerf2real.core import cameras
+from nerf2real.core import cameras, least_squares
+from nerf2real.core.progress import Progress, no_progress
 
 # Groups are tried in this order until one is read; the time grows with the number of codes:
 # 30, 55 and 105 ms a picture of 640x480. The large sets contain the small ones.
@@ -80,7 +81,7 @@ def detect(
   images: Sequence[pathlib.Path | np.ndarray],
   *,
   dictionaries: Sequence[Sequence[str]] = DICTIONARIES,
-  progress: Callable[[float, str], None] | None = None,
+  progress: Progress = no_progress,
 ) -> list[Detection]:
   """Finds markers in pictures (paths, or uint8 arrays [H, W] or [H, W, 3]).
 
@@ -95,12 +96,11 @@ def detect(
       corners, ids, _, which = detector.detectMarkersMultiDict(_read(image))
       if ids is not None:
         for quad, marker, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
-          quad = np.asarray(quad, np.float64).reshape(4, 2) + 0.5  # OpenCV's first pixel is at 0, 0
+          quad = np.asarray(quad, np.float64).reshape(4, 2) + cameras.PIXEL_CENTRE
           if np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=-1).min() >= _MIN_SIDE_PX:
             found.append(Detection(names[int(index)], int(marker), view, quad))
-      if progress:
-        done = (number + (view + 1) / len(images)) / len(dictionaries)
-        progress(done, f"looking for markers {names[0]}, ...")
+      done = (number + (view + 1) / len(images)) / len(dictionaries)
+      progress(done, f"looking for markers {names[0]}, ...")
     everything += found
     views = collections.defaultdict(set)
     for d in found:
@@ -172,8 +172,8 @@ def _fit_marker(
     return None
   # The corners of one picture share its pose error: a picture counts as one observation.
   variance = 2 * np.mean(error**2) * 4
-  covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * variance
-  return float(fit.x[6]), float(np.sqrt(covariance[6, 6])), _square(fit.x), len(kept), rms
+  spread = least_squares.standard_deviations(least_squares.covariance(fit.jac.T, variance=variance))
+  return float(fit.x[6]), float(spread[6]), _square(fit.x), len(kept), rms
 
 
 def marker_scale(
