@@ -24,7 +24,8 @@ from typing import Any
 
 import tyro
 
-from benchmarks.harness import ROOT, last_error, percentile
+from benchmarks.ledger import ROOT
+from benchmarks.turns import percentile
 
 # Words of the path to a number that say nothing about what it is.
 _CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs"}
@@ -73,6 +74,13 @@ def key(path: tuple[str, ...]) -> tuple[str, ...]:
   """Returns what two layouts of a file have in common: the words of a path, sorted."""
   words = re.findall(r"[a-z0-9]+", " ".join(path).lower())
   return tuple(sorted({_SYNONYMS.get(word, word) for word in words} - _CONTAINERS))
+
+
+def last_error(done: subprocess.CompletedProcess[str]) -> str:
+  """Returns the line in which a program that failed says why."""
+  lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
+  errors = [line for line in lines if re.match(r"(\w+\.)*\w*(Error|Exception|error)\b", line)]
+  return (errors or lines)[-1]
 
 
 def run_once(checkout: Path, command: list[str]) -> dict[tuple[str, ...], tuple[str, float]]:

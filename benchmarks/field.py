@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks import blur_ablation, harness
+from benchmarks import blur_ablation, compare, harness
 from benchmarks.field_worker import save_views
 from benchmarks.ledger import ROOT
 
@@ -81,7 +81,7 @@ def train(
     timeout=timeout,
   )
   if done.returncode:
-    raise RuntimeError(f"training in {checkout} failed: {harness.last_error(done)}")
+    raise RuntimeError(f"training in {checkout} failed: {compare.last_error(done)}")
   return json.loads(done.stdout.splitlines()[-1])
 
 

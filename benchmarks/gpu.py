@@ -24,7 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from benchmarks import harness, ledger
+from benchmarks import compare, harness, ledger
 from benchmarks.ledger import ROOT, Value
 
 Figures = dict[str, dict[str, Value]]
@@ -171,7 +171,7 @@ def run_check(name: str, command: list[str], out: Path, *, limit: float, device:
   except subprocess.TimeoutExpired:
     raise RuntimeError(f"took longer than {limit:g} s") from None
   if done.returncode:
-    raise RuntimeError(harness.last_error(done))
+    raise RuntimeError(compare.last_error(done))
   figures = json.loads((out / f"{name}.json").read_text())["figures"]
   prefix = "" if name != "learner" else "learner_paper_"
   return {f"{prefix}{row}": values for row, values in figures.items()}

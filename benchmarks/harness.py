@@ -14,24 +14,39 @@ Nothing here imports numpy, so that `one_thread` comes before its threads are ma
 
 import dataclasses
 import datetime
-import gc
 import importlib.metadata
 import json
 import os
 import platform
-import re
 import shlex
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from benchmarks import ledger
+from benchmarks import compare, ledger
 from benchmarks.ledger import ROOT, Rate, Value
+from benchmarks.turns import Times, interleave, percentile
+
+__all__ = [  # what scripts use of this module, and of those that it is made of
+  "Machine",
+  "Options",
+  "Rate",
+  "Times",
+  "Value",
+  "finish",
+  "interleave",
+  "machine",
+  "one_core",
+  "one_thread",
+  "percentile",
+  "provenance",
+  "run",
+  "table",
+]
 
 _PACKAGES = ("numpy", "mujoco", "dm-control", "jax", "warp-lang", "numba", "eclipse-zenoh")
 T = TypeVar("T")
@@ -69,8 +84,6 @@ def run(
   chosen = tyro.cli(settings, description=description)
   other = getattr(chosen, "other", None)
   if compares and other is not None:
-    from benchmarks import compare
-
     command = compare.own_command(sys.argv, other)
     sys.exit(compare.main(compare.Settings(other=other, command=command, turns=chosen.turns)))  # type: ignore[attr-defined]
   sys.exit(main(chosen))
@@ -132,13 +145,6 @@ def _output(*command: str) -> str:
   return next(iter(done.stdout.splitlines()), "")
 
 
-def last_error(done: subprocess.CompletedProcess[str]) -> str:
-  """Returns the line in which a program that failed says why."""
-  lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
-  errors = [line for line in lines if re.match(r"(\w+\.)*\w*(Error|Exception|error)\b", line)]
-  return (errors or lines)[-1]
-
-
 def command_line() -> str:
   """Returns this command as it is typed in the root, without --write."""
   script = Path(sys.argv[0]).resolve()
@@ -171,78 +177,6 @@ def provenance(seed: int | str | None = None) -> dict[str, Any]:
     "versions": versions(),
     "load": round(os.getloadavg()[0], 1),
   }
-
-
-def percentile(values: Sequence[float], share: float) -> float:
-  """Returns a percentile (0 to 100) of values, interpolated linearly."""
-  ranked = sorted(values)
-  place = (len(ranked) - 1) * share / 100
-  below = int(place)
-  above = min(below + 1, len(ranked) - 1)
-  return ranked[below] + (place - below) * (ranked[above] - ranked[below])
-
-
-@dataclasses.dataclass
-class Times:
-  """Durations of one call, repeated [s]."""
-
-  elapsed: list[float] = dataclasses.field(default_factory=list)
-  processor: list[float] = dataclasses.field(default_factory=list)
-
-  def figures(self, *, per: int = 1) -> dict[str, float]:
-    """Returns median, p95 and longest by the clock, and median by processor time.
-
-    Args:
-      per: Units of work in a call; times are for one of them.
-    """
-    elapsed = [1e3 * value / per for value in self.elapsed]
-    processor = [1e3 * value / per for value in self.processor]
-    return {
-      "median_ms": percentile(elapsed, 50),
-      "p95_ms": percentile(elapsed, 95),
-      "longest_ms": max(elapsed),
-      "processor_median_ms": percentile(processor, 50),
-      "processor_p95_ms": percentile(processor, 95),
-    }
-
-  def rate(self, *, per: int = 1) -> float:
-    """Returns units of work a second of all calls together."""
-    return per * len(self.elapsed) / sum(self.elapsed)
-
-
-def interleave(
-  calls: Mapping[str, Callable[[int], Any]],
-  *,
-  rounds: int,
-  warm_up: int = 1,
-  limits: Mapping[str, int] | None = None,
-  seconds: float | None = None,
-) -> dict[str, Times]:
-  """Times calls that take turns, so that they see the same machine.
-
-  Args:
-    calls: By name; each gets the number of the round.
-    rounds: Turns of every call.
-    warm_up: Turns before them that are not counted (compilation, caches).
-    limits: Fewer turns for slow calls, by name.
-    seconds: Stop once every call has had so much time, where that comes before `rounds`.
-  """
-  times = {name: Times() for name in calls}
-  for _ in range(warm_up):
-    for call in calls.values():
-      call(0)
-  gc.collect()
-  for index in range(rounds):
-    for name, call in calls.items():
-      if index >= (limits or {}).get(name, rounds):
-        continue
-      begin, begin_processor = time.perf_counter(), time.process_time()
-      call(index)
-      times[name].processor.append(time.process_time() - begin_processor)
-      times[name].elapsed.append(time.perf_counter() - begin)
-    if seconds is not None and min(sum(t.elapsed) for t in times.values()) >= seconds:
-      break
-  return times
 
 
 def table(figures: Mapping[str, Mapping[str, Value]], *, first: str = "") -> str:
