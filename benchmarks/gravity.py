@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from nerf2real import real, suite
-from nerf2real.real.loop.motion import RobotSettings
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walk import Command, Gait

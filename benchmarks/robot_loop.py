@@ -31,11 +31,12 @@ import numpy as np
 import tyro
 
 from nerf2real import real
-from nerf2real.real.loop.clock import SteppedClock, prefer_this_thread
+from nerf2real.real.clock import SteppedClock, prefer_this_thread
 from nerf2real.real.loop.environment import RobotEnvironment
 from nerf2real.real.safety.monitor import SafetyError
 from nerf2real.real.virtual.process import VirtualRobotProcess
 from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.real.virtual.stream import VirtualCamera
 from nerf2real.suite.op3 import constants
 
 RESULTS = Path(__file__).parent / "results" / "robot_loop.json"
@@ -79,11 +80,12 @@ def wave(step: int, standing: np.ndarray) -> np.ndarray:
 @contextlib.contextmanager
 def robot_for(arguments: Arguments) -> Iterator[Any]:
   """Starts the robot."""
+  camera = VirtualCamera() if arguments.camera else None
   if arguments.stepped:
-    with VirtualRobot(seed=0, camera=arguments.camera, stepped=True) as robot:
+    with VirtualRobot(seed=0, camera=camera, stepped=True) as robot:
       yield robot
   else:
-    with VirtualRobotProcess(seed=0, camera=arguments.camera) as robot:
+    with VirtualRobotProcess(seed=0, camera=camera) as robot:
       yield robot
 
 

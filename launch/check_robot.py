@@ -24,6 +24,7 @@ import tyro
 from nerf2real import real
 from nerf2real.real.loading import Connection
 from nerf2real.real.loop.environment import RobotEnvironment
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.safety.monitor import SafetyError
 from nerf2real.suite.op3 import constants
 
@@ -55,16 +56,16 @@ def check(arguments: Arguments, robot: str | Connection, recorder: Any = None) -
   camera: Any = arguments.camera
   if isinstance(camera, str) and camera.isdigit():
     camera = int(camera)
+  connection = Connection(port=robot) if isinstance(robot, str) else robot
   with real.load(
     "nerf_nav",
-    robot=robot,
-    camera=camera,
+    robot=dataclasses.replace(
+      connection, camera=camera, offsets=arguments.offsets, lens=arguments.lens
+    ),
     image_size=None if camera is None else (60, 80),
     time_limit=arguments.seconds,
-    offsets=arguments.offsets,
-    lens=arguments.lens,
+    settings=RobotSettings(dry_run=arguments.dry_run),
     recorder=recorder,
-    dry_run=arguments.dry_run,
   ) as environment:
     timestep = environment.reset()
     while not timestep.last():

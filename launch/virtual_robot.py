@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 
 from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.real.virtual.stream import VirtualCamera
 
 _PUSH = 10.0  # N
 _PUSH_TIME = 0.2  # s
@@ -56,8 +57,9 @@ class Arguments:
 
 def run(arguments: Arguments) -> None:
   """Starts the robot and waits."""
+  camera = VirtualCamera() if arguments.camera else None
   with VirtualRobot(
-    world=arguments.world, seed=arguments.seed, camera=arguments.camera, ball=arguments.ball
+    world=arguments.world, seed=arguments.seed, camera=camera, ball=arguments.ball
   ) as robot:
     robot.faults.loss = arguments.loss
     robot.place(arguments.x, arguments.y, arguments.yaw)

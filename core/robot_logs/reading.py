@@ -12,6 +12,7 @@ import numpy as np
 from nerf2real.core.robot_logs.messages import (
   BATTERY,
   COMMANDS,
+  IMAGE,
   IMU,
   PWM,
   STATES,
@@ -44,7 +45,7 @@ __all__ = [
   "read_log",
 ]
 
-_TOPICS = (COMMANDS, STATES, PWM, IMU, BATTERY)
+_TOPICS = (COMMANDS, STATES, PWM, IMU, BATTERY, IMAGE)
 MINIMUM_DURATION = 1.0
 """s; chosen: a shorter log holds not one period of the slowest excitation of a servo joint."""
 
@@ -74,6 +75,8 @@ class Log:
   """The file was damaged and this is what could be read of it."""
   path: pathlib.Path | None = None
   """The file, which holds the pictures too; None of a log that was never written."""
+  pictures: int = 0
+  """How many pictures the file holds."""
 
   @property
   def joints(self) -> tuple[str, ...]:
@@ -103,10 +106,13 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
   if not path.is_file():
     raise FileNotFoundError(f"Found no file {path}, expected a measured log (.mcap).")
   topics: dict[str, Topic] = {}
-  damaged = False
+  pictures, damaged = 0, False
   try:
     # Temperatures are found by type: the topic's name is free, frame_id names the joint.
     for reading in read_messages(path, topics=_TOPICS, schemas=[TEMPERATURE_TYPE]):
+      if reading.topic == IMAGE:  # read again when they are looked at: too many to keep
+        pictures += 1
+        continue
       if reading.topic not in topics:
         topics[reading.topic] = Topic(reading.topic, reading.schema)
       topics[reading.topic].append(reading)
@@ -143,6 +149,7 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
     temperatures=temperatures(topics.values(), start),
     recovered=damaged,
     path=path,
+    pictures=pictures,
   )
   if log.duration < MINIMUM_DURATION:
     raise LogError(

@@ -30,8 +30,11 @@ class View:
   """One picture in which the board was found."""
 
   name: str
-  corners: np.ndarray  # float32 [rows * columns, 2] pixel
-  size: tuple[int, int]  # width, height of the picture
+  """Of the file or frame."""
+  corners: np.ndarray
+  """float32 [rows * columns, 2] pixel."""
+  size: tuple[int, int]
+  """Width, height of the picture."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,13 +42,21 @@ class Calibration:
   """A calibrated camera."""
 
   width: int
+  """Of the pictures [pixel]."""
   height: int
-  values: np.ndarray  # [8] as NAMES; focal lengths and centre in pixels, OpenCV's convention
-  stddevs: np.ndarray  # [8] standard deviations, block jackknife over the views
-  rms: float  # of the reprojection error over the views kept [pixel]
-  views: tuple[str, ...]  # kept
-  rejected: tuple[str, ...]  # views that fitted badly
-  coverage: float  # share of the picture's 8 x 6 cells in which a corner was seen
+  """Of the pictures [pixel]."""
+  values: np.ndarray
+  """[8] as NAMES; focal lengths and centre in pixels, OpenCV's convention."""
+  stddevs: np.ndarray
+  """[8] standard deviations, block jackknife over the views."""
+  rms: float
+  """Of the reprojection error over the views kept [pixel]."""
+  views: tuple[str, ...]
+  """Kept."""
+  rejected: tuple[str, ...]
+  """Views that fitted badly."""
+  coverage: float
+  """Share of the picture's 8 x 6 cells in which a corner was seen."""
 
   @property
   def camera(self) -> Camera:

@@ -219,10 +219,10 @@ class Recorder:
 
 
 def _joint_state(
-  topic: str, t: float, names: Sequence[str], **fields: Sequence[float] | None
+  topic: str, t: float, names: Sequence[str], **fields: Sequence[float] | np.ndarray | None
 ) -> Call:
   return "joint_state", t, (topic, tuple(names)), {k: _copy(v) for k, v in fields.items()}
 
 
-def _copy(values: Sequence[float] | None) -> Any:
+def _copy(values: Sequence[float] | np.ndarray | None) -> Any:
   return None if values is None else np.array(values, np.float64)

@@ -62,7 +62,7 @@ class Body:
     world: str = "floor",
     hidden: Hidden | None = None,
     ball: bool = False,
-    furnish=None,
+    furnish: Callable[[mujoco.MjSpec], None] | None = None,
     looks: bool = True,
   ):
     """Builds the world and hangs the robot at its origin.

@@ -37,13 +37,20 @@ _BROWN_OUT = 6.0  # V below which a servo's controller resets: ours
 class MotorParameters:
   """What differs from servo to servo and from battery to battery."""
 
-  strength: np.ndarray  # [N] factor on the torque
-  gear_share: np.ndarray  # [N] friction as a share of the torque
-  dry_friction: np.ndarray  # [N] N m
-  encoder_offset: np.ndarray  # [N] counts that the encoder reads too much
-  goal_delay: float = 0.0  # s from the arrival of a goal to its effect
-  battery_voltage: float = 12.0  # V without load
-  battery_resistance: float = 0.08  # Ohm
+  strength: np.ndarray
+  """[N] factor on the torque."""
+  gear_share: np.ndarray
+  """[N] friction as a share of the torque."""
+  dry_friction: np.ndarray
+  """[N] N m."""
+  encoder_offset: np.ndarray
+  """[N] counts that the encoder reads too much."""
+  goal_delay: float = 0.0
+  """s from the arrival of a goal to its effect."""
+  battery_voltage: float = 12.0
+  """V without load."""
+  battery_resistance: float = 0.08
+  """Ohm."""
 
   @classmethod
   def nominal(cls, count: int) -> "MotorParameters":

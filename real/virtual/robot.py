@@ -9,14 +9,15 @@ Everything else here (`place`, `truth`, `faults`, ...) is what a person in the r
 the host has only the port and the camera.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.real.clock import Clock, RealClock, SteppedClock
 from nerf2real.real.loading import Connection
-from nerf2real.real.loop.clock import Clock, RealClock, SteppedClock
 from nerf2real.real.safety.operator import Hand
 from nerf2real.real.virtual.body import Body, Truth
 from nerf2real.real.virtual.bus.devices import Devices
@@ -24,25 +25,10 @@ from nerf2real.real.virtual.bus.faults import Faults
 from nerf2real.real.virtual.bus.protocol_rehearsal import Cable
 from nerf2real.real.virtual.bus.wire import Wire
 from nerf2real.real.virtual.hidden import Hidden
-from nerf2real.real.virtual.stream import CameraStream, Sensor
+from nerf2real.real.virtual.stream import CameraStream, Sensor, VirtualCamera
 from nerf2real.scenes.builtin.eye import Eye
 from nerf2real.suite.op3 import constants
 
-# The lens of the virtual robot's camera: as wide as the C920 of the facts, not quite without
-# distortion, its axis not quite in the middle. Ours.
-LENS = Camera(
-  width=320,
-  height=240,
-  fx=303.5,
-  fy=303.1,
-  cx=161.6,
-  cy=118.9,
-  k1=0.045,
-  k2=-0.07,
-  p1=0.0004,
-  p2=-0.0003,
-)
-FRAME_RATE = 30.0  # Hz
 _SUPERSAMPLE = 1  # 45 dB from 4 x 4 samples at 30x40, and half the time of 2 x 2
 _HEAD_CAMERA = "op3/head_camera"
 _OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
@@ -83,20 +69,21 @@ class Eyes:
 class SteppedCamera:
   """The camera of a robot on a `SteppedClock`: the stream's sensor, without a network."""
 
-  def __init__(self, eyes: Eyes, clock: Clock, *, latency: float, sensor: Sensor):
+  def __init__(self, eyes: Eyes, clock: Clock, settings: VirtualCamera, *, seed: int):
     """Makes the camera; pictures are taken at multiples of the frame's duration."""
-    self._eyes, self._clock, self._latency, self.sensor = eyes, clock, latency, sensor
+    self._eyes, self._clock, self._settings = eyes, clock, settings
+    self.sensor = Sensor(settings, seed=seed)
     self._frame, self._picture = -1, np.zeros((1, 1, 3), np.uint8)
     self.frozen = False  # no new pictures come
 
   def read(self) -> tuple[np.ndarray, float]:
     """Returns the newest picture that has arrived, uint8 [H, W, 3], and its age [s]."""
-    now = self._clock.now()
-    frame = int(np.floor((now - self._latency) * FRAME_RATE + 1e-6))
+    now, rate = self._clock.now(), self._settings.rate
+    frame = int(np.floor((now - self._settings.latency) * rate + 1e-6))
     if frame != self._frame and not (self.frozen and self._frame >= 0):
       self._frame = frame
-      self._picture = self.sensor.develop(self._eyes.picture(frame / FRAME_RATE))
-    return self._picture, now - self._frame / FRAME_RATE
+      self._picture = self.sensor.develop(self._eyes.picture(frame / rate))
+    return self._picture, now - self._frame / rate
 
   def close(self) -> None:
     """Has nothing to free: the picture belongs to the robot."""
@@ -112,13 +99,9 @@ class VirtualRobot:
     seed: int | None = None,
     hidden: Hidden | None = None,
     stepped: bool = False,
-    camera: bool = False,
+    camera: VirtualCamera | None = None,
     ball: bool = False,
-    lens: Camera = LENS,
-    latency: float = 0.04,
-    gain: float = 1.0,
-    noise: float = 2.0,
-    furnish=None,
+    furnish: Callable[[mujoco.MjSpec], None] | None = None,
   ):
     """Builds the robot, hanging in the hand of a person, supply off.
 
@@ -127,12 +110,8 @@ class VirtualRobot:
       seed: Seed of what is hidden, of noise and of chances; None: as in the data sheets.
       hidden: What is hidden, instead of a draw.
       stepped: Whether time jumps (`SteppedClock`), for rehearsals faster than real time.
-      camera: Whether there is a camera (needs EGL).
+      camera: The camera (needs EGL); None: a robot without.
       ball: Whether there is a ball.
-      lens: The camera's lens.
-      latency: s from the light to the arrival of a picture.
-      gain: Of the camera; 1 is neutral.
-      noise: Of the camera [8-bit levels].
       furnish: Called with the world's `mujoco.MjSpec` before the robot is put in, to change it.
     """
     if hidden is None:
@@ -140,7 +119,8 @@ class VirtualRobot:
       hidden = Hidden.none(count) if seed is None else Hidden.draw(seed, count)
     self.clock: RealClock | SteppedClock = SteppedClock() if stepped else RealClock()
     self.faults = Faults()
-    self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish, looks=camera)
+    looks = camera is not None
+    self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish, looks=looks)
     self.body.time = self.clock.now()
     devices = Devices(self.body, faults=self.faults, seed=seed or 0)
     self._wire: Wire | Cable
@@ -150,17 +130,15 @@ class VirtualRobot:
       self._wire = Wire(devices, self.clock)
     self.devices = devices
     self.operator = Hand(self.hold)
-    self.eyes = Eyes(self.body, lens) if camera else None
+    self.eyes = None if camera is None else Eyes(self.body, camera.lens)
     self.camera: SteppedCamera | None = None
     self.stream: CameraStream | None = None
-    if self.eyes is not None and stepped:
-      sensor = Sensor(gain=gain, exposure=1.0, noise=noise, seed=seed or 0)
-      self.camera = SteppedCamera(self.eyes, self.clock, latency=latency, sensor=sensor)
-    elif self.eyes is not None:
-      self.stream = CameraStream(
-        self.eyes.picture, rate_hz=FRAME_RATE, latency_s=latency, gain=gain, noise=noise
-      )
-      self.stream.start()
+    if self.eyes is not None and camera is not None:
+      if stepped:
+        self.camera = SteppedCamera(self.eyes, self.clock, camera, seed=seed or 0)
+      else:
+        self.stream = CameraStream(self.eyes.picture, camera)
+        self.stream.start()
 
   @property
   def port(self) -> str:

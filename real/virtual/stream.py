@@ -7,6 +7,7 @@ it has controls that are read back: `GET /controls` gives them, `GET /controls?g
 (the gain in the units of the Logitech C920, in which 50 is neutral).
 """
 
+import dataclasses
 import json
 import threading
 import time
@@ -18,6 +19,22 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 
+from nerf2real.core.cameras import Camera
+
+# The lens of the virtual robot's camera; chosen: as wide as a Logitech C920's, not quite without
+# distortion, its axis not quite in the middle.
+LENS = Camera(
+  width=320,
+  height=240,
+  fx=303.5,
+  fy=303.1,
+  cx=161.6,
+  cy=118.9,
+  k1=0.045,
+  k2=-0.07,
+  p1=0.0004,
+  p2=-0.0003,
+)
 NEUTRAL_GAIN = 50.0  # of the C920 (paper: the default of the navigation experiments)
 MAX_GAIN, MAX_EXPOSURE = 255.0, 16.0  # the driver's ranges; of exposure in shares of the neutral
 _GAMMA = 2.2
@@ -28,19 +45,36 @@ _BOUNDARY = "frame"
 _WAIT = 0.5  # s a client's thread waits for a frame before it looks whether the stream has ended
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VirtualCamera:
+  """The virtual robot's camera."""
+
+  lens: Camera = LENS
+  """What the pictures are rendered through."""
+  rate: float = 30.0
+  """Pictures a second."""
+  latency: float = 0.04
+  """s from the light to the arrival of a picture."""
+  gain: float = 1.0
+  """Factor on the signal; 1 is neutral."""
+  exposure: float = 1.0
+  """Factor on the light; 1 is neutral."""
+  noise: float = 2.0
+  """Standard deviation at mid grey and gain 1 [8-bit levels]."""
+
+  def __post_init__(self) -> None:
+    if not self.rate > 0:
+      raise ValueError(f"The camera's rate must be positive [Hz], found {self.rate}.")
+    if not self.latency >= 0:
+      raise ValueError(f"The camera's latency must be 0 s or more, found {self.latency}.")
+
+
 class Sensor:
   """What the camera makes of a true picture."""
 
-  def __init__(self, *, gain: float, exposure: float, noise: float, seed: int = 0):
-    """Sets the sensor.
-
-    Args:
-      gain: Factor on the signal; 1 is neutral.
-      exposure: Factor on the light; 1 is neutral.
-      noise: Standard deviation at mid grey and gain 1 [8-bit levels].
-      seed: Of the noise.
-    """
-    self.gain, self.exposure, self.noise = gain, exposure, noise
+  def __init__(self, settings: VirtualCamera, *, seed: int = 0):
+    """Sets the sensor, with a seed for its noise."""
+    self.gain, self.exposure, self.noise = settings.gain, settings.exposure, settings.noise
     self._rng = np.random.default_rng(seed)
 
   def develop(self, picture: np.ndarray) -> np.ndarray:
@@ -67,12 +101,8 @@ class CameraStream:
   def __init__(
     self,
     render: Callable[[], np.ndarray],
+    settings: VirtualCamera | None = None,
     *,
-    rate_hz: float = 30.0,
-    latency_s: float = 0.03,
-    gain: float = 1.0,
-    exposure: float = 1.0,
-    noise: float = 2.0,
     port: int = 0,
     seed: int = 0,
   ):
@@ -81,20 +111,13 @@ class CameraStream:
     Args:
       render: Returns the true picture now, RGB uint8 [H, W, 3]; always called from the stream's own
         thread, which may therefore own an OpenGL context that the first call makes.
-      rate_hz: Pictures a second.
-      latency_s: From taking a picture to sending it [s].
-      gain: Factor on the signal; 1 is neutral.
-      exposure: Factor on the light; 1 is neutral.
-      noise: Standard deviation at mid grey and gain 1 [8-bit levels].
+      settings: Rate, latency and the sensor's response; the lens is the renderer's.
       port: 0 takes a free one.
       seed: Of the noise.
     """
-    if not rate_hz > 0:
-      raise ValueError(f"The stream's rate must be positive [Hz], found {rate_hz}.")
-    if not latency_s >= 0:
-      raise ValueError(f"The stream's latency must be 0 s or more, found {latency_s}.")
-    self._render, self._period, self._latency = render, 1.0 / rate_hz, latency_s
-    self.sensor = Sensor(gain=gain, exposure=exposure, noise=noise, seed=seed)
+    settings = settings or VirtualCamera()
+    self._render, self._period, self._latency = render, 1.0 / settings.rate, settings.latency
+    self.sensor = Sensor(settings, seed=seed)
     self._blocked = False
     self._frozen = False
     self._due: deque[tuple[float, bytes]] = deque()

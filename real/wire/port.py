@@ -11,7 +11,7 @@ from pathlib import Path
 import dynamixel_sdk
 import serial
 
-from nerf2real.real.loop.clock import Clock
+from nerf2real.real.clock import Clock
 
 _PATIENCE = 0.1  # s that an answer may be late outside the cycle
 _GRACE = 0.005  # s after a time-out in which bytes that lie here are still taken

@@ -26,8 +26,6 @@ from nerf2real.suite.tasks.delayed_picture import DelayedPicture
 from nerf2real.suite.tasks.settings import TaskSettings
 from nerf2real.suite.tasks.state import RobotIndices, RobotState, Start
 
-MIN_UPRIGHT = 0.5  # cosine of the torso's tilt below which it has fallen (60 degrees): ours
-MIN_HEIGHT = 0.14  # m of the torso's origin above the floor (standing: 0.246): ours
 _MAX_START_ATTEMPTS = 100
 
 
@@ -288,8 +286,8 @@ class RobotTask(composer.Task):
   def fallen(self) -> bool:
     """Whether the robot has fallen: tilted, low, or on the floor with anything but its feet."""
     return (
-      self._state.rotation[2, 2] < MIN_UPRIGHT
-      or self._state.position[2] < MIN_HEIGHT
+      self._state.rotation[2, 2] < constants.MIN_UPRIGHT
+      or self._state.position[2] < constants.MIN_HEIGHT
       or self._touch.floor
     )
 

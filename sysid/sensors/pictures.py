@@ -48,11 +48,6 @@ class Source:
   """frame_id of the pictures."""
 
 
-def count(path: pathlib.Path) -> int:
-  """Returns the number of pictures in a file."""
-  return sum(1 for _ in _messages(path, IMAGE))
-
-
 def source(path: pathlib.Path, start_ns: int) -> Source:
   """Returns a log's pictures with their lens.
 

@@ -11,7 +11,7 @@ import weakref
 
 import serial
 
-from nerf2real.real.loop.clock import SteppedClock
+from nerf2real.real.clock import SteppedClock
 from nerf2real.real.virtual.bus.devices import Devices
 from nerf2real.real.virtual.bus.line import Line
 
