@@ -33,8 +33,8 @@ from nerf2real.real.virtual.stream import LENS, VirtualCamera
 from nerf2real.scenes.quality.image_quality import psnr
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.pictures.camera import CameraSettings
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import CameraSettings
 from nerf2real.suite.tasks.base import Start
 
 _STEP = constants.CONTROL_TIMESTEP

@@ -29,6 +29,7 @@ import rich.table
 import tyro
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.serialization import from_plain, read_json
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes import bundle
 from nerf2real.scenes.builtin import furniture, room
@@ -74,8 +75,7 @@ def load_field(settings: Settings) -> tuple[Field, Similarity]:
   if settings.field is not None:
     if settings.room_from_unit is None:
       raise SystemExit("--field needs --room-from-unit: where the field lies in the room.")
-    placed = json.loads(settings.room_from_unit.read_text())
-    return Field.load(settings.field), Similarity.from_dict(placed)
+    return Field.load(settings.field), read_json(settings.room_from_unit, Similarity)
   scene = bundle.Bundle.load(settings.bundle)
   placed = scene.figures.get("room_from_world")
   if placed is None:
@@ -83,7 +83,7 @@ def load_field(settings: Settings) -> tuple[Field, Similarity]:
       f"{scene.folder} has no figure room_from_world: it is no bundle of the built-in room, whose "
       "true pictures this benchmark compares with."
     )
-  return Field.load(scene.field_path), Similarity.from_dict(placed) @ scene.world_from_unit
+  return Field.load(scene.field_path), from_plain(placed, Similarity) @ scene.world_from_unit
 
 
 def robot_poses(count: int, *, seed: int = 7) -> np.ndarray:

@@ -5,7 +5,6 @@ follow OpenCV: x right, y down, z forward. Shapes: H height, W width.
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -124,10 +123,6 @@ class Camera:
     plane = (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
     ideal = self.undistort(plane)
     return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
-
-  def to_dict(self) -> dict[str, Any]:
-    """Returns the fields as plain numbers, for JSON."""
-    return dataclasses.asdict(self)
 
   @classmethod
   def from_vertical_fov(cls, fov: float, width: int, height: int) -> "Camera":

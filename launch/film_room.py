@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import rich.console
-import rich.progress
 import tyro
 
+from nerf2real.core.progress import progress_bar
 from nerf2real.scenes.builtin import filming
 from nerf2real.scenes.builtin.eye import EglMissingError
 
@@ -32,21 +32,9 @@ class Arguments:
 def main(arguments: Arguments) -> int:
   """Films; returns the exit status."""
   console = rich.console.Console(stderr=True)
-  columns = (
-    rich.progress.TextColumn("filming"),
-    rich.progress.BarColumn(),
-    rich.progress.MofNCompleteColumn(),
-    rich.progress.TimeRemainingColumn(),
-  )
   try:
-    with rich.progress.Progress(*columns, console=console) as bar:
-      task = bar.add_task("filming", total=arguments.film.frames)
-      filming.film(
-        arguments.out,
-        seed=arguments.seed,
-        settings=arguments.film,
-        progress=lambda done, total: bar.update(task, completed=done, total=total),
-      )
+    with progress_bar("filming", console=console) as progress:
+      filming.film(arguments.out, seed=arguments.seed, settings=arguments.film, progress=progress)
   except (EglMissingError, OSError, ValueError) as error:
     console.print(f"[red]{error}[/red]")
     return 1

@@ -21,6 +21,7 @@ from nerf2real.agents.link.arguments import add_link_arguments, link_settings
 from nerf2real.agents.link.sessions import LinkError
 from nerf2real.agents.processes.checkpoints import CheckpointError, read_info
 from nerf2real.agents.processes.learner import Learner, RunSettings
+from nerf2real.core.serialization import from_plain
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -77,7 +78,7 @@ def agent_settings(arguments: argparse.Namespace) -> tuple[str, configs.DmpoConf
   """The environment and the agent's settings: those of the checkpoint when a run is resumed."""
   info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
   if info is not None:
-    environment, config = info["environment"], configs.from_dict(info["config"])
+    environment, config = info["environment"], from_plain(info["config"], configs.DmpoConfig)
     if arguments.env not in (None, environment):
       raise ValueError(
         f"{arguments.run} was trained on {environment}, found --env {arguments.env}."

@@ -19,8 +19,8 @@ from rich.progress import track
 
 from nerf2real import suite
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.pictures.overview import TopDown
-from nerf2real.suite.pictures.third_person import ThirdPerson
+from nerf2real.suite.views.overview import TopDown
+from nerf2real.suite.views.third_person import ThirdPerson
 
 _HEIGHT, _WIDTH = 360, 480  # pixels of the third person's picture and of the enlarged robot's view
 _FRAME_STEPS = 2  # control steps between frames: 20 frames/s

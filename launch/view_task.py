@@ -19,7 +19,7 @@ from nerf2real import suite
 from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.suite import loading
 from nerf2real.suite.op3 import constants, op3
-from nerf2real.suite.pictures.third_person import best_azimuth, clear_distance, direction
+from nerf2real.suite.views.third_person import best_azimuth, clear_distance, direction
 
 _SPRING = 40.0  # N/m between the handle that is dragged and the torso
 _MAX_FORCE = 20.0  # N

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,13 +10,14 @@ import cv2
 import numpy as np
 import trimesh
 
+from nerf2real.core import files
+from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion
 from nerf2real.scenes.poses import localise
 from nerf2real.scenes.quality import held_out as evaluate
 from nerf2real.scenes.quality import report
-from nerf2real.scenes.stages import to_plain
 
 if TYPE_CHECKING:
   from nerf2real.scenes.pipeline import Job
@@ -69,7 +69,7 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
   """
   (out / "scene.json").unlink(missing_ok=True)
   for stage, item in _FILES:
-    _replace(job.folder(stage) / item, out / item)
+    files.copy_atomically(job.folder(stage) / item, out / item)
   contact = job.load("contact", "contact.json")
   parts = collision.read_parts(out / "collision")
   figures = _figures(job, contact)
@@ -132,15 +132,15 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
     "source": {"name": job.source.name, "kind": job.capture.kind, "sha256": job.source_key},
     "settings": settings,
     "hashes": {stage: result.key for stage, result in results.items()},
-    "world_from_unit": transform.to_dict(),
+    "world_from_unit": to_plain(transform),
     "scale": job.alignment.scale_source,
-    "alignment": job.alignment.to_dict(),
+    "alignment": to_plain(job.alignment),
     "extent": {
       "lower": job.alignment.extent_lower.tolist(),
       "upper": job.alignment.extent_upper.tolist(),
     },
     "goals": contact["goals"],
-    "camera": job.localisation.camera.to_dict(),
+    "camera": to_plain(job.localisation.camera),
     "collision_parts": sorted(path.name for path in (out / "collision").glob("part_*.obj")),
     "figures": figures,
     "seconds": seconds,
@@ -204,15 +204,3 @@ def _map_picture(space: free_space.FreeSpace, goals: np.ndarray, path: np.ndarra
   for goal in goals:
     cv2.drawMarker(picture, pixel(goal), (0, 114, 178), cv2.MARKER_TILTED_CROSS, 24, 4)
   return picture
-
-
-def _replace(source: Path, target: Path) -> None:
-  """Copies a file or folder over an older one."""
-  partial = target.with_name(f".{target.name}.partial")
-  if source.is_dir():
-    shutil.rmtree(partial, ignore_errors=True)
-    shutil.copytree(source, partial)
-    shutil.rmtree(target, ignore_errors=True)
-  else:
-    shutil.copyfile(source, partial)
-  partial.replace(target)

@@ -16,9 +16,12 @@ import cv2
 import numpy as np
 import pycolmap
 
+from nerf2real.core import files
+from nerf2real.core.progress import Progress, part
+from nerf2real.core.serialization import read_json, write_json
 from nerf2real.scenes import assembly, bundle, stages
 from nerf2real.scenes.capture import keyframes
-from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
+from nerf2real.scenes.capture.capture import CaptureSettings, read_capture, source_kind
 from nerf2real.scenes.field import anchors, photometry
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.fused.trainer import FusedField
@@ -122,8 +125,9 @@ def make_scene(
   """
   out = Path(out)
   fixed = overrides.read(override) if override else None
-  source_key = stages.hash_path(Path(source))
-  override_key = stages.hash_path(override) if override else ""
+  source_kind(Path(source))  # raises where it cannot be used
+  source_key = files.hash_path(source)
+  override_key = files.hash_path(override) if override else ""
   cache = stages.Stages(out / STAGES, show_progress=show_progress)
   job = Job(Path(source), source_key, settings, cache, override=fixed, override_key=override_key)
   job.keyframes()
@@ -169,7 +173,7 @@ class Job:
   def keyframes(self) -> None:
     """Writes the sharpest frames."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       taken = read_capture(
         self.source, folder / "images", settings=self.settings.capture, progress=progress
       )
@@ -184,7 +188,7 @@ class Job:
   def poses(self) -> None:
     """Finds the camera and its poses."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       localising.localise(
         self.capture.folder,
         folder,
@@ -227,7 +231,7 @@ class Job:
       "train_width": self.settings.train_width,
     }
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       training, _ = self.views().split(self.settings.held_out_every)
       field, outcome = train(
         training.evened(),
@@ -236,7 +240,7 @@ class Job:
         checkpoint_dir=folder / "checkpoints",
       )
       field.save(folder / "field.safetensors")
-      (folder / "training.json").write_text(json.dumps(stages.to_plain(outcome), indent=1))
+      write_json(folder / "training.json", outcome)
       shutil.rmtree(folder / "checkpoints", ignore_errors=True)
 
     self.stages.run("field", run, settings=settings, inputs=self._keys("poses"))
@@ -252,12 +256,12 @@ class Job:
   def figures(self) -> None:
     """Scores the held-out views."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       _, held_out = self.views().split(self.settings.held_out_every)
       scores, figures = evaluate.evaluate(self.renderer, held_out, progress=progress)
       figures["exposure_ratio"] = photometry.exposure_ratio(held_out.gains)
       evaluate.save_scores(scores, folder)
-      (folder / "figures.json").write_text(json.dumps(figures, indent=1))
+      write_json(folder / "figures.json", figures)
 
     self.stages.run(
       "figures", run, settings=self.settings.held_out_every, inputs=self._keys("field")
@@ -266,7 +270,7 @@ class Job:
   def depth(self) -> None:
     """Renders depth where the capture's cameras stood."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       camera = self.localisation.camera
       width = min(self.settings.depth_width, camera.width)
       camera = camera.resized(width, round(camera.height * width / camera.width))
@@ -299,14 +303,14 @@ class Job:
       "override": self._override_key,
     }
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       found = self.localisation
       marker = None
       if self.settings.marker_side is not None:
         images = self.folder("keyframes") / "images"
         detections = markers.detect(
           [images / image for image in found.names],
-          progress=lambda fraction, text: progress(0.6 * fraction, text),
+          progress=part(progress, 0.0, 0.6),
         )
         marker = markers.marker_scale(
           detections,
@@ -323,25 +327,25 @@ class Job:
         marker=marker,
         settings=self.settings.align,
         override=self._override,
-        progress=lambda fraction, text: progress(0.6 + 0.4 * fraction, text),
+        progress=part(progress, 0.6, 1.0),
       )
-      values = result.to_dict()
       if self.settings.marker_side is not None and marker is None:
-        values["warnings"].append(
+        missing = (
           f"No marker of side {self.settings.marker_side} m was read consistently in three "
           "pictures or more: print it larger, lay it flat, film it from nearer."
         )
-      (folder / "alignment.json").write_text(json.dumps(values, indent=1))
+        result = dataclasses.replace(result, warnings=(*result.warnings, missing))
+      write_json(folder / "alignment.json", result)
 
     self.stages.run("world", run, settings=settings, inputs=self._keys("depth"))
-    self.alignment = aligning.Alignment.from_dict(self.load("world", "alignment.json"))
+    self.alignment = read_json(self.folder("world") / "alignment.json", aligning.Alignment)
     self.world_depth = self.unit_depth.transformed(self.alignment.world_from_unit)
 
   def surface(self) -> None:
     """Makes the coloured surface mesh."""
     settings = self.settings.mesh
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       place = self.alignment
       grid = fusion.fuse(
         self.world_depth,
@@ -349,7 +353,7 @@ class Job:
         upper=place.extent_upper,
         voxel=settings.voxel,
         truncation=settings.truncation,
-        progress=lambda fraction, text: progress(0.5 * fraction, text),
+        progress=part(progress, 0.0, 0.5),
       )
       if settings.source == "density":
         grid = meshing.density_to_grid(
@@ -383,7 +387,7 @@ class Job:
     """Makes the convex parts and the map of the free floor, and measures them."""
     settings = self.settings
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       place = self.alignment
       shape = dataclasses.replace(settings.collision, floor_threshold=place.floor_threshold)
       top = np.minimum(place.extent_upper, [np.inf, np.inf, shape.top])
@@ -392,11 +396,9 @@ class Job:
         lower=place.extent_lower,
         upper=place.extent_upper,
         settings=shape,
-        progress=lambda fraction, text: progress(0.2 * fraction, text),
+        progress=part(progress, 0.0, 0.2),
       )
-      parts = convex.decompose(
-        grid, settings=shape.parts, progress=lambda f, text: progress(0.2 + 0.6 * f, text)
-      )
+      parts = convex.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
       contact.write_parts(parts, folder / "collision")
       progress(0.8, "free space")
       space = free_space(
@@ -425,9 +427,9 @@ class Job:
         "free_area_m2": float(space.reachable.sum() * space.resolution**2),
         "collision_parts": len(parts),
         "collision_error_m": error.p95,
-        "collision_error": error.to_dict(),
+        "collision_error": error,
       }
-      (folder / "contact.json").write_text(json.dumps(values, indent=1))
+      write_json(folder / "contact.json", values)
 
     self.stages.run(
       "contact", run, settings=[settings.collision, settings.free_space], inputs=self._keys("world")
@@ -436,7 +438,7 @@ class Job:
   def poisson(self) -> None:
     """Renders the paper's baseline, the Poisson mesh of the COLMAP points, at held-out views."""
 
-    def run(folder: Path, progress: stages.Progress) -> None:
+    def run(folder: Path, progress: Progress) -> None:
       found = self.localisation
       _, held_out = self.views().split(self.settings.held_out_every)
       progress(0.0, "Poisson mesh")
@@ -456,9 +458,7 @@ class Job:
         image_quality.psnr(pictures[name], held_out.images[index])
         for index, name in enumerate(held_out.names)
       ]
-      (folder / "figures.json").write_text(
-        json.dumps({"baseline_psnr_db": float(np.mean(quality))})
-      )
+      write_json(folder / "figures.json", {"baseline_psnr_db": float(np.mean(quality))})
 
     self.stages.run(
       "baseline", run, settings=self.settings.held_out_every, inputs=self._keys("poses")

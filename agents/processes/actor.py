@@ -19,6 +19,7 @@ from nerf2real.agents.dmpo.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import ActorLink, Grant
 from nerf2real.agents.processes.environments import make_environment
+from nerf2real.core.serialization import from_plain
 
 _log = logging.getLogger(__name__)
 _POLL = 0.01  # s between questions while no credit is granted
@@ -34,8 +35,8 @@ class _Process:
     self._stop = threading.Event()
     description = self._describe()
     self.description = description
-    self.config: configs.DmpoConfig = configs.from_dict(description["config"])
-    self.layout = Layout.from_dict(description["layout"])
+    self.config: configs.DmpoConfig = from_plain(description["config"], configs.DmpoConfig)
+    self.layout = from_plain(description["layout"], Layout)
     self.environment: dm_env.Environment = make_environment(
       description["environment"], seed=seed, history=self.config.history
     )

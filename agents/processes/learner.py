@@ -25,6 +25,7 @@ from nerf2real.agents.link.server import LearnerLink
 from nerf2real.agents.processes.checkpoints import BEST, CheckpointError, Checkpoints
 from nerf2real.agents.processes.environments import make_environment
 from nerf2real.agents.processes.logs import MetricsLog
+from nerf2real.core.serialization import to_plain
 
 _log = logging.getLogger(__name__)
 _RECENT_EPISODES = 20  # over which returns are averaged in the status
@@ -129,8 +130,8 @@ class Learner:
       known=self.replay.origins(),
       description={
         "environment": settings.environment,
-        "config": configs.to_dict(config),
-        "layout": self.layout.to_dict(),
+        "config": to_plain(config),
+        "layout": to_plain(self.layout),
         "seed": settings.seed,
         "evaluation_period": settings.evaluation_period,
         "evaluation_episodes": settings.evaluation_episodes,
@@ -245,7 +246,7 @@ class Learner:
       parameters,
       layout=self.layout,
       environment=self._settings.environment,
-      settings=configs.to_dict(self._config),
+      settings=to_plain(self._config),
       info=self._info() | info,
     )
 
@@ -269,8 +270,8 @@ class Learner:
       steps, updates = self.limiter.steps, self.limiter.updates
     return {
       "environment": self._settings.environment,
-      "config": configs.to_dict(self._config),
-      "layout": self.layout.to_dict(),
+      "config": to_plain(self._config),
+      "layout": to_plain(self.layout),
       "seed": self._settings.seed,
       "steps": steps,
       "updates": updates,

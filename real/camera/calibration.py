@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import yaml
 
+from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -235,7 +236,7 @@ def write_camera_info(path: Path, calibration: Calibration, *, name: str = "came
   lines.append(f"# RMS {calibration.rms:.3f} pixel over {len(calibration.views)} views")
   info = camera_info(calibration, name=name)
   text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
-  Path(path).write_text("\n".join(lines) + "\n" + text)
+  files.write_atomically(path, "\n".join(lines) + "\n" + text)
 
 
 def read_camera_info(path: Path) -> Camera:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.serialization import to_plain
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.assembly import Reconstruction, TruthFigures
 from nerf2real.scenes.builtin import filming, furniture, room
@@ -98,7 +99,7 @@ def measure(result: Reconstruction) -> TruthFigures:
     views = views or scores
   figures |= _contact_figures(result, rigid)
   # Where the truth's frame lies: benchmarks compare other pictures of the bundle with the truth.
-  return TruthFigures({**figures, "room_from_world": rigid.to_dict()}, views)
+  return TruthFigures({**figures, "room_from_world": to_plain(rigid)}, views)
 
 
 def _robot_scores(

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.video import CaptureError
@@ -31,8 +32,13 @@ class KnownPoses:
   files: tuple[Path, ...]  # picture of each pose
   world_from_camera: np.ndarray  # [N, 4, 4], OpenCV camera axes, the source's frame
   points: np.ndarray  # [P, 3], the source's frame; empty where the source has none
-  point_colors: np.ndarray  # uint8 [P, 3]
+  point_colors: NDArray[np.uint8]  # [P, 3]
   point_errors: np.ndarray  # mean reprojection error [P] [pixel]
+
+  def __post_init__(self):
+    # JSON does not keep the columns of an array without rows.
+    for name in ("points", "point_colors"):
+      object.__setattr__(self, name, getattr(self, name).reshape(-1, 3))
 
   def selected(self, indices: list[int], camera: Camera) -> "KnownPoses":
     """Keeps some of the pictures, with the camera of the pictures as they were written."""

@@ -5,12 +5,11 @@ every choice can be overridden (`scenes.geometry.overrides`). Shapes: N cameras,
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from nerf2real.core import similarity
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import floor as floors
 from nerf2real.scenes.geometry import markers, overrides
 
@@ -56,25 +55,6 @@ class Alignment:
     """Angle between the world's z axis and a true up direction [3] of the unit frame."""
     up = self.world_from_unit.rotation @ (true_up / np.linalg.norm(true_up))
     return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
-
-  def to_dict(self) -> dict[str, Any]:
-    """Returns plain numbers, lists and strings, for JSON."""
-    values = dataclasses.asdict(self)
-    values["world_from_unit"] = self.world_from_unit.to_dict()
-    values["extent_lower"] = self.extent_lower.tolist()
-    values["extent_upper"] = self.extent_upper.tolist()
-    values["warnings"] = list(self.warnings)
-    return values
-
-  @classmethod
-  def from_dict(cls, values: dict[str, Any]) -> "Alignment":
-    """Inverts `to_dict`."""
-    values = dict(values)
-    values["world_from_unit"] = similarity.Similarity.from_dict(values["world_from_unit"])
-    values["extent_lower"] = np.array(values["extent_lower"])
-    values["extent_upper"] = np.array(values["extent_upper"])
-    values["warnings"] = tuple(values["warnings"])
-    return cls(**values)
 
 
 def rotation_to_up(normal: np.ndarray) -> np.ndarray:
@@ -152,7 +132,7 @@ def align(
   marker: markers.MarkerScale | None = None,
   settings: AlignSettings | None = None,
   override: overrides.Overrides | None = None,
-  progress: Callable[[float, str], None] | None = None,
+  progress: Progress = no_progress,
 ) -> Alignment:
   """Finds the world frame.
 
@@ -167,13 +147,12 @@ def align(
     marker: Scale from a marker.
     settings: Settings.
     override: What a person fixed.
-    progress: Called with the share done and a word.
+    progress: Called with the fraction done and a text.
 
   Raises:
     ValueError: no floor was found.
   """
   settings, override = settings or AlignSettings(), override or overrides.Overrides()
-  report = progress or (lambda share, word: None)
   warnings: list[str] = []
   positions = frame_from_camera[:, :3, 3]
   if surface_points is not None and len(surface_points) > _MAX_DENSE:
@@ -188,7 +167,7 @@ def align(
     if override.up is None and override.floor_points is None:
       raise
 
-  report(0.0, "floor")
+  progress(0.0, "floor")
   if override.floor_points is not None:
     normal, offset = floors.fit_plane(override.floor_points, camera_up)
     error = override.floor_points @ normal - offset
@@ -225,7 +204,7 @@ def align(
       "report, and give floor_points in the override file if it is wrong."
     )
 
-  report(0.4, "yaw")
+  progress(0.4, "yaw")
   upright = rotation_to_up(plane.normal)
   heights = plane.heights(dense) * metres
   band = (heights > 0.1) & (heights < settings.max_height)
@@ -244,7 +223,7 @@ def align(
   if override.yaw_deg is None:
     rotation = _longer_side_along_x(rotation, dense[band] if band.any() else dense)
 
-  report(0.7, "extent")
+  progress(0.7, "extent")
   base = similarity.Similarity(metres, rotation, np.zeros(3))
   surface = base.apply(dense)
   cameras_world = base.apply(positions)
@@ -274,7 +253,7 @@ def align(
       f"{np.round(upper, 2).tolist()} m. Correct extent_lower and extent_upper in the override "
       "file."
     )
-  report(1.0, "aligned")
+  progress(1.0, "aligned")
   return Alignment(
     world_from_unit=similarity.Similarity(metres, rotation, -shift - np.array([0, 0, height])),
     extent_lower=lower,

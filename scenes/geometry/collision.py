@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import convex, fusion
 from nerf2real.scenes.geometry import mesh as meshes
 
@@ -78,7 +79,7 @@ def solid_grid(
   lower: np.ndarray,
   upper: np.ndarray,
   settings: CollisionSettings | None = None,
-  progress: fusion.Progress | None = None,
+  progress: Progress = no_progress,
 ) -> fusion.Grid:
   """Fuses depth into the grid that collides: cropped, without floor and floaters, world frame.
 
@@ -87,7 +88,7 @@ def solid_grid(
     lower: Lower corner of the extent [3].
     upper: Upper corner of the extent [3].
     settings: Settings.
-    progress: Called with the share done and a word.
+    progress: Called with the fraction done and a text.
   """
   settings = settings or CollisionSettings()
   lower = np.array([lower[0], lower[1], 0.0])

@@ -24,6 +24,7 @@ import numpy as np
 from scipy import ndimage, spatial
 from skimage import measure
 
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import fusion
 from nerf2real.scenes.geometry import mesh as meshes
 
@@ -265,7 +266,7 @@ def decompose(
   grid: fusion.Grid,
   *,
   settings: ConvexSettings | None = None,
-  progress: fusion.Progress | None = None,
+  progress: Progress = no_progress,
 ) -> list[Part]:
   """Decomposes the solid of a grid.
 
@@ -306,15 +307,13 @@ def decompose(
         parts += _coacd(piece, start, matter, settings)
       else:
         parts += _split(piece, start, whole, matter, settings)
-    if progress:
-      progress(0.8 * (number + 1) / len(starts), "convex parts")
+    progress(0.8 * (number + 1) / len(starts), "convex parts")
   tolerance = settings.tolerance
   parts = _merge(parts, space, tolerance, settings, target=1)
   while len(parts) > settings.max_parts and tolerance < 8 * settings.tolerance:
     tolerance *= 1.25
     parts = _merge(parts, space, tolerance, settings, target=settings.max_parts)
-  if progress:
-    progress(1.0, f"{len(parts)} convex parts")
+  progress(1.0, f"{len(parts)} convex parts")
   return parts
 
 

@@ -8,7 +8,7 @@ Shapes: H rows along y, W columns along x (row 0 is the smallest y in memory).
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ import yaml
 from scipy import ndimage
 from skimage import graph
 
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import convex, fusion
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205  # map_server's grey values
@@ -188,7 +189,7 @@ def free_space(
   upper: np.ndarray,
   seen: fusion.Grid | None = None,
   settings: FreeSpaceSettings | None = None,
-  progress: Callable[[float, str], None] | None = None,
+  progress: Progress = no_progress,
 ) -> FreeSpace:
   """Maps the ground inside an extent.
 
@@ -200,7 +201,7 @@ def free_space(
     unknown
       and no place to stand. Without it everything inside the extent counts as seen.
     settings: Settings.
-    progress: Called with the share done and a word.
+    progress: Called with the fraction done and a text.
   """
   settings = settings or FreeSpaceSettings()
   origin, size = np.asarray(lower[:2], np.float64), settings.resolution
@@ -212,8 +213,7 @@ def free_space(
       # Cell (0, 0) has its centre at half a cell; fillConvexPoly takes 1/16 of a cell.
       pixels = np.round(((corners - origin) / size - 0.5) * 16).astype(np.int32)
       cv2.fillConvexPoly(blocked, cv2.convexHull(pixels), 1, shift=4)
-    if progress:
-      progress((number + 1) / len(parts), "free space")
+    progress((number + 1) / len(parts), "free space")
   cells = np.where(blocked > 0, OCCUPIED, FREE).astype(np.uint8)
   if seen is not None:
     heights = seen.centres(2)

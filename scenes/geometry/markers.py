@@ -7,7 +7,7 @@ metres is the scale. Shapes: K detections of one marker.
 
 import collections
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -15,6 +15,7 @@ import numpy as np
 from scipy import optimize
 
 from nerf2real.core import cameras
+from nerf2real.core.progress import Progress, no_progress
 
 # Groups are tried in this order until one is read; the time grows with the number of codes:
 # 30, 55 and 105 ms a picture of 640x480. The large sets contain the small ones.
@@ -80,7 +81,7 @@ def detect(
   images: Sequence[pathlib.Path | np.ndarray],
   *,
   dictionaries: Sequence[Sequence[str]] = DICTIONARIES,
-  progress: Callable[[float, str], None] | None = None,
+  progress: Progress = no_progress,
 ) -> list[Detection]:
   """Finds markers in pictures (paths, or uint8 arrays [H, W] or [H, W, 3]).
 
@@ -98,9 +99,8 @@ def detect(
           quad = np.asarray(quad, np.float64).reshape(4, 2) + 0.5  # OpenCV's first pixel is at 0, 0
           if np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=-1).min() >= _MIN_SIDE_PX:
             found.append(Detection(names[int(index)], int(marker), view, quad))
-      if progress:
-        done = (number + (view + 1) / len(images)) / len(dictionaries)
-        progress(done, f"looking for markers {names[0]}, ...")
+      done = (number + (view + 1) / len(images)) / len(dictionaries)
+      progress(done, f"looking for markers {names[0]}, ...")
     everything += found
     views = collections.defaultdict(set)
     for d in found:

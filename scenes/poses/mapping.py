@@ -9,8 +9,9 @@ import numpy as np
 import pycolmap
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
-from nerf2real.scenes.poses.matching import Report, image_ids, quiet
+from nerf2real.scenes.poses.matching import image_ids, quiet
 
 MIN_OBSERVATIONS = 20  # points a picture must see to count as registered; ours
 MAX_ERROR = 4.0  # observations further off are dropped [pixel]; COLMAP
@@ -25,7 +26,7 @@ _NOTHING = (ValueError, RuntimeError)  # what pycolmap raises
 
 
 def map_globally(
-  database: Path, images_folder: Path, *, seed: int, report: Report | None = None
+  database: Path, images_folder: Path, *, seed: int, report: Progress = no_progress
 ) -> list[pycolmap.Reconstruction]:
   """Solves for all rotations, then all positions, then adjusts; the largest model first.
 
@@ -35,8 +36,7 @@ def map_globally(
   options = pycolmap.GlobalPipelineOptions()
   options.num_threads = os.cpu_count() or 1
   options.random_seed = seed
-  if report is not None:
-    report(0.0, "solving for all poses at once")
+  report(0.0, "solving for all poses at once")
   with tempfile.TemporaryDirectory(dir=database.parent) as folder:
     # The global mapper writes calibrated focal lengths into its database: it gets its own copy.
     copy = Path(folder) / "database.db"
@@ -52,7 +52,7 @@ def map_globally(
 
 
 def map_incrementally(
-  database: Path, images_folder: Path, *, seed: int, report: Report | None = None
+  database: Path, images_folder: Path, *, seed: int, report: Progress = no_progress
 ) -> list[pycolmap.Reconstruction]:
   """Adds picture after picture; the largest model first.
 
@@ -74,8 +74,7 @@ def map_incrementally(
   def next_image() -> None:
     nonlocal seen
     seen += 1
-    if report is not None:
-      report(min(1.0, seen / total), f"placed {min(seen, total)} of {total} pictures")
+    report(min(1.0, seen / total), f"placed {min(seen, total)} of {total} pictures")
 
   with tempfile.TemporaryDirectory(dir=database.parent) as folder:
     try:
@@ -146,7 +145,7 @@ def camera_fault(camera: Camera) -> str | None:
 
 
 def refine(
-  model: pycolmap.Reconstruction, *, report: Report | None = None
+  model: pycolmap.Reconstruction, *, report: Progress = no_progress
 ) -> tuple[pycolmap.Reconstruction, str]:
   """Adjusts poses, points and all parameters of the lens; frees fewer where the result is absurd.
 
@@ -157,8 +156,7 @@ def refine(
   Returns:
     The refined model and a sentence on the lens: which parameters are free and why not all.
   """
-  if report is not None:
-    report(0.0, "adjusting poses and lens")
+  report(0.0, "adjusting poses and lens")
   base = pycolmap.Reconstruction(model)
   _adjust(base, principal=False, distortion=True)
   fault = camera_fault(_camera(base))
@@ -168,8 +166,7 @@ def refine(
       camera.params = np.concatenate([camera.params[:4], np.zeros(4)])
     _adjust(base, principal=False, distortion=False)
     return base, f"focal lengths only, no distortion, because {fault}"
-  if report is not None:
-    report(0.5, "adjusting poses and lens, principal point free")
+  report(0.5, "adjusting poses and lens, principal point free")
   full = pycolmap.Reconstruction(base)
   _adjust(full, principal=True, distortion=True)
   fault = camera_fault(_camera(full))

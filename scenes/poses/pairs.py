@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from nerf2real.core.progress import Progress, no_progress
+
 Pair = tuple[int, int]  # indices of two keyframes, the smaller first
 
 
@@ -55,7 +57,7 @@ def sparse_keyframes(count: int, limit: int) -> np.ndarray:
 
 
 def overlap_scores(
-  descriptors: np.ndarray, *, ratio: float, progress: Callable[[float], None] | None = None
+  descriptors: np.ndarray, *, ratio: float, progress: Progress = no_progress
 ) -> np.ndarray:
   """Counts mutual nearest neighbours that pass the ratio test for every pair of pictures.
 
@@ -65,7 +67,7 @@ def overlap_scores(
   Args:
     descriptors: float32 [M, K, D], of length 1; rows of zeros where a picture has fewer than K.
     ratio: Largest ratio of nearest to second-nearest distance.
-    progress: Called with a fraction.
+    progress: Called with the fraction done and a text.
 
   Returns:
     Symmetric counts int [M, M], zero on the diagonal.
@@ -85,8 +87,8 @@ def overlap_scores(
     passed = (1 - first < ratio**2 * (1 - second)) & (first > 0)
     mutual = np.take_along_axis(back, nearest.T, axis=1) == columns  # [i, K]
     scores[i, :i] = (mutual & passed.T).sum(axis=1)
-    if progress is not None and i % 10 == 0:
-      progress((i / count) ** 2)
+    if i % 10 == 0:
+      progress((i / count) ** 2, "looking for loop closures")
   return scores + scores.T
 
 

@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from nerf2real.suite.pictures.camera import RobotCamera
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import RobotCamera
 
 
 class DelayedPicture:

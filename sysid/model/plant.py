@@ -15,8 +15,8 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects.passive import rotation_matrix
-from nerf2real.sysid.data.measured import Measured, measured
 from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.measured import Measured, measured
 from nerf2real.sysid.model.reduction import Reduction, Surroundings, start_velocity
 
 Array = np.ndarray

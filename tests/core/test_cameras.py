@@ -1,5 +1,7 @@
 """The camera model against OpenCV's."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -43,4 +45,4 @@ def test_vertical_field_of_view():
 @pytest.mark.parametrize("change", [{"width": 0}, {"height": -1}, {"fx": 0.0}])
 def test_impossible_cameras_are_refused(change):
   with pytest.raises(ValueError, match="found"):
-    Camera(**{**CAMERA.to_dict(), **change})
+    dataclasses.replace(CAMERA, **change)

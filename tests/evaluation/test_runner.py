@@ -10,6 +10,7 @@ import pytest
 
 from nerf2real.agents.dmpo import belief, config, export, learning, networks
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.core.serialization import to_plain
 from nerf2real.evaluation import episodes, operated, plants, report, runner
 from nerf2real.evaluation.plants import Sight
 from nerf2real.evaluation.policies import Belief
@@ -143,7 +144,7 @@ def exported(tmp_path_factory):
     learning.flatten_params(parameters),
     layout=layout,
     environment="suite:nerf_nav",
-    settings=config.to_dict(preset),
+    settings=to_plain(preset),
     info={},
   )
   return folder

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from launch import check_robot
+from nerf2real.launch import check_robot
 from nerf2real.real.virtual.bus.devices import IDS
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants

@@ -202,11 +202,12 @@ def test_film_is_whole_and_its_truth_fits(renderer, tmp_path):
   )
   steps = []
   video = tmp_path / "room.mp4"
-  filming.film(video, settings=settings, progress=lambda done, total: steps.append((done, total)))
+  filming.film(video, settings=settings, progress=lambda *report: steps.append(report))
   assert sorted(p.name for p in tmp_path.iterdir()) == ["room.mp4", "room_truth.json"]
   with av.open(str(video)) as container:
     frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
   assert len(frames) == settings.frames == 8 == len(steps)
+  assert steps[-1] == (1.0, "picture 8 of 8")
   truth = filming.read_truth(tmp_path / "room_truth.json")
   assert truth["camera"] == settings.camera
   assert truth["world_from_camera"].shape == (8, 4, 4)
@@ -223,7 +224,7 @@ def test_truth_of_another_version_is_refused(tmp_path):
 
 
 def test_interrupted_film_leaves_nothing(renderer, tmp_path):
-  def stop(done, total):
+  def stop(fraction, text):
     raise KeyboardInterrupt
 
   settings = filming.FilmSettings(

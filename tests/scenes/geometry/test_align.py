@@ -8,6 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core import cameras, similarity
+from nerf2real.core.serialization import from_plain, to_plain
+from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.geometry import align, markers, overrides
 from tests.scenes import furnished_room
 
@@ -146,9 +148,14 @@ def test_every_choice_can_be_overridden(room, tmp_path):
   assert abs((up.world_from_unit @ transform).translation[2]) < 0.01
 
 
+def test_alignment_of_the_shipped_bundle_is_read():
+  values = Bundle.load().scene["alignment"]
+  assert to_plain(from_plain(values, align.Alignment)) == values
+
+
 def test_alignment_survives_json(room):
   found = solve(room, unit_frame())
-  again = align.Alignment.from_dict(json.loads(json.dumps(found.to_dict())))
+  again = from_plain(json.loads(json.dumps(to_plain(found))), align.Alignment)
   points = np.random.default_rng(0).random((5, 3))
   np.testing.assert_allclose(
     again.world_from_unit.apply(points), found.world_from_unit.apply(points)

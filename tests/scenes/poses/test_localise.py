@@ -245,7 +245,7 @@ def test_load_returns_what_was_saved(corner):
   np.testing.assert_allclose(
     again.unit_from_source.translation, result.unit_from_source.translation
   )
-  assert not (folder / "out" / "sfm.partial").exists()
+  assert not list((folder / "out").glob("*partial*")) + list((folder / "out").glob(".*"))
   with pytest.raises(LocalisationError, match="holds no localisation"):
     load(folder)
 

@@ -12,8 +12,8 @@ from nerf2real import suite
 from nerf2real.suite import protocols
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.pictures.camera import CameraSettings, world_from_camera
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import CameraSettings, world_from_camera
 from nerf2real.suite.tasks import ball_push, nerf_nav, rewards
 from nerf2real.suite.tasks.state import Start
 from tests.suite.synthetic import FlatRenderer, make_room

@@ -12,7 +12,7 @@ import numpy as np
 
 from nerf2real.core.cameras import Camera
 from nerf2real.suite.op3 import op3
-from nerf2real.suite.pictures.camera import GeomCaster, RobotCamera
+from nerf2real.suite.sensors.camera import GeomCaster, RobotCamera
 from nerf2real.suite.tasks.base import RobotTask
 
 _DISTANCE, _ELEVATION = 1.4, np.deg2rad(22.0)  # m and rad from the robot

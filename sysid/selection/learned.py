@@ -9,8 +9,8 @@ import numpy as np
 
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.effects.residual import features
+from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.fitting import Fit, Problem
-from nerf2real.sysid.hypotheses import signatures
 from nerf2real.sysid.hypotheses.terms import compose
 from nerf2real.sysid.selection.race import folds_by_log
 

@@ -8,9 +8,9 @@ that is missing. Shapes: N samples.
 
 import numpy as np
 
+from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.fitting import Fit, Problem
-from nerf2real.sysid.hypotheses import signatures
-from nerf2real.sysid.hypotheses.signatures import TorqueResidual
+from nerf2real.sysid.fit.signatures import TorqueResidual
 from nerf2real.sysid.hypotheses.terms import compose
 from nerf2real.sysid.model.kernel import INDEX
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.suite.pictures import third_person
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.tasks.state import Start
+from nerf2real.suite.views import third_person
 from tests.suite.synthetic import FlatRenderer, make_room
 
 _HEIGHT, _WIDTH = 120, 160
