@@ -230,8 +230,6 @@ class RobotTask(composer.Task):
       self.draws.pushes.at(self._data.time) + self.hand_force
     )
     self._substep = 0
-    if self._picture is not None:
-      self._picture.start_step()
 
   def before_substep(
     self, physics: Any, action: np.ndarray, random_state: np.random.RandomState
@@ -246,7 +244,7 @@ class RobotTask(composer.Task):
       self._substep, data.sensordata[self._indices.imu], qpos[self._indices.joint_qpos]
     )
     if self._picture is not None:
-      self._picture.record(self._substep, qpos)
+      self._picture.record(qpos)
     self._touch.note(data)
     self._substep += 1
 
