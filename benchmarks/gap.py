@@ -28,8 +28,8 @@ import tyro
 
 from nerf2real import real, suite
 from nerf2real.real.virtual.body import Truth
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.real.virtual.stream import LENS, VirtualCamera
 from nerf2real.scenes.quality.image_quality import psnr
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants

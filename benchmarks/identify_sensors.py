@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from nerf2real import real
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.real.recorder.recorder import Recorder
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.real.virtual.stream import LENS, VirtualCamera
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.op3.op3 import OP3
 from nerf2real.sysid.sensors import floor, sensing

@@ -34,9 +34,9 @@ from nerf2real import real
 from nerf2real.real.clock import SteppedClock, prefer_this_thread
 from nerf2real.real.loop.environment import RobotEnvironment
 from nerf2real.real.safety.monitor import SafetyError
+from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.process import VirtualRobotProcess
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.real.virtual.stream import VirtualCamera
 from nerf2real.suite.op3 import constants
 
 RESULTS = Path(__file__).parent / "results" / "robot_loop.json"

@@ -12,8 +12,8 @@ from nerf2real.evaluation import perturbations, starts
 from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial, make_intruder
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.safety.monitor import Reason
+from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.real.virtual.stream import VirtualCamera
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT

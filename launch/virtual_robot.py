@@ -21,8 +21,8 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
 import tyro
 
+from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.real.virtual.stream import VirtualCamera
 
 _PUSH = 10.0  # N
 _PUSH_TIME = 0.2  # s

@@ -17,8 +17,8 @@ from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-MIN_VIEWS = 8  # ours: eight numbers of the lens need well more than two views
-_OUTLIER = 2.5  # views with more than this times the median error are left out: ours
+MIN_VIEWS = 8  # chosen: eight numbers of the lens need well more than two views
+_OUTLIER = 2.5  # views with more than this times the median error are left out: chosen
 _BLOCKS = 10  # of the jackknife: neighbouring frames of a video err alike
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _FLAGS = cv2.CALIB_FIX_K3  # the OPENCV model has two radial terms

@@ -23,7 +23,7 @@ from nerf2real.suite.sensors.delays import History
 STEP = 0.001  # s
 WORLDS = ("floor", "room")
 PREFIX = "op3/"
-_STOP_MARGIN = 0.5  # rad from the control limits to a joint's mechanical stop: ours
+_STOP_MARGIN = 0.5  # rad from the control limits to a joint's mechanical stop: chosen
 _HELD_HEIGHT = 0.30  # m of the torso: legs hang free
 _HAND_SPEED = 0.1  # m/s
 _LET_GO_LAG = 0.002  # m that the torso stays above the sinking hand when the feet carry it

@@ -43,7 +43,7 @@ class Hidden:
 
   @classmethod
   def draw(cls, seed: int, count: int = 20) -> "Hidden":
-    """Draws a robot: the ranges are ours, of the size that robots of one kind differ by."""
+    """Draws a robot: the ranges are chosen, of the size that robots of one kind differ by."""
     rng = np.random.default_rng([seed, 5])
     motors = MotorParameters(
       strength=rng.uniform(0.92, 1.05, count),

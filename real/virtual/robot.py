@@ -10,13 +10,11 @@ the host has only the port and the camera.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import Camera
-from nerf2real.real.clock import Clock, RealClock, SteppedClock
+from nerf2real.real.clock import RealClock, SteppedClock
 from nerf2real.real.loading import Connection
 from nerf2real.real.safety.operator import Hand
 from nerf2real.real.virtual.body import Body, Truth
@@ -24,69 +22,10 @@ from nerf2real.real.virtual.bus.devices import Devices
 from nerf2real.real.virtual.bus.faults import Faults
 from nerf2real.real.virtual.bus.protocol_rehearsal import Cable
 from nerf2real.real.virtual.bus.wire import Wire
+from nerf2real.real.virtual.camera import Eyes, SteppedCamera, VirtualCamera
 from nerf2real.real.virtual.hidden import Hidden
-from nerf2real.real.virtual.stream import CameraStream, Sensor, VirtualCamera
-from nerf2real.scenes.builtin.eye import Eye
+from nerf2real.real.virtual.stream import CameraStream
 from nerf2real.suite.op3 import constants
-
-_SUPERSAMPLE = 1  # 45 dB from 4 x 4 samples at 30x40, and half the time of 2 x 2
-_HEAD_CAMERA = "op3/head_camera"
-_OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
-
-
-class Eyes:
-  """True pictures from the robot's head. One thread uses it: an OpenGL context belongs to one."""
-
-  def __init__(self, body: Body, lens: Camera):
-    self._body, self._lens = body, lens
-    self._eye: Any = None
-    self._data: Any = None
-
-  def picture(self, time: float | None = None) -> np.ndarray:
-    """Returns the picture uint8 [H, W, 3] of now, or of a moment [s] up to 0.6 s ago."""
-    model = self._body.model
-    if self._eye is None or self._data is None:
-      self._eye = Eye(model, groups=(0, 2))  # not the head, inside which the camera is
-      self._data = mujoco.MjData(model)
-    data = self._data
-    data.qpos[:] = self._body.pose_at(self._body.time if time is None else time)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_camlight(model, data)
-    self._eye.update(data)
-    camera = model.camera(_HEAD_CAMERA).id
-    pose = np.eye(4)
-    pose[:3, :3] = data.cam_xmat[camera].reshape(3, 3) @ _OPENCV_FROM_MUJOCO
-    pose[:3, 3] = data.cam_xpos[camera]
-    return self._eye.render(self._lens, pose, supersample=_SUPERSAMPLE)[0]
-
-  def close(self) -> None:
-    """Frees the OpenGL context."""
-    if self._eye is not None:
-      self._eye.close()
-      self._eye = None
-
-
-class SteppedCamera:
-  """The camera of a robot on a `SteppedClock`: the stream's sensor, without a network."""
-
-  def __init__(self, eyes: Eyes, clock: Clock, settings: VirtualCamera, *, seed: int):
-    """Makes the camera; pictures are taken at multiples of the frame's duration."""
-    self._eyes, self._clock, self._settings = eyes, clock, settings
-    self.sensor = Sensor(settings, seed=seed)
-    self._frame, self._picture = -1, np.zeros((1, 1, 3), np.uint8)
-    self.frozen = False  # no new pictures come
-
-  def read(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture that has arrived, uint8 [H, W, 3], and its age [s]."""
-    now, rate = self._clock.now(), self._settings.rate
-    frame = int(np.floor((now - self._settings.latency) * rate + 1e-6))
-    if frame != self._frame and not (self.frozen and self._frame >= 0):
-      self._frame = frame
-      self._picture = self.sensor.develop(self._eyes.picture(frame / rate))
-    return self._picture, now - self._frame / rate
-
-  def close(self) -> None:
-    """Has nothing to free: the picture belongs to the robot."""
 
 
 class VirtualRobot:

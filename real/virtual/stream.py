@@ -1,13 +1,11 @@
 """The virtual robot's camera: an MJPEG stream over HTTP, as network cameras give it.
 
-The pictures are those of the true room, never of the radiance field. The sensor has a response of
-its own: white balance, gain and exposure act on the light, photons and the amplifier add noise, a
-JPEG encoder follows, and every frame leaves a fixed time after it was taken. Like a webcam's driver
-it has controls that are read back: `GET /controls` gives them, `GET /controls?gain=90` sets them
-(the gain in the units of the Logitech C920, in which 50 is neutral).
+A JPEG encoder follows the sensor, and every frame leaves a fixed time after it was taken. Like a
+webcam's driver it has controls that are read back: `GET /controls` gives them,
+`GET /controls?gain=90` sets them (the gain in the units of the Logitech C920, in which 50 is
+neutral).
 """
 
-import dataclasses
 import json
 import threading
 import time
@@ -19,80 +17,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.real.virtual.camera import Sensor, VirtualCamera
 
-# The lens of the virtual robot's camera; chosen: as wide as a Logitech C920's, not quite without
-# distortion, its axis not quite in the middle.
-LENS = Camera(
-  width=320,
-  height=240,
-  fx=303.5,
-  fy=303.1,
-  cx=161.6,
-  cy=118.9,
-  k1=0.045,
-  k2=-0.07,
-  p1=0.0004,
-  p2=-0.0003,
-)
 NEUTRAL_GAIN = 50.0  # of the C920 (paper: the default of the navigation experiments)
 MAX_GAIN, MAX_EXPOSURE = 255.0, 16.0  # the driver's ranges; of exposure in shares of the neutral
-_GAMMA = 2.2
-_WHITE_BALANCE = (1.02, 1.0, 0.97)  # of this sensor, on red, green and blue light: ours
-_SHOT_NOISE = 0.5  # share of the noise at mid grey that goes with the root of the light: ours
 _JPEG_QUALITY = 85
 _BOUNDARY = "frame"
 _WAIT = 0.5  # s a client's thread waits for a frame before it looks whether the stream has ended
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VirtualCamera:
-  """The virtual robot's camera."""
-
-  lens: Camera = LENS
-  """What the pictures are rendered through."""
-  rate: float = 30.0
-  """Pictures a second."""
-  latency: float = 0.04
-  """s from the light to the arrival of a picture."""
-  gain: float = 1.0
-  """Factor on the signal; 1 is neutral."""
-  exposure: float = 1.0
-  """Factor on the light; 1 is neutral."""
-  noise: float = 2.0
-  """Standard deviation at mid grey and gain 1 [8-bit levels]."""
-
-  def __post_init__(self) -> None:
-    if not self.rate > 0:
-      raise ValueError(f"The camera's rate must be positive [Hz], found {self.rate}.")
-    if not self.latency >= 0:
-      raise ValueError(f"The camera's latency must be 0 s or more, found {self.latency}.")
-
-
-class Sensor:
-  """What the camera makes of a true picture."""
-
-  def __init__(self, settings: VirtualCamera, *, seed: int = 0):
-    """Sets the sensor, with a seed for its noise."""
-    self.gain, self.exposure, self.noise = settings.gain, settings.exposure, settings.noise
-    self._rng = np.random.default_rng(seed)
-
-  def develop(self, picture: np.ndarray) -> np.ndarray:
-    """Returns the picture uint8 [H, W, 3] that leaves the sensor.
-
-    light = (v / 255)^2.2 * exposure * balance; noise of variance a + b light, times the gain;
-    value = 255 * clip(gain * light + noise)^(1 / 2.2)
-    """
-    table = (np.arange(256) / 255.0) ** _GAMMA
-    light = table[picture] * (self.exposure * np.asarray(_WHITE_BALANCE))
-    if self.noise > 0:
-      middle = 0.5**_GAMMA
-      # Levels to light at mid grey: d light / d value.
-      deviation = self.noise / 255.0 * _GAMMA * 0.5 ** (_GAMMA - 1)
-      share = _SHOT_NOISE * light / middle + (1 - _SHOT_NOISE)
-      light = light + self._rng.normal(size=light.shape) * deviation * np.sqrt(share)
-    signal = np.clip(self.gain * light, 0.0, 1.0) ** (1 / _GAMMA)
-    return np.rint(255 * signal).astype(np.uint8)
 
 
 class CameraStream:

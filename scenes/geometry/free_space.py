@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,7 +18,9 @@ from scipy import ndimage
 from skimage import graph
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.geometry import convex, fusion
+
+if TYPE_CHECKING:  # a robot's host reads maps, and builds none
+  from nerf2real.scenes.geometry import convex, fusion
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205  # map_server's grey values
 
@@ -162,7 +165,7 @@ def read(path: pathlib.Path) -> FreeSpace:
   )
 
 
-def _shadow(part: convex.Part, low: float, high: float) -> np.ndarray | None:
+def _shadow(part: "convex.Part", low: float, high: float) -> np.ndarray | None:
   """Corners [K, 2] of what a convex part covers between two heights; None if it is elsewhere.
 
   A convex body's slab is convex, so its shadow is the hull of its corners: the part's own within
@@ -183,11 +186,11 @@ def _shadow(part: convex.Part, low: float, high: float) -> np.ndarray | None:
 
 
 def free_space(
-  parts: Sequence[convex.Part],
+  parts: Sequence["convex.Part"],
   *,
   lower: np.ndarray,
   upper: np.ndarray,
-  seen: fusion.Grid | None = None,
+  seen: "fusion.Grid | None" = None,
   settings: FreeSpaceSettings | None = None,
   progress: Progress = no_progress,
 ) -> FreeSpace:

@@ -10,7 +10,8 @@ import pytest
 from nerf2real.real.camera import device as cameras
 from nerf2real.real.camera.device import CaptureSettings
 from nerf2real.real.camera.source import resize
-from nerf2real.real.virtual.stream import CameraStream, Sensor, VirtualCamera
+from nerf2real.real.virtual.camera import Sensor, VirtualCamera
+from nerf2real.real.virtual.stream import CameraStream
 
 SIZE = (30, 40)
 

@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.process import VirtualRobotProcess
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.real.virtual.stream import LENS, VirtualCamera
 from nerf2real.real.wire.bus import Bus, BusError
 from nerf2real.real.wire.servos import Servos
 from nerf2real.scenes.builtin.eye import EglMissingError
