@@ -27,6 +27,7 @@ import numpy as np
 import tyro
 
 from nerf2real import real, suite
+from nerf2real.core import rotations
 from nerf2real.real.virtual.body import Truth
 from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
@@ -162,9 +163,7 @@ class Simulation:
     model = self.environment.physics.model.ptr
     free = model.joint(f"{task.robot.mjcf_model.model}/").qposadr[0]
     data.qpos[free : free + 3] = truth.position
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, truth.rotation.ravel())
-    data.qpos[free + 3 : free + 7] = quaternion
+    data.qpos[free + 3 : free + 7] = rotations.quaternion_from_matrix(truth.rotation)
     for name, angle in zip(constants.JOINT_NAMES, truth.joints, strict=True):
       data.qpos[model.joint(f"{task.robot.mjcf_model.model}/{name}").qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)

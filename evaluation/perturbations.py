@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
+from nerf2real.core.rotations import yaw_quaternion
 from nerf2real.suite.op3 import constants
 
 NONE, BLOCKED_CAMERA, MOVED_OBJECT, PERSON = "none", "blocked_camera", "moved_object", "person"
@@ -129,7 +130,7 @@ class Intruder:
     """Puts it where it is at a time of the episode [s]."""
     place, heading = self.place(time)
     data.mocap_pos[self._mocap] = (*place, 0.0)
-    data.mocap_quat[self._mocap] = (np.cos(heading / 2), 0, 0, np.sin(heading / 2))
+    data.mocap_quat[self._mocap] = yaw_quaternion(heading)
 
   def touched(self, data: mujoco.MjData) -> bool:
     """Returns whether a part of the robot other than the feet touches it now."""

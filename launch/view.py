@@ -63,13 +63,12 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
     parts[-1].visible = False
   frusta = []
   sfm = localise.load(bundle.folder / "sfm")
-  fov = 2 * np.arctan(0.5 * sfm.camera.height / sfm.camera.fy)
   for name, pose in list(zip(sfm.names, sfm.world_from_camera, strict=True))[::_CAMERA_STEP]:
     world = bundle.world_from_unit.apply_pose(pose)
     frusta.append(
       server.scene.add_camera_frustum(
         f"/cameras/{name}",
-        fov=float(fov),
+        fov=sfm.camera.vertical_fov,
         aspect=sfm.camera.width / sfm.camera.height,
         scale=0.08,
         wxyz=transforms.SO3.from_matrix(world[:3, :3]).wxyz,

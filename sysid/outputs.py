@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.core.files import write_atomically
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.suite.effects.files import from_list, to_list
@@ -126,13 +127,12 @@ def identify(
     Path(model), out / "model_extended.xml", [*found.calibration, *found.objects]
   )
   details = _details(found, Path(model), whole, sensed)
-  (out / "details.json").write_text(json.dumps(details, indent=2, allow_nan=False) + "\n")
+  write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
   content["seconds"] = round(time.perf_counter() - began, 1)
-  (out / "report.html").write_text(
-    report.page(found, content, details, others, whole, settings.window_s)
-  )
+  page = report.page(found, content, details, others, whole, settings.window_s)
+  write_atomically(out / "report.html", page)
   content["seconds"] = round(time.perf_counter() - began, 1)
-  (out / "report.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+  write_atomically(out / "report.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
   return content
 
 

@@ -23,7 +23,6 @@ _BLOCKS = 10  # of the jackknife: neighbouring frames of a video err alike
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _FLAGS = cv2.CALIB_FIX_K3  # the OPENCV model has two radial terms
 _REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-_PIXEL_CENTRE = 0.5  # COLMAP's coordinates of the upper left pixel's centre, against OpenCV's 0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,10 +61,9 @@ class Calibration:
   @property
   def camera(self) -> Camera:
     """The camera in the convention of `core.cameras`."""
-    named = dict(zip(NAMES, (float(v) for v in self.values), strict=True))
-    named["cx"] += _PIXEL_CENTRE
-    named["cy"] += _PIXEL_CENTRE
-    return Camera(width=self.width, height=self.height, **named)
+    fx, fy, cx, cy, *distortion = self.values
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return Camera.from_opencv(self.width, self.height, matrix, distortion)
 
 
 def read_pictures(source: Path, *, every: int = 1) -> Iterator[tuple[str, np.ndarray]]:
@@ -261,15 +259,4 @@ def read_camera_info(path: Path) -> Camera:
       f"{path} has the distortion {model!r} with k3 = {rest}, expected plumb_bob with k3 = 0: "
       "calibrate again with two radial terms."
     )
-  return Camera(
-    width=size[0],
-    height=size[1],
-    fx=float(matrix[0]),
-    fy=float(matrix[4]),
-    cx=float(matrix[2]) + _PIXEL_CENTRE,
-    cy=float(matrix[5]) + _PIXEL_CENTRE,
-    k1=k1,
-    k2=k2,
-    p1=p1,
-    p2=p2,
-  )
+  return Camera.from_opencv(*size, matrix, (k1, k2, p1, p2))

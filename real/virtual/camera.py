@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import pose_of_mujoco_camera
 from nerf2real.real.clock import Clock
 from nerf2real.real.virtual.body import Body
 from nerf2real.scenes.builtin.eye import Eye
@@ -31,7 +32,6 @@ LENS = Camera(
 )
 _SUPERSAMPLE = 1  # 45 dB from 4 x 4 samples at 30x40, and half the time of 2 x 2
 _HEAD_CAMERA = "op3/head_camera"
-_OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 _GAMMA = 2.2
 _WHITE_BALANCE = (1.02, 1.0, 0.97)  # of this sensor, on red, green and blue light: chosen
 _SHOT_NOISE = 0.5  # share of the noise at mid grey that goes with the root of the light: chosen
@@ -107,9 +107,7 @@ class Eyes:
     mujoco.mj_camlight(model, data)
     self._eye.update(data)
     camera = model.camera(_HEAD_CAMERA).id
-    pose = np.eye(4)
-    pose[:3, :3] = data.cam_xmat[camera].reshape(3, 3) @ _OPENCV_FROM_MUJOCO
-    pose[:3, 3] = data.cam_xpos[camera]
+    pose = pose_of_mujoco_camera(data.cam_xpos[camera], data.cam_xmat[camera])
     return self._eye.render(self._lens, pose, supersample=_SUPERSAMPLE)[0]
 
   def close(self) -> None:

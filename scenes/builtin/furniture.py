@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.rotations import yaw_matrix as yaw
 from nerf2real.scenes.builtin import art
-from nerf2real.scenes.builtin.placing import ROOM_SIZE, Group, facing, yaw
+from nerf2real.scenes.builtin.placing import ROOM_SIZE, Group, facing
 from nerf2real.scenes.builtin.potted_plant import plant
 from nerf2real.scenes.builtin.solids import Solid
 

@@ -12,6 +12,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from nerf2real.core.rotations import camera_axes
+
 _RATE = 120.0  # samples of the path a second
 _SMOOTHING = 0.5  # standard deviation of the filter that rounds off the rounds' joints [s]
 _CENTRE = np.array([0.32, -0.17])  # of the open floor [m]
@@ -138,9 +140,7 @@ class Walk:
       position[:, axis] += shake_position * _shake(rng, times, 0.4, 4.0)
     level = np.cos(pitch)
     forward = np.stack([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)], -1)
-    right = np.cross(forward, [0.0, 0, 1])
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    down = np.cross(forward, right)
+    right, down, _ = np.moveaxis(camera_axes(forward), -1, 0)
     angle = shake_angle * np.stack([_shake(rng, times, 0.4, 5.0) for _ in range(3)], -1)
     forward = forward + angle[:, :1] * right + angle[:, 1:2] * down
     right = right + angle[:, 2:] * down

@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from nerf2real.core import similarity
+from nerf2real.core import rotations, similarity
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import floor as floors
 from nerf2real.scenes.geometry import markers, overrides
@@ -57,15 +57,6 @@ class Alignment:
     return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
 
 
-def rotation_to_up(normal: np.ndarray) -> np.ndarray:
-  """The smallest rotation [3, 3] that turns a unit normal [3] to +z."""
-  x, y, z = normal
-  if z < -1 + 1e-9:
-    return np.diag([1.0, -1.0, -1.0])
-  a, b = 1 / (1 + z), -x * y / (1 + z)
-  return np.array([[1 - x * x * a, b, -x], [b, 1 - y * y * a, -y], [x, y, z]])
-
-
 def wall_yaw(normals: np.ndarray, *, weights: np.ndarray | None = None) -> float | None:
   """Direction of the walls from normals [P, 3], z up: an angle in [0, pi/2), or None.
 
@@ -111,11 +102,6 @@ def point_yaw(points: np.ndarray) -> float:
   best = coarse[np.argmin([entropy(a) for a in coarse])]
   fine = best + np.radians(np.arange(-1, 1.01, 0.1))
   return float(np.mod(fine[np.argmin([entropy(a) for a in fine])], np.pi / 2))
-
-
-def _turn(angle: float) -> np.ndarray:
-  c, s = np.cos(angle), np.sin(angle)
-  return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
 def _cells(points: np.ndarray, size: float) -> np.ndarray:
@@ -205,7 +191,7 @@ def align(
     )
 
   progress(0.4, "yaw")
-  upright = rotation_to_up(plane.normal)
+  upright = rotations.rotation_to_up(plane.normal)
   heights = plane.heights(dense) * metres
   band = (heights > 0.1) & (heights < settings.max_height)
   if override.yaw_deg is not None:
@@ -219,7 +205,7 @@ def align(
         point_yaw((dense[band] if band.sum() > 100 else dense) @ upright.T),
         "points",
       )
-  rotation = _turn(-yaw) @ upright
+  rotation = rotations.yaw_matrix(-yaw) @ upright
   if override.yaw_deg is None:
     rotation = _longer_side_along_x(rotation, dense[band] if band.any() else dense)
 
@@ -337,5 +323,5 @@ def _longer_side_along_x(rotation: np.ndarray, points: np.ndarray) -> np.ndarray
   """Adds the quarter turns that put the longer side along x, nearest to the frame's own x axis."""
   spans = [np.ptp(np.quantile(points @ rotation[axis], [0.02, 0.98])) for axis in range(2)]
   if spans[1] > spans[0]:
-    rotation = _turn(np.pi / 2) @ rotation
-  return _turn(np.pi) @ rotation if rotation[0, 0] < 0 else rotation
+    rotation = rotations.yaw_matrix(np.pi / 2) @ rotation
+  return rotations.yaw_matrix(np.pi) @ rotation if rotation[0, 0] < 0 else rotation

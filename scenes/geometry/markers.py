@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy import optimize
 
-from nerf2real.core import cameras
+from nerf2real.core import cameras, least_squares
 from nerf2real.core.progress import Progress, no_progress
 
 # Groups are tried in this order until one is read; the time grows with the number of codes:
@@ -96,7 +96,7 @@ def detect(
       corners, ids, _, which = detector.detectMarkersMultiDict(_read(image))
       if ids is not None:
         for quad, marker, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
-          quad = np.asarray(quad, np.float64).reshape(4, 2) + 0.5  # OpenCV's first pixel is at 0, 0
+          quad = np.asarray(quad, np.float64).reshape(4, 2) + cameras.PIXEL_CENTRE
           if np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=-1).min() >= _MIN_SIDE_PX:
             found.append(Detection(names[int(index)], int(marker), view, quad))
       done = (number + (view + 1) / len(images)) / len(dictionaries)
@@ -172,8 +172,8 @@ def _fit_marker(
     return None
   # The corners of one picture share its pose error: a picture counts as one observation.
   variance = 2 * np.mean(error**2) * 4
-  covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * variance
-  return float(fit.x[6]), float(np.sqrt(covariance[6, 6])), _square(fit.x), len(kept), rms
+  spread = least_squares.standard_deviations(least_squares.covariance(fit.jac.T, variance=variance))
+  return float(fit.x[6]), float(spread[6]), _square(fit.x), len(kept), rms
 
 
 def marker_scale(

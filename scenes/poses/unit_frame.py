@@ -5,6 +5,7 @@ Shapes: N cameras, P points.
 
 import numpy as np
 
+from nerf2real.core import rotations
 from nerf2real.core.similarity import Similarity
 
 POINT_FRACTION = 0.98  # of the points inside [-1, 1]^3; the rest are outliers and far views
@@ -29,21 +30,9 @@ def mean_up(world_from_camera: np.ndarray) -> np.ndarray:
   return up / np.linalg.norm(up)
 
 
-def _rotation_to_z(up: np.ndarray) -> np.ndarray:
-  """Shortest rotation [3, 3] that takes a unit vector to +z."""
-  axis = np.cross(up, [0.0, 0.0, 1.0])
-  cosine = up[2]
-  if cosine < -1 + 1e-12:
-    return np.diag([1.0, -1.0, -1.0])
-  cross = np.array(
-    [[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]], np.float64
-  )
-  return np.eye(3) + cross + cross @ cross / (1 + cosine)
-
-
 def _yaw_of_smallest_box(points: np.ndarray) -> np.ndarray:
   """Rotation [3, 3] about z after which the points' box, robustly, covers the smallest area."""
-  best, result = np.inf, np.eye(3)
+  best, smallest = np.inf, 0.0
   for angle in np.linspace(0, np.pi / 2, _YAW_STEPS, endpoint=False):
     cosine, sine = np.cos(angle), np.sin(angle)
     x = cosine * points[:, 0] - sine * points[:, 1]
@@ -52,9 +41,8 @@ def _yaw_of_smallest_box(points: np.ndarray) -> np.ndarray:
     low_y, high_y = np.percentile(y, _BOX_PERCENTILES)
     area = (high_x - low_x) * (high_y - low_y)
     if area < best:
-      best = area
-      result = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-  return result
+      best, smallest = area, angle
+  return rotations.yaw_matrix(smallest)
 
 
 def unit_from_source(world_from_camera: np.ndarray, points: np.ndarray) -> Similarity:
@@ -72,7 +60,7 @@ def unit_from_source(world_from_camera: np.ndarray, points: np.ndarray) -> Simil
   poses = np.asarray(world_from_camera, np.float64)
   centres = poses[:, :3, 3]
   everything = np.concatenate([np.asarray(points, np.float64).reshape(-1, 3), centres])
-  rotation = _rotation_to_z(mean_up(poses))
+  rotation = rotations.rotation_to_up(mean_up(poses))
   rotation = _yaw_of_smallest_box(everything @ rotation.T) @ rotation
   turned, cameras = everything @ rotation.T, centres @ rotation.T
   low, high = np.percentile(turned, _BOX_PERCENTILES, axis=0)

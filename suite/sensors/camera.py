@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import pose_of_mujoco_camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.suite.op3 import constants, op3
 
@@ -22,8 +23,6 @@ _DISPLAY_GAMMA = 2.2  # of the pictures: light = value ** 2.2
 _LIGHT_DIRECTION = np.array([0.3, 0.2, 0.933])  # towards the light, in the world; ours
 _AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; ours
 _CULLING_SLACK = 1e-3  # rad added to the cone around a geom
-# OpenCV camera axes (x right, y down, z forward) from MuJoCo's (x right, y up, z backward).
-_OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 
 
 class FieldRenderer(Protocol):
@@ -91,10 +90,7 @@ def _checked_size(image_size: tuple[int, int]) -> tuple[int, int]:
 
 def world_from_camera(data: mujoco.MjData, camera_id: int) -> np.ndarray:
   """Returns the pose [4, 4] of a MuJoCo camera with OpenCV's axes."""
-  pose = np.eye(4)
-  pose[:3, :3] = data.cam_xmat[camera_id].reshape(3, 3) @ _OPENCV_FROM_MUJOCO
-  pose[:3, 3] = data.cam_xpos[camera_id]
-  return pose
+  return pose_of_mujoco_camera(data.cam_xpos[camera_id], data.cam_xmat[camera_id])
 
 
 class GeomCaster:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.core import rotations
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.camera import RobotCamera
@@ -137,8 +138,7 @@ class BallPush(RobotTask):
 
   def _in_front(self, random_state: np.random.RandomState) -> np.ndarray:
     root = self._indices.root_qpos
-    w, x, y, z = self._data.qpos[root + 3 : root + 7]
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    yaw = rotations.yaw_of(rotations.matrix_from_quaternion(self._data.qpos[root + 3 : root + 7]))
     ahead, aside = random_state.uniform(*_AHEAD), random_state.uniform(-_ASIDE, _ASIDE)
     forward = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-forward[1], forward[0]])

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import camera_axes
 from nerf2real.suite.op3 import op3
 from nerf2real.suite.sensors.camera import GeomCaster, RobotCamera
 from nerf2real.suite.tasks.base import RobotTask
@@ -70,10 +71,8 @@ def best_azimuth(task: RobotTask, physics: Any) -> float:
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
   """Returns the pose world from camera [4, 4] (OpenCV's axes), upright, looking at a point."""
   forward = (target - position) / np.linalg.norm(target - position)
-  right = np.cross(forward, (0.0, 0.0, 1.0))
-  right /= np.linalg.norm(right)
   pose = np.eye(4)
-  pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+  pose[:3, :3] = camera_axes(forward)
   pose[:3, 3] = position
   return pose
 

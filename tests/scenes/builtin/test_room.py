@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import yaw_matrix
 from nerf2real.scenes.builtin import eye, filming, furniture, room, solids, walk
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
@@ -122,7 +123,7 @@ def test_path_keeps_clear_of_everything():
   ],
 )
 def test_distances_agree_with_mujoco(kind, size, rounding, mujoco_kind):
-  rotation = furniture.yaw(0.7)
+  rotation = yaw_matrix(0.7)
   solid = solids.Solid(
     name="s",
     kind=kind,
