@@ -18,6 +18,7 @@ from rich.table import Table
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.builtin import yardstick
 from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.settings import SceneSettings, preset
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,16 +41,16 @@ class Arguments:
   camera_height: float | None = None
   """Median height of the camera above the floor [m]: gives the scale where there is no marker."""
   override: Path | None = None
-  """YAML or JSON that fixes floor, scale, yaw, extent by hand; see scenes/geometry/overrides.py."""
+  """YAML or JSON that fixes floor, scale, yaw or extent; see scenes/alignment/overrides.py."""
   baseline: Literal["none", "colmap"] | None = None
   """"colmap" adds the Poisson mesh of the COLMAP points to the report."""
   name: str | None = None
   """The scene's name; the output folder's if not given."""
 
 
-def settings_of(arguments: Arguments) -> pipeline.SceneSettings:
+def settings_of(arguments: Arguments) -> SceneSettings:
   """Applies the arguments to their preset."""
-  settings = pipeline.preset(arguments.preset)
+  settings = preset(arguments.preset)
   if arguments.keyframes is not None:
     taken = dataclasses.replace(settings.capture, num_keyframes=arguments.keyframes)
     settings = dataclasses.replace(settings, capture=taken)

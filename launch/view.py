@@ -22,6 +22,7 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.geometry.mesh import load_glb
 from nerf2real.scenes.poses import localise
 
 _CAMERA_STEP = 3  # every third camera is drawn
@@ -43,7 +44,7 @@ class Arguments:
 
 def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
   """Adds meshes, parts, cameras and the free-space map, each with a switch."""
-  visual = trimesh.load_mesh(bundle.visual_path)
+  visual = load_glb(bundle.visual_path)
   shown = server.scene.add_mesh_trimesh("/visual", visual)
   shown.visible = False
   parts = []

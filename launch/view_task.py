@@ -17,6 +17,7 @@ from viser import transforms
 
 from nerf2real import suite
 from nerf2real.scenes.field.render import browser as field_view
+from nerf2real.scenes.geometry.mesh import load_glb
 from nerf2real.suite import loading
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.views.third_person import best_azimuth, clear_distance, direction
@@ -137,7 +138,7 @@ class TaskViewer:
     found: list[Any] = [server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)]
     visual = getattr(scene, "visual_path", None)
     if visual is not None and Path(visual).is_file():
-      found.append(server.scene.add_mesh_trimesh("/room", trimesh.load_mesh(visual)))
+      found.append(server.scene.add_mesh_trimesh("/room", load_glb(Path(visual))))
     else:
       for index, path in enumerate(scene.collision_parts):
         part = trimesh.load_mesh(path)

@@ -26,7 +26,6 @@ BALL_IN_FRONT = 0.5  # share of episodes with the ball just in front of the robo
 # m ahead of and beside the robot's torso, when it starts in front: ours.
 _AHEAD, _ASIDE = (0.25, 0.45), 0.08
 _MAX_ATTEMPTS = 100
-_PLACE_GRID = 0.05  # m between the places that are looked at for a free one
 
 
 class BallPush(RobotTask):
@@ -70,9 +69,7 @@ class BallPush(RobotTask):
 
     Where the room's furniture stands in the way, robot and ball start at the nearest free place.
     """
-    center = self.workspace.center
-    robot = self._nearest_free(center + trial.robot_xy)
-    ball = self._nearest_free(center + trial.ball_xy)
+    robot, ball = self.workspace.starts(trial, self.scene.free_space)
     self.set_start(
       Start((float(robot[0]), float(robot[1])), trial.robot_yaw),
       ball_xy=(float(ball[0]), float(ball[1])),
@@ -120,21 +117,12 @@ class BallPush(RobotTask):
     """Draws a free place of the workspace [2]."""
     for _ in range(_MAX_ATTEMPTS):
       xy = random_state.uniform(self.workspace.lower, self.workspace.upper)
-      if self.scene.free_space.is_reachable(xy[None])[0]:
+      if self.scene.free_space.is_reachable(xy):
         return xy
     raise ValueError(
       f"Found no free place in the workspace of {getattr(self.scene, 'name', '')!r} in "
       f"{_MAX_ATTEMPTS} attempts."
     )
-
-  def _nearest_free(self, xy: np.ndarray) -> np.ndarray:
-    """Returns the point [2] itself if a robot can stand there, or else the nearest such place."""
-    if self.scene.free_space.is_reachable(xy[None])[0]:
-      return xy
-    side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2
-    points = self.workspace.lower + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
-    points = points[np.asarray(self.scene.free_space.is_reachable(points), bool)]
-    return points[np.argmin(np.linalg.norm(points - xy, axis=1))]
 
   def _in_front(self, random_state: np.random.RandomState) -> np.ndarray:
     root = self._indices.root_qpos

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core import cameras
-from nerf2real.scenes.geometry import markers
+from nerf2real.scenes.alignment import markers
 from tests.scenes import furnished_room
 
 CAMERA = cameras.Camera(

@@ -1,4 +1,4 @@
-"""Finds the floor: the lowest large plane near the cameras' mean up direction.
+"""Detects the floor plane by RANSAC: the lowest large plane across the cameras' mean up direction.
 
 The plane with the most points can be a table top, and the lowest plane a reflection or a few stray
 points. So planes are measured by the ground they cover, not by their points, and of those that
@@ -9,6 +9,9 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+
+from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.overrides import Overrides
 
 _MIN_POINTS = 30
 _PLANES = 12  # candidate planes that are peeled off one after another
@@ -193,3 +196,94 @@ def refine_floor(floor: Floor, points: np.ndarray, *, tolerance: float) -> Floor
     points=int(inside.sum()),
     residual=float(np.sqrt(np.mean(error**2))),
   )
+
+
+class FoundFloor(NamedTuple):
+  """The floor plane, and whether the dense points agree with the sparse ones."""
+
+  floor: Floor
+  dense_trusted: bool  # False where the dense points show a floor well above the sparse ones'
+
+
+def rough_up(evidence: Evidence, override: Overrides) -> np.ndarray:
+  """The cameras' mean up direction [3]; the unit frame's where only the override has one."""
+  try:
+    return mean_up(evidence.frame_from_camera)
+  except ValueError:
+    if override.up is None and override.floor_points is None:
+      raise
+    return np.array([0.0, 0.0, 1.0])
+
+
+def choose_floor(
+  evidence: Evidence, override: Overrides, *, settings: FloorSettings, max_gap: float
+) -> Choice[FoundFloor]:
+  """Finds the floor plane from the override or from dense and sparse points.
+
+  Dense depth shows the textureless floor that sparse points miss; sparse points are right even
+  where the field is a fog.
+
+  Args:
+    evidence: Points and cameras.
+    override: May hold points on the floor, or the up direction.
+    settings: Of the search.
+    max_gap: Dense above sparse floor, as a share of the cameras' height, from which the dense
+      points are not trusted.
+
+  Raises:
+    ValueError: No floor was found.
+  """
+  camera_up = rough_up(evidence, override)
+  if override.floor_points is not None:
+    normal, offset = fit_plane(override.floor_points, camera_up)
+    error = override.floor_points @ normal - offset
+    floor = Floor(normal, offset, len(error), 0.0, float(np.sqrt(np.mean(error**2))), 0.0)
+    return Choice(FoundFloor(floor, True), "manual_points")
+  up, source = camera_up, "plane"
+  if override.up is not None:  # a person's up is exact: only the height is searched
+    up, source = override.up / np.linalg.norm(override.up), "manual_up"
+    settings = dataclasses.replace(settings, max_tilt_deg=1.0)
+  found = _search(evidence, up, settings, max_gap)
+  warnings: tuple[str, ...] = ()
+  if not found.dense_trusted:
+    warnings = (
+      "The field's depth shows its floor well above that of the sparse points: the field is "
+      "blurred, and so will be its contact geometry. Train it longer; floor, yaw and extent are "
+      "taken from the sparse points.",
+    )
+  if override.up is not None:
+    floor = found.floor
+    moved = floor.offset + float((up - floor.normal) @ evidence.positions.mean(0))
+    found = found._replace(floor=floor._replace(normal=up, offset=moved))
+  return Choice(found, source, warnings)
+
+
+def _search(
+  evidence: Evidence, up: np.ndarray, settings: FloorSettings, max_gap: float
+) -> FoundFloor:
+  """Searches the floor in the dense and in the sparse points and compares both."""
+  positions = evidence.positions
+
+  def search(cloud: np.ndarray) -> Floor:
+    return find_floor(cloud, up=up, camera_positions=positions, settings=settings)
+
+  if evidence.surface_points is None:
+    return FoundFloor(search(evidence.points), True)
+  try:
+    dense = search(_thin(evidence.surface_points))
+  except ValueError:
+    return FoundFloor(search(evidence.points), False)
+  try:
+    sparse = search(evidence.points)
+  except ValueError:
+    return FoundFloor(dense, True)
+  centre = positions.mean(0)
+  above = 1 - float(dense.heights(centre)) / float(sparse.heights(centre))
+  return FoundFloor(dense, True) if above < max_gap else FoundFloor(sparse, False)
+
+
+def _thin(points: np.ndarray) -> np.ndarray:
+  """Dense points with equal weight for equal area: close surfaces fill many pixels."""
+  size = 0.01 * float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=-1)))
+  _, first = np.unique(np.floor(points / size).astype(np.int64), axis=0, return_index=True)
+  return points[first]

@@ -1,4 +1,4 @@
-"""The manual override file: a person's word for every automatic choice of the alignment.
+"""The override file: values by hand in place of the alignment's automatic choices.
 
 YAML or JSON. Positions are in the unit frame unless they are said to be in the world frame.
 """
@@ -14,7 +14,7 @@ import yaml
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Overrides:
-  """What a person fixed by hand; None leaves the choice to the program."""
+  """Values given by hand; None leaves the choice to the program."""
 
   floor_points: np.ndarray | None = None  # [K >= 3, 3] points on the floor, unit frame
   up: np.ndarray | None = None  # [3] up direction, unit frame; the floor is then searched across it

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.scenes.geometry import floor
+from nerf2real.scenes.alignment import floor
 
 
 def room(rng, *, floor_points=900, table_points=4000, below=120):
