@@ -15,6 +15,7 @@ import serial
 
 from nerf2real.real.clock import Clock, RealClock
 from nerf2real.real.wire import op3, opencr
+from nerf2real.real.wire.packets import PacketHandler
 from nerf2real.real.wire.port import Port
 
 TORQUE_ENABLE, GOAL_POSITION = 64, 116
@@ -120,7 +121,7 @@ class Bus:
     self._directions, self._id_row = self.wiring.directions, np.array(self._ids)
     self._lock = threading.Lock()
     self._port = Port(path, baud=self.settings.baud, clock=self.clock)
-    self._handler = sdk.Protocol2PacketHandler()
+    self._handler = PacketHandler()
     self._return_delay = 2e-6 * self.settings.return_delay
 
   def close(self) -> None:
