@@ -167,6 +167,11 @@ class Learner:
     self._stop.set()
 
   @property
+  def problem(self) -> str:
+    """What could not be written when it was last tried; empty if all could."""
+    return self._problem
+
+  @property
   def limiter(self) -> RateLimiter:
     """The run's counters; other threads write to them."""
     return self.link.limiter
@@ -253,14 +258,14 @@ class Learner:
   def save(self) -> None:
     """Writes a checkpoint and exports the policy; a failure is reported, and training goes on."""
     self._last_save = time.monotonic()
+    self._problem = ""
     self._attempt(lambda: self._checkpoints.save(self._state, self._info()))
     self._attempt(lambda: self._export("newest", learning.served_parameters(self._state), {}))
-    self.replay.flush()
+    self._attempt(self.replay.flush)
 
   def _attempt(self, write: Any) -> None:
     try:
       write()
-      self._problem = ""
     except (CheckpointError, OSError) as error:
       self._problem = str(error)
       _log.error("%s", error)

@@ -21,7 +21,8 @@ import nerf2real.real.loading
 from nerf2real.real.camera.device import Camera
 from nerf2real.real.recorder.recorder import Recorder
 note("real")
-from launch import check_robot
+import nerf2real.real.check
+from nerf2real.launch import check_robot
 note("check_robot")
 for task in nerf2real.suite.ALL_TASKS:
   try:

@@ -1,8 +1,4 @@
-"""The scripts that show a task: the video of a rollout and the viewer in the browser."""
-
-import importlib.util
-import sys
-from pathlib import Path
+"""What shows a task: the video of a rollout and the viewer in the browser."""
 
 import av
 import numpy as np
@@ -10,22 +6,10 @@ import pytest
 import viser
 
 from nerf2real import suite
+from nerf2real.suite.viewer.elements import bars
+from nerf2real.suite.viewer.task_viewer import TaskViewer
+from nerf2real.suite.views.rollout import run_episodes
 from tests.suite.synthetic import FlatRenderer, make_room
-
-_LAUNCH = Path(__file__).parents[2] / "launch"
-
-
-@pytest.fixture(autouse=True)
-def _scripts_find_each_other(monkeypatch):
-  monkeypatch.syspath_prepend(str(_LAUNCH))
-
-
-def _script(name):
-  spec = importlib.util.spec_from_file_location(name, _LAUNCH / f"{name}.py")
-  module = importlib.util.module_from_spec(spec)
-  sys.modules[name] = module
-  spec.loader.exec_module(module)
-  return module
 
 
 @pytest.fixture
@@ -42,10 +26,8 @@ def room(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("task", suite.ALL_TASKS)
 def test_rollout_writes_a_video_of_the_length_asked_for(task, room, tmp_path):
-  rollout = _script("rollout")
   path = tmp_path / "videos" / "out.mp4"
-  arguments = rollout.Arguments(task=task, video=path, seconds=1.0, policy="random")
-  rollout.run(arguments)
+  run_episodes(task, video=path, seconds=1.0, policy="random")
   frames = [f.to_ndarray(format="rgb24") for f in av.open(str(path)).decode(video=0)]
   assert len(frames) == 20
   height, width = frames[0].shape[:2]
@@ -56,17 +38,15 @@ def test_rollout_writes_a_video_of_the_length_asked_for(task, room, tmp_path):
 
 
 def test_rollout_reports_how_episodes_ended(room):
-  rollout = _script("rollout")
-  lines = rollout.run(rollout.Arguments(seconds=6.0, policy="random"))
+  lines = run_episodes(seconds=6.0, policy="random")
   assert lines and all("ended by fall" in line and "no success" in line for line in lines)
 
 
 def test_viewer_shows_the_state_and_pushes(room):
-  view_task = _script("view_task")
   environment = suite.load("ball_push", random=0)
   server = viser.ViserServer(host="127.0.0.1", port=18_734, verbose=False)
   try:
-    viewer = view_task.TaskViewer(environment, server)
+    viewer = TaskViewer(environment, server)
     viewer._start_push("left")
     before = environment.task.state
     for _ in range(8):
@@ -85,6 +65,5 @@ def test_viewer_shows_the_state_and_pushes(room):
 
 
 def test_bars_grow_to_their_side():
-  view_task = _script("view_task")
-  page = view_task.bars({"turn": -1.5, "speed": 0.75})
+  page = bars({"turn": -1.5, "speed": 0.75})
   assert "left:0.0%;width:50.0%" in page and "left:50.0%;width:25.0%" in page

@@ -1,9 +1,5 @@
-"""A task in the browser: the robot in its room, its picture, its reward; it can be pushed by hand.
+"""A task in the browser: robot and room, its picture, its reward; it can be pushed by hand."""
 
-Started by `python launch/view.py --task nerf_nav`.
-"""
-
-import html
 import threading
 import time
 from pathlib import Path
@@ -20,6 +16,7 @@ from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.geometry.mesh import load_glb
 from nerf2real.suite import loading
 from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.viewer.elements import bars, geom_mesh
 from nerf2real.suite.views.third_person import best_azimuth, clear_distance, direction
 
 _SPRING = 40.0  # N/m between the handle that is dragged and the torso
@@ -31,41 +28,7 @@ _SHOW_STEPS, _PICTURE_STEPS = 2, 4  # control steps between showings of the moti
 _HANDLE_HEIGHT = 0.28  # m of the handle above the torso, so that it does not hide the robot
 _SETBACK = 0.02  # m by which the field's floor is lowered, so that it does not swallow the feet
 _LINE_WIDTH = 0.015  # m of the lines on the floor
-_BAR_RANGE = 1.5  # a bar's full length is a reward term of this size
 _DIRECTIONS = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}
-
-
-def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-  """Returns the surface of a box, cylinder, capsule or sphere in its own frame."""
-  size = model.geom_size[geom]
-  kind = mujoco.mjtGeom(model.geom_type[geom])
-  if kind == mujoco.mjtGeom.mjGEOM_BOX:
-    return trimesh.creation.box(2 * size)
-  if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-    return trimesh.creation.cylinder(size[0], 2 * size[1], sections=24)
-  if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-    return trimesh.creation.capsule(2 * size[1], size[0], count=(16, 16))
-  if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-    return trimesh.creation.icosphere(3, size[0])
-  return None
-
-
-def bars(terms: dict[str, float]) -> str:
-  """Returns the reward terms as bars from the middle, as HTML."""
-  rows = []
-  for name, value in terms.items():
-    share = 50 * min(abs(value) / _BAR_RANGE, 1.0)
-    left = 50.0 if value >= 0 else 50.0 - share
-    color = "#009E73" if value >= 0 else "#D55E00"
-    rows.append(
-      f'<div style="display:flex;align-items:center;font-size:12px;margin:3px 12px">'
-      f'<span style="width:8.5em">{html.escape(name)}</span>'
-      f'<span style="flex:1;position:relative;height:11px;background:#8883">'
-      f'<i style="position:absolute;left:{left:.1f}%;width:{share:.1f}%;height:100%;'
-      f'background:{color}"></i></span>'
-      f'<span style="width:4em;text-align:right">{value:+.2f}</span></div>'
-    )
-  return "".join(rows)
 
 
 class TaskViewer:
@@ -81,7 +44,7 @@ class TaskViewer:
       server: The page's server.
       field: Draws the room as a radiance field; None: only as a mesh.
     """
-    self._environment, self._server = environment, server
+    self._environment, self.server = environment, server
     self._steps = 0
     self._last_episode = ""
     self._rng = np.random.default_rng(0)
@@ -95,7 +58,7 @@ class TaskViewer:
     self._show()
 
   def _add_room(self, field: field_view.FieldView | None) -> None:
-    server, task = self._server, self._environment.task
+    server, task = self.server, self._environment.task
     server.scene.set_up_direction("+z")
     meshes = self._add_meshes(visible=field is None)
     if field is not None:
@@ -134,7 +97,7 @@ class TaskViewer:
 
   def _add_meshes(self, *, visible: bool) -> list[Any]:
     """Adds the room's surface, or else its convex parts, and a grid on the floor."""
-    server, scene = self._server, self._environment.task.scene
+    server, scene = self.server, self._environment.task.scene
     found: list[Any] = [server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)]
     visual = getattr(scene, "visual_path", None)
     if visual is not None and Path(visual).is_file():
@@ -167,7 +130,7 @@ class TaskViewer:
       for sign in (-1, 1):
         place = middle.copy()
         place[1 - axis] += sign * size[1 - axis] / 2
-        self._server.scene.add_box(
+        self.server.scene.add_box(
           f"{name}/{axis}{sign}", color=color, dimensions=(*length, 0.004), position=(*place, 0.01)
         )
 
@@ -181,13 +144,13 @@ class TaskViewer:
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
           self._radii[int(geom)] = float(model.geom_size[geom, 0])
         color = tuple(round(255 * c) for c in model.geom_rgba[geom, :3])
-        handles[int(geom)] = self._server.scene.add_mesh_simple(
+        handles[int(geom)] = self.server.scene.add_mesh_simple(
           f"/moving/{geom}", mesh.vertices, mesh.faces, color=color, flat_shading=True
         )
     return handles
 
   def _add_controls(self) -> None:
-    gui = self._server.gui
+    gui = self.server.gui
     self._running = gui.add_checkbox("run", True)
     self._policy = gui.add_dropdown("policy", ("stand", "random"))
     self._follow = gui.add_checkbox("find the robot when it starts anew", True)
@@ -204,7 +167,7 @@ class TaskViewer:
       gui.add_button_group("direction", tuple(_DIRECTIONS)).on_click(
         lambda event: self._start_push(event.target.value)
       )
-    self._handle = self._server.scene.add_transform_controls(
+    self._handle = self.server.scene.add_transform_controls(
       "/hand",
       scale=0.16,
       disable_rotations=True,
@@ -264,7 +227,7 @@ class TaskViewer:
     """Forgets a push and shows the robot where it stands now."""
     self._push_until = 0.0
     if self._follow.value:
-      for client in self._server.get_clients().values():
+      for client in self.server.get_clients().values():
         self._face(client.camera)
 
   def _show(self, picture: np.ndarray | None = None) -> None:
@@ -274,7 +237,7 @@ class TaskViewer:
       environment.physics.data.ptr,
       environment.task,
     )
-    with self._server.atomic():
+    with self.server.atomic():
       for geom, handle in self._geoms.items():
         handle.position = data.geom_xpos[geom]
         handle.wxyz = transforms.SO3.from_matrix(data.geom_xmat[geom].reshape(3, 3)).wxyz
@@ -304,8 +267,8 @@ class TaskViewer:
 
 def view_task(
   task: str, *, scene: Path | None = None, host: str = "127.0.0.1", port: int = 8080
-) -> None:
-  """Serves a task until interrupted.
+) -> TaskViewer:
+  """Serves a task's page; the returned viewer's `run` steps it.
 
   Args:
     task: Name of the task.
@@ -318,9 +281,4 @@ def view_task(
   environment = suite.load(task, scene=bundle, renderer=renderer)
   server = viser.ViserServer(host=host, port=port, label=f"task {task}", verbose=False)
   field = field_view.FieldView(renderer, bundle.world_from_unit)
-  viewer = TaskViewer(environment, server, field=field)
-  print(f"open http://{host}:{server.get_port()} (Ctrl-C ends)")
-  try:
-    viewer.run(threading.Event())
-  except KeyboardInterrupt:
-    server.stop()
+  return TaskViewer(environment, server, field=field)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerf2real.launch import check_robot
+from nerf2real.real import check
 from nerf2real.real.virtual.bus.devices import IDS
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants
@@ -16,9 +16,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 def _check(robot, **arguments):
-  return check_robot.check(
-    check_robot.Arguments(robot="virtual", seconds=0.5, **arguments), robot.connection()
-  )
+  return check.check(robot.connection(), seconds=0.5, **arguments)
 
 
 def test_a_good_robot_passes_and_its_joints_are_listed():
