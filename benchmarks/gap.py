@@ -26,7 +26,8 @@ import numpy as np
 from nerf2real import real, suite
 from nerf2real.core import rotations
 from nerf2real.real.virtual.body import Truth
-from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
+from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.scenes.quality.image_quality import psnr
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants
@@ -171,7 +172,8 @@ def run_virtual(
   """Runs every motion on a virtual robot in the true room; returns the traces by motion."""
   found = {}
   camera = settings.picture_steps > 0
-  with VirtualRobot(world="room", seed=seed, stepped=True, camera=camera) as robot:
+  eye = VirtualCamera() if camera else None
+  with VirtualRobot(world="room", seed=seed, stepped=True, camera=eye) as robot:
     environment = real.load(
       "nerf_nav",
       robot=robot.connection(),

@@ -19,7 +19,7 @@ harness.one_thread()
 import numpy as np
 
 from nerf2real import real, suite
-from nerf2real.real.loop.motion import RobotSettings
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walk import Command, Gait

@@ -26,7 +26,8 @@ from nerf2real import real
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.rotations import yaw_quaternion
 from nerf2real.real.recorder.recorder import Recorder
-from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
+from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.op3.op3 import OP3
 from nerf2real.sysid.sensors import floor, sensing
@@ -107,9 +108,8 @@ def film(
   path: Path, arguments: Arguments, seed: int, *, wave: int, late: float, scale: float, gain: float
 ) -> None:
   """Records a held robot that moves and films."""
-  with VirtualRobot(
-    stepped=True, seed=seed, world="room", camera=True, latency=_LATE, gain=gain
-  ) as robot:
+  camera = VirtualCamera(latency=_LATE, gain=gain)
+  with VirtualRobot(stepped=True, seed=seed, world="room", camera=camera) as robot:
     connection = dataclasses.replace(robot.connection(), camera=Arrival(robot.camera, late))
     actions = motion(wave, round(arguments.seconds / _STEP))
     lifting = round(2.0 / _STEP)

@@ -28,9 +28,10 @@ harness.one_thread()  # idle OpenBLAS threads spin on a core
 import numpy as np
 
 from nerf2real import real
-from nerf2real.real.loop.clock import SteppedClock, prefer_this_thread
+from nerf2real.real.clock import SteppedClock, prefer_this_thread
 from nerf2real.real.loop.environment import RobotEnvironment
 from nerf2real.real.safety.monitor import SafetyError
+from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.process import VirtualRobotProcess
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants
@@ -74,11 +75,12 @@ def wave(step: int, standing: np.ndarray) -> np.ndarray:
 @contextlib.contextmanager
 def robot_for(arguments: Arguments) -> Iterator[Any]:
   """Starts the robot."""
+  camera = VirtualCamera() if arguments.camera else None
   if arguments.stepped:
-    with VirtualRobot(seed=_SEED, camera=arguments.camera, stepped=True) as robot:
+    with VirtualRobot(seed=_SEED, camera=camera, stepped=True) as robot:
       yield robot
   else:
-    with VirtualRobotProcess(seed=_SEED, camera=arguments.camera) as robot:
+    with VirtualRobotProcess(seed=_SEED, camera=camera) as robot:
       yield robot
 
 

@@ -24,8 +24,9 @@ from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.gaits.walker import Pose, Walker
+from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT, Start
+from nerf2real.suite.tasks.base import Start
 
 GOALS = (
   (0.6, 0.0),

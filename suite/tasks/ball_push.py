@@ -11,7 +11,7 @@ from nerf2real.core import rotations
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.camera import RobotCamera
-from nerf2real.suite.tasks import rewards, touch
+from nerf2real.suite.tasks import catalogue, rewards, touch
 from nerf2real.suite.tasks.ball import Ball
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.privileged import Quantity
@@ -19,8 +19,8 @@ from nerf2real.suite.tasks.settings import TaskSettings
 from nerf2real.suite.tasks.state import Start
 from nerf2real.suite.tasks.workspace import Workspace, find_workspace
 
-NAME = "ball_push"
-TIME_LIMIT = protocols.BALL_TIME_LIMIT  # s (paper)
+NAME = catalogue.BALL_PUSH
+TIME_LIMIT = catalogue.TIME_LIMITS[NAME]  # s
 FALL = "fall"
 BALL_IN_FRONT = 0.5  # share of episodes with the ball just in front of the robot (paper)
 # m ahead of and beside the robot's torso, when it starts in front: ours.
