@@ -115,6 +115,8 @@ class Learner:
       self._init_from = info.get("init_from", "")
     elif settings.init_from is not None:
       self._state = _begin_with(settings.init_from, self._state, self.layout)
+    # Remembered: reading it from the state would wait for the update that the device works on.
+    self._scaled = scaling.is_measured(self._state.scaling)
     self.replay = self._open_replay(resume)
     limiter = self._make_limiter(info)
     self._log = MetricsLog(settings.run)
@@ -257,7 +259,7 @@ class Learner:
     return minutes is not None and self._seconds >= 60 * minutes
 
   def _update(self, previous: dict[str, Any]) -> dict[str, Any]:
-    if not scaling.is_measured(self._state.scaling):
+    if not self._scaled:
       self._measure_scaling()
     with self._times.stage("sampling"):
       batch = self.replay.sample(self._random, self._config.batch_size)
@@ -279,6 +281,7 @@ class Learner:
       _SCALING_TRAJECTORIES,
       names=(*scaling.NAMES, "last"),
     )
+    self._scaled = True
     seen = np.arange(self._config.trajectory_length) <= sample["last"][:, None]
     scales = scaling.measure({name: sample[name][seen] for name in scaling.NAMES}, self.layout)
     self._state = learning.with_scaling(self._state, scales, keep_policy=bool(self._init_from))
