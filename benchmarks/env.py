@@ -29,7 +29,7 @@ from dm_control import suite as dm_suite
 
 from nerf2real import suite
 from nerf2real.suite import loading
-from nerf2real.suite.pictures.camera import world_from_camera
+from nerf2real.suite.sensors.camera import world_from_camera
 
 SIZES = ((30, 40), (60, 80))
 _RESETS = 3  # timed after every turn

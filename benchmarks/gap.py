@@ -27,13 +27,14 @@ import numpy as np
 import tyro
 
 from nerf2real import real, suite
+from nerf2real.core import rotations
 from nerf2real.real.virtual.body import Truth
 from nerf2real.real.virtual.robot import LENS, VirtualRobot
 from nerf2real.scenes.quality.image_quality import psnr
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.pictures.camera import CameraSettings
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import CameraSettings
 from nerf2real.suite.tasks.base import Start
 
 _STEP = constants.CONTROL_TIMESTEP
@@ -161,9 +162,7 @@ class Simulation:
     model = self.environment.physics.model.ptr
     free = model.joint(f"{task.robot.mjcf_model.model}/").qposadr[0]
     data.qpos[free : free + 3] = truth.position
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, truth.rotation.ravel())
-    data.qpos[free + 3 : free + 7] = quaternion
+    data.qpos[free + 3 : free + 7] = rotations.quaternion_from_matrix(truth.rotation)
     for name, angle in zip(constants.JOINT_NAMES, truth.joints, strict=True):
       data.qpos[model.joint(f"{task.robot.mjcf_model.model}/{name}").qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)

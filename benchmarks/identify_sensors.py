@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real import real
 from nerf2real.core.robot_logs.reading import read_log
+from nerf2real.core.rotations import yaw_quaternion
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.virtual.robot import LENS, VirtualRobot
 from nerf2real.suite.op3 import constants
@@ -159,7 +160,7 @@ def stand(path: Path, seed: int, slope: tuple[float, float]) -> None:
           steps = round(turn / _TURNING / _STEP)
           yaws = robot.truth().yaw + turn * np.arange(1, steps + 1) / steps
           for yaw in yaws:
-            robot.body.data.mocap_quat[hand] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+            robot.body.data.mocap_quat[hand] = yaw_quaternion(yaw)
             environment.step(action)
           robot.hold(False)
           for _ in range(round(1.0 / _STEP)):

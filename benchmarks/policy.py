@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.core.serialization import to_plain
 
 TARGETS = {(30, 40): 10.0, (60, 80): 25.0}  # ms
 # As the suite gives them: 5 steps of 20 joints, 20 previous controls, 3 gyroscope, 3
@@ -52,7 +53,7 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
     flatten_params({"policy": params}),
     layout=layout,
     environment="benchmark",
-    settings=config.to_dict(settings),
+    settings=to_plain(settings),
     info={},
   )
   return load_policy(folder)

@@ -28,7 +28,9 @@ import rich.console
 import rich.table
 import tyro
 
+from nerf2real.core import rotations
 from nerf2real.core.cameras import Camera
+from nerf2real.core.serialization import from_plain, read_json
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes import bundle
 from nerf2real.scenes.builtin import furniture, room
@@ -74,8 +76,7 @@ def load_field(settings: Settings) -> tuple[Field, Similarity]:
   if settings.field is not None:
     if settings.room_from_unit is None:
       raise SystemExit("--field needs --room-from-unit: where the field lies in the room.")
-    placed = json.loads(settings.room_from_unit.read_text())
-    return Field.load(settings.field), Similarity.from_dict(placed)
+    return Field.load(settings.field), read_json(settings.room_from_unit, Similarity)
   scene = bundle.Bundle.load(settings.bundle)
   placed = scene.figures.get("room_from_world")
   if placed is None:
@@ -83,7 +84,7 @@ def load_field(settings: Settings) -> tuple[Field, Similarity]:
       f"{scene.folder} has no figure room_from_world: it is no bundle of the built-in room, whose "
       "true pictures this benchmark compares with."
     )
-  return Field.load(scene.field_path), Similarity.from_dict(placed) @ scene.world_from_unit
+  return Field.load(scene.field_path), from_plain(placed, Similarity) @ scene.world_from_unit
 
 
 def robot_poses(count: int, *, seed: int = 7) -> np.ndarray:
@@ -94,9 +95,7 @@ def robot_poses(count: int, *, seed: int = 7) -> np.ndarray:
   for pose in poses:
     yaw, tilt = random.uniform(0, 2 * np.pi), LOOK_DOWN + random.normal(0, 0.05)
     forward = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), -np.sin(tilt)])
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
+    pose[:3, :3] = rotations.camera_axes(forward)
     pose[:2, 3] = random.uniform(lower + WALL_DISTANCE, upper - WALL_DISTANCE)
     pose[2, 3] = EYE_HEIGHT
   return poses
@@ -112,8 +111,7 @@ class MujocoDrawer:
     quality.shadowsize = 0 if fast else standard.shadowsize
     quality.offsamples = 0 if fast else standard.offsamples
     body = spec.worldbody.add_body(name="eye", mocap=True)
-    fovy = np.rad2deg(2 * np.arctan(camera.height / (2 * camera.fy)))
-    body.add_camera(name="eye", fovy=fovy)
+    body.add_camera(name="eye", fovy=np.rad2deg(camera.vertical_fov))
     self._model = spec.compile()
     self._data = mujoco.MjData(self._model)
     self._renderer = mujoco.Renderer(self._model, height=camera.height, width=camera.width)
@@ -122,9 +120,8 @@ class MujocoDrawer:
         self._renderer.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
     self._places = []
     for pose in poses:
-      quaternion = np.empty(4)
-      rotation = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-      mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+      rotation = pose[:3, :3] @ rotations.OPENGL_FROM_OPENCV
+      quaternion = rotations.quaternion_from_matrix(rotation)
       self._places.append((pose[:3, 3], quaternion))
 
   def draw(self, view: int) -> np.ndarray:

@@ -2,13 +2,17 @@
 
 Pixel coordinates follow COLMAP: the centre of the upper left pixel is (0.5, 0.5). Camera axes
 follow OpenCV: x right, y down, z forward. Shapes: H height, W width.
+
+OpenCV's functions and ROS's messages have that centre at (0, 0) instead: `PIXEL_CENTRE` is added to
+what they return, and to nothing else.
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
+PIXEL_CENTRE = 0.5  # of the upper left pixel, here and in COLMAP, against OpenCV's and ROS's 0
 _UNDISTORT_ITERATIONS = 20  # Newton steps; converges in fewer than 10 for lenses of phones
 
 
@@ -47,6 +51,18 @@ class Camera:
   def distortion(self) -> np.ndarray:
     """The coefficients k1, k2, p1, p2 [4], in OpenCV's order."""
     return np.array([self.k1, self.k2, self.p1, self.p2], np.float64)
+
+  @property
+  def opencv_matrix(self) -> np.ndarray:
+    """The intrinsic matrix [3, 3] for OpenCV and ROS, whose first pixel's centre is at (0, 0)."""
+    matrix = self.matrix
+    matrix[:2, 2] -= PIXEL_CENTRE
+    return matrix
+
+  @property
+  def vertical_fov(self) -> float:
+    """The vertical field of view without distortion [rad]; MuJoCo's fovy, in rad."""
+    return float(2 * np.arctan(0.5 * self.height / self.fy))
 
   @property
   def pixel_angle(self) -> float:
@@ -119,18 +135,46 @@ class Camera:
       Directions [..., 3], not normalised: a sample at parameter t has depth t.
     """
     if pixels is None:
-      u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+      u, v = np.meshgrid(*(np.arange(n) + PIXEL_CENTRE for n in (self.width, self.height)))
       pixels = np.stack([u, v], axis=-1)
     plane = (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
     ideal = self.undistort(plane)
     return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
 
-  def to_dict(self) -> dict[str, Any]:
-    """Returns the fields as plain numbers, for JSON."""
-    return dataclasses.asdict(self)
+  @classmethod
+  def from_opencv(
+    cls, width: int, height: int, matrix: np.ndarray, distortion: Sequence[float]
+  ) -> "Camera":
+    """Returns the camera that OpenCV calibrated, or that ROS's CameraInfo describes.
+
+    Args:
+      width: Picture width [pixel].
+      height: Picture height [pixel].
+      matrix: Intrinsic matrix, [3, 3] or its 9 numbers row by row.
+      distortion: k1, k2, p1, p2.
+    """
+    (fx, _, cx), (_, fy, cy), _ = np.reshape(np.asarray(matrix, np.float64), (3, 3)).tolist()
+    k1, k2, p1, p2 = map(float, distortion)
+    return cls(
+      width=int(width),
+      height=int(height),
+      fx=fx,
+      fy=fy,
+      cx=cx + PIXEL_CENTRE,
+      cy=cy + PIXEL_CENTRE,
+      k1=k1,
+      k2=k2,
+      p1=p1,
+      p2=p2,
+    )
 
   @classmethod
   def from_vertical_fov(cls, fov: float, width: int, height: int) -> "Camera":
     """Returns an ideal pinhole camera with a vertical field of view [rad]."""
-    focal = 0.5 * height / np.tan(0.5 * fov)
+    focal = focal_length(fov, height)
     return cls(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+
+
+def focal_length(fov: float, size: int) -> float:
+  """Returns the focal length [pixel] of a field of view [rad] across a number of pixels."""
+  return float(0.5 * size / np.tan(0.5 * fov))

@@ -1,7 +1,6 @@
 """Similarity transforms of space: x -> scale * rotation @ x + translation."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -56,18 +55,3 @@ class Similarity:
     variance = ((source - centre_s) ** 2).sum() / len(source)
     scale = float(np.trace(np.diag(values) @ sign) / variance) if with_scale else 1.0
     return cls(scale, rotation, centre_t - scale * rotation @ centre_s)
-
-  def to_dict(self) -> dict[str, Any]:
-    """Returns plain numbers and lists, for JSON."""
-    return {
-      "scale": float(self.scale),
-      "rotation": np.asarray(self.rotation).tolist(),
-      "translation": np.asarray(self.translation).tolist(),
-    }
-
-  @classmethod
-  def from_dict(cls, values: dict[str, Any]) -> "Similarity":
-    """Inverts `to_dict`."""
-    return cls(
-      float(values["scale"]), np.array(values["rotation"]), np.array(values["translation"])
-    )

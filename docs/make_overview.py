@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.pages import parts as report_parts
+from nerf2real.core.serialization import from_plain
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import room, yardstick
 from nerf2real.scenes.builtin.eye import Eye
@@ -42,7 +43,7 @@ def _contact_model(bundle: Bundle) -> mujoco.MjModel:
 def main() -> None:
   """Writes the picture beside this script."""
   bundle = Bundle.load()
-  world_from_truth = Similarity.from_dict(bundle.figures["room_from_world"]).inverse()
+  world_from_truth = from_plain(bundle.figures["room_from_world"], Similarity).inverse()
   unit_from_truth = bundle.world_from_unit.inverse() @ world_from_truth
   renderer = Renderer(Field.load(bundle.field_path), threads=2)
   camera = yardstick.robot_camera(*_SIZE)

@@ -6,6 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain
+
 SUCCESS, COLLISION, FALL, LOST, STOPPED = "success", "collision", "fall", "lost", "stopped"
 OUTCOMES = (SUCCESS, COLLISION, FALL, LOST, STOPPED)
 FILE = "episodes.jsonl"
@@ -64,17 +67,6 @@ class Episode:
     return (*dataclasses.astuple(self.setting), self.index)
 
 
-def _decode(line: str) -> Episode:
-  fields = json.loads(line)
-  fields["setting"] = Setting(**fields["setting"])
-  fields["moments"] = [
-    Moment(**{**m, "position": None if m["position"] is None else tuple(m["position"])})
-    for m in fields.get("moments", [])
-  ]
-  fields["goal"] = tuple(fields["goal"])
-  return Episode(**fields)
-
-
 class Store:
   """The episodes of an evaluation's folder."""
 
@@ -95,18 +87,18 @@ class Store:
     lines = text.splitlines()
     for number, line in enumerate(lines):
       try:
-        self.episodes.append(_decode(line))
-      except (ValueError, KeyError, TypeError) as error:
+        self.episodes.append(from_plain(json.loads(line), Episode))
+      except ValueError as error:
         if number == len(lines) - 1:  # the run was cut off while it wrote: that episode is rerun
           kept = "".join(f"{whole}\n" for whole in lines[:-1])
-          self.path.write_text(kept)
+          files.write_atomically(self.path, kept)
           return
         raise ValueError(
           f"{self.path}, line {number + 1} is damaged ({error}): remove that line, its episode is "
           "run again."
         ) from error
     if text and not text.endswith("\n"):
-      self.path.write_text(text + "\n")
+      files.write_atomically(self.path, text + "\n")
 
   def done(self) -> set[tuple[Any, ...]]:
     """Returns the keys of the episodes that are there."""
@@ -115,7 +107,7 @@ class Store:
   def add(self, episode: Episode) -> None:
     """Keeps an episode."""
     with self.path.open("a") as stream:
-      stream.write(json.dumps(dataclasses.asdict(episode)) + "\n")
+      stream.write(json.dumps(to_plain(episode)) + "\n")
     self.episodes.append(episode)
 
 

@@ -10,7 +10,7 @@ import dm_env
 import numpy as np
 
 from nerf2real import real
-from nerf2real.evaluation import episodes, perturbations, starts
+from nerf2real.evaluation import episodes, perturbations
 from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
 from nerf2real.real.camera.device import Controls
 from nerf2real.real.loading import Connection
@@ -118,7 +118,8 @@ class OperatedPlant(Plant):
   def start(self, trial: Trial) -> dm_env.TimeStep:
     if isinstance(trial, BallTrial):
       assert self._workspace is not None
-      pose, ball = starts.ball_start(self.scene, self._workspace, trial)
+      robot, ball = self._workspace.starts(trial, self.scene.free_space)
+      pose = Pose(float(robot[0]), float(robot[1]), trial.robot_yaw)
       self._say(f"Put the ball at x = {ball[0]:.2f} m, y = {ball[1]:.2f} m.")
     else:
       x, y = (float(value) for value in self._starts[trial.position])

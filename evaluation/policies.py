@@ -1,6 +1,5 @@
 """What an evaluation asks of a policy, and the scripted walker as one."""
 
-import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
@@ -8,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from nerf2real.core.serialization import to_plain
 from nerf2real.evaluation.plants import BALL, Sight
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import Walker
@@ -71,7 +71,7 @@ class GaitPolicy:
     """
     head_pan = constants.BALL_PUSHING_HEAD_PAN if protocol == BALL else None
     self._walker = Walker(scene, gait=settings, head_pan_limit=head_pan)
-    text = json.dumps(dataclasses.asdict(settings or GaitSettings()), sort_keys=True)
+    text = json.dumps(to_plain(settings or GaitSettings()), sort_keys=True)
     self.policy_id = hashlib.sha256(text.encode()).hexdigest()[:12]
 
   def reset(self, sight: Sight) -> None:

@@ -7,7 +7,7 @@ import dm_env
 import numpy as np
 
 from nerf2real import real
-from nerf2real.evaluation import perturbations, starts
+from nerf2real.evaluation import perturbations
 from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial, make_intruder
 from nerf2real.real.loading import Connection
 from nerf2real.real.recorder.recorder import Recorder
@@ -126,7 +126,8 @@ class RehearsedPlant(Plant):
     self._disturb(0.0)
     if isinstance(trial, BallTrial):
       assert self._workspace is not None
-      pose, ball = starts.ball_start(self.scene, self._workspace, trial)
+      robot, ball = self._workspace.starts(trial, self.scene.free_space)
+      pose = Pose(float(robot[0]), float(robot[1]), trial.robot_yaw)
       self.robot.place_ball(*ball)
     else:
       x, y = (float(value) for value in self._starts[trial.position])

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from nerf2real.core import files
 from nerf2real.core.pages import parts
 from nerf2real.evaluation import maps, tables
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Moment
@@ -56,9 +57,7 @@ def write(
   page = parts.page(
     "Evaluation", lead, [section for section in sections if section], with_plots=False
   )
-  temporary = path.with_suffix(".part")
-  temporary.write_text(page)
-  temporary.replace(path)
+  files.write_atomically(path, page)
 
 
 _OUTCOME_TEXT = (

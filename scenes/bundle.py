@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.core.serialization import from_plain, write_json
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes import stages
-from nerf2real.scenes.geometry import free_space
+from nerf2real.scenes.geometry import map_server
+from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 
 FORMAT = "scene-bundle"
 FORMAT_VERSION = 1
@@ -110,7 +111,7 @@ class Bundle:
   @property
   def world_from_unit(self) -> Similarity:
     """Maps the field's frame to the world."""
-    return Similarity.from_dict(self.scene["world_from_unit"])
+    return from_plain(self.scene["world_from_unit"], Similarity)
 
   @property
   def extent(self) -> tuple[np.ndarray, np.ndarray]:
@@ -123,9 +124,9 @@ class Bundle:
     return np.array(self.scene["goals"], np.float64).reshape(-1, 2)
 
   @functools.cached_property
-  def free_space(self) -> "free_space.FreeSpace":
+  def free_space(self) -> FreeSpaceMap:
     """The free floor area."""
-    return free_space.read(self.free_space_path)
+    return map_server.read(self.free_space_path)
 
   @property
   def figures(self) -> Mapping[str, Any]:
@@ -135,5 +136,5 @@ class Bundle:
 
 def write_scene(folder: Path, scene: Mapping[str, Any]) -> None:
   """Writes scene.json, the last file of a bundle."""
-  content = {"format": FORMAT, "format_version": FORMAT_VERSION, **stages.to_plain(scene)}
-  stages.write_atomically(Path(folder) / "scene.json", json.dumps(content, indent=1))
+  content = {"format": FORMAT, "format_version": FORMAT_VERSION, **scene}
+  write_json(Path(folder) / "scene.json", content)

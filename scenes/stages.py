@@ -1,4 +1,4 @@
-"""Stages of a long job: cached by the hash of what went in, resumed after an interruption.
+"""Caches the stages of a long job by the hash of their inputs; resumes interrupted ones.
 
 A stage writes into a work folder that carries its key. When it ends, the folder is renamed to its
 final name, so that a folder with that name is always whole. A second run with the same inputs and
@@ -7,20 +7,20 @@ settings finds it and does nothing; one with others starts that stage and all th
 
 import contextlib
 import dataclasses
-import errno
 import hashlib
 import json
-import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from rich import progress as rich_progress
+from nerf2real.core import files
+from nerf2real.core.progress import Progress, progress_bar
+from nerf2real.core.serialization import to_plain
 
-Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is being done
+T = TypeVar("T")
 
 _RECORD = "stage.json"
 _KEY_LENGTH = 16  # hexadecimal digits of the key in a folder's name
@@ -28,49 +28,6 @@ _KEY_LENGTH = 16  # hexadecimal digits of the key in a folder's name
 
 class StageError(ValueError):
   """A stage could not be run; the message is one line for the user."""
-
-
-def no_progress(fraction: float, text: str) -> None:
-  """Ignores a report of progress."""
-
-
-def to_plain(value: Any) -> Any:
-  """Turns settings (dataclasses, paths, tuples) into what JSON can hold."""
-  if dataclasses.is_dataclass(value) and not isinstance(value, type):
-    return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-  if isinstance(value, Mapping):
-    return {str(k): to_plain(v) for k, v in value.items()}
-  if isinstance(value, (list, tuple)):
-    return [to_plain(v) for v in value]
-  if isinstance(value, Path):
-    return str(value)
-  return value
-
-
-def hash_path(path: Path) -> str:
-  """Returns the SHA-256 of a file's content, or of all files below a folder with their names."""
-  path = Path(path)
-  if not path.exists():
-    raise StageError(f"{path} does not exist; give an existing file or folder.")
-  digest = hashlib.sha256()
-  files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-  for file in files:
-    if path.is_dir():
-      digest.update(str(file.relative_to(path)).encode())
-    with file.open("rb") as stream:
-      digest.update(hashlib.file_digest(stream, "sha256").digest())
-  return digest.hexdigest()
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
-  """Writes a file whole or not at all."""
-  path = Path(path)
-  temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-  try:
-    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-    temporary.replace(path)
-  finally:
-    temporary.unlink(missing_ok=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +39,18 @@ class StageResult:
   made: str  # drawn when it was made: two runs of equal settings may differ, as training does
   seconds: float  # how long it took, summed over interrupted runs
   cached: bool  # True where an earlier run had done it
+
+
+class Made(NamedTuple, Generic[T]):
+  """A stage's result and the folder that it was read from."""
+
+  value: T
+  stage: StageResult
+
+  @property
+  def stamp(self) -> str:
+    """Hash of this result as the input of other stages."""
+    return self.stage.made
 
 
 class Stages:
@@ -131,7 +100,7 @@ class Stages:
       made = str(record.get("made", key))
       result = StageResult(final, key, made, float(record["seconds"]), cached=True)
       self.results[name] = result
-      with self._bar(name) as report:
+      with progress_bar(name, shown=self._show_progress) as report:
         report(1.0, "done before")
       return result
 
@@ -143,11 +112,11 @@ class Stages:
     earlier = float(self._read_record(work).get("seconds", 0.0))
     start = time.monotonic()
     try:
-      with self._bar(name) as report:
+      with progress_bar(name, shown=self._show_progress) as report:
         function(work, report)
         report(1.0, "done")
     except OSError as error:
-      if error.errno in (errno.ENOSPC, errno.EDQUOT):
+      if files.is_disk_full(error):
         raise StageError(
           f"The disk that holds {self.folder} is full (stage {name}): free some space and run the "
           "same command again, it continues here."
@@ -159,29 +128,10 @@ class Stages:
         self._write_record(work, {"seconds": seconds})
     made = uuid.uuid4().hex
     self._write_record(work, {"key": key, "made": made, "seconds": seconds, **description})
-    if final.exists():
-      shutil.rmtree(final)
-    work.rename(final)
+    files.replace_folder(work, final)
     result = StageResult(final, key, made, seconds, cached=False)
     self.results[name] = result
     return result
-
-  @contextlib.contextmanager
-  def _bar(self, name: str) -> Iterator[Progress]:
-    if not self._show_progress:
-      yield no_progress
-      return
-    columns = (
-      rich_progress.TextColumn(f"{name:<12}"),
-      rich_progress.BarColumn(bar_width=30),
-      rich_progress.TaskProgressColumn(),
-      rich_progress.TimeElapsedColumn(),
-      rich_progress.TimeRemainingColumn(elapsed_when_finished=True),
-      rich_progress.TextColumn("{task.description}"),
-    )
-    with rich_progress.Progress(*columns) as bar:
-      task = bar.add_task("", total=1.0)
-      yield lambda fraction, text: bar.update(task, completed=fraction, description=text)
 
   @staticmethod
   def _read_record(folder: Path) -> dict[str, Any]:
@@ -192,4 +142,4 @@ class Stages:
 
   @staticmethod
   def _write_record(folder: Path, record: Mapping[str, Any]) -> None:
-    write_atomically(folder / _RECORD, json.dumps(record, indent=1, sort_keys=True))
+    files.write_atomically(folder / _RECORD, json.dumps(record, indent=1, sort_keys=True))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from nerf2real.core import errors
 from nerf2real.suite.effects import Effect, read_effects
 from nerf2real.suite.environment import Environment
-from nerf2real.suite.pictures.camera import CameraSettings, FieldRenderer, RobotCamera
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import CameraSettings, FieldRenderer, RobotCamera
 from nerf2real.suite.tasks import ball_push, nerf_nav
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP, TaskSettings

@@ -4,15 +4,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+  from nerf2real.sysid.outputs import evaluate, identify
   from nerf2real.sysid.selection.identification import Settings
-  from nerf2real.sysid.selection.outputs import evaluate, identify
 
 __all__ = ["Settings", "evaluate", "identify"]
 
 _HOMES = {
   "Settings": "nerf2real.sysid.selection.identification",
-  "evaluate": "nerf2real.sysid.selection.outputs",
-  "identify": "nerf2real.sysid.selection.outputs",
+  "evaluate": "nerf2real.sysid.outputs",
+  "identify": "nerf2real.sysid.outputs",
 }
 
 

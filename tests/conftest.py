@@ -2,5 +2,11 @@
 
 import os
 
+from hypothesis import settings
+
 if "DISPLAY" not in os.environ:
   os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported, so before anything else
+
+# The first example of a test may wait for imports, compilers or other programs of the machine.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")

@@ -7,7 +7,6 @@ A unit is given where there is one; everything else is a pure number.
 """
 
 import dataclasses
-import typing
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -288,28 +287,6 @@ def preset(name: str) -> DmpoConfig:
   if name not in PRESETS:
     raise ValueError(f"Unknown preset {name!r}: expected one of {', '.join(PRESETS)}.")
   return PRESETS[name]()
-
-
-def to_dict(config: DmpoConfig) -> dict[str, Any]:
-  """Turns settings into what JSON can hold."""
-  return dataclasses.asdict(config)
-
-
-def from_dict(values: Mapping[str, Any], cls: type = DmpoConfig) -> Any:
-  """Rebuilds settings that `to_dict` wrote; raises ValueError for a name that is not known."""
-  hints = typing.get_type_hints(cls)
-  unknown = sorted(set(values) - set(hints))
-  if unknown:
-    raise ValueError(
-      f"Unknown settings {unknown} for {cls.__name__}: they were written by another version."
-    )
-  parsed = {}
-  for name, value in values.items():
-    if dataclasses.is_dataclass(hints[name]):
-      parsed[name] = from_dict(value, hints[name])  # type: ignore[arg-type]
-    else:
-      parsed[name] = tuple(value) if isinstance(value, list) else value
-  return cls(**parsed)
 
 
 def override(config: DmpoConfig, assignments: Mapping[str, Any]) -> DmpoConfig:

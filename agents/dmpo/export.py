@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ import numpy as np
 
 from nerf2real.agents.dmpo.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain
 
 FORMAT_VERSION = 1
 _ARRAYS, _RECORD = "policy.npz", "policy.json"
@@ -49,7 +50,7 @@ def export_policy(
     parameters: flat named arrays, `learning.served_parameters`.
     layout: the environment's layout.
     environment: the environment's name.
-    settings: the agent's settings, `config.to_dict`.
+    settings: the agent's settings as plain values, `to_plain(config)`.
     info: counters such as steps and updates, and the return where it is known.
   """
   folder.mkdir(parents=True, exist_ok=True)
@@ -61,13 +62,13 @@ def export_policy(
   record = {
     "format_version": FORMAT_VERSION,
     "environment": environment,
-    "layout": layout.to_dict(),
+    "layout": to_plain(layout),
     "settings": dict(settings),
     "info": dict(info),
     "sha256": hashlib.sha256(data).hexdigest(),
   }
-  replace_file(folder / _ARRAYS, data)
-  replace_file(folder / _RECORD, json.dumps(record, indent=1).encode())
+  files.write_atomically(folder / _ARRAYS, data)
+  files.write_atomically(folder / _RECORD, json.dumps(record, indent=1))
 
 
 def load_policy(folder: Path | str) -> ExportedPolicy:
@@ -81,7 +82,7 @@ def load_policy(folder: Path | str) -> ExportedPolicy:
   policy = Policy(parameters, init_stddev=network["init_stddev"], min_stddev=network["min_stddev"])
   return ExportedPolicy(
     policy=policy,
-    layout=Layout.from_dict(record["layout"]),
+    layout=from_plain(record["layout"], Layout),
     environment=record["environment"],
     history=record["settings"]["history"],
     info=record["info"],
@@ -107,16 +108,3 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     raise ValueError(f"{folder}: the arrays are not those of {_RECORD}; export it again.")
   with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
     return record, {name: arrays[name] for name in arrays.files}
-
-
-def replace_file(path: Path, data: bytes) -> None:
-  """Writes a file as a whole: another process sees the old content or the new."""
-  temporary = path.with_name(f".{path.name}.{os.getpid()}")
-  try:
-    with temporary.open("wb") as stream:
-      stream.write(data)
-      stream.flush()
-      os.fsync(stream.fileno())
-    temporary.replace(path)
-  finally:
-    temporary.unlink(missing_ok=True)

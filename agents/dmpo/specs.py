@@ -104,18 +104,6 @@ class Layout:
       _concatenate(observation, self.privileged_names),
     )
 
-  def to_dict(self) -> dict[str, Any]:
-    """Turns the layout into what JSON can hold."""
-    return dataclasses.asdict(self)
-
-  @classmethod
-  def from_dict(cls, values: Mapping[str, Any]) -> "Layout":
-    """Rebuilds a layout that `to_dict` wrote."""
-    fields: dict[str, Any] = {
-      name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
-    }
-    return cls(**fields)
-
 
 def _concatenate(observation: Mapping[str, Any], names: tuple[str, ...]) -> np.ndarray:
   parts = [np.ravel(np.asarray(observation[name], np.float32)) for name in names]

@@ -24,6 +24,7 @@ from nerf2real.agents.link.schema import MessageError
 from nerf2real.agents.processes.environments import make_environment, trials_of
 from nerf2real.agents.processes.timings import StageTimes
 from nerf2real.agents.processes.trials import clopper_pearson
+from nerf2real.core.serialization import from_plain
 
 _log = logging.getLogger(__name__)
 _POLL = 0.01  # s between questions while no credit is granted
@@ -61,8 +62,8 @@ class _Process:
     self._stop = threading.Event()
     answer = self._describe()
     self.description = description = answer["description"]
-    self.config: configs.DmpoConfig = configs.from_dict(description["config"])
-    self.layout = Layout.from_dict(description["layout"])
+    self.config: configs.DmpoConfig = from_plain(description["config"], configs.DmpoConfig)
+    self.layout = from_plain(description["layout"], Layout)
     if not deterministic:
       entropy = (*entropy, description["begin_steps"], answer["predecessors"])
     self.seed, action_seed = (int(s) for s in np.random.SeedSequence(entropy).generate_state(2))

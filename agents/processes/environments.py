@@ -63,8 +63,8 @@ def _dm_control(rest: str, options: dict[str, str], seed: int) -> dm_env.Environ
 def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
   from nerf2real import suite
   from nerf2real.core.camera_info import read_camera_info
-  from nerf2real.suite.pictures.camera import CameraSettings
   from nerf2real.suite.randomisation.draws import RandomisationSettings
+  from nerf2real.suite.sensors.camera import CameraSettings
 
   protocol = options.pop("protocol", None)
   known = _protocols(rest)

@@ -26,6 +26,7 @@ from nerf2real.agents.processes.checkpoints import BEST, CheckpointError, Checkp
 from nerf2real.agents.processes.environments import evaluation_name, make_environment
 from nerf2real.agents.processes.logs import MetricsLog
 from nerf2real.agents.processes.timings import StageTimes
+from nerf2real.core.serialization import to_plain
 
 _log = logging.getLogger(__name__)
 _RECENT_EPISODES = 20  # over which returns are averaged in the status
@@ -65,7 +66,7 @@ class RunSettings:
   """Environment steps between evaluations [steps]."""
   evaluation_episodes: int | None = None
   """Episodes of an evaluation; None: half of its protocol's trials, or 5 without a protocol."""
-  evaluation_environment: str | None = None
+  evaluation_env: str | None = None
   """The environment of the evaluations; None: `environments.evaluation_name` says."""
 
 
@@ -139,12 +140,11 @@ class Learner:
       known=self.replay.origins(),
       description={
         "environment": settings.environment,
-        "config": configs.to_dict(config),
-        "layout": self.layout.to_dict(),
+        "config": to_plain(config),
+        "layout": to_plain(self.layout),
         "seed": settings.seed,
         "begin_steps": limiter.steps,
-        "evaluation_environment": settings.evaluation_environment
-        or evaluation_name(settings.environment),
+        "evaluation_environment": settings.evaluation_env or evaluation_name(settings.environment),
         "evaluation_period": settings.evaluation_period,
         "evaluation_episodes": settings.evaluation_episodes,
         "max_env_steps": settings.max_env_steps,
@@ -209,6 +209,11 @@ class Learner:
   def stop(self) -> None:
     """Ends `run` after the present update; safe in a signal handler."""
     self._stop.set()
+
+  @property
+  def problem(self) -> str:
+    """What could not be written when it was last tried; empty if all could."""
+    return self._problem
 
   @property
   def limiter(self) -> RateLimiter:
@@ -332,7 +337,7 @@ class Learner:
       parameters,
       layout=self.layout,
       environment=self._settings.environment,
-      settings=configs.to_dict(self._config),
+      settings=to_plain(self._config),
       info=self._info() | info,
     )
 
@@ -357,8 +362,8 @@ class Learner:
       refill_until, unpaid = self.limiter.refill_until, self.limiter.unpaid
     return {
       "environment": self._settings.environment,
-      "config": configs.to_dict(self._config),
-      "layout": self.layout.to_dict(),
+      "config": to_plain(self._config),
+      "layout": to_plain(self.layout),
       "seed": self._settings.seed,
       "steps": steps,
       "updates": updates,

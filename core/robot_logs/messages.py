@@ -27,7 +27,6 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 BATTERY_TYPE, TEMPERATURE_TYPE = "sensor_msgs/msg/BatteryState", "sensor_msgs/msg/Temperature"
 
-_PIXEL_CENTRE = 0.5  # of the upper left pixel in core.cameras; ROS has it at 0
 
 Message = tuple[str, str, dict[str, Any]]
 
@@ -219,16 +218,16 @@ def image(time_ns: int, jpeg: bytes) -> Message:
 
 def camera_info(time_ns: int, camera: Camera) -> Message:
   """Returns a lens in ROS's pixel convention."""
-  cx, cy = camera.cx - _PIXEL_CENTRE, camera.cy - _PIXEL_CENTRE
+  matrix = camera.opencv_matrix
   fields = {
     "header": header(time_ns, CAMERA_FRAME),
     "height": camera.height,
     "width": camera.width,
     "distortion_model": "plumb_bob",
     "d": [*camera.distortion.tolist(), 0.0],
-    "k": [camera.fx, 0.0, cx, 0.0, camera.fy, cy, 0.0, 0.0, 1.0],
+    "k": matrix.ravel().tolist(),
     "r": np.eye(3).ravel().tolist(),
-    "p": [camera.fx, 0.0, cx, 0.0, 0.0, camera.fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    "p": np.hstack([matrix, np.zeros((3, 1))]).ravel().tolist(),
     "binning_x": 0,
     "binning_y": 0,
     "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},

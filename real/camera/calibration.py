@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import yaml
 
+from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -22,7 +23,6 @@ _BLOCKS = 10  # of the jackknife: neighbouring frames of a video err alike
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _FLAGS = cv2.CALIB_FIX_K3  # the OPENCV model has two radial terms
 _REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-_PIXEL_CENTRE = 0.5  # COLMAP's coordinates of the upper left pixel's centre, against OpenCV's 0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,10 +50,9 @@ class Calibration:
   @property
   def camera(self) -> Camera:
     """The camera in the convention of `core.cameras`."""
-    named = dict(zip(NAMES, (float(v) for v in self.values), strict=True))
-    named["cx"] += _PIXEL_CENTRE
-    named["cy"] += _PIXEL_CENTRE
-    return Camera(width=self.width, height=self.height, **named)
+    fx, fy, cx, cy, *distortion = self.values
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return Camera.from_opencv(self.width, self.height, matrix, distortion)
 
 
 def read_pictures(source: Path, *, every: int = 1) -> Iterator[tuple[str, np.ndarray]]:
@@ -224,4 +223,4 @@ def write_camera_info(path: Path, calibration: Calibration, *, name: str = "came
   lines.append(f"# RMS {calibration.rms:.3f} pixel over {len(calibration.views)} views")
   info = camera_info(calibration, name=name)
   text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
-  Path(path).write_text("\n".join(lines) + "\n" + text)
+  files.write_atomically(path, "\n".join(lines) + "\n" + text)

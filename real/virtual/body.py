@@ -14,6 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from nerf2real.core import rotations
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.motors import Motors
 from nerf2real.suite.op3 import constants, op3
@@ -50,7 +51,7 @@ class Truth(NamedTuple):
   @property
   def yaw(self) -> float:
     """Heading [rad]."""
-    return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+    return rotations.yaw_of(self.rotation)
 
 
 class Body:
@@ -114,7 +115,7 @@ class Body:
     with self.lock:
       data, root = self.data, self._root
       data.qpos[root : root + 3] = (x, y, _HELD_HEIGHT)
-      data.qpos[root + 3 : root + 7] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+      data.qpos[root + 3 : root + 7] = rotations.yaw_quaternion(yaw)
       data.qpos[self._qpos] = constants.standing_targets()
       data.qvel[:] = 0.0
       self.hold(True)
@@ -142,7 +143,7 @@ class Body:
         if not data.eq_active[self._weld]:
           data.mocap_pos[self._hand] = data.qpos[self._root : self._root + 3]
           yaw = self.truth().yaw
-          data.mocap_quat[self._hand] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+          data.mocap_quat[self._hand] = rotations.yaw_quaternion(yaw)
         data.eq_active[self._weld] = 1
       self._lowering = not held
 
@@ -215,12 +216,10 @@ class Body:
     """Returns what an observer in the room knows."""
     with self.lock:
       data = self.data
-      rotation = np.empty(9)
-      mujoco.mju_quat2Mat(rotation, data.qpos[self._root + 3 : self._root + 7])
       return Truth(
         time=self.time,
         position=data.qpos[self._root : self._root + 3].copy(),
-        rotation=rotation.reshape(3, 3),
+        rotation=rotations.matrix_from_quaternion(data.qpos[self._root + 3 : self._root + 7]),
         velocity=data.qvel[self._root_dof : self._root_dof + 3].copy(),
         joints=data.qpos[self._qpos].copy(),
         touches_room=self._touches[0],
@@ -314,10 +313,5 @@ def _robot(hidden: Hidden) -> mujoco.MjSpec:
       geom.friction[0] = hidden.foot_friction
       geom.priority = 1  # the foot's friction counts, not the larger of the two
       geom.solref[0] = hidden.contact_time
-  imu = spec.site("imu")
-  angle = float(np.linalg.norm(hidden.imu_tilt))
-  if angle > 0:
-    turn = np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, np.asarray(hidden.imu_tilt) / angle, angle)
-    imu.quat = turn
+  spec.site("imu").quat = rotations.quaternion_from_rotvec(hidden.imu_tilt)
   return spec

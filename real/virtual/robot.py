@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import pose_of_mujoco_camera
 from nerf2real.real.loading import Connection
 from nerf2real.real.loop.clock import Clock, RealClock, SteppedClock
 from nerf2real.real.safety.operator import Hand
@@ -45,7 +46,6 @@ LENS = Camera(
 FRAME_RATE = 30.0  # Hz
 _SUPERSAMPLE = 1  # 45 dB from 4 x 4 samples at 30x40, and half the time of 2 x 2
 _HEAD_CAMERA = "op3/head_camera"
-_OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 
 
 class Eyes:
@@ -68,9 +68,7 @@ class Eyes:
     mujoco.mj_camlight(model, data)
     self._eye.update(data)
     camera = model.camera(_HEAD_CAMERA).id
-    pose = np.eye(4)
-    pose[:3, :3] = data.cam_xmat[camera].reshape(3, 3) @ _OPENCV_FROM_MUJOCO
-    pose[:3, 3] = data.cam_xpos[camera]
+    pose = pose_of_mujoco_camera(data.cam_xpos[camera], data.cam_xmat[camera])
     return self._eye.render(self._lens, pose, supersample=_SUPERSAMPLE)[0]
 
   def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a MuJoCo model through any OPENCV camera, with area-averaged pixels.
+"""Renders a MuJoCo model through any OPENCV camera, with area-averaged pixels.
 
 A larger pinhole picture is rendered, sampled where the lens looks, and averaged over each pixel.
 """
@@ -10,11 +10,11 @@ import cv2
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.cameras import PIXEL_CENTRE, Camera
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 
 MAX_WIDTH, MAX_HEIGHT = 2560, 2048  # of the pinhole picture [pixel]; the model's offscreen buffer
 _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
-_FLIP_YZ = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera looks along -z with y up
 
 
 def _context_class():
@@ -44,11 +44,11 @@ class _Lens:
 
 def _sampling(camera: Camera, lens_size, factor: int) -> tuple[np.ndarray, np.ndarray]:
   width, height, tan_x, tan_y = lens_size
-  u = (np.arange(camera.width * factor) + 0.5) / factor
-  v = (np.arange(camera.height * factor) + 0.5) / factor
+  u = (np.arange(camera.width * factor) + PIXEL_CENTRE) / factor
+  v = (np.arange(camera.height * factor) + PIXEL_CENTRE) / factor
   plane = camera.rays(np.stack(np.meshgrid(u, v), -1))[..., :2]
-  x = (plane[..., 0] / tan_x + 1) * width / 2 - 0.5
-  y = (plane[..., 1] / tan_y + 1) * height / 2 - 0.5
+  x = (plane[..., 0] / tan_x + 1) * width / 2 - PIXEL_CENTRE
+  y = (plane[..., 1] / tan_y + 1) * height / 2 - PIXEL_CENTRE
   return x.astype(np.float32), y.astype(np.float32)
 
 
@@ -139,7 +139,7 @@ class Eye:
 
   def _pinhole(self, lens: _Lens, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     near, far = (float(v) * self._model.stat.extent for v in self._planes)
-    rotation = np.asarray(pose)[:3, :3] @ _FLIP_YZ
+    rotation = np.asarray(pose)[:3, :3] @ OPENGL_FROM_OPENCV
     for eye in self._scene.camera:
       eye.pos, eye.up, eye.forward = np.asarray(pose)[:3, 3], rotation[:, 1], -rotation[:, 2]
       eye.frustum_center, eye.frustum_width = 0.0, near * lens.tan_x

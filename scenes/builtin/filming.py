@@ -2,8 +2,7 @@
 
 import dataclasses
 import json
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,10 @@ import av
 import cv2
 import numpy as np
 
+from nerf2real.core import files
 from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.serialization import from_plain, to_plain, write_json
 from nerf2real.scenes.builtin import furniture, room, walk
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
@@ -34,7 +36,7 @@ LENS = Camera(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FilmSettings:
-  """How the film is shot and stored."""
+  """Settings of the film's walk, camera and file."""
 
   camera: Camera = LENS
   """The phone's lens and picture size."""
@@ -106,7 +108,7 @@ def film(
   seed: int = 0,
   settings: FilmSettings | None = None,
   truth_path: Path | None = None,
-  progress: Callable[[int, int], None] | None = None,
+  progress: Progress = no_progress,
 ) -> None:
   """Writes the film and its truth; nothing is left behind under their names unless whole.
 
@@ -115,17 +117,15 @@ def film(
     seed: Seed of the room, the path and the noise.
     settings: How to film.
     truth_path: The truth's JSON file; beside the video if None: name_truth.json.
-    progress: Called with the number of pictures done and of all.
+    progress: Called with the fraction done and a text.
   """
   settings = settings or FilmSettings()
   out_video = Path(out_video)
   truth_path = Path(truth_path or out_video.with_name(f"{out_video.stem}_truth.json"))
   out_video.parent.mkdir(parents=True, exist_ok=True)
   truth_path.parent.mkdir(parents=True, exist_ok=True)
-  partial = out_video.with_name(f".{out_video.stem}.partial.mp4")
-  partial_truth = truth_path.with_name(f".{truth_path.stem}.partial.json")
   poses = []
-  try:
+  with files.atomic_path(out_video) as partial, files.atomic_path(truth_path) as partial_truth:
     with av.open(str(partial), "w") as container:
       rate = round(settings.frame_rate)
       stream = container.add_stream("libx264", rate=rate)
@@ -142,30 +142,22 @@ def film(
         frame = av.VideoFrame.from_ndarray(noisy, format="rgb24")
         container.mux(stream.encode(frame))
         poses.append(pose)
-        if progress is not None:
-          progress(index + 1, settings.frames)
+        done = index + 1
+        progress(done / settings.frames, f"picture {done} of {settings.frames}")
       container.mux(stream.encode())
-    partial_truth.write_text(json.dumps(truth(seed, settings, np.array(poses))))
-    os.replace(partial, out_video)
-    os.replace(partial_truth, truth_path)
-  finally:
-    partial.unlink(missing_ok=True)
-    partial_truth.unlink(missing_ok=True)
+    write_json(partial_truth, truth(seed, settings, np.array(poses)), indent=None)
 
 
 def truth(seed: int, settings: FilmSettings, world_from_camera: np.ndarray) -> dict:
-  """Returns what is known of the film as plain numbers; poses are [T, 4, 4]."""
+  """Returns the film's ground truth as plain numbers; poses are [T, 4, 4]."""
+  plain = to_plain(settings)
   return {
     "version": TRUTH_VERSION,
     "seed": seed,
     "frame": "world: z up, floor z = 0, metres; camera axes of OpenCV; pose in mid exposure",
     "frame_rate": settings.frame_rate,
-    "settings": {
-      field.name: getattr(settings, field.name)
-      for field in dataclasses.fields(settings)
-      if field.name != "camera"
-    },
-    "camera": settings.camera.to_dict(),
+    "settings": {name: value for name, value in plain.items() if name != "camera"},
+    "camera": plain["camera"],
     "marker": {
       "dictionary": "DICT_4X4_50",
       "id": furniture.MARKER_ID,
@@ -188,6 +180,6 @@ def read_truth(path: Path) -> dict:
   poses = np.tile(np.eye(4), (len(values["world_from_camera"]), 1, 1))
   poses[:, :3] = values["world_from_camera"]
   values["world_from_camera"] = poses
-  values["camera"] = Camera(**values["camera"])
+  values["camera"] = from_plain(values["camera"], Camera, source=path)
   values["marker"]["corners"] = np.array(values["marker"]["corners"])
   return values

@@ -1,4 +1,4 @@
-"""What stands in the built-in room, as lists of solids. World frame: z up, floor z = 0, metres.
+"""Furniture of the built-in room, as lists of solids. World frame: z up, floor z = 0, metres.
 
 The room spans x in [-2.5, 2.5], y in [-2, 2], z in [0, 2.5]. Furniture stands along the walls; the
 rectangle FREE_AREA of the floor stays empty for a robot and a ball.
@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.rotations import yaw_matrix as yaw
 from nerf2real.scenes.builtin import art
-from nerf2real.scenes.builtin.placing import ROOM_SIZE, Group, facing, yaw
+from nerf2real.scenes.builtin.placing import ROOM_SIZE, Group, facing
 from nerf2real.scenes.builtin.potted_plant import plant
 from nerf2real.scenes.builtin.solids import Solid
 

@@ -1,18 +1,13 @@
-"""Placing solids in the built-in room. World frame: z up, floor z = 0, metres."""
+"""Places solids in the built-in room. World frame: z up, floor z = 0, metres."""
 
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from nerf2real.core.rotations import yaw_matrix
 from nerf2real.scenes.builtin.solids import Solid
 
 ROOM_SIZE = (5.0, 4.0, 2.5)  # x in [-2.5, 2.5], y in [-2, 2], z in [0, 2.5]
-
-
-def yaw(angle: float) -> np.ndarray:
-  """Returns the rotation about z by an angle [rad]."""
-  return Rotation.from_euler("z", angle).as_matrix()
 
 
 def facing(normal: tuple[float, float, float]) -> np.ndarray:
@@ -29,7 +24,11 @@ class Group:
     self, name: str, position: tuple[float, ...] | np.ndarray = (0.0, 0.0, 0.0), angle: float = 0.0
   ):
     self.solids: list[Solid] = []
-    self._name, self._position, self._rotation = name, np.asarray(position, float), yaw(angle)
+    self._name, self._position, self._rotation = (
+      name,
+      np.asarray(position, float),
+      yaw_matrix(angle),
+    )
 
   def add(self, kind: str, size, position, material: str, *, rotation=None, **look: Any) -> None:
     """Adds a solid given in the group's frame."""

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core import rotations
 from nerf2real.scenes.builtin.placing import ROOM_SIZE, Group
 from nerf2real.scenes.builtin.solids import Solid
 
@@ -19,11 +20,12 @@ def plant(rng: np.random.Generator) -> list[Solid]:
     lean, azimuth = rng.uniform(0.05, 0.38), rng.uniform(0, 2 * np.pi)
     direction = np.array([np.sin(lean) * np.cos(azimuth), np.sin(lean) * np.sin(azimuth), 1.0])
     length = rng.uniform(0.55, 1.3)
-    turn = Rotation.align_vectors([direction], [[0, 0, 1.0]])[0].as_matrix()
-    middle = foot + 0.5 * length * direction / np.linalg.norm(direction)
+    direction /= np.linalg.norm(direction)
+    turn = rotations.shortest_rotation(np.array([0.0, 0.0, 1.0]), direction)
+    middle = foot + 0.5 * length * direction
     group.add("cone", (0.013, 0.008, length / 2), middle, "leaf", rotation=turn, tiles=1.0)
     for along in np.arange(0.25, 1.01, 0.11):
-      start = foot + along * length * direction / np.linalg.norm(direction)
+      start = foot + along * length * direction
       _leaf(group, rng, base, start)
   return group.solids
 

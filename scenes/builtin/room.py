@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nerf2real.core import rotations
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.builtin import furniture, solids, surfaces
 from nerf2real.scenes.builtin.eye import Eye
@@ -138,8 +139,7 @@ def _add_solid(spec: mujoco.MjSpec, solid: solids.Solid, *, looks: bool) -> None
     userface=mesh.faces.ravel(),
     inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
   )
-  quaternion = np.empty(4)
-  mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(solid.rotation).ravel())
+  quaternion = rotations.quaternion_from_matrix(solid.rotation)
   place: dict[str, Any] = {"pos": solid.position.tolist(), "quat": quaternion.tolist()}
   if looks:
     spec.worldbody.add_geom(

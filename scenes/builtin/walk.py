@@ -1,4 +1,4 @@
-"""The path of a hand-held phone through the built-in room.
+"""Simulates the path of a hand-held phone through the built-in room.
 
 Four rounds: along the furniture at eye height looking across the room, near the middle looking
 outwards, and the same two at the height of a small robot. Between rounds the phone moves straight
@@ -11,6 +11,8 @@ import dataclasses
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
+
+from nerf2real.core.rotations import camera_axes
 
 _RATE = 120.0  # samples of the path a second
 _SMOOTHING = 0.5  # standard deviation of the filter that rounds off the rounds' joints [s]
@@ -138,9 +140,7 @@ class Walk:
       position[:, axis] += shake_position * _shake(rng, times, 0.4, 4.0)
     level = np.cos(pitch)
     forward = np.stack([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)], -1)
-    right = np.cross(forward, [0.0, 0, 1])
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    down = np.cross(forward, right)
+    right, down, _ = np.moveaxis(camera_axes(forward), -1, 0)
     angle = shake_angle * np.stack([_shake(rng, times, 0.4, 5.0) for _ in range(3)], -1)
     forward = forward + angle[:, :1] * right + angle[:, 1:2] * down
     right = right + angle[:, 2:] * down

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import camera_axes
+from nerf2real.core.serialization import to_plain
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.assembly import Reconstruction, TruthFigures
 from nerf2real.scenes.builtin import filming, furniture, room
 from nerf2real.scenes.geometry import convex
 from nerf2real.scenes.quality import collision_error, image_quality
 from nerf2real.scenes.quality import held_out as evaluate
+from nerf2real.scenes.results import Reconstruction, TruthFigures
 
 VIDEO = filming.SHIPPED_VIDEO
 TRUTH = VIDEO.with_name("room_truth.json")
@@ -49,9 +51,8 @@ def robot_poses(count: int = _ROBOT_VIEWS, *, seed: int = 0) -> np.ndarray:
       rng.uniform(0.16, 0.5),
     )  # the paper's head tilt, downwards
     forward = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), -np.sin(tilt)])
-    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, :3] = camera_axes(forward)
     pose[:3, 3] = position
     poses.append(pose)
   return np.stack(poses)
@@ -98,7 +99,7 @@ def measure(result: Reconstruction) -> TruthFigures:
     views = views or scores
   figures |= _contact_figures(result, rigid)
   # Where the truth's frame lies: benchmarks compare other pictures of the bundle with the truth.
-  return TruthFigures({**figures, "room_from_world": rigid.to_dict()}, views)
+  return TruthFigures({**figures, "room_from_world": to_plain(rigid)}, views)
 
 
 def _robot_scores(

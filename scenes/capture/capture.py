@@ -1,16 +1,16 @@
-"""Capture: a video, pictures or a posed data set becomes a folder of sharp keyframes."""
+"""Selects the sharpest keyframes of a video, of pictures or of a posed data set."""
 
 import dataclasses
 import itertools
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from nerf2real.core import files
 from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.sources import (
   KnownPoses,
   find_colmap_model,
@@ -22,7 +22,6 @@ from nerf2real.scenes.capture.sources import (
 from nerf2real.scenes.capture.video import (
   CaptureError,
   Frame,
-  Progress,
   inspect_video,
   limit_size,
   sharpest_frames,
@@ -31,12 +30,12 @@ from nerf2real.scenes.capture.video import (
 
 __all__ = ["Capture", "CaptureError", "CaptureSettings", "read_capture"]
 
-MIN_IMAGES = 8  # fewer pictures do not make a room; ours
+MIN_IMAGES = 8  # fewer pictures do not cover a room
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CaptureSettings:
-  """What is kept of a capture and when it is doubted. Sources: ours, where not said otherwise."""
+  """Settings of the keyframes and of the warnings."""
 
   num_keyframes: int = 150  # parts of the capture; the sharpest frame of each is kept
   max_size: int = 1920  # long side of a keyframe; larger pictures are reduced [pixel]
@@ -67,7 +66,7 @@ class Capture:
 
 
 def source_kind(source: Path) -> str:
-  """Says what a source is: "video", "images", "colmap" or "transforms".
+  """Returns the kind of a source: "video", "images", "colmap" or "transforms".
 
   Raises:
     CaptureError: If it does not exist or is none of these.
@@ -98,7 +97,7 @@ def read_capture(
   folder: Path,
   *,
   settings: CaptureSettings | None = None,
-  progress: Progress | None = None,
+  progress: Progress = no_progress,
 ) -> Capture:
   """Reads a source and writes its keyframes.
 
@@ -106,7 +105,7 @@ def read_capture(
     source: A video, a folder of pictures, a folder with a COLMAP model, or a transforms.json.
     folder: Where the keyframes are written; replaced as a whole and only when all went well.
     settings: What to keep and when to warn.
-    progress: Called with (fraction, text).
+    progress: Called with the fraction done and a text.
 
   Raises:
     CaptureError: If the source cannot become a capture; the message is one line.
@@ -118,24 +117,17 @@ def read_capture(
       f"num_keyframes is {settings.num_keyframes}, expected at least {settings.min_images}."
     )
   kind = source_kind(source)
-  partial = folder.with_name(folder.name + ".partial")
-  shutil.rmtree(partial, ignore_errors=True)
-  partial.mkdir(parents=True)
-  try:
+  with files.atomic_folder(folder) as partial:
     if kind == "video":
       capture = _read_video(source, partial, settings, progress)
     else:
       capture = _read_pictures(source, kind, partial, settings, progress)
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(partial, folder)
-  finally:
-    shutil.rmtree(partial, ignore_errors=True)
   images = [folder / path.name for path in capture.images]
   return dataclasses.replace(capture, folder=folder, images=images)
 
 
 def _read_video(
-  source: Path, folder: Path, settings: CaptureSettings, progress: Progress | None
+  source: Path, folder: Path, settings: CaptureSettings, progress: Progress
 ) -> Capture:
   info = inspect_video(source)
   if info.num_frames < settings.min_images:
@@ -161,7 +153,7 @@ def _read_video(
 
 
 def _read_pictures(
-  source: Path, kind: str, folder: Path, settings: CaptureSettings, progress: Progress | None
+  source: Path, kind: str, folder: Path, settings: CaptureSettings, progress: Progress
 ) -> Capture:
   known = None
   if kind == "colmap":
@@ -203,7 +195,7 @@ def _read_picture(path: Path) -> np.ndarray:
 
 
 def _sharpest_pictures(
-  files: list[Path], settings: CaptureSettings, progress: Progress | None
+  files: list[Path], settings: CaptureSettings, progress: Progress
 ) -> Iterator[Frame]:
   """Yields the sharpest picture of each of equal parts of a list of files."""
   parts = min(settings.num_keyframes, len(files))
@@ -215,8 +207,7 @@ def _sharpest_pictures(
       value = sharpness(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
       if best is None or value > best.sharpness:
         best = Frame(index, 0.0, value, limit_size(image, settings.max_size))
-    if progress is not None:
-      progress(last / len(files), f"picture {last} of {len(files)}")
+    progress(last / len(files), f"picture {last} of {len(files)}")
     if best is not None:
       yield best
 
@@ -261,7 +252,7 @@ def _write(
 
 
 def _quality_warnings(capture: Capture, settings: CaptureSettings) -> list[str]:
-  """Says what the keyframes themselves lack; parallax is judged after matching."""
+  """Returns warnings about the keyframes themselves; parallax is judged after matching."""
   found = []
   if min(capture.width, capture.height) < settings.warn_short_side:
     found.append(

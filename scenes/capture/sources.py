@@ -12,14 +12,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.cameras import Camera, focal_length
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.video import CaptureError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: y and z change sign
-CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera; ours
-ROTATION_TOLERANCE = 1e-2  # of a pose's 3x3 part to a rotation; ours
+CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera
+ROTATION_TOLERANCE = 1e-2  # of a pose's 3x3 part to a rotation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +32,13 @@ class KnownPoses:
   files: tuple[Path, ...]  # picture of each pose
   world_from_camera: np.ndarray  # [N, 4, 4], OpenCV camera axes, the source's frame
   points: np.ndarray  # [P, 3], the source's frame; empty where the source has none
-  point_colors: np.ndarray  # uint8 [P, 3]
+  point_colors: NDArray[np.uint8]  # [P, 3]
   point_errors: np.ndarray  # mean reprojection error [P] [pixel]
+
+  def __post_init__(self):
+    # JSON does not keep the columns of an array without rows.
+    for name in ("points", "point_colors"):
+      object.__setattr__(self, name, getattr(self, name).reshape(-1, 3))
 
   def selected(self, indices: list[int], camera: Camera) -> "KnownPoses":
     """Keeps some of the pictures, with the camera of the pictures as they were written."""
@@ -157,13 +163,13 @@ def _transforms_camera(values: dict[str, Any], path: Path) -> Camera:
   if "fl_x" in values:
     fx = float(values["fl_x"])
   elif "camera_angle_x" in values:
-    fx = 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
+    fx = focal_length(float(values["camera_angle_x"]), width)
   else:
     raise CaptureError(f"{path}: no focal length: expected 'fl_x' or 'camera_angle_x'.")
   if "fl_y" in values:
     fy = float(values["fl_y"])
   elif "camera_angle_y" in values and "fl_x" not in values:
-    fy = 0.5 * height / np.tan(0.5 * float(values["camera_angle_y"]))
+    fy = focal_length(float(values["camera_angle_y"]), height)
   else:
     fy = fx
   distortion = {name: float(values.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2")}
@@ -215,7 +221,8 @@ def read_transforms(source: Path) -> KnownPoses:
       deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not deviation < ROTATION_TOLERANCE or np.linalg.det(matrix[:3, :3]) < 0:
       raise CaptureError(f"{path}: transform_matrix of {frame['file_path']} is no rigid pose.")
-    poses.append(matrix @ OPENCV_FROM_OPENGL)
+    matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
+    poses.append(matrix)
   empty = np.zeros((0, 3))
   return KnownPoses(
     kind="transforms",

@@ -1,11 +1,11 @@
-"""Videos: one streaming pass that keeps the sharpest frame of each part.
+"""Reads a video in one streaming pass and keeps the sharpest frame of each part.
 
 Memory holds one candidate picture, never the film: a video of any length streams through.
 """
 
 import collections
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
@@ -13,11 +13,11 @@ import av.error
 import cv2
 import numpy as np
 
+from nerf2real.core.progress import Progress, no_progress
+
 STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; ours, so that
 # pictures of different resolution are comparable; pictures are never enlarged
-DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged; ours
-
-Progress = Callable[[float, str], None]
+DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged
 
 
 class CaptureError(ValueError):
@@ -36,7 +36,7 @@ class Frame:
 
 @dataclasses.dataclass(frozen=True)
 class VideoInfo:
-  """What a video's header and packets say, before any decoding."""
+  """Facts of a video's header and packets, without decoding."""
 
   num_frames: int  # packets of the video stream
   declared_frames: int  # what the header promises; 0 where it does not say
@@ -140,7 +140,7 @@ def sharpest_frames(
   max_size: int,
   info: VideoInfo,
   warnings: list[str],
-  progress: Progress | None = None,
+  progress: Progress = no_progress,
 ) -> Iterator[Frame]:
   """Cuts a video into equal parts and yields the sharpest frame of each.
 
@@ -150,7 +150,7 @@ def sharpest_frames(
     max_size: Longer pictures are reduced to this long side [pixel].
     info: From `inspect_video`.
     warnings: Receives a line when a little of the video was damaged.
-    progress: Called with (fraction, text).
+    progress: Called with the fraction done and a text.
 
   Raises:
     CaptureError: If more than DAMAGED_FRACTION of the video cannot be decoded.
@@ -170,7 +170,7 @@ def sharpest_frames(
     value = sharpness(frame.reformat(format="gray").to_ndarray())
     if best is None or value > best[0]:
       best = (value, index, frame)
-    if progress is not None and index % 10 == 0:
+    if index % 10 == 0:
       progress(min(1.0, index / info.num_frames), f"frame {index} of {info.num_frames}")
   expected = max(info.num_frames, info.declared_frames)
   lost = max(expected - counts["decoded"], 0) + counts["broken"]

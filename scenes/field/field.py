@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
+from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain
 from nerf2real.scenes.field import encoding
 from nerf2real.scenes.field.contraction import grid_coordinates
 
@@ -193,13 +195,10 @@ class Field:
     metadata = {
       "format": "radiance field",
       "format_version": str(FORMAT_VERSION),
-      "settings": json.dumps(dataclasses.asdict(self.settings)),
+      "settings": json.dumps(to_plain(self.settings)),
       "training_pixel_angle": repr(float(self.training_pixel_angle)),
     }
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(safetensors.numpy.save(tensors, metadata=metadata))
-    partial.replace(path)
+    files.write_atomically(path, safetensors.numpy.save(tensors, metadata=metadata))
 
   @classmethod
   def load(cls, path: str | Path) -> "Field":
@@ -216,7 +215,7 @@ class Field:
           f"{path} has format version {metadata['format_version']}, this program reads up to "
           f"{FORMAT_VERSION}; update the program."
         )
-      settings = FieldSettings(**json.loads(metadata["settings"]))
+      settings = from_plain(json.loads(metadata["settings"]), FieldSettings, source=path)
       params = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}  # noqa: SIM118
     for name, shape in settings.shapes.items():
       if name not in params or params[name].shape != shape:

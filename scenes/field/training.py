@@ -15,12 +15,14 @@ from typing import Protocol
 import numpy as np
 import safetensors.numpy
 
+from nerf2real.core import files
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.serialization import to_plain
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.fused.trainer import FusedTrainer
 from nerf2real.scenes.field.reference_training import ReferenceTrainer
 from nerf2real.scenes.field.settings import TrainSettings, preset
 from nerf2real.scenes.field.views import Views
-from nerf2real.scenes.stages import Progress, no_progress, to_plain
 
 __all__ = ["TrainError", "TrainReport", "TrainSettings", "learning_rate", "preset", "train"]
 
@@ -181,7 +183,7 @@ def _not_finite(what: str, step: int, rate: float) -> str:
 def _run_key(views: Views, settings: TrainSettings, seed: int) -> str:
   """Hash of all that a checkpoint depends on."""
   digest = hashlib.sha256(json.dumps(to_plain(settings), sort_keys=True).encode())
-  digest.update(json.dumps([views.camera.to_dict(), list(views.names), seed]).encode())
+  digest.update(json.dumps([to_plain(views.camera), list(views.names), seed]).encode())
   digest.update(np.ascontiguousarray(views.world_from_camera).tobytes())
   digest.update(np.ascontiguousarray(views.images).tobytes())
   return digest.hexdigest()
@@ -189,9 +191,7 @@ def _run_key(views: Views, settings: TrainSettings, seed: int) -> str:
 
 def _save_checkpoint(path: Path, key: str, seconds: float, arrays: dict[str, np.ndarray]) -> None:
   metadata = {"key": key, "seconds": repr(seconds)}
-  partial = path.with_name(path.name + ".partial")
-  safetensors.numpy.save_file(arrays, partial, metadata=metadata)
-  partial.replace(path)
+  files.write_atomically(path, safetensors.numpy.save(arrays, metadata=metadata))
 
 
 def _load_checkpoint(path: Path, key: str) -> tuple[float, dict[str, np.ndarray]] | None:

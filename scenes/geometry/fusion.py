@@ -6,7 +6,6 @@ surface, and unknown otherwise. Shapes: N views, H height, W width, X, Y, Z voxe
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -14,8 +13,7 @@ import numba
 import numpy as np
 
 from nerf2real.core import cameras, similarity
-
-Progress = Callable[[float, str], None]
+from nerf2real.core.progress import Progress, no_progress
 
 _MIN_COSINE = 0.15  # steepest incidence that still counts: at 81 degrees depth is mostly noise
 _EDGE = 0.08  # a pixel whose neighbour is this much deeper (relative) sits on a silhouette
@@ -194,7 +192,7 @@ def fuse(
   upper: np.ndarray,
   voxel: float,
   truncation: float | None = None,
-  progress: Progress | None = None,
+  progress: Progress = no_progress,
 ) -> Grid:
   """Averages truncated signed distances of all views over a box.
 
@@ -207,10 +205,10 @@ def fuse(
     upper: Upper corner of the box [3].
     voxel: Edge of a voxel.
     truncation: Band around a surface in which distances are averaged; 3 voxels if None.
-    progress: Called with the share done and a word.
+    progress: Called with the fraction done and a text.
 
   Source: Curless and Levoy 1996, A volumetric method for building complex models from range images,
-  section 3; the tangent planes are ours.
+  section 3; the tangent planes are an addition.
   """
   lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
   shape = np.maximum(np.ceil((upper - lower) / voxel).astype(int), 1) + 1
@@ -251,8 +249,7 @@ def fuse(
       values,
       weights,
     )
-    if progress:
-      progress(min(1.0, (start + batch) / len(depth)), "fusing depth")
+    progress(min(1.0, (start + batch) / len(depth)), "fusing depth")
   seen = weights > 0
   np.divide(values, weights * truncation, out=values, where=seen)
   values[~seen] = 1.0

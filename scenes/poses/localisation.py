@@ -1,19 +1,19 @@
-"""The result of localising, and its folder: a COLMAP model with its figures beside it.
+"""Camera, poses and points of a capture, and their folder: a COLMAP model with its figures.
 
 Shapes: N registered keyframes, P points.
 """
 
 import dataclasses
 import json
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
+from nerf2real.core import files
 from nerf2real.core.cameras import Camera
+from nerf2real.core.serialization import from_plain, write_json
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.sources import to_opencv
 from nerf2real.scenes.poses import mapping
@@ -76,21 +76,17 @@ def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Locali
 
 def save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Path) -> None:
   """Writes the model and its figures; the folder appears whole or not at all."""
-  partial = folder.with_name(folder.name + ".partial")
-  shutil.rmtree(partial, ignore_errors=True)
-  partial.mkdir(parents=True)
-  model.write(str(partial))
   figures = {
     "registered_fraction": localisation.registered_fraction,
     "reprojection_error_px": localisation.reprojection_error_px,
     "strategy": localisation.strategy,
-    "unit_from_source": localisation.unit_from_source.to_dict(),
-    "warnings": list(localisation.warnings),
+    "unit_from_source": localisation.unit_from_source,
+    "warnings": localisation.warnings,
     "seconds": localisation.seconds,
   }
-  (partial / _FIGURES).write_text(json.dumps(figures, indent=2))
-  shutil.rmtree(folder, ignore_errors=True)
-  os.replace(partial, folder)
+  with files.atomic_folder(folder) as partial:
+    model.write(str(partial))
+    write_json(partial / _FIGURES, figures, indent=2)
 
 
 def load(folder: Path) -> Localisation:
@@ -105,6 +101,6 @@ def load(folder: Path) -> Localisation:
     model = pycolmap.Reconstruction(str(folder))
   except (OSError, ValueError, RuntimeError) as error:
     raise LocalisationError(f"{folder} holds no localisation: {error}") from error
-  values["unit_from_source"] = Similarity.from_dict(values["unit_from_source"])
+  values["unit_from_source"] = from_plain(values["unit_from_source"], Similarity)
   values["warnings"] = tuple(values["warnings"])
   return from_model(model, values)

@@ -1,4 +1,4 @@
-"""Localise: keyframes become one camera, poses and sparse points in the unit frame.
+"""Localises keyframes by structure from motion: one camera, poses, points in the unit frame.
 
 `localise` leaves `sfm/` (a COLMAP model in the unit frame, and `localisation.json`); features and
 matches stay in `work/database.db`, so that an interrupted run continues. Shapes: N registered
@@ -10,13 +10,13 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 
+from nerf2real.core.progress import Progress, no_progress, part
+from nerf2real.core.serialization import to_plain
 from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap
 from nerf2real.scenes.poses import mapping, matching
 from nerf2real.scenes.poses.localisation import (
@@ -35,7 +35,6 @@ from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_fr
 
 __all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "localise"]
 
-Progress = Callable[[float, str], None]
 
 _MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
 _STAGE_SHARES = {"features": 0.25, "matching": 0.4, "mapping": 0.25, "refining": 0.1}
@@ -43,7 +42,7 @@ _STAGE_SHARES = {"features": 0.25, "matching": 0.4, "mapping": 0.25, "refining":
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LocaliseSettings:
-  """How keyframes are localised. Sources: ours, where not said otherwise."""
+  """Settings of structure from motion."""
 
   features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
   pairs: PairSettings = dataclasses.field(default_factory=PairSettings)
@@ -65,7 +64,7 @@ def localise(
   *,
   settings: LocaliseSettings | None = None,
   known: KnownPoses | None = None,
-  progress: Progress | None = None,
+  progress: Progress = no_progress,
 ) -> Localisation:
   """Localises the pictures of a folder.
 
@@ -74,7 +73,7 @@ def localise(
     out_folder: Receives `sfm/` and `work/`.
     settings: How.
     known: Poses that came with the pictures, in the order of their sorted names; they are kept.
-    progress: Called with (fraction, text).
+    progress: Called with the fraction done and a text.
 
   Raises:
     LocalisationError: If too few keyframes can be localised.
@@ -112,7 +111,7 @@ class _Mapped:
 class _Steps:
   """Times the steps and turns their progress into one fraction."""
 
-  def __init__(self, progress: Progress | None):
+  def __init__(self, progress: Progress):
     self._progress = progress
     self._name, self._start = "", time.perf_counter()
     self.seconds: dict[str, float] = {}
@@ -128,12 +127,10 @@ class _Steps:
     self._name = ""
 
   def report(self, fraction: float, text: str) -> None:
-    if self._progress is None:
-      return
     done = 0.0
     for name, share in _STAGE_SHARES.items():
       if name == self._name:
-        self._progress(done + share * min(max(fraction, 0.0), 1.0), text)
+        part(self._progress, done, done + share)(fraction, text)
         return
       done += share
 
@@ -147,8 +144,8 @@ def _prepare_work(
 ) -> Path:
   """Returns the database, after removing one that was made of other pictures or settings."""
   digest = hashlib.sha256()
-  described: dict[str, Any] = dataclasses.asdict(settings.features)
-  described["camera"] = None if known is None else known.camera.to_dict()
+  described = to_plain(settings.features)
+  described["camera"] = None if known is None else to_plain(known.camera)
   described["seed"] = settings.seed
   digest.update(json.dumps(described, sort_keys=True).encode())
   for name in names:

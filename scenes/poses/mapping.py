@@ -1,4 +1,4 @@
-"""From verified matches to one refined COLMAP model."""
+"""Maps verified matches to one refined COLMAP model: incremental or global."""
 
 import os
 import shutil
@@ -9,23 +9,22 @@ import numpy as np
 import pycolmap
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
-from nerf2real.scenes.poses.matching import Report, image_ids, quiet
+from nerf2real.scenes.poses.matching import image_ids, quiet
 
-MIN_OBSERVATIONS = 20  # points a picture must see to count as registered; ours
+MIN_OBSERVATIONS = 20  # points a picture must see to count as registered
 MAX_ERROR = 4.0  # observations further off are dropped [pixel]; COLMAP
 MIN_ANGLE = 1.5  # points seen under a smaller angle are dropped [degree]; COLMAP
-_LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]; ours
-_MAX_PRINCIPAL_SHIFT = (
-  0.08  # of the principal point from the middle, times the picture's size; ours
-)
-_MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative; ours
-_MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels; ours
+_LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]
+_MAX_PRINCIPAL_SHIFT = 0.08  # of the principal point from the middle, times the picture's size
+_MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative
+_MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels
 _NOTHING = (ValueError, RuntimeError)  # what pycolmap raises
 
 
 def map_globally(
-  database: Path, images_folder: Path, *, seed: int, report: Report | None = None
+  database: Path, images_folder: Path, *, seed: int, report: Progress = no_progress
 ) -> list[pycolmap.Reconstruction]:
   """Solves for all rotations, then all positions, then adjusts; the largest model first.
 
@@ -35,8 +34,7 @@ def map_globally(
   options = pycolmap.GlobalPipelineOptions()
   options.num_threads = os.cpu_count() or 1
   options.random_seed = seed
-  if report is not None:
-    report(0.0, "solving for all poses at once")
+  report(0.0, "solving for all poses at once")
   with tempfile.TemporaryDirectory(dir=database.parent) as folder:
     # The global mapper writes calibrated focal lengths into its database: it gets its own copy.
     copy = Path(folder) / "database.db"
@@ -52,7 +50,7 @@ def map_globally(
 
 
 def map_incrementally(
-  database: Path, images_folder: Path, *, seed: int, report: Report | None = None
+  database: Path, images_folder: Path, *, seed: int, report: Progress = no_progress
 ) -> list[pycolmap.Reconstruction]:
   """Adds picture after picture; the largest model first.
 
@@ -74,8 +72,7 @@ def map_incrementally(
   def next_image() -> None:
     nonlocal seen
     seen += 1
-    if report is not None:
-      report(min(1.0, seen / total), f"placed {min(seen, total)} of {total} pictures")
+    report(min(1.0, seen / total), f"placed {min(seen, total)} of {total} pictures")
 
   with tempfile.TemporaryDirectory(dir=database.parent) as folder:
     try:
@@ -125,7 +122,7 @@ def _adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool
 
 
 def camera_fault(camera: Camera) -> str | None:
-  """Says what is impossible about an estimated camera, None if nothing is.
+  """Returns what is impossible about an estimated camera, None if nothing is.
 
   The radial polynomial r (1 + k1 r^2 + k2 r^4) must grow up to the farthest corner: where parallax
   is low, distortion trades against depth and folds the picture.
@@ -146,7 +143,7 @@ def camera_fault(camera: Camera) -> str | None:
 
 
 def refine(
-  model: pycolmap.Reconstruction, *, report: Report | None = None
+  model: pycolmap.Reconstruction, *, report: Progress = no_progress
 ) -> tuple[pycolmap.Reconstruction, str]:
   """Adjusts poses, points and all parameters of the lens; frees fewer where the result is absurd.
 
@@ -157,8 +154,7 @@ def refine(
   Returns:
     The refined model and a sentence on the lens: which parameters are free and why not all.
   """
-  if report is not None:
-    report(0.0, "adjusting poses and lens")
+  report(0.0, "adjusting poses and lens")
   base = pycolmap.Reconstruction(model)
   _adjust(base, principal=False, distortion=True)
   fault = camera_fault(_camera(base))
@@ -168,8 +164,7 @@ def refine(
       camera.params = np.concatenate([camera.params[:4], np.zeros(4)])
     _adjust(base, principal=False, distortion=False)
     return base, f"focal lengths only, no distortion, because {fault}"
-  if report is not None:
-    report(0.5, "adjusting poses and lens, principal point free")
+  report(0.5, "adjusting poses and lens, principal point free")
   full = pycolmap.Reconstruction(base)
   _adjust(full, principal=True, distortion=True)
   fault = camera_fault(_camera(full))

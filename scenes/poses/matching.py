@@ -1,4 +1,4 @@
-"""Features and matches in a COLMAP database that survives interruption.
+"""Extracts and matches features into a COLMAP database that survives interruption.
 
 Every call does only what the database does not hold yet.
 """
@@ -8,15 +8,14 @@ import dataclasses
 import os
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.poses.pairs import Pair, PairSettings, choose_pairs, overlap_scores
-
-Report = Callable[[float, str], None]
 
 _EXTRACTION_CHUNK = 8  # pictures between two progress reports
 _MATCHING_CHUNK = 300  # pairs between two progress reports
@@ -27,10 +26,10 @@ _FATAL_ONLY = 3  # glog level
 class FeatureSettings:
   """Features and their matching."""
 
-  max_num_features: int = 1536  # of a picture, the largest first; time grows with the square; ours
-  few_num_features: int = 4096  # the same for captures of few pictures; ours
-  few_pictures: int = 40  # so many are few; ours
-  max_image_size: int = 1600  # long side at which features are sought [pixel]; ours
+  max_num_features: int = 1536  # of a picture, the largest first; time grows with the square
+  few_num_features: int = 4096  # the same for captures of few pictures
+  few_pictures: int = 40  # so many are few
+  max_image_size: int = 1600  # long side at which features are sought [pixel]
   affine_shape: bool = True  # paper, appendix A
   guided_matching: bool = True  # paper, appendix A
   focal_factor: float = 1.2  # first guess of the focal length, times the long side; COLMAP
@@ -73,7 +72,7 @@ def extract_features(
   *,
   settings: FeatureSettings,
   camera: pycolmap.Camera | None = None,
-  report: Report | None = None,
+  report: Progress = no_progress,
 ) -> None:
   """Finds affine-shape SIFT features of pictures that share one OPENCV camera.
 
@@ -83,7 +82,7 @@ def extract_features(
     names: The pictures.
     settings: Of the features.
     camera: Known intrinsics; a first guess from the picture size if None.
-    report: Called with (fraction, text).
+    report: Called with the fraction done and a text.
   """
   reader = pycolmap.ImageReaderOptions()
   reader.camera_model = "OPENCV"
@@ -114,9 +113,8 @@ def extract_features(
         extraction_options=options,
         device=pycolmap.Device.cpu,
       )
-    if report is not None:
-      found = min(first + _EXTRACTION_CHUNK, len(missing))
-      report(found / len(missing), f"features of {found + len(done)} of {len(names)} pictures")
+    found = min(first + _EXTRACTION_CHUNK, len(missing))
+    report(found / len(missing), f"features of {found + len(done)} of {len(names)} pictures")
 
 
 def feature_counts(database: Path) -> np.ndarray:
@@ -145,7 +143,7 @@ def largest_descriptors(database: Path, ids: list[int], count: int) -> np.ndarra
 
 
 def find_pairs(
-  database: Path, settings: PairSettings, *, report: Report | None = None
+  database: Path, settings: PairSettings, *, report: Progress = no_progress
 ) -> tuple[list[Pair], str]:
   """Chooses which pictures of the database to match: see `scenes.poses.pairs`."""
   ids = list(image_ids(database).values())
@@ -157,7 +155,7 @@ def find_pairs(
     return overlap_scores(
       descriptors,
       ratio=settings.score_ratio,
-      progress=None if report is None else lambda f: report(f, "looking for loop closures"),
+      progress=report,
     )
 
   return choose_pairs(feature_counts(database), settings, score=score)
@@ -177,7 +175,7 @@ def match_pairs(
   *,
   settings: FeatureSettings,
   seed: int,
-  report: Report | None = None,
+  report: Progress = no_progress,
 ) -> int:
   """Matches and verifies pairs, given as indices into the sorted names.
 
@@ -213,7 +211,6 @@ def match_pairs(
           verification_options=verification,
           device=pycolmap.Device.cpu,
         )
-      if report is not None:
-        found = min(first + _MATCHING_CHUNK, len(missing))
-        report(found / len(missing), f"matched {found} of {len(missing)} pairs")
+      found = min(first + _MATCHING_CHUNK, len(missing))
+      report(found / len(missing), f"matched {found} of {len(missing)} pairs")
   return len(missing)

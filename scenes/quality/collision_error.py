@@ -1,11 +1,11 @@
-"""Distance between the convex parts' surface and the scene's surface, both ways.
+"""Measures the distance between the convex parts' surface and the scene's surface, both ways.
 
 Only what can be touched counts: the parts' surface is found by MuJoCo's own rays from where cameras
 were and from the free space, so the far side of a wall, which nobody sees, is not judged.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -31,10 +31,6 @@ class CollisionError(NamedTuple):
   def p95(self) -> float:
     """The larger of both 95th percentiles: the bundle's collision_error_m."""
     return max(self.parts_to_surface_p95, self.surface_to_parts_p95)
-
-  def to_dict(self) -> dict[str, Any]:
-    """Returns plain numbers, for JSON."""
-    return {name: float(value) for name, value in self._asdict().items()}
 
 
 def exposed_points(

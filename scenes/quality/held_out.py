@@ -1,4 +1,4 @@
-"""Quality of a field on held-out pictures, at full and at robot resolution.
+"""Scores a field on held-out pictures, at full and at robot resolution.
 
 Shapes: N views, H height, W width.
 """
@@ -11,11 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.serialization import write_json
 from nerf2real.scenes.field import photometry
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.quality import image_quality
-from nerf2real.scenes.stages import Progress, no_progress
 
 ROBOT_SIZES = ((30, 40), (60, 80))  # picture sizes [H, W] of the policies; paper, table I
 
@@ -68,7 +69,7 @@ def evaluate(
     renderer: Draws the field.
     views: Held-out pictures with their poses in the field's frame.
     robot_sizes: Picture sizes (height, width) beside the full one.
-    progress: Told how far it is.
+    progress: Called with the fraction done and a text.
 
   Returns:
     The scores at full size, and the figures: medians would hide failures, so these are means.
@@ -100,7 +101,7 @@ def save_scores(scores: Sequence[ViewScore], folder: Path) -> None:
     depth=np.stack([score.depth for score in scores]).astype(np.float16),
   )
   rows = [{"name": s.name, "psnr_db": s.psnr_db, "ssim": s.ssim} for s in scores]
-  (folder / "views.json").write_text(json.dumps(rows, indent=1))
+  write_json(folder / "views.json", rows)
 
 
 def load_scores(folder: Path) -> list[ViewScore]:

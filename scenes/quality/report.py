@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import trimesh
 
+from nerf2real.core import files
 from nerf2real.core.pages import parts
 from nerf2real.scenes.quality.held_out import ViewScore
 
@@ -85,7 +86,7 @@ def write(path: Path, data: ReportData) -> None:
       "Settings", "", parts.details("all settings", json.dumps(data.settings, indent=1))
     ),
   ]
-  Path(path).write_text(parts.page(data.title, data.lead, sections, with_plots=True))
+  files.write_atomically(path, parts.page(data.title, data.lead, sections, with_plots=True))
 
 
 def _summary(data: ReportData) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from nerf2real.core.files import write_atomically
 from nerf2real.suite.effects.effect import Effect, Parameter, Value
 from nerf2real.suite.effects.registry import kind_of
 
@@ -110,7 +111,7 @@ def _parse(item: Any) -> Effect:
 
 def write_effects(path: str | Path, effects: Iterable[Effect]) -> None:
   """Writes effects.json."""
-  Path(path).write_text(json.dumps(to_list(effects), indent=2, allow_nan=False) + "\n")
+  write_atomically(path, json.dumps(to_list(effects), indent=2, allow_nan=False) + "\n")
 
 
 def read_effects(path: str | Path) -> list[Effect]:

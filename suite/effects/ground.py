@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from nerf2real.core import rotations
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Effect, Kind, Operator, Parameter
 
@@ -26,14 +27,10 @@ class FloorSlope(Operator):
     model = binding.model
     for effect in self.effects:
       vector = np.array([self.value(effect, "x"), self.value(effect, "y"), 0.0])
-      angle = float(np.linalg.norm(vector))
-      if angle == 0:
+      if not vector.any():
         continue
-      turn, result = np.zeros(4), np.zeros(4)
-      mujoco.mju_axisAngle2Quat(turn, vector / angle, angle)
       for geom in _geoms(binding, effect, planes=True):
-        mujoco.mju_mulQuat(result, turn, model.geom_quat[geom])
-        model.geom_quat[geom] = result
+        model.geom_quat[geom] = rotations.rotate_quaternion(vector, model.geom_quat[geom])
         model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 

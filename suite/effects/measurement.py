@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 
+from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
-from nerf2real.suite.effects.passive import rotation_matrix
 
 _JOINT_CHANNELS = ("joint_positions", "joint_velocities")
 _IMU_CHANNELS = ("gyroscope", "accelerometer")
@@ -115,8 +115,7 @@ class ImuTilt(Operator):
   def bind(self, binding: Binding) -> None:
     total = np.eye(3)
     for effect in self.effects:
-      rotation = rotation_matrix([self.value(effect, axis) for axis in "xyz"])
-      total = total if rotation is None else total @ rotation
+      total = total @ matrix_from_rotvec([self.value(effect, axis) for axis in "xyz"])
     self._transpose = None if np.array_equal(total, np.eye(3)) else total.T
 
   def observe(self, channel: str, value: Array, time: float) -> Array:

@@ -2,9 +2,9 @@
 
 import math
 
-import mujoco
 import numpy as np
 
+from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Kind, Operator, Parameter
 from nerf2real.suite.randomisation import inertia
@@ -91,20 +91,8 @@ class GravityTilt(Operator):
 
   def bind(self, binding: Binding) -> None:
     for effect in self.effects:
-      rotation = rotation_matrix([self.value(effect, "x"), self.value(effect, "y"), 0.0])
-      if rotation is not None:
-        binding.model.opt.gravity[:] = rotation @ binding.model.opt.gravity
-
-
-def rotation_matrix(vector: list[float] | np.ndarray) -> np.ndarray | None:
-  """Returns the rotation matrix [3, 3] of a rotation vector [3], None for no rotation."""
-  angle = float(np.linalg.norm(vector))
-  if angle == 0:
-    return None
-  quaternion, matrix = np.zeros(4), np.zeros(9)
-  mujoco.mju_axisAngle2Quat(quaternion, np.asarray(vector, np.float64) / angle, angle)
-  mujoco.mju_quat2Mat(matrix, quaternion)
-  return matrix.reshape(3, 3)
+      turn = matrix_from_rotvec([self.value(effect, "x"), self.value(effect, "y"), 0.0])
+      binding.model.opt.gravity[:] = turn @ binding.model.opt.gravity
 
 
 def _factor(name: str, doc: str) -> Parameter:

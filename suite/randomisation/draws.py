@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from nerf2real.suite.randomisation import inertia
 from nerf2real.suite.sensors import filters
@@ -228,14 +229,11 @@ class Randomiser:
   def _move_site(self, site: int, draws: EpisodeDraws) -> None:
     model = self._model
     model.site_pos[site] = self._nominal["site_pos"][site] + draws.imu_shift
-    angle = float(np.linalg.norm(draws.imu_tilt))
-    if angle > 0:
-      turn = np.zeros(4)
-      mujoco.mju_axisAngle2Quat(turn, draws.imu_tilt / angle, angle)
-      result = np.zeros(4)
-      mujoco.mju_mulQuat(result, self._nominal["site_quat"][site], turn)
-      model.site_quat[site] = result
-    if angle > 0 or np.any(draws.imu_shift):
+    if np.any(draws.imu_tilt):
+      nominal = Rotation.from_quat(self._nominal["site_quat"][site], scalar_first=True)
+      turned = nominal * Rotation.from_rotvec(draws.imu_tilt)
+      model.site_quat[site] = turned.as_quat(scalar_first=True)
+    if np.any(draws.imu_tilt) or np.any(draws.imu_shift):
       model.site_sameframe[site] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
   def _resize_ball(self, draws: EpisodeDraws) -> None:

@@ -8,6 +8,8 @@ recompiled.
 import mujoco
 import numpy as np
 
+from nerf2real.core import rotations
+
 Array = np.ndarray
 
 # What attach_mass and mj_setConst may write (mujoco 3.17), apart from model.stat.
@@ -120,9 +122,7 @@ def attach_mass(
       ' cannot be added afterwards. Expected <body simple="false"> in its model, or the position of'
       f" its centre of mass, {model.body_ipos[body].tolist()}."
     )
-  rotation = np.zeros(9)
-  mujoco.mju_quat2Mat(rotation, model.body_iquat[body])
-  axes = rotation.reshape(3, 3)
+  axes = rotations.matrix_from_quaternion(model.body_iquat[body])
   mass, com, inertia = combine_point_mass(
     float(model.body_mass[body]),
     model.body_ipos[body].copy(),
@@ -136,7 +136,7 @@ def attach_mass(
   model.body_mass[body] = mass
   model.body_ipos[body] = com
   model.body_inertia[body] = moments
-  mujoco.mju_mat2Quat(model.body_iquat[body], principal.flatten())
+  model.body_iquat[body] = rotations.quaternion_from_matrix(principal)
   # The compiler notes bodies whose inertial frame is the body's frame, to skip transforms.
   model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 

@@ -1,1 +1,1 @@
-"""Proprioceptive sensors: filters, gravity estimate, delays and histories."""
+"""The robot's sensors: camera, IMU path, gravity estimate, delays and histories."""

@@ -16,6 +16,7 @@ line may add.
 from typing import NamedTuple
 
 import numpy as np
+from scipy import signal
 
 Array = np.ndarray
 
@@ -55,16 +56,11 @@ def low_pass_coefficients(cutoff_hz: float, sample_rate_hz: float, *, order: int
       f"Found a cutoff of {cutoff_hz} Hz at {sample_rate_hz} Hz sampling, expected between 0 and"
       f" half the sampling rate, {sample_rate_hz / 2} Hz."
     )
-  warped = float(np.tan(np.pi * cutoff_hz / sample_rate_hz))
-  if order == 1:
-    gain = warped / (1 + warped)
-    return Coefficients(gain, gain, 0.0, (warped - 1) / (warped + 1), 0.0)
-  if order == 2:
-    norm = 1 + np.sqrt(2) * warped + warped**2
-    b = warped**2 / norm
-    a1, a2 = 2 * (warped**2 - 1) / norm, (1 - np.sqrt(2) * warped + warped**2) / norm
-    return Coefficients(b, 2 * b, b, float(a1), float(a2))
-  raise ValueError(f"Found low-pass order {order}, expected 1 or 2.")
+  if order not in (1, 2):
+    raise ValueError(f"Found low-pass order {order}, expected 1 or 2.")
+  b, a = signal.butter(order, cutoff_hz, fs=sample_rate_hz)
+  (b0, b1, b2), (_, a1, a2) = (np.append(values, 0.0)[:3].tolist() for values in (b, a))
+  return Coefficients(b0, b1, b2, a1, a2)
 
 
 class LowPass:

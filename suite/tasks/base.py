@@ -17,9 +17,9 @@ from nerf2real.suite.arena import SceneArena
 from nerf2real.suite.effects import EffectStack
 from nerf2real.suite.environment import Reading
 from nerf2real.suite.op3 import constants, op3
-from nerf2real.suite.pictures.camera import RobotCamera
 from nerf2real.suite.randomisation import draws as randomising
 from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.camera import RobotCamera
 from nerf2real.suite.sensors.proprioception import Proprioception
 from nerf2real.suite.tasks import privileged, touch
 from nerf2real.suite.tasks.delayed_picture import DelayedPicture

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.pictures.camera import RobotCamera
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import RobotCamera
 
 _ROUNDING = 1e-9  # of a frame
 

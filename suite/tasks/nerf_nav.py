@@ -11,7 +11,7 @@ import numpy as np
 
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.pictures.camera import RobotCamera
+from nerf2real.suite.sensors.camera import RobotCamera
 from nerf2real.suite.tasks import rewards
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.settings import TaskSettings

@@ -11,6 +11,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from nerf2real.core.rotations import shortest_rotation
+
 Array = np.ndarray
 
 MAX_YAW_SPEED = np.pi  # rad/s, paper, r_turn
@@ -48,13 +50,7 @@ def gravity_aligned_frame(world_from_torso: Array, gravity: Array = _DOWN) -> Ar
   rotation = np.asarray(world_from_torso, np.float64)
   down = np.asarray(gravity, np.float64) / np.linalg.norm(gravity)
   start = -rotation[:, 2]
-  cosine = float(start @ down)
-  if cosine < -1 + 1e-12:
-    x = rotation[:, 0]
-    return (2 * np.outer(x, x) - np.eye(3)) @ rotation
-  ax, ay, az = np.cross(start, down)
-  skew = np.array([[0.0, -az, ay], [az, 0.0, -ax], [-ay, ax, 0.0]])
-  return (np.eye(3) + skew + skew @ skew / (1 + cosine)) @ rotation
+  return shortest_rotation(start, down, half_turn_axis=rotation[:, 0]) @ rotation
 
 
 def yaw_rate(world_from_torso: Array, angular_velocity: Array, gravity: Array = _DOWN) -> float:

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from dm_control import composer, mjcf
 
+from nerf2real.core import rotations
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.tasks import rewards
 from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP
@@ -28,7 +29,7 @@ class RobotState(NamedTuple):
   @property
   def yaw(self) -> float:
     """Heading in the world [rad]."""
-    return float(np.arctan2(self.aligned[1, 0], self.aligned[0, 0]))
+    return rotations.yaw_of(self.aligned)
 
   def relative(self, xy: np.ndarray) -> np.ndarray:
     """Returns a point of the floor [2] relative to the robot, gravity-aligned frame [2] [m]."""
@@ -97,8 +98,7 @@ class RobotIndices:
     qpos, root = self._data.qpos, self.root_qpos
     qpos[root : root + 2] = start.xy
     qpos[root + 2] = posture[2]
-    turn = np.array([np.cos(start.yaw / 2), 0, 0, np.sin(start.yaw / 2)])
-    mujoco.mju_mulQuat(qpos[root + 3 : root + 7], turn, posture[3:7])
+    mujoco.mju_mulQuat(qpos[root + 3 : root + 7], rotations.yaw_quaternion(start.yaw), posture[3:7])
     qpos[self.joint_qpos] = posture[7:]
 
 

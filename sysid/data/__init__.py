@@ -1,1 +1,1 @@
-"""Measured logs of one joint: checks before anything is fitted, and what is measured."""
+"""Checks of measured logs before anything is fitted."""

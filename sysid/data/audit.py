@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import JointSeries, Log
-from nerf2real.sysid.data.measured import fresh, quantum
+from nerf2real.sysid.model.measured import fresh, quantum
 from nerf2real.sysid.model.reduction import smooth_motion
 
 _GAP = 3.0  # median periods without a message that count as a gap

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.sysid.data.measured import quantum
 from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.hypotheses.terms import compose
 from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.measured import quantum
 from nerf2real.sysid.selection.race import Entry
 
 Array = np.ndarray

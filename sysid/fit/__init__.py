@@ -1,1 +1,1 @@
-"""Fits of hypotheses to logs, and the intervals of their values."""
+"""Fits of hypotheses to logs: least squares, intervals of the values, residual signatures."""

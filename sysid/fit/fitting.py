@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerf2real.sysid.data.measured import quantum
 from nerf2real.sysid.hypotheses.terms import Term, compose
 from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.model.measured import quantum
 from nerf2real.sysid.model.plant import JointPlant, Output
 
 Array = np.ndarray

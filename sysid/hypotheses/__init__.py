@@ -1,1 +1,1 @@
-"""Effect hypotheses: candidates, their parameters, and signatures in the residual."""
+"""Effect hypotheses: the candidates that logs can show, and their parameters."""

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerf2real.suite.effects import Effect
-from nerf2real.suite.effects.passive import rotation_matrix
 
 _POINT = 1e-4  # m, radius of a payload: no inertia of its own
 
@@ -60,9 +59,8 @@ def _absolute(spec: mujoco.MjSpec, folder: Path) -> None:
 def _put(spec: mujoco.MjSpec, effect: Effect) -> None:
   value = {n: float(v) for n, v in effect.parameters.items() if isinstance(v, (int, float))}
   if effect.kind == "gravity_tilt":
-    turn = rotation_matrix([value["x"], value["y"], 0.0])
-    if turn is not None:
-      spec.option.gravity = turn @ np.array(spec.option.gravity)
+    turn = Rotation.from_rotvec([value["x"], value["y"], 0.0])
+    spec.option.gravity = turn.apply(spec.option.gravity)
     return
   if effect.kind == "floor_slope":
     turn = Rotation.from_rotvec([value["x"], value["y"], 0.0])

@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.suite.effects.passive import rotation_matrix
-from nerf2real.sysid.data.measured import Measured, measured
+from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.measured import Measured, measured
 from nerf2real.sysid.model.reduction import Reduction, Surroundings, start_velocity
 
 Array = np.ndarray
@@ -202,8 +202,7 @@ class JointPlant:
     if self._gravity is None:
       self._gravity = [r.gravity(self.joint) for r in self.reductions]
     before = self.model.opt.gravity
-    turn = rotation_matrix([x, y, 0.0])
-    after = before if turn is None else turn @ before
+    after = matrix_from_rotvec([x, y, 0.0]) @ before
     return [_combine(parts, after - before) for parts in self._gravity]
 
   def absorb(

@@ -13,7 +13,7 @@ from mujoco import rollout
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, EffectStack
-from nerf2real.sysid.data.measured import fresh
+from nerf2real.sysid.model.measured import fresh
 from nerf2real.sysid.model.plant import actuator_of, holds_position
 from nerf2real.sysid.model.reduction import smooth_motion, start_velocity
 

@@ -7,10 +7,10 @@ import numpy as np
 from nerf2real.core.pages import parts
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.fitting import Fit
-from nerf2real.sysid.hypotheses import balance, signatures
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.report import charts
+from nerf2real.sysid.report import balance, charts
 from nerf2real.sysid.selection.identification import Found, Identified
 
 _WARMER = 1.0  # K by which a joint's temperature must change to be drawn

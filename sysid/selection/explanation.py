@@ -7,8 +7,9 @@ import dataclasses
 
 import numpy as np
 
+from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.fitting import Problem
-from nerf2real.sysid.hypotheses import candidates, signatures
+from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.plant import JointPlant
 from nerf2real.sysid.selection import race

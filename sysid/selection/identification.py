@@ -15,10 +15,17 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log, check_against_model, read_log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
-from nerf2real.sysid.hypotheses import claims
-from nerf2real.sysid.model import learned
 from nerf2real.sysid.model.simulation import Clocks
-from nerf2real.sysid.selection import chain, common, decision, detection, race, screening
+from nerf2real.sysid.selection import (
+  chain,
+  claims,
+  common,
+  decision,
+  detection,
+  learned,
+  race,
+  screening,
+)
 from nerf2real.sysid.selection.common import WHOLE
 from nerf2real.sysid.selection.decision import Thresholds
 from nerf2real.sysid.selection.explanation import Effort, Ladder, even_out

@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core import least_squares, rotations
 from nerf2real.core.robot_logs.reading import ImuSeries, Log
 from nerf2real.sysid.model.reduction import smooth_motion
 from nerf2real.sysid.sensors import standing
@@ -143,8 +144,7 @@ def _stops(model: mujoco.MjModel, log: Log, root: int, site: int) -> _Stops:
     ahead, left = _level(first[0])
     now = (first[1].inv() * turned).apply(_level(up)[0])
     headings.append(np.arctan2(now @ left, now @ ahead))
-  w, x, y, z = model.qpos0[start + 3 : start + 7]
-  faced = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+  faced = rotations.yaw_of(rotations.matrix_from_quaternion(model.qpos0[start + 3 : start + 7]))
   return _Stops(np.array(headings) + faced, np.array(tilts).reshape(-1, 2), sensor)
 
 
@@ -188,7 +188,7 @@ def _fit(stops: _Stops, slope: bool, chosen: Array) -> tuple[Array, Array]:
   """Returns s and b [4] and their covariance per square rad; s is 0 without slope."""
   design = _design(stops)[chosen].reshape(-1, 4)
   free = [0, 1, 2, 3] if slope else [2, 3]
-  inverse = np.linalg.pinv(design[:, free].T @ design[:, free], rcond=1e-6)
+  inverse = least_squares.covariance(design[:, free].T, rcond=1e-6)
   x, covariance = np.zeros(4), np.zeros((4, 4))
   x[free] = inverse @ design[:, free].T @ stops.tilt[chosen].ravel()
   covariance[np.ix_(free, free)] = inverse
@@ -224,7 +224,7 @@ def _judge(stops: _Stops, plane: str) -> Part:
     x, covariance = _fit(stops, True, every)
     left = stops.tilt - _design(stops) @ x
     noise = np.sqrt(_NOISE**2 + np.sum(left**2) / max(2 * count - 4, 1))
-    half = _SIGMAS * noise * np.sqrt(np.diag(covariance)[:2])
+    half = _SIGMAS * noise * least_squares.standard_deviations(covariance)[:2]
     gain = _left_out(stops, False) - _left_out(stops, True)
     well = np.linalg.norm(x[:2]) - half.max() > _USUAL and half.max() < np.linalg.norm(x[:2])
     told = np.linalg.matrix_rank(_design(stops).reshape(-1, 4), tol=0.3) == 4

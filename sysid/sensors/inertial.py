@@ -19,9 +19,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nerf2real.core import least_squares
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import Effect, kind_of
-from nerf2real.suite.effects.passive import rotation_matrix
 from nerf2real.sysid.model.reduction import smooth_motion
 
 Array = np.ndarray
@@ -212,13 +213,12 @@ def _noise(read: Array) -> Array:
 def _predict(part: _Readings, kinds: Sequence[str], x: Array) -> Array:
   """Returns what an IMU with effects reads [N, 6]."""
   value = {n: v for k, v in _unpack(kinds, x).items() for n, v in zip(_LAYOUT[k], v, strict=True)}
-  tilt = rotation_matrix([value.get(a, 0.0) for a in _AXES])
+  tilt = matrix_from_rotvec([value.get(a, 0.0) for a in _AXES])
   delay = value.get("delay", 0.0)
   seen = np.stack([np.interp(part.stamp - delay, part.time, c) for c in part.truth.T], axis=1)
   scale = np.repeat([value.get(c, 1.0) for c in _CHANNELS], 3)
   bias = np.array([value.get(f"{c}_{a}", 0.0) for c in _CHANNELS for a in _AXES])
-  if tilt is not None:
-    seen = np.hstack([seen[:, :3] @ tilt, seen[:, 3:] @ tilt])
+  seen = np.hstack([seen[:, :3] @ tilt, seen[:, 3:] @ tilt])
   return seen * scale + bias
 
 
@@ -248,10 +248,8 @@ def _fit(
   for _ in range(_STEPS if len(x) else 0):
     base = _residuals(parts, noise, kinds, x)[chosen]
     jacobian = _jacobian(parts, noise, kinds, x)[:, chosen]
-    weight = 1.0 / np.sqrt(1.0 + np.square(base / _SOFT))
-    flat = (jacobian * weight).reshape(len(x), -1)
-    step = np.linalg.pinv(flat @ flat.T, rcond=1e-9) @ (flat @ (base * weight).ravel())
-    x = x - step
+    weight = least_squares.cauchy_weights(base, _SOFT)
+    x = x - least_squares.gauss_newton_step(jacobian * weight, base * weight, rcond=1e-9)
     if "imu_lag" in kinds:
       place = sum(len(_LAYOUT[k]) for k in kinds[: kinds.index("imu_lag")])
       x[place] = np.clip(x[place], -_LATEST, _LATEST)
@@ -305,16 +303,10 @@ def _intervals(
 ) -> dict[str, dict[str, tuple[float, float]]]:
   """Returns intervals of all values, from the scatter of the residual over whole seconds."""
   base = _residuals(parts, noise, kinds, x)
-  jacobian = _jacobian(parts, noise, kinds, x)
-  flat = jacobian.reshape(len(x), -1)
-  inverse = np.linalg.pinv(flat @ flat.T, rcond=1e-9)
-  labels = _blocks(parts)
-  meat = np.zeros((len(x), len(x)))
-  for block in np.unique(labels):
-    inside = labels == block
-    gradient = np.einsum("nij,ij->n", jacobian[:, inside], base[inside])
-    meat += np.outer(gradient, gradient)
-  spread = _SIGMAS * np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
+  found = least_squares.block_covariance(
+    _jacobian(parts, noise, kinds, x), base, _blocks(parts), rcond=1e-9
+  )
+  spread = _SIGMAS * least_squares.standard_deviations(found)
   low, high = _unpack(kinds, x - spread), _unpack(kinds, x + spread)
   return {
     k: {n: (float(low[k][i]), float(high[k][i])) for i, n in enumerate(_LAYOUT[k])} for k in kinds

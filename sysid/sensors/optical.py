@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core import least_squares
 from nerf2real.core.cameras import Camera
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.sensors import pictures, tracks, viewpoint
@@ -182,7 +183,7 @@ class _Problem:
     """Returns weights [N, 1]: robust, tracks of a pair count as one, all in units of noise."""
     alike = np.sqrt(len(self.pair) / (self.pair[-1] + 1))
     size = np.linalg.norm(base, axis=1, keepdims=True) / self.noise
-    return 1.0 / (self.noise * alike * np.sqrt(1.0 + (size / _SOFT) ** 2))
+    return least_squares.cauchy_weights(size, _SOFT) / (self.noise * alike)
 
   def fit(self, free: Array, start: Array, chosen: Array, steps: int = _STEPS) -> Array:
     """Returns the values that explain the chosen tracks best."""
@@ -191,10 +192,12 @@ class _Problem:
       base = self.residual(x)
       jacobian = self.jacobian(x, free, base)[:, chosen]
       weight = self.weight(base)[chosen]
-      flat = (jacobian * weight).reshape(len(free), -1)
-      prior = self.prior[free]
-      gradient = flat @ (base[chosen] * weight).ravel() + prior**2 * (x - _START)[free]
-      step = np.linalg.lstsq(flat @ flat.T + np.diag(prior**2 + 1e-9), gradient, rcond=None)[0]
+      step = least_squares.gauss_newton_step(
+        jacobian * weight,
+        base[chosen] * weight,
+        prior_precision=self.prior[free] ** 2 + 1e-9,
+        prior_offset=(x - _START)[free],
+      )
       x[free] -= step
       x[0], x[5] = np.clip(x[0], *_LATEST), max(x[5], 0.0)
       x[1] = np.clip(x[1], -0.7, 0.7)
@@ -236,17 +239,14 @@ class _Problem:
     free = _free(names)
     base = self.residual(x)
     weight = self.weight(base)
-    jacobian = self.jacobian(x, free, base) * weight
-    flat = jacobian.reshape(len(free), -1)
-    prior = np.diag(self.prior[free] ** 2)
-    inverse = np.linalg.pinv(flat @ flat.T + prior, rcond=1e-12)
-    meat = prior.copy()
-    for block in np.unique(self.block):
-      inside = self.block == block
-      gradient = np.einsum("nij,ij->n", jacobian[:, inside], (base * weight)[inside])
-      meat += np.outer(gradient, gradient)
+    found = least_squares.block_covariance(
+      self.jacobian(x, free, base) * weight,
+      base * weight,
+      self.block,
+      prior=np.diag(self.prior[free] ** 2),
+    )
     result = np.zeros(6)
-    result[free] = np.sqrt(np.maximum(np.diag(inverse @ meat @ inverse), 0.0))
+    result[free] = least_squares.standard_deviations(found)
     return result
 
 

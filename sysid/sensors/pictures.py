@@ -27,7 +27,6 @@ _REDUCED = {
   4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
   8: cv2.IMREAD_REDUCED_GRAYSCALE_8,
 }
-_CENTRE = 0.5  # of the upper left pixel in core.cameras; ROS has it at 0
 _MODELS = ("plumb_bob", "")  # of distortion that core.cameras has: k1, k2, p1, p2
 _ASPECT = 0.01  # relative: pictures that are wider or less wide than the lens says were cropped
 
@@ -129,16 +128,4 @@ def _lens(name: str, info: Any) -> Camera:
   fx, fy = float(info.k[0]), float(info.k[4])
   if not (fx > 0 and fy > 0):  # ROS: a camera that is not calibrated has zeros
     raise LensError(f"{name} has a lens that is not calibrated (focal length {fx}): calibrate it.")
-  k1, k2, p1, p2 = map(float, distortion[:4])
-  return Camera(
-    width=int(info.width),
-    height=int(info.height),
-    fx=fx,
-    fy=fy,
-    cx=float(info.k[2]) + _CENTRE,
-    cy=float(info.k[5]) + _CENTRE,
-    k1=k1,
-    k2=k2,
-    p1=p1,
-    p2=p2,
-  )
+  return Camera.from_opencv(info.width, info.height, info.k, distortion[:4])

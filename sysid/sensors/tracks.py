@@ -13,6 +13,7 @@ import dataclasses
 import cv2
 import numpy as np
 
+from nerf2real.core.cameras import PIXEL_CENTRE
 from nerf2real.sysid.sensors import pictures
 
 Array = np.ndarray
@@ -65,8 +66,8 @@ def follow(source: pictures.Source, duration: float) -> Tracks:
     index.append(np.full(len(start), len(first)))
     first.append(old)
     second.append(stamp)
-    before.append(start + 0.5)
-    after.append(end + 0.5)
+    before.append(start + PIXEL_CENTRE)
+    after.append(end + PIXEL_CENTRE)
   points = np.zeros((0, 2))
   return Tracks(
     np.array(first),

@@ -11,11 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.sysid.model.reduction import smooth_motion
 
 Array = np.ndarray
-
-_OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])  # x right, y down, z forward from y up, z backward
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +73,6 @@ def along(model: mujoco.MjModel, log: Log, camera: int) -> View:
     data.qpos[qpos] = motion.position[n]
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
-    turn[n] = data.cam_xmat[camera].reshape(3, 3) @ _OPENCV_FROM_MUJOCO
+    turn[n] = data.cam_xmat[camera].reshape(3, 3) @ OPENGL_FROM_OPENCV
     place[n] = data.cam_xpos[camera]
   return View(motion.time, Rotation.from_matrix(turn), place)

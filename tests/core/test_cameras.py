@@ -1,10 +1,12 @@
 """The camera model against OpenCV's."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.cameras import Camera, focal_length
 
 CAMERA = Camera(
   width=64, height=48, fx=50, fy=51, cx=31, cy=25, k1=0.12, k2=-0.05, p1=0.01, p2=-0.005
@@ -35,6 +37,8 @@ def test_resized_camera_sees_the_same_field():
 
 def test_vertical_field_of_view():
   camera = Camera.from_vertical_fov(np.radians(43.3), 40, 30)
+  assert camera.vertical_fov == pytest.approx(np.radians(43.3))
+  assert camera.fx == camera.fy == focal_length(np.radians(43.3), 30)
   top, bottom = camera.rays(np.array([[20.0, 0.0], [20.0, 30.0]]))
   cosine = top @ bottom / np.linalg.norm(top) / np.linalg.norm(bottom)
   assert np.degrees(np.arccos(cosine)) == pytest.approx(43.3)
@@ -43,4 +47,16 @@ def test_vertical_field_of_view():
 @pytest.mark.parametrize("change", [{"width": 0}, {"height": -1}, {"fx": 0.0}])
 def test_impossible_cameras_are_refused(change):
   with pytest.raises(ValueError, match="found"):
-    Camera(**{**CAMERA.to_dict(), **change})
+    dataclasses.replace(CAMERA, **change)
+
+
+def test_opencv_and_ros_count_pixels_from_the_first_centre():
+  again = Camera.from_opencv(CAMERA.width, CAMERA.height, CAMERA.opencv_matrix, CAMERA.distortion)
+  assert dataclasses.astuple(again) == pytest.approx(dataclasses.astuple(CAMERA))
+  flat = CAMERA.opencv_matrix.ravel()
+  assert Camera.from_opencv(CAMERA.width, CAMERA.height, flat, CAMERA.distortion) == again
+  points = np.array([[0.1, -0.2, 1.0], [-0.3, 0.1, 2.0]])
+  expected, _ = cv2.projectPoints(
+    points, np.zeros(3), np.zeros(3), CAMERA.opencv_matrix, CAMERA.distortion
+  )
+  np.testing.assert_allclose(CAMERA.project(points), expected[:, 0] + 0.5, atol=1e-9)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.serialization import from_plain, to_plain
 from nerf2real.core.similarity import Similarity
 
 
@@ -32,7 +33,7 @@ def test_composition_and_inverse(transform):
     (transform @ transform).apply(points), transform.apply(transform.apply(points))
   )
   np.testing.assert_allclose(transform.inverse().apply(transform.apply(points)), points)
-  again = Similarity.from_dict(transform.to_dict())
+  again = from_plain(to_plain(transform), Similarity)
   np.testing.assert_array_equal(again.apply(points), transform.apply(points))
 
 

@@ -1,16 +1,14 @@
 """`launch/identify.py`: bad input is one line that says what was found and what to do."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.launch import identify as script
 from tests.sysid.synthetic import ARM, PENDULUM
 
-_LAUNCH = Path(__file__).parents[2] / "launch"
 START = 1_700_000_000_000_000_000
 NO_ACTUATOR = PENDULUM.replace(
   '<position name="joint" joint="joint" kp="21" forcerange="-4 4"/>', ""
@@ -20,14 +18,10 @@ NO_ACTUATOR = PENDULUM.replace(
 @pytest.fixture
 def identify(monkeypatch, capsys):
   """Runs the command line; returns exit code, stdout and stderr."""
-  spec = importlib.util.spec_from_file_location("identify", _LAUNCH / "identify.py")
-  module = importlib.util.module_from_spec(spec)
-  monkeypatch.setitem(sys.modules, "identify", module)
-  spec.loader.exec_module(module)
 
   def run(*arguments):
     monkeypatch.setattr(sys, "argv", ["identify.py", *map(str, arguments)])
-    code = module.main()
+    code = script.main()
     return code, *capsys.readouterr()
 
   return run

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from nerf2real.scenes.stages import StageError, Stages, hash_path, write_atomically
+from nerf2real.scenes.stages import StageError, Stages
 
 
 def make(folder):
@@ -76,26 +76,6 @@ def test_full_disk_is_one_clear_line(tmp_path):
   with pytest.raises(StageError, match="full.*free some space"):
     make(tmp_path).run("a", full, settings=1, inputs={})
   assert not (tmp_path / "a").exists()
-
-
-def test_folder_hash_sees_names_and_content(tmp_path):
-  (tmp_path / "x").write_text("1")
-  before = hash_path(tmp_path)
-  (tmp_path / "x").rename(tmp_path / "y")
-  renamed = hash_path(tmp_path)
-  (tmp_path / "y").write_text("2")
-  assert len({before, renamed, hash_path(tmp_path)}) == 3
-  with pytest.raises(StageError, match="does not exist"):
-    hash_path(tmp_path / "absent")
-
-
-def test_atomic_write_keeps_the_old_file_on_failure(tmp_path, monkeypatch):
-  target = tmp_path / "file"
-  target.write_text("old")
-  monkeypatch.setattr("pathlib.Path.write_bytes", lambda self, data: 1 / 0)
-  with pytest.raises(ZeroDivisionError):
-    write_atomically(target, "new")
-  assert target.read_text() == "old"
 
 
 def test_a_stage_made_again_is_another_one(tmp_path):

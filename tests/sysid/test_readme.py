@@ -22,5 +22,10 @@ def test_the_example_writes_a_log(tmp_path, monkeypatch):
 def test_every_file_is_in_the_table():
   folder = pathlib.Path(sysid.__file__).parent
   text = (folder / "README.md").read_text()
-  files = {path.name for path in folder.glob("*.py")} - {"__init__.py"}
-  assert {name for name in files if f"`{name}`" not in text} == set()
+  missing = []
+  for path in folder.rglob("*.py"):
+    place = path.relative_to(folder)
+    named = (f"`{place}`", f"`{place.name}`", f"`{place.parent}/`")
+    if place.name != "__init__.py" and not any(name in text for name in named):
+      missing.append(str(place))
+  assert missing == []

@@ -14,6 +14,7 @@ from nerf2real.agents.dmpo import acting, config, export, inference, learning, n
 from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.processes import environments
+from nerf2real.core.serialization import to_plain
 
 PRESET = config.override(config.preset("vision_small"), {"network.lstm_size": 8})
 
@@ -27,7 +28,7 @@ def _exported(folder, environment_name="agents:cue"):
     learning.flatten_params({"policy": params}),
     layout=layout,
     environment=environment_name,
-    settings=config.to_dict(PRESET),
+    settings=to_plain(PRESET),
     info={"updates": 3},
   )
   return environment, layout

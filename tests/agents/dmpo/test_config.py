@@ -7,6 +7,7 @@ import json
 import pytest
 
 from nerf2real.agents.dmpo import config
+from nerf2real.core.serialization import from_plain, to_plain
 
 # Byravan et al. 2022, appendix, table of DMPO hyperparameters, in its order.
 TABLE = {
@@ -45,7 +46,7 @@ def test_the_paper_s_table_is_the_default(name):
 @pytest.mark.parametrize("name", config.PRESETS)
 def test_settings_survive_json(name):
   settings = config.preset(name)
-  assert config.from_dict(json.loads(json.dumps(config.to_dict(settings)))) == settings
+  assert from_plain(json.loads(json.dumps(to_plain(settings))), config.DmpoConfig) == settings
 
 
 @pytest.mark.parametrize(
@@ -68,4 +69,4 @@ def test_overrides_reach_inside_and_unknown_names_are_refused():
   with pytest.raises(ValueError, match="vmin must lie below"):
     config.override(config.DmpoConfig(), {"network.vmax": -200.0})
   with pytest.raises(ValueError, match="another version"):
-    config.from_dict({"colour": 1})
+    from_plain({"colour": 1}, config.DmpoConfig)

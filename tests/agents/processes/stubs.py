@@ -11,6 +11,7 @@ from dm_env import specs
 from nerf2real.agents.dmpo import config, learning, networks
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import Grant
+from nerf2real.core.serialization import from_plain, to_plain
 
 SMALL = {"network.policy_layers": (8,), "network.critic_layers": (8,), "num_samples": 2}
 
@@ -63,8 +64,8 @@ def description(environment, name, **changes):
   return {
     "environment": name,
     "evaluation_environment": name,
-    "config": config.to_dict(settings),
-    "layout": Layout.of(environment).to_dict(),
+    "config": to_plain(settings),
+    "layout": to_plain(Layout.of(environment)),
     "begin_steps": 0,
     "evaluation_period": 100,
     "evaluation_episodes": None,
@@ -97,8 +98,8 @@ class StubLink:
     }
 
   def parameters(self, *, hold=False):
-    settings = config.from_dict(self._description["config"])
-    layout = Layout.from_dict(self._description["layout"])
+    settings = from_plain(self._description["config"], config.DmpoConfig)
+    layout = from_plain(self._description["layout"], Layout)
     state = learning.make_learning(settings, layout).init(networks.jax.random.PRNGKey(0))
     return 0, learning.served_parameters(state)
 

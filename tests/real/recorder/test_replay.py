@@ -1,7 +1,6 @@
 """The replay of a recorded log: what the page holds, and what the server gives."""
 
 import base64
-import importlib.util
 import json
 import re
 import threading
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 from nerf2real.real.recorder import process as recorder_process
-from nerf2real.real.recorder import replay
+from nerf2real.real.recorder import replay, replay_server
 
 NAMES = ("l_knee", "r_knee")
 START = 1_700_000_000.0
@@ -105,10 +104,7 @@ def test_nothing_to_show_is_said(tmp_path):
 
 
 def test_server_gives_page_and_pictures(log):
-  spec = importlib.util.spec_from_file_location("replay_log", Path("launch/replay_log.py"))
-  script = importlib.util.module_from_spec(spec)
-  spec.loader.exec_module(script)
-  server = script.make_server(replay.load(log), host="127.0.0.1", port=0)
+  server = replay_server.make_server(replay.load(log), host="127.0.0.1", port=0)
   threading.Thread(target=server.serve_forever, daemon=True).start()
   try:
     base = f"http://127.0.0.1:{server.server_port}"

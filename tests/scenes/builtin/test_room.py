@@ -1,6 +1,9 @@
 """Tests of the built-in room: its truth, its pictures and its film."""
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import av
 import cv2
@@ -9,6 +12,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import yaw_matrix
 from nerf2real.scenes.builtin import eye, filming, furniture, room, solids, walk
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
@@ -122,7 +126,7 @@ def test_path_keeps_clear_of_everything():
   ],
 )
 def test_distances_agree_with_mujoco(kind, size, rounding, mujoco_kind):
-  rotation = furniture.yaw(0.7)
+  rotation = yaw_matrix(0.7)
   solid = solids.Solid(
     name="s",
     kind=kind,
@@ -202,11 +206,12 @@ def test_film_is_whole_and_its_truth_fits(renderer, tmp_path):
   )
   steps = []
   video = tmp_path / "room.mp4"
-  filming.film(video, settings=settings, progress=lambda done, total: steps.append((done, total)))
+  filming.film(video, settings=settings, progress=lambda *report: steps.append(report))
   assert sorted(p.name for p in tmp_path.iterdir()) == ["room.mp4", "room_truth.json"]
   with av.open(str(video)) as container:
     frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
   assert len(frames) == settings.frames == 8 == len(steps)
+  assert steps[-1] == (1.0, "picture 8 of 8")
   truth = filming.read_truth(tmp_path / "room_truth.json")
   assert truth["camera"] == settings.camera
   assert truth["world_from_camera"].shape == (8, 4, 4)
@@ -223,7 +228,7 @@ def test_truth_of_another_version_is_refused(tmp_path):
 
 
 def test_interrupted_film_leaves_nothing(renderer, tmp_path):
-  def stop(done, total):
+  def stop(fraction, text):
     raise KeyboardInterrupt
 
   settings = filming.FilmSettings(
@@ -253,3 +258,19 @@ def test_shipped_film_and_truth_belong_together():
   assert (frame.width, frame.height) == (truth["camera"].width, truth["camera"].height)
   assert truth["room_size"] == list(ROOM_SIZE)
   np.testing.assert_allclose(truth["marker"]["corners"], furniture.marker_corners())
+
+
+def test_making_a_scene_loads_no_robot():
+  """The room and the script that makes scenes need nothing above scenes."""
+  root = Path(__file__).parents[3]
+  program = (
+    "import sys, runpy; runpy.run_path(sys.argv[1], run_name='loaded');"
+    "print(*(name for name in sys.modules if name.startswith('nerf2real.')))"
+  )
+  script = root / "launch" / "make_scene.py"
+  result = subprocess.run(
+    [sys.executable, "-c", program, script], cwd=root, capture_output=True, text=True, check=True
+  )
+  packages = {name.split(".")[1] for name in result.stdout.split()}
+  assert packages == {"core", "scenes"}
+  assert "nerf2real.scenes.builtin.yardstick" in result.stdout.split()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.data.measured import fresh, quantum
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.fitting import Problem, soft
 from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.model.measured import fresh, quantum
 from nerf2real.sysid.model.plant import JointPlant
 from nerf2real.sysid.selection import detection, race
 from tests.sysid.synthetic import COUNT, PENDULUM, logs_of

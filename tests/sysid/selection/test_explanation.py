@@ -8,9 +8,9 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.fitting import Fit, Problem
-from nerf2real.sysid.hypotheses import candidates, claims
+from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.model.plant import JointPlant
-from nerf2real.sysid.selection import decision, explanation, identification, joint, race
+from nerf2real.sysid.selection import claims, decision, explanation, identification, joint, race
 from tests.sysid.synthetic import PENDULUM, logs_of
 
 

@@ -12,13 +12,13 @@ from nerf2real import sysid
 from nerf2real.core.robot_logs.reading import LogError
 from nerf2real.suite.effects import Effect, EffectStack, read_effects
 from nerf2real.sysid.data.audit import audit
+from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.fitting import Problem
-from nerf2real.sysid.hypotheses import signatures
 from nerf2real.sysid.hypotheses.candidates import calibration
-from nerf2real.sysid.model import extended_model, learned
+from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.plant import JointPlant
-from nerf2real.sysid.selection import decision, elaboration, explanation, race
+from nerf2real.sysid.selection import decision, elaboration, explanation, learned, race
 from nerf2real.sysid.selection.chain import ancestors
 from nerf2real.sysid.selection.identification import analyse
 from tests.sysid.synthetic import ARM, PENDULUM, log_of, logs_of

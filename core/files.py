@@ -1,0 +1,135 @@
+"""Atomic writes: a file or folder appears under its name whole or not at all.
+
+The content goes to a temporary sibling, which is renamed when it is complete; after an error the
+sibling is removed and what was there before is untouched. A full disk or an exhausted quota is
+raised as `DiskFullError`, one line for the user.
+"""
+
+import contextlib
+import errno
+import hashlib
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+class DiskFullError(OSError):
+  """The disk or the quota is exhausted; the message is one line that names the path."""
+
+  def __str__(self) -> str:
+    return str(self.strerror)
+
+
+def is_disk_full(error: BaseException) -> bool:
+  """Returns whether an error says that the disk or the quota is exhausted."""
+  return isinstance(error, OSError) and error.errno in _FULL
+
+
+@contextlib.contextmanager
+def explain_disk_full(path: str | Path) -> Iterator[None]:
+  """Raises DiskFullError, naming `path`, where the block raises ENOSPC or EDQUOT."""
+  try:
+    yield
+  except DiskFullError:
+    raise
+  except OSError as error:
+    if not is_disk_full(error):
+      raise
+    reason = "the disk is full" if error.errno == errno.ENOSPC else "the disk quota is used up"
+    raise DiskFullError(
+      error.errno, f"Could not write {path}: {reason}. Free some space and try again.", str(path)
+    ) from error
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+  """Yields a temporary path with the same suffix, for writers that take a file name.
+
+  When the block ends, the temporary file is synchronised to disk and renamed to `path`.
+
+  Raises:
+    DiskFullError: The disk or the quota is exhausted.
+    FileNotFoundError: The folder of `path` is missing, or the block wrote no file.
+  """
+  path = Path(path)
+  owner = f"{os.getpid()}-{threading.get_native_id()}"
+  partial = path.with_name(f".{path.stem}.{owner}.partial{path.suffix}")
+  try:
+    with explain_disk_full(path):
+      yield partial
+      with partial.open("rb") as stream:
+        os.fsync(stream.fileno())
+      partial.replace(path)
+  finally:
+    with contextlib.suppress(OSError):  # must not hide the error that is under way
+      partial.unlink(missing_ok=True)
+
+
+def write_atomically(path: str | Path, content: str | bytes) -> None:
+  """Writes text (UTF-8) or bytes; see `atomic_path` for the errors."""
+  with atomic_path(path) as partial:
+    partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+  """Yields an empty temporary folder that replaces the folder `path` when the block ends.
+
+  One process at a time may write a folder: the temporary folder of an interrupted one is removed.
+
+  Raises:
+    DiskFullError: The disk or the quota is exhausted.
+  """
+  path = Path(path)
+  partial = path.with_name(f".{path.name}.partial")
+  shutil.rmtree(partial, ignore_errors=True)
+  try:
+    with explain_disk_full(path):
+      partial.mkdir(parents=True)
+      yield partial
+      replace_folder(partial, path)
+  finally:
+    shutil.rmtree(partial, ignore_errors=True)
+
+
+def replace_folder(source: Path, target: Path) -> None:
+  """Renames a folder to `target` on the same disk; an older target is removed."""
+  retired = target.with_name(f".{target.name}.retired")
+  shutil.rmtree(retired, ignore_errors=True)
+  if target.exists():
+    target.rename(retired)
+  source.rename(target)
+  shutil.rmtree(retired, ignore_errors=True)
+
+
+def copy_atomically(source: Path, target: Path) -> None:
+  """Copies a file or folder; an older target is replaced."""
+  if source.is_dir():
+    with atomic_folder(target) as partial:
+      shutil.copytree(source, partial, dirs_exist_ok=True)
+  else:
+    with atomic_path(target) as partial:
+      shutil.copyfile(source, partial)
+
+
+def hash_path(path: str | Path) -> str:
+  """Returns the SHA-256 of a file's content, or of all files below a folder with their names.
+
+  Raises:
+    FileNotFoundError: There is neither a file nor a folder.
+  """
+  path = Path(path)
+  if not path.exists():
+    raise FileNotFoundError(f"{path} does not exist; give an existing file or folder.")
+  digest = hashlib.sha256()
+  files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+  for file in files:
+    if path.is_dir():
+      digest.update(str(file.relative_to(path)).encode())
+    with file.open("rb") as stream:
+      digest.update(hashlib.file_digest(stream, "sha256").digest())
+  return digest.hexdigest()

@@ -1,1 +1,0 @@
-"""Pictures of the simulated world: the robot's camera, a map, a spectator's view."""

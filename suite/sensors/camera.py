@@ -1,0 +1,266 @@
+"""The robot's camera: the scene's radiance field and MuJoCo's moving geoms in one picture.
+
+Both are cast along the same rays, one for each pixel, from the calibrated OPENCV model (distortion
+included): the field by `scenes.field.render.renderer.Renderer`, the geoms by
+MuJoCo's own ray caster, so that no GL is needed. Per pixel the nearer one is seen. The paper
+draws the moving objects always in front (`compositing="overlay"`). Shapes: H height, W width, N
+rays, G geoms.
+"""
+
+import dataclasses
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import pose_of_mujoco_camera
+from nerf2real.core.similarity import Similarity
+from nerf2real.suite.op3 import constants, op3
+
+DEPTH, OVERLAY = "depth", "overlay"
+_DISPLAY_GAMMA = 2.2  # of the pictures: light = value ** 2.2
+_LIGHT_DIRECTION = np.array([0.3, 0.2, 0.933])  # towards the light, in the world; ours
+_AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; ours
+_CULLING_SLACK = 1e-3  # rad added to the cone around a geom
+
+
+class FieldRenderer(Protocol):
+  """What the camera needs of a renderer of the scene."""
+
+  def render(self, camera: Camera, unit_from_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns colour uint8 [H, W, 3] and z-depth float32 [H, W], inf where there is nothing."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+  """Settings of the robot's camera; the defaults are neutral."""
+
+  lens: Camera | None = None  # a calibrated camera; None: no distortion, 43.3 degrees vertically
+  compositing: str = DEPTH  # "depth", or "overlay": moving objects always in front, as the paper
+  gain: float = 1.0  # factor on the light; the paper's gains are ratios of its default of 50
+  exposure: float = 1.0  # another factor on the light
+  white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors on red, green, blue light
+  noise: float = 0.0  # standard deviation of the noise at gain 1 [8-bit levels]
+  latency: float = 0.0  # s, in addition to the delay that an episode draws
+  rate: float = 1 / constants.CONTROL_TIMESTEP  # pictures a second [Hz]; between two the last stays
+
+  def __post_init__(self):
+    if self.compositing not in (DEPTH, OVERLAY):
+      raise ValueError(
+        f"Unknown compositing {self.compositing!r}: expected {DEPTH!r} or {OVERLAY!r}."
+      )
+    for name in ("gain", "exposure"):
+      if not getattr(self, name) > 0:
+        raise ValueError(f"The camera's {name} must be positive, found {getattr(self, name)}.")
+    for name in ("noise", "latency"):
+      if not 0 <= getattr(self, name) < np.inf:
+        raise ValueError(f"The camera's {name} must be 0 or more, found {getattr(self, name)}.")
+    fastest = 1 / constants.CONTROL_TIMESTEP
+    if not 0 < self.rate <= fastest:
+      raise ValueError(
+        f"The camera's rate must be above 0 and at most that of the control, {fastest:g} Hz, found "
+        f"{self.rate:g} Hz."
+      )
+
+  def camera(self, image_size: tuple[int, int]) -> Camera:
+    """Returns the camera model for a picture of (height, width)."""
+    height, width = _checked_size(image_size)
+    if self.lens is not None:
+      return self.lens.resized(width, height)
+    return Camera.from_vertical_fov(constants.CAMERA_VERTICAL_FOV, width, height)
+
+  def response(self) -> np.ndarray | None:
+    """Returns the table uint8 [256, 3] from neutral to recorded values; None if it is neutral.
+
+    value' = 255 * clip(gain * exposure * balance * (value / 255)^2.2)^(1 / 2.2)
+    """
+    factors = self.gain * self.exposure * np.asarray(self.white_balance, np.float64)
+    if (factors == 1).all():
+      return None
+    levels = np.arange(256)[:, None] * factors ** (1 / _DISPLAY_GAMMA)
+    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def _checked_size(image_size: tuple[int, int]) -> tuple[int, int]:
+  try:
+    height, width = (int(number) for number in image_size)
+  except (TypeError, ValueError):
+    height = width = 0
+  if height < 1 or width < 1:
+    raise ValueError(
+      f"image_size must be (height, width) of at least 1 pixel each, found {image_size!r}; "
+      "the paper uses (30, 40) and (60, 80)."
+    )
+  return height, width
+
+
+def world_from_camera(data: mujoco.MjData, camera_id: int) -> np.ndarray:
+  """Returns the pose [4, 4] of a MuJoCo camera with OpenCV's axes."""
+  return pose_of_mujoco_camera(data.cam_xpos[camera_id], data.cam_xmat[camera_id])
+
+
+class GeomCaster:
+  """Casts a camera's rays against the geoms that can move."""
+
+  def __init__(
+    self, model: mujoco.MjModel, camera: Camera, *, groups: tuple[int, ...] = (op3.VISIBLE_GROUP,)
+  ):
+    """Prepares the rays.
+
+    Args:
+      model: The compiled model; its `geom_rgba` and sizes are read at every call.
+      camera: The camera model.
+      groups: The MuJoCo geom groups that are seen.
+    """
+    self._model = model
+    self._shape = (camera.height, camera.width)
+    self._rays = camera.rays().reshape(-1, 3)  # [N, 3], z = 1
+    self._directions = self._rays / np.linalg.norm(self._rays, axis=1, keepdims=True)
+    moving = model.body_weldid[model.geom_bodyid] != 0
+    self._geoms = np.flatnonzero(np.isin(model.geom_group, groups) & moving)
+    self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
+    self._groups[list(groups)] = 1
+    count = len(self._rays)
+    self._ids, self._depth = np.empty(count, np.int32), np.empty(count)
+    self._normals = np.empty(3 * count)
+
+  def candidates(self, data: mujoco.MjData, pose: np.ndarray) -> np.ndarray:
+    """Returns the indices of rays that come near a geom's bounding sphere."""
+    offsets = (data.geom_xpos[self._geoms] - pose[:3, 3]) @ pose[:3, :3]  # camera frame [G, 3]
+    distances = np.sqrt(np.einsum("gi,gi->g", offsets, offsets))
+    radii = self._model.geom_rbound[self._geoms]
+    ahead = offsets[:, 2] > -radii  # nothing behind the camera is seen
+    offsets, distances, radii = offsets[ahead], distances[ahead], radii[ahead]
+    if not len(offsets):
+      return np.empty(0, np.int64)
+    outside = distances > radii
+    angle = np.arcsin(np.divide(radii, distances, where=outside, out=np.ones_like(radii)))
+    limits = np.where(outside, np.cos(angle + _CULLING_SLACK), -1.0)
+    cosines = self._directions @ (offsets / np.maximum(distances, 1e-9)[:, None]).T  # [N, G]
+    return np.flatnonzero((cosines >= limits).any(axis=1))
+
+  def cast(self, data: mujoco.MjData, pose: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Casts the rays.
+
+    Args:
+      data: MuJoCo's state with kinematics up to date.
+      pose: World from camera [4, 4], OpenCV's axes.
+
+    Returns:
+      The hit rays' pixel indices [K], z-depths [K] [m], geom ids [K] and unit normals [K, 3].
+    """
+    rays = self.candidates(data, pose)
+    count = len(rays)
+    ids, depth, normals = self._ids[:count], self._depth[:count], self._normals[: 3 * count]
+    if count:
+      vectors = (self._rays[rays] @ pose[:3, :3].T).ravel()
+      mujoco.mj_multiRay(
+        self._model,
+        data,
+        pose[:3, 3].copy(),
+        vectors,
+        self._groups,
+        0,
+        -1,
+        ids,
+        depth,
+        normals,
+        count,
+        mujoco.mjMAXVAL,
+      )
+    hit = np.flatnonzero(ids >= 0) if count else rays
+    return rays[hit], depth[hit], ids[hit], normals.reshape(-1, 3)[hit]
+
+  def shade(self, ids: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Returns the colours uint8 [K, 3] of surfaces: the geom's colour under one lamp."""
+    light = _AMBIENT + _DIFFUSE * np.maximum(normals @ _LIGHT_DIRECTION, 0.0)
+    colors = self._model.geom_rgba[ids, :3] * light[:, None]
+    return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)
+
+
+class RobotCamera:
+  """The picture that the robot takes."""
+
+  def __init__(
+    self,
+    renderer: FieldRenderer,
+    camera: Camera,
+    *,
+    world_from_unit: Similarity,
+    settings: CameraSettings | None = None,
+  ):
+    """Connects a renderer of the scene with the lens of the robot.
+
+    Args:
+      renderer: Renders the field in the unit frame.
+      camera: The robot's lens at the picture's size.
+      world_from_unit: Maps the field's frame to the world [m].
+      settings: How the sensor responds and how geoms are composited.
+    """
+    self.camera = camera
+    self.settings = settings or CameraSettings()
+    self._renderer = renderer
+    self._unit_from_world = world_from_unit.inverse()
+    self._meters_per_unit = world_from_unit.scale
+    self._response = self.settings.response()
+    self.caster: GeomCaster | None = None
+    self.camera_id = -1
+
+  @property
+  def shape(self) -> tuple[int, int, int]:
+    """The picture's shape (H, W, 3)."""
+    return self.camera.height, self.camera.width, 3
+
+  def set_gain(self, gain: float) -> None:
+    """Changes the gain from the next picture on."""
+    self.settings = dataclasses.replace(self.settings, gain=gain)
+    self._response = self.settings.response()
+
+  def bind(self, model: mujoco.MjModel, camera_id: int) -> None:
+    """Takes the geoms and the mounting from a compiled model."""
+    self.caster = GeomCaster(model, self.camera)
+    self.camera_id = camera_id
+
+  def render_field(
+    self, pose: np.ndarray, lens: Camera | None = None
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Renders the scene alone: colour uint8 [H, W, 3] and z-depth [H, W] [m].
+
+    Args:
+      pose: World from camera [4, 4], OpenCV's axes.
+      lens: Another camera model than the robot's, for a spectator's view.
+    """
+    unit_from_camera = self._unit_from_world.apply_pose(pose)
+    color, depth = self._renderer.render(lens or self.camera, unit_from_camera)
+    return color, depth * self._meters_per_unit
+
+  def render(self, data: mujoco.MjData, random_state: np.random.RandomState | None = None) -> Any:
+    """Returns the picture uint8 [H, W, 3] at a state with kinematics up to date.
+
+    Args:
+      data: MuJoCo's state.
+      random_state: Source of the sensor's noise; without one there is none.
+    """
+    if self.caster is None:
+      raise RuntimeError("The camera has no model yet: call bind(model, camera_id) first.")
+    pose = world_from_camera(data, self.camera_id)
+    color, depth = self.render_field(pose)
+    pixels, distances, ids, normals = self.caster.cast(data, pose)
+    if len(pixels):
+      if self.settings.compositing == DEPTH:
+        front = np.flatnonzero(distances < depth.reshape(-1)[pixels])
+        pixels, ids, normals = pixels[front], ids[front], normals[front]
+      color = np.array(color)
+      color.reshape(-1, 3)[pixels] = self.caster.shade(ids, normals)
+    return self._develop(color, random_state)
+
+  def _develop(self, color: np.ndarray, random_state: np.random.RandomState | None) -> np.ndarray:
+    """Applies the sensor's response and noise."""
+    if self._response is not None:
+      color = np.stack([self._response[color[..., i], i] for i in range(3)], axis=-1)
+    if self.settings.noise > 0 and random_state is not None:
+      deviation = self.settings.noise * self.settings.gain
+      noisy = color + random_state.normal(0.0, deviation, color.shape)
+      color = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return color

@@ -1,0 +1,44 @@
+"""Parts of a computation report their share of the whole."""
+
+import io
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from nerf2real.core.progress import no_progress, part, progress_bar
+
+fractions = st.floats(0.0, 1.0)
+
+
+@given(ends=st.tuples(fractions, fractions).map(sorted), fraction=st.floats(-1.0, 2.0))
+def test_a_part_stays_in_its_share(ends, fraction):
+  reports: list[tuple[float, str]] = []
+  start, end = ends
+  part(lambda *report: reports.append(report), start, end)(fraction, "text")
+  ((found, text),) = reports
+  assert start - 1e-12 <= found <= end + 1e-12 and text == "text"
+  if 0 <= fraction <= 1:
+    assert found == pytest.approx(start + (end - start) * fraction)
+
+
+def test_parts_nest():
+  reports: list[float] = []
+  half = part(lambda fraction, _: reports.append(fraction), 0.5, 1.0)
+  part(half, 0.0, 0.5)(1.0, "")
+  assert reports == [0.75]
+
+
+def test_the_bar_shows_name_and_text():
+  stream = io.StringIO()
+  with progress_bar("depth", console=Console(file=stream, width=120)) as progress:
+    progress(0.5, "picture 1 of 2")
+  for word in ("depth", "50%", "picture 1 of 2"):
+    assert word in stream.getvalue()
+
+
+def test_a_hidden_bar_is_silent(capsys):
+  with progress_bar("depth", shown=False) as progress:
+    progress(0.5, "picture 1 of 2")
+  assert progress is no_progress and capsys.readouterr().out == ""
