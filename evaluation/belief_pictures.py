@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from nerf2real.agents.dmpo import belief_plot
+from nerf2real.agents.dmpo.acting import task_of
 from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
 from nerf2real.agents.dmpo.specs import planar_pose
 from nerf2real.agents.processes.environments import make_environment
@@ -14,13 +15,6 @@ from nerf2real.scenes.geometry import floor_picture
 
 _SCALE = 80  # pixel/m
 _COLUMNS = 4  # moments in a row of the picture
-
-
-def task_of(environment: Any) -> Any:
-  """The task below the wrappers of an environment."""
-  while hasattr(environment, "_environment"):
-    environment = environment._environment
-  return environment.task
 
 
 def run_episode(

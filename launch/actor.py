@@ -7,7 +7,6 @@ The learner says which environment to run. --evaluate makes it the evaluator.
 
 import dataclasses
 import logging
-import os
 import signal
 import sys
 import uuid
@@ -48,11 +47,12 @@ def run(arguments: Arguments) -> None:
   """Acts or evaluates until the run is over or it is stopped.
 
   Raises:
-    CommandError: It cannot join with these arguments.
+    CommandError: It cannot join with these arguments (only this ends with `REFUSED`), the learner
+      refuses a question, or several episodes in a row failed.
   """
   from nerf2real.agents.link.client import ActorLink
   from nerf2real.agents.link.schema import MessageError
-  from nerf2real.agents.processes.actor import ActorProcess, EvaluatorProcess
+  from nerf2real.agents.processes.actor import ActorProcess, EpisodesFailed, EvaluatorProcess
 
   role = "evaluator" if arguments.evaluate else "actor"
   name = f"{role}-{arguments.index}-{uuid.uuid4().hex[:8]}"
@@ -72,15 +72,12 @@ def run(arguments: Arguments) -> None:
     if arguments.evaluate:
       process = EvaluatorProcess(link, seed=arguments.seed + _EVALUATOR_SEED)
     else:
-      # The process id makes a replaced actor draw other episodes than its predecessor.
-      process = ActorProcess(
-        link, seed=arguments.seed + 1000 * arguments.index + os.getpid() % 1000
-      )
+      process = ActorProcess(link, seed=arguments.seed, index=arguments.index)
   except (sessions.LinkError, MessageError, ValueError) as error:
     raise command.CommandError(error, status=REFUSED) from error
   try:
     process.run()
-  except MessageError as error:
+  except (EpisodesFailed, MessageError) as error:
     raise command.CommandError(error) from error
   finally:
     link.close()

@@ -10,6 +10,7 @@ instead, with the login of that router's first user.
 import dataclasses
 import json
 import logging
+import os
 import signal
 import sys
 from pathlib import Path
@@ -23,7 +24,10 @@ from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
 from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 
+# NumPy only samples here; XLA has --threads.
+_ENVIRONMENT = {**command.NOT_DRAWING, **command.ONE_THREAD}
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 _ASSIGNMENT = tyro.conf.arg(metavar="NAME=VALUE")
 _WHERE = tyro.conf.create_mutex_group(required=False)
 
@@ -50,6 +54,13 @@ class Arguments:
   """Seed of parameters, sampling and, with an actor's number, of its episodes."""
   max_env_steps: int | None = None
   """Environment steps of the run; until it is stopped if not given."""
+  minutes: float | None = None
+  """Time of the run, over all its parts [min]; until it is stopped if not given."""
+  init_from: Path | None = None
+  """Folder of an exported policy to begin with, with fresh optimisers and critic; random weights if
+  not given."""
+  threads: int = max(1, _CORES // 2)
+  """Processor threads of the updates: half of the cores, the rest is for actors."""
   resume: bool = False
   """Continue from the newest checkpoint."""
   checkpoint_period: float = 300.0
@@ -60,8 +71,12 @@ class Arguments:
   """Keep the replay in files, so that it survives the learner."""
   evaluation_period: int = 10_000
   """Environment steps between evaluations [steps]."""
-  evaluation_episodes: int = 5
-  """Episodes of an evaluation."""
+  evaluation_episodes: int | None = None
+  """Episodes of an evaluation; half of the protocol's trials, or 5 without a protocol, if not
+  given."""
+  evaluation_env: str | None = None
+  """Environment of the evaluations; for suite:... the protocol of the paper's table I if not
+  given."""
   link: tyro.conf.OmitArgPrefixes[sessions.LinkSettings] = sessions.LinkSettings()
   """The link's settings."""
 
@@ -77,15 +92,26 @@ def agent_settings(arguments: Arguments) -> tuple[str, configs.DmpoConfig]:
   info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
   if info is not None:
     environment, config = info["environment"], from_plain(info["config"], configs.DmpoConfig)
-    if arguments.env not in (None, environment):
+    given = arguments.env or environment
+    if given.partition("?")[0] != environment.partition("?")[0]:
       raise ValueError(
-        f"{arguments.run} was trained on {environment}, found --env {arguments.env}."
+        f"{arguments.run} was trained on {environment}, found --env {arguments.env}: only the "
+        "options after the question mark may change."
       )
+    environment = given
   elif arguments.env is None:
     raise ValueError("Say what to learn, such as --env suite:nerf_nav.")
   else:
     environment, config = arguments.env, configs.preset(arguments.preset or "paper")
   return environment, configs.override(config, dict(map(_assignment, arguments.set)))
+
+
+def set_threads(count: int) -> None:
+  """Limits XLA's threads on the processor; to be called before the first computation."""
+  os.environ.setdefault("NPROC", str(count))  # size of XLA's thread pool
+  if count == 1:
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
 
 
 def _assignment(text: str) -> tuple[str, Any]:
@@ -104,12 +130,14 @@ def run(arguments: Arguments) -> None:
   """Learns until the run is over or it is stopped.
 
   Raises:
-    CommandError: It cannot start with these arguments, or what was learned was not saved.
+    CommandError: It cannot start with these arguments, trajectories can no longer be taken in, or
+      what was learned was not saved.
   """
   from nerf2real.agents.processes.checkpoints import CheckpointError
-  from nerf2real.agents.processes.learner import Learner, RunSettings
+  from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
 
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
+  set_threads(arguments.threads)
   try:
     environment, config = agent_settings(arguments)
     names = {field.name for field in dataclasses.fields(RunSettings)} - {"environment"}
@@ -128,7 +156,10 @@ def run(arguments: Arguments) -> None:
     raise command.CommandError(error, status=REFUSED) from error
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())
-  learner.run()
+  try:
+    learner.run()
+  except LearnerError as error:
+    raise command.CommandError(error) from error
   if learner.problem:
     raise command.CommandError(
       f"The run ended and was not saved: {learner.problem}", status=NOT_SAVED
@@ -137,7 +168,7 @@ def run(arguments: Arguments) -> None:
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
-  return command.main(Arguments, run, environment=command.NOT_DRAWING, errors=())
+  return command.main(Arguments, run, environment=_ENVIRONMENT, errors=())
 
 
 if __name__ == "__main__":

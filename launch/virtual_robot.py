@@ -57,12 +57,14 @@ class Arguments:
 
 def run(arguments: Arguments) -> None:
   """Starts the robot and waits."""
+  from nerf2real.real.virtual.camera import VirtualCamera
   from nerf2real.real.virtual.robot import VirtualRobot
 
+  camera = VirtualCamera() if arguments.camera else None
   with (
     contextlib.suppress(KeyboardInterrupt),
     VirtualRobot(
-      world=arguments.world, seed=arguments.seed, camera=arguments.camera, ball=arguments.ball
+      world=arguments.world, seed=arguments.seed, camera=camera, ball=arguments.ball
     ) as robot,
   ):
     robot.faults.loss = arguments.loss

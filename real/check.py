@@ -1,6 +1,7 @@
 """Checks a robot before a policy runs on it: devices, readings, standing, timing."""
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 
 from nerf2real.real.loading import Connection, load
 from nerf2real.real.loop.environment import RobotEnvironment
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.suite.op3 import constants
 
 VIRTUAL = "virtual"
@@ -49,16 +51,14 @@ def check(
     recorder: Records everything.
     dry_run: Reads everything and writes nothing to the servos.
   """
+  connection = Connection(port=robot) if isinstance(robot, str) else robot
   with load(
     "nerf_nav",
-    robot=robot,
-    camera=camera,
+    robot=dataclasses.replace(connection, camera=camera, offsets=offsets, lens=lens),
     image_size=None if camera is None else _IMAGE_SIZE,
     time_limit=seconds,
-    offsets=offsets,
-    lens=lens,
+    settings=RobotSettings(dry_run=dry_run),
     recorder=recorder,
-    dry_run=dry_run,
   ) as environment:
     timestep = environment.reset()
     while not timestep.last():

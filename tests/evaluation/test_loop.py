@@ -7,11 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.core.robot_logs.reading import check_against_model, read_log
+from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.evaluation.loop import closing, gap, motions, recording
 from nerf2real.launch import close_loop as script
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 from nerf2real.suite.op3 import constants
+from nerf2real.sysid.data.compatibility import check_against_model
 
 
 @pytest.mark.parametrize("kind", ["sweep", "slow", "steps", "mixed", "sway"])

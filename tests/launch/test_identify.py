@@ -5,7 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.core.robot_logs import messages
+from nerf2real.core.robot_logs.writer import open_log
 from nerf2real.launch import identify as script
 from tests.sysid.synthetic import ARM, PENDULUM
 
@@ -29,13 +30,14 @@ def identify(monkeypatch, capsys):
 
 def _log(path, *, duration=2.0, commands=True, joints=("joint",), spoil=None, cut=None):
   """Writes a log of joints that move; `spoil(index, fields)` changes states."""
-  with log_writer.open_log(path, joints) as log:
+  with open_log(path) as log:
     for index in range(round(duration * 100)):
       t = START + index * 10_000_000
       if commands and index % 2 == 0:
-        log.command(t, position=[0.1] * len(joints))
-      fields = {"stamp_ns": t, "position": [np.sin(0.1 * index)] * len(joints)}
-      log.state(**(spoil(index, fields) if spoil else fields))
+        log.write(messages.joint_state(t, messages.COMMANDS, joints, position=[0.1] * len(joints)))
+      fields = {"time_ns": t, "position": [np.sin(0.1 * index)] * len(joints)}
+      fields = spoil(index, fields) if spoil else fields
+      log.write(messages.joint_state(topic=messages.STATES, names=joints, **fields))
   if cut is not None:
     path.write_bytes(path.read_bytes()[:cut])
   return path
@@ -51,9 +53,9 @@ def _at(which, **changes):
     ({"commands": False}, "has no commands"),
     ({"joints": ("elbow",)}, "['elbow'] that the model lacks"),
     ({"spoil": _at(50, position=[np.nan])}, "NaN or infinite positions"),
-    ({"spoil": _at(50, stamp_ns=START)}, "time runs backwards"),
+    ({"spoil": _at(50, time_ns=START)}, "time runs backwards"),
     ({"duration": 0.1}, "expected at least 1 s"),
-    ({"spoil": lambda index, fields: {**fields, "stamp_ns": START + index * 10**9}}, "a second"),
+    ({"spoil": lambda index, fields: {**fields, "time_ns": START + index * 10**9}}, "a second"),
     ({"cut": 2000}, "truncated or damaged"),
     ({"cut": 0}, "is empty"),
   ],

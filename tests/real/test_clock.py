@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from nerf2real.real.loop.clock import RealClock, SteppedClock
+from nerf2real.real.clock import RealClock, SteppedClock
 
 
 def test_stepped_work_runs_at_its_times_in_order():

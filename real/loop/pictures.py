@@ -1,27 +1,17 @@
 """The newest picture of the robot's camera in the policy's size: its age, its loss, its record."""
 
 import logging
-from typing import Any, Protocol
+from typing import Any
 
-import cv2
 import numpy as np
 
-from nerf2real.real.loop.clock import Clock
+from nerf2real.real.camera.source import CameraSource, resize
+from nerf2real.real.clock import Clock
 from nerf2real.real.loop.timing import Timing
 from nerf2real.real.safety.monitor import Monitor, Stop
 
 _SAME_PICTURE = 0.002  # s by which the age of one picture may be measured differently
 _log = logging.getLogger(__name__)
-
-
-class CameraSource(Protocol):
-  """Where pictures come from, such as `real.camera.device.Camera`."""
-
-  def read(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture, RGB uint8 [H, W, 3], and its age [s]; never waits."""
-
-  def close(self) -> None:
-    """Frees the camera."""
 
 
 class Pictures:
@@ -60,9 +50,8 @@ class Pictures:
     Args:
       watched: Whether the monitor judges; it does during an episode.
     """
-    height, width = self._size
     age: float | None = None
-    picture: np.ndarray = np.zeros((height, width, 3), np.uint8)
+    picture: np.ndarray = np.zeros((*self._size, 3), np.uint8)
     try:
       picture, age = self.camera.read()
     except Exception as error:  # whatever a driver raises, it is a lost picture
@@ -72,16 +61,13 @@ class Pictures:
       self._timing.add("camera age", age)
       self._record(picture, now - age)
     stop = self._monitor.camera(now, age) if watched else None
-    if picture.shape[:2] != (height, width):
-      picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
-    return picture, stop
+    return resize(picture, self._size), stop
 
   def _record(self, picture: np.ndarray, taken: float) -> None:
     if self._recorder is None or taken < self._recorded + _SAME_PICTURE:
       return
     self._recorded = taken
-    full = getattr(self.camera, "read_full", None)
-    self._recorder.image(self._clock.wall(taken), picture if full is None else full()[0])
+    self._recorder.image(self._clock.wall(taken), picture)
 
   def close(self) -> None:
     """Frees the camera."""

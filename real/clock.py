@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 _SWITCH_INTERVAL = 0.0001  # s that a thread may keep others from running; Python's own is 5 ms
-_WATCHING, _ACTING = 20, 10  # of SCHED_FIFO, 1 to 99; ours: above ordinary programs
+_WATCHING, _ACTING = 20, 10  # of SCHED_FIFO, 1 to 99; chosen: above ordinary programs
 _log = logging.getLogger(__name__)
 
 
