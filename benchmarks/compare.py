@@ -24,7 +24,7 @@ from typing import Any
 
 import tyro
 
-from benchmarks.ledger import ROOT
+from benchmarks.ledger.records import ROOT
 from benchmarks.turns import percentile
 
 # Words of the path to a number that say nothing about what it is.

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from benchmarks import blur_ablation, compare, harness
 from benchmarks.field_worker import save_views
-from benchmarks.ledger import ROOT
+from benchmarks.ledger.records import ROOT
 
 WORKER = Path(__file__).with_name("field_worker.py")
 # Where a checkout keeps its trainer: a file that shows the layout, then the worker's arguments.

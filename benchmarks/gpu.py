@@ -24,8 +24,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from benchmarks import compare, harness, ledger
-from benchmarks.ledger import ROOT, Value
+from benchmarks import compare, harness
+from benchmarks.ledger import records as ledger
+from benchmarks.ledger.records import ROOT, Value
 
 Figures = dict[str, dict[str, Value]]
 SIZES = ((30, 40), (60, 80))  # picture sizes [H, W] of the policies

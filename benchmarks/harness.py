@@ -27,8 +27,9 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from benchmarks import compare, ledger
-from benchmarks.ledger import ROOT, Rate, Value
+from benchmarks import compare
+from benchmarks.ledger import records as ledger
+from benchmarks.ledger.records import ROOT, Rate, Value
 from benchmarks.turns import Times, interleave, percentile
 
 __all__ = [  # what scripts use of this module, and of those that it is made of

@@ -19,7 +19,7 @@ from typing import Any
 
 from benchmarks import harness
 from benchmarks.blind_sets import scoring
-from benchmarks.ledger import ROOT
+from benchmarks.ledger.records import ROOT
 
 RESULTS = ROOT / "benchmarks" / "results"
 

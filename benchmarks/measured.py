@@ -11,7 +11,7 @@ import pathlib
 from typing import Any
 
 from benchmarks import harness
-from benchmarks.ledger import ROOT
+from benchmarks.ledger.records import ROOT
 from nerf2real import sysid
 
 

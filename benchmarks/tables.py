@@ -4,9 +4,9 @@
   python benchmarks/tables.py --write    # generates the blocks and docs/figures.md anew
 
 A README marks a block with `<!-- figures: NAME -->` and `<!-- /figures -->`; what stands between
-comes from the block of that name in `benchmarks/tables.md`, where `{id/value:.1f}` is a value of a
+comes from the block of that name in `benchmarks/ledger/tables.md`: `{id/value:.1f}` is a value of a
 record, `{id/value.count}` a rate's count, and a line `{row id}` a table's row: what, found, asked.
-Figures in prose outside of blocks: see `benchmarks/prose.py`.
+Figures in prose outside of blocks: see `benchmarks/ledger/prose.py`.
 """
 
 import dataclasses
@@ -17,11 +17,12 @@ from pathlib import Path
 
 import tyro
 
-from benchmarks import ledger, prose
-from benchmarks.ledger import ROOT, Record
+from benchmarks.ledger import prose
+from benchmarks.ledger import records as ledger
+from benchmarks.ledger.records import ROOT, Record
 
 MOVE = "b263fe5"  # commit that moved the code into folders; earlier figures are of the code before
-TEMPLATES = Path(__file__).with_name("tables.md")
+TEMPLATES = Path(__file__).parent / "ledger" / "tables.md"
 PAGE = Path("docs/figures.md")
 _READMES = ("README.md", "*/README.md", "*/*/README.md")
 _LINKS = "nerf2real"  # holds links to the folders
@@ -48,7 +49,7 @@ def render(template: str, records: Mapping[str, Record]) -> str:
 
   def find(key: str) -> Record:
     if key not in records:
-      raise ValueError(f"benchmarks/tables.md names record {key!r}, which is not there.")
+      raise ValueError(f"benchmarks/ledger/tables.md names record {key!r}, which is not there.")
     return records[key]
 
   def value(match: re.Match[str]) -> str:
@@ -80,7 +81,7 @@ def fill(text: str, blocks: Mapping[str, str], records: Mapping[str, Record]) ->
   def block(match: re.Match[str]) -> str:
     name = match[1]
     if name not in blocks:
-      raise ValueError(f"benchmarks/tables.md has no block {name!r}.")
+      raise ValueError(f"benchmarks/ledger/tables.md has no block {name!r}.")
     return f"<!-- figures: {name} -->\n{render(blocks[name], records)}<!-- /figures -->"
 
   return prose.BLOCK.sub(block, text)
@@ -171,7 +172,7 @@ def check(
     problems += prose.unrecorded(text, name, records, allowed)
   problems += [f"tables.md: no README has the block {name}" for name in sorted(set(blocks) - used)]
   typed = "\n".join(_VALUE.sub("` `", _ROW.sub("", block)) for block in blocks.values())
-  problems += prose.unrecorded(typed, "benchmarks/tables.md", records, allowed)
+  problems += prose.unrecorded(typed, "benchmarks/ledger/tables.md", records, allowed)
   for record in records.values():
     missing = [path for path in record.evidence if not (root / path).exists()]
     problems += [f"record {record.id}: its evidence {path} is not there" for path in missing]

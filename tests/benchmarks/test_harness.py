@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import compare, field, harness, ledger
+from benchmarks import compare, field, harness
+from benchmarks.ledger import records as ledger
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from benchmarks import ledger
-from benchmarks.ledger import Rate, Record
+from benchmarks.ledger import records as ledger
+from benchmarks.ledger.records import Rate, Record
 
 ORIGIN = {
   "command": "python benchmarks/x.py",

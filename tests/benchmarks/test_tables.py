@@ -2,8 +2,10 @@
 
 import pytest
 
-from benchmarks import ledger, prose, tables
-from benchmarks.ledger import Rate, Record
+from benchmarks import tables
+from benchmarks.ledger import prose
+from benchmarks.ledger import records as ledger
+from benchmarks.ledger.records import Rate, Record
 
 RECORDS = {
   record.id: record
@@ -46,7 +48,7 @@ def root(tmp_path):
 
 
 def _check(root, allowed=None):
-  return tables.check(root, RECORDS, BLOCKS, allowed or {"benchmarks/tables.md": {}})
+  return tables.check(root, RECORDS, BLOCKS, allowed or {"benchmarks/ledger/tables.md": {}})
 
 
 def test_this_checkout_s_readmes_agree_with_their_records():
@@ -108,7 +110,7 @@ def test_what_is_recorded_or_allowed_or_no_figure_passes(root, sentence):
 def test_a_figure_typed_into_a_template_is_found(root):
   blocks = {"speed": BLOCKS["speed"] + "| e | 77 ms |\n"}
   found = tables.check(root, RECORDS, blocks, {})
-  assert any('benchmarks/tables.md: "77 ms" has no record' in line for line in found)
+  assert any('benchmarks/ledger/tables.md: "77 ms" has no record' in line for line in found)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 A figure is a number with a unit, or "N of M". It is recorded if it stands in a block that
 `benchmarks/tables.py` generates, or in a paragraph with `<!-- record: id, id -->` and equals a
 value of one of these records at the precision that it is written with. Settings, sizes and the
-paper's values are listed in `benchmarks/settings.toml`, each with what it is.
+paper's values are listed in `benchmarks/ledger/settings.toml`, each with what it is.
 """
 
 import re
@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from benchmarks.ledger import Rate, Record
+from benchmarks.ledger.records import Rate, Record
 
 ALLOWED = Path(__file__).with_name("settings.toml")
 
