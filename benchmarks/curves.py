@@ -30,7 +30,11 @@ def read_run(folder: Path) -> dict[str, Any]:
   rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
   launches = [json.loads(line) for line in (folder / "launches.jsonl").read_text().splitlines()]
   info = read_info(folder) or {}
-  evaluations = [r for r in rows if r["source"].startswith("evaluator")]
+  evaluations = [
+    r
+    for r in rows
+    if r["source"].startswith("evaluator") and "return" in r and not r.get("confirmation")
+  ]
   episodes = [r for r in rows if r["source"].startswith("actor") and "return" in r]
   seconds = sum(_span([r["time"] for r in rows], launches, i) for i in range(len(launches)))
   last = rows[-1]

@@ -21,7 +21,7 @@ from nerf2real.agents.link import sessions
 from nerf2real.agents.link.arguments import add_link_arguments, link_settings
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.link.schema import MessageError
-from nerf2real.agents.processes.actor import ActorProcess, EvaluatorProcess
+from nerf2real.agents.processes.actor import ActorProcess, EpisodesFailed, EvaluatorProcess
 
 _EVALUATOR_SEED = 1_000_000  # far from the actors' seeds
 
@@ -62,15 +62,17 @@ def main() -> int:
     if arguments.evaluate:
       process = EvaluatorProcess(link, seed=arguments.seed + _EVALUATOR_SEED)
     else:
-      # The process id makes a replaced actor draw other episodes than its predecessor.
-      process = ActorProcess(
-        link, seed=arguments.seed + 1000 * arguments.index + os.getpid() % 1000
-      )
-    process.run()
-    link.close()
+      process = ActorProcess(link, seed=arguments.seed, index=arguments.index)
   except (sessions.LinkError, MessageError, ValueError) as error:
     print(f"error: {error}", file=sys.stderr)
-    return 2
+    return 2  # another start would not help: only joining ends so
+  try:
+    process.run()
+  except (EpisodesFailed, MessageError) as error:
+    print(f"error: {error}", file=sys.stderr)
+    return 1
+  finally:
+    link.close()
   return 0
 
 

@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # the environment is only asked for its specs
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # NumPy only samples here; XLA has --threads
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link.arguments import add_link_arguments, link_settings
 from nerf2real.agents.link.sessions import LinkError
 from nerf2real.agents.processes.checkpoints import CheckpointError, read_info
-from nerf2real.agents.processes.learner import Learner, RunSettings
+from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
 from nerf2real.core.serialization import from_plain
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -45,7 +47,20 @@ def parse() -> argparse.Namespace:
   )
   parser.add_argument("--seed", type=int, default=0)
   parser.add_argument("--max-env-steps", type=int, help="environment steps of the run")
+  parser.add_argument("--minutes", type=float, help="time of the run, over all its parts [min]")
   parser.add_argument("--resume", action="store_true", help="continue from the newest checkpoint")
+  parser.add_argument(
+    "--init-from",
+    type=Path,
+    metavar="POLICY",
+    help="begin with an exported policy, with fresh optimisers and critic",
+  )
+  parser.add_argument(
+    "--threads",
+    type=int,
+    default=max(1, _cores() // 2),
+    help="processor threads of the updates; half of the cores, the rest is for actors",
+  )
   parser.add_argument(
     "--checkpoint-period",
     type=float,
@@ -69,7 +84,15 @@ def parse() -> argparse.Namespace:
     default=RunSettings.evaluation_period,
     help="environment steps between evaluations",
   )
-  parser.add_argument("--evaluation-episodes", type=int, default=RunSettings.evaluation_episodes)
+  parser.add_argument(
+    "--evaluation-episodes",
+    type=int,
+    help="episodes of an evaluation; half of the protocol's trials, or 5 without a protocol",
+  )
+  parser.add_argument(
+    "--evaluation-env",
+    help="environment of the evaluations; the protocol of the paper's table I for suite:...",
+  )
   add_link_arguments(parser, side="learner")
   return parser.parse_args()
 
@@ -79,15 +102,30 @@ def agent_settings(arguments: argparse.Namespace) -> tuple[str, configs.DmpoConf
   info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
   if info is not None:
     environment, config = info["environment"], from_plain(info["config"], configs.DmpoConfig)
-    if arguments.env not in (None, environment):
+    given = arguments.env or environment
+    if given.partition("?")[0] != environment.partition("?")[0]:
       raise ValueError(
-        f"{arguments.run} was trained on {environment}, found --env {arguments.env}."
+        f"{arguments.run} was trained on {environment}, found --env {arguments.env}: only the "
+        "options after the question mark may change."
       )
+    environment = given
   elif arguments.env is None:
     raise ValueError("Say what to learn, such as --env suite:nerf_nav.")
   else:
     environment, config = arguments.env, configs.preset(arguments.preset or "paper")
   return environment, configs.override(config, dict(map(_assignment, arguments.set)))
+
+
+def _cores() -> int:
+  return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def set_threads(count: int) -> None:
+  """Limits XLA's threads on the processor; to be called before the first computation."""
+  os.environ.setdefault("NPROC", str(count))  # size of XLA's thread pool
+  if count == 1:
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
 
 
 def _assignment(text: str) -> tuple[str, Any]:
@@ -106,6 +144,7 @@ def main() -> int:
   arguments = parse()
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
   try:
+    set_threads(arguments.threads)
     environment, config = agent_settings(arguments)
     settings = RunSettings(
       environment=environment,
@@ -117,6 +156,9 @@ def main() -> int:
       replay_on_disk=arguments.replay_on_disk,
       evaluation_period=arguments.evaluation_period,
       evaluation_episodes=arguments.evaluation_episodes,
+      evaluation_environment=arguments.evaluation_env,
+      minutes=arguments.minutes,
+      init_from=arguments.init_from,
     )
     learner = Learner(
       settings,
@@ -126,12 +168,16 @@ def main() -> int:
       resume=arguments.resume,
       join=arguments.connect is not None,
     )
-  except (ValueError, LinkError, CheckpointError) as error:
+  except (ValueError, OSError, LinkError, CheckpointError) as error:
     print(f"error: {error}", file=sys.stderr)
     return 2
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())
-  learner.run()
+  try:
+    learner.run()
+  except LearnerError as error:
+    print(f"error: {error}", file=sys.stderr)
+    return 1
   return 0
 
 

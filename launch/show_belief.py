@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from nerf2real.agents.dmpo import belief_plot
+from nerf2real.agents.dmpo.acting import task_of
 from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
 from nerf2real.agents.dmpo.specs import planar_pose
 from nerf2real.agents.processes.environments import make_environment
@@ -25,13 +26,6 @@ from nerf2real.agents.processes.environments import make_environment
 _CELL = 0.05  # m
 _FREE, _OTHER = 235, 60  # grey levels of the floor where the robot fits, and of all else
 _COLUMNS = 4  # moments in a row of the picture
-
-
-def task_of(environment: Any) -> Any:
-  """The task below the wrappers of an environment."""
-  while hasattr(environment, "_environment"):
-    environment = environment._environment
-  return environment.task
 
 
 def floor_map(task: Any, extent: belief_plot.Extent) -> np.ndarray:

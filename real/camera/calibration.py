@@ -1,7 +1,7 @@
 """Calibrates a camera from pictures of a checkerboard: an OPENCV model with its uncertainty.
 
 Pixels follow OpenCV and ROS here: the centre of the upper left pixel is (0, 0). `core.cameras`
-has it at (0.5, 0.5); `Calibration.camera` and `read_camera_info` convert. N views.
+has it at (0.5, 0.5); `Calibration.camera` and `core.camera_info` convert. N views.
 """
 
 import dataclasses
@@ -224,28 +224,3 @@ def write_camera_info(path: Path, calibration: Calibration, *, name: str = "came
   info = camera_info(calibration, name=name)
   text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
   files.write_atomically(path, "\n".join(lines) + "\n" + text)
-
-
-def read_camera_info(path: Path) -> Camera:
-  """Reads a camera_info YAML as ROS and `write_camera_info` write it.
-
-  Raises:
-    ValueError: The file is none, or of another distortion model.
-  """
-  try:
-    info = yaml.safe_load(Path(path).read_text())
-    matrix, coefficients = info["camera_matrix"]["data"], info["distortion_coefficients"]["data"]
-    size = int(info["image_width"]), int(info["image_height"])
-    model = info["distortion_model"]
-  except (yaml.YAMLError, KeyError, TypeError) as error:
-    raise ValueError(
-      f"{path} is no camera_info YAML ({error}): write one with launch/calibrate_camera.py or "
-      "ROS's camera_calibration."
-    ) from error
-  k1, k2, p1, p2, *rest = (float(c) for c in [*coefficients, 0, 0, 0, 0][:5])
-  if model != "plumb_bob" or any(rest):
-    raise ValueError(
-      f"{path} has the distortion {model!r} with k3 = {rest}, expected plumb_bob with k3 = 0: "
-      "calibrate again with two radial terms."
-    )
-  return Camera.from_opencv(*size, matrix, (k1, k2, p1, p2))

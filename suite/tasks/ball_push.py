@@ -3,9 +3,11 @@
 Byravan et al. 2022, NeRF2Real, section "Tasks" and appendix "Rewards".
 """
 
+import functools
 from typing import Any
 
 import numpy as np
+from dm_control import composer
 
 from nerf2real.core import rotations
 from nerf2real.suite import protocols
@@ -100,7 +102,9 @@ class BallPush(RobotTask):
 
   def _place(self, random_state: np.random.RandomState) -> None:
     in_front = random_state.uniform() < BALL_IN_FRONT
-    for _ in range(_MAX_ATTEMPTS):
+    for attempt in range(2 * _MAX_ATTEMPTS):
+      if attempt == _MAX_ATTEMPTS:  # there is no room in front of the robot: beside it there may be
+        in_front = False
       self._put_ball((0.0, 0.0), height=10.0)  # out of the way while the robot is placed
       self._stand_somewhere(
         lambda: Start(tuple(self._free_place(random_state)), random_state.uniform(-np.pi, np.pi))
@@ -111,9 +115,9 @@ class BallPush(RobotTask):
       self._put_ball(self._in_front(random_state) if in_front else self._free_place(random_state))
       if not self._ball_touches_anything():
         return
-    raise ValueError(
-      f"Found no place for robot and ball in {_MAX_ATTEMPTS} attempts: the workspace of the scene "
-      f"{getattr(self.scene, 'name', '')!r} is too full."
+    raise composer.EpisodeInitializationError(
+      f"Found no place for robot and ball in {2 * _MAX_ATTEMPTS} attempts: the workspace of the "
+      f"scene {getattr(self.scene, 'name', '')!r} is too full."
     )
 
   def _free_place(self, random_state: np.random.RandomState) -> np.ndarray:
@@ -122,19 +126,20 @@ class BallPush(RobotTask):
       xy = random_state.uniform(self.workspace.lower, self.workspace.upper)
       if self.scene.free_space.is_reachable(xy[None])[0]:
         return xy
-    raise ValueError(
-      f"Found no free place in the workspace of {getattr(self.scene, 'name', '')!r} in "
-      f"{_MAX_ATTEMPTS} attempts."
-    )
+    return self._free_grid[random_state.randint(len(self._free_grid))]
+
+  @functools.cached_property
+  def _free_grid(self) -> np.ndarray:
+    """The places [N, 2] of a grid over the workspace at which a robot can stand."""
+    side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2
+    points = self.workspace.lower + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    return points[np.asarray(self.scene.free_space.is_reachable(points), bool)]
 
   def _nearest_free(self, xy: np.ndarray) -> np.ndarray:
     """Returns the point [2] itself if a robot can stand there, or else the nearest such place."""
     if self.scene.free_space.is_reachable(xy[None])[0]:
       return xy
-    side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2
-    points = self.workspace.lower + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
-    points = points[np.asarray(self.scene.free_space.is_reachable(points), bool)]
-    return points[np.argmin(np.linalg.norm(points - xy, axis=1))]
+    return self._free_grid[np.argmin(np.linalg.norm(self._free_grid - xy, axis=1))]
 
   def _in_front(self, random_state: np.random.RandomState) -> np.ndarray:
     root = self._indices.root_qpos

@@ -108,6 +108,11 @@ class RobotTask(composer.Task):
     return self._state
 
   @property
+  def render_time(self) -> float:
+    """Time spent on pictures since the environment was built [s]."""
+    return 0.0 if self._picture is None else self._picture.render_time
+
+  @property
   def standing_action(self) -> np.ndarray:
     """The action [20] that holds the reference pose (clipped to the limits)."""
     return self._standing.astype(np.float32)
@@ -218,7 +223,7 @@ class RobotTask(composer.Task):
       rng=np.random.default_rng(random_state.randint(2**31)),
     )
     if self._picture is not None:
-      self._picture.reset(self._data.qpos)
+      self._picture.reset(self._data.qpos, random_state)
     self._state = self._indices.read()
 
   def before_step(
