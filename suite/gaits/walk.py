@@ -5,6 +5,9 @@ upright over the floor, and `legs` turns them into joint positions. Because the 
 and the control signal is filtered, the targets lead the pattern; the filter is inverted exactly
 within its bounds. Feedback of the turning rates and the tilt acts on ankles and hips. Parameters
 were searched for with `launch/tune_gait.py`.
+
+Where something else than this gait drives the robot, `follow` keeps its hidden state (filter, phase
+and amplitude) at what was really applied, so that its next action fits the robot's motion.
 """
 
 import dataclasses
@@ -16,6 +19,11 @@ from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
 
 _TIMESTEP = constants.CONTROL_TIMESTEP
+_HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")]
+# rad by which `follow` corrects the phase in a control step; chosen: a third of what the gait
+# itself advances, so that half a period is caught up in 26 steps.
+_PHASE_CORRECTION = 0.12
+_LOCKABLE = 0.5  # amplitude from which a phase can be told from the legs; chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,6 +75,7 @@ class Command:
   forward: float = 0.0  # -1 to 1: share of the full stride
   turn: float = 0.0  # -1 to 1: share of the full turning step, positive to the left
   step: bool = True  # False: come to a stand
+  head: tuple[float, float] | None = None  # pan, tilt [rad]; None: as in the reference pose
 
 
 class Gait:
@@ -93,6 +102,8 @@ class Gait:
     self._amplitude = 0.0
     self._forward = self._turn = 0.0
     self._crouched = 0.0  # share of the way from the reference pose to the gait's own
+    self._head: tuple[float, float] | None = None
+    self._feedback: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
 
   @property
   def phase(self) -> float:
@@ -124,15 +135,48 @@ class Gait:
       self._phase = (self._phase + 2 * np.pi * _TIMESTEP / settings.period) % (2 * np.pi)
     else:
       self._phase = 0.0
-    targets = self._targets(self._phase, gyroscope, gravity)
-    return self._invert(targets)
+    self._head, self._feedback = command.head, (gyroscope, gravity)
+    return self._invert(self._targets(self._phase, self._amplitude))
 
-  def _targets(self, phase, gyroscope, gravity) -> np.ndarray:
+  def follow(self, control: np.ndarray) -> None:
+    """Sets the hidden state to a control that was applied in place of this gait's own.
+
+    To be called after `act`. The filter takes the control's value. Phase and amplitude move
+    towards those whose pattern comes nearest to it in the legs, by one step of a search each: the
+    phase by up to 0.12 rad either way, the amplitude down by what `act` raises it twice over.
+
+    Args:
+      control: Filtered control signal of the last control step [20], normalised.
+    """
+    control = np.asarray(control, np.float64)
+    self._filter.reset(control)
+    if self._amplitude < _LOCKABLE:
+      return
+    applied = (self._middle + self._half_range * control)[legs.COLUMNS]
+
+    def mismatch(phase: float, amplitude: float) -> float:
+      targets = self._clip(self._targets(phase, amplitude))[legs.COLUMNS]
+      return float(np.sum((targets - applied) ** 2))
+
+    phase, amplitude = self._phase, self._amplitude
+    found = min(
+      (phase, phase - _PHASE_CORRECTION, phase + _PHASE_CORRECTION),
+      key=lambda candidate: mismatch(candidate, amplitude),
+    )
+    self._phase = found % (2 * np.pi)
+    lower = amplitude - 2 * _TIMESTEP / self.settings.stop_time
+    if mismatch(found, lower) < mismatch(found, amplitude):
+      self._amplitude = lower
+
+  def _targets(self, phase: float, amplitude: float) -> np.ndarray:
     """Returns the position targets [20] that shall leave the action filter."""
     settings = self.settings
+    gyroscope, gravity = self._feedback
     ahead = phase + 2 * np.pi * settings.lead / settings.period
-    pattern = self.pattern(ahead, self._forward, self._turn, self._amplitude)
+    pattern = self.pattern(ahead, self._forward, self._turn, amplitude)
     targets = self._standing.copy()
+    if self._head is not None:
+      targets[_HEAD] += self._crouched * (np.asarray(self._head) - targets[_HEAD])
     if gyroscope is not None:
       roll = settings.roll_rate_gain * gyroscope[0]
       pitch = settings.pitch_rate_gain * gyroscope[1]
@@ -176,13 +220,13 @@ class Gait:
       angles.append(leg)
     return np.stack(angles)
 
+  def _clip(self, targets: np.ndarray) -> np.ndarray:
+    return np.clip(targets, self._middle - self._half_range, self._middle + self._half_range)
+
   def _invert(self, targets: np.ndarray) -> np.ndarray:
     """Returns the action whose filtered value comes nearest to the targets."""
     strength = self._filter.strength
-    wanted = (
-      np.clip(targets, self._middle - self._half_range, self._middle + self._half_range)
-      - self._middle
-    ) / self._half_range
+    wanted = (self._clip(targets) - self._middle) / self._half_range
     assert self._filter.value is not None
     action = np.clip((wanted - strength * self._filter.value) / (1 - strength), -1.0, 1.0)
     action = action.astype(np.float32)

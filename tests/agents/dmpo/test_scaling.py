@@ -8,6 +8,7 @@ import pytest
 from nerf2real.agents.dmpo import config, export, learning, networks, scaling
 from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.core.serialization import to_plain
 
 LAYOUT = Layout("camera", (6, 8, 3), ("a", "b"), (3, 2), ("privileged/p",), (4,), 2)
 CONFIG = config.override(
@@ -59,7 +60,7 @@ def _exported(state, folder):
     learning.served_parameters(state),
     layout=LAYOUT,
     environment="test",
-    settings=config.to_dict(CONFIG),
+    settings=to_plain(CONFIG),
     info={},
   )
   return export.load_policy(folder).policy

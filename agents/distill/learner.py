@@ -1,0 +1,415 @@
+"""The learner of a distillation: takes labelled episodes in, trains the student stage by stage.
+
+What a run leaves in its folder: `data/` (episodes), `state.npz` (the learner's state),
+`settings.json`, `policy/newest` (the exported student) and `metrics.jsonl`. All of it is written
+whole; a killed run goes on from its last state with all its episodes.
+"""
+
+import dataclasses
+import io
+import json
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import zenoh
+
+from nerf2real.agents.distill import settings as stages
+from nerf2real.agents.distill import student
+from nerf2real.agents.distill.dataset import Dataset, Span, Streams, Unroll
+from nerf2real.agents.distill.features import FeatureCache
+from nerf2real.agents.distill.learning import TrainingState, make_updates
+from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
+from nerf2real.agents.dmpo import scaling
+from nerf2real.agents.dmpo.export import export_policy, load_arrays
+from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
+from nerf2real.agents.link.server import LearnerLink
+from nerf2real.agents.link.sessions import LinkSettings
+from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.processes.logs import MetricsLog
+from nerf2real.agents.processes.timings import StageTimes
+from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain, write_json
+
+_log = logging.getLogger(__name__)
+STATE = "state.npz"
+POLICY = Path("policy") / "newest"
+_WAIT = 0.5  # s between looks for the first frames
+_SLACK = 10_000  # frames that collectors may be on the way with when the run has all
+_FINAL_RATE = 0.02  # of the learning rate, at a stage's end
+_VALIDATION_EPISODES = 8
+_VALIDATION_PERIOD = 120.0  # s
+_VALIDATION_ROUND = 200  # steps: lengths are padded to multiples of it, so that few are compiled
+_UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Counters:
+  """What a saved state says besides arrays."""
+
+  updates: int = 0
+  elapsed: float = 0.0  # s of training, over all parts of the run
+  begun: int | None = None  # frames at which the first student was published
+
+
+def stage_at(settings: DistillSettings, progress: float) -> tuple[int, float]:
+  """Returns the stage's index and the progress within it, at a progress of the run in [0, 1]."""
+  begin = 0.0
+  for index, stage in enumerate(settings.stages):
+    if progress < begin + stage.share or index == len(settings.stages) - 1:
+      return index, min(1.0, (progress - begin) / stage.share)
+    begin += stage.share
+  raise AssertionError("a distillation has at least one stage")
+
+
+def cosine(progress: float) -> float:
+  """The learning rate's factor: from 1 to `_FINAL_RATE` along half a cosine."""
+  return _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + float(np.cos(np.pi * progress)))
+
+
+class Learner:
+  """Owns data set, student and link; `run` trains until its minutes are over."""
+
+  def __init__(
+    self,
+    settings: DistillSettings,
+    run: Path,
+    *,
+    session: zenoh.Session,
+    link: LinkSettings,
+    seed: int,
+    minutes: float,
+    resume: bool,
+  ):
+    """Begins a run or continues one.
+
+    Args:
+      settings: of the distillation.
+      run: the run's folder.
+      session: from `sessions.listen`.
+      link: the link's settings.
+      seed: of first weights, augmentation and sampling.
+      minutes: training time over all parts of the run [min].
+      resume: continues the run in the folder.
+
+    Raises:
+      ValueError: the folder holds a run already, or none to continue.
+    """
+    self._settings, self._run, self._minutes = settings, run, minutes
+    if (run / SETTINGS).exists() != resume:
+      raise ValueError(
+        f"{run} holds no run to continue: leave --resume out."
+        if resume
+        else f"{run} holds a run already: continue it with --resume, or take another folder."
+      )
+    environment = make_environment(settings.environment, seed=seed)
+    self._layout = Layout.of(environment)
+    environment.close()
+    self._data = Dataset(
+      run / "data",
+      self._layout,
+      capacity=settings.max_frames + _SLACK,
+      holdout=settings.holdout,
+    )
+    self._updates = make_updates(settings, self._layout)
+    self._state = self._updates.init(jax.random.PRNGKey(seed))
+    self._counters = Counters()
+    if (run / STATE).exists():
+      self._state, self._counters = load_state(run / STATE, like=self._state)
+    write_json(run / SETTINGS, settings)
+    self._rng = np.random.default_rng((seed, self._data.frames))
+    self._cache = FeatureCache(
+      self._updates.features, self._data, copies=settings.copies, width=self._width, seed=seed
+    )
+    limiter = RateLimiter(
+      LimiterSettings(
+        steps_per_update=1.0,
+        min_replay_steps=settings.max_frames,
+        trajectory_steps=1,
+        max_steps=settings.max_frames,
+      ),
+      steps=self._data.frames,
+    )
+    self._log = MetricsLog(run, tensorboard=False)
+    self._times = StageTimes()
+    self._stop = threading.Event()
+    self._last: dict[str, float] = {}  # times of the last periodical work
+    self._is_fit = False  # whether encoder and policy belong together now
+    self._recent: list[dict[str, jax.Array]] = []
+    self._link = LearnerLink(
+      session,
+      link,
+      limiter=limiter,
+      insert=self._data.insert,
+      known=self._data.origins,
+      description={
+        "settings": to_plain(settings),
+        "layout": to_plain(self._layout),
+        "begin_frames": self._data.frames,
+        "begun": self._counters.begun,
+      },
+    )
+    if (run / POLICY).exists():
+      self._link.publish_parameters(
+        load_arrays(run / POLICY), version=max(1, self._counters.updates)
+      )
+
+  @property
+  def _width(self) -> int:
+    return self._settings.agent.network.image_features
+
+  @property
+  def _progress(self) -> float:
+    return self._counters.elapsed / (60.0 * self._minutes)
+
+  def stop(self) -> None:
+    """Ends `run` with a saved state; safe in a signal handler."""
+    self._stop.set()
+
+  def run(self) -> None:
+    """Trains until the minutes are over or `stop` is called.
+
+    Raises:
+      RuntimeError: episodes can no longer be taken in.
+    """
+    try:
+      self._wait_for_first_frames()
+      while not self._stop.is_set() and self._progress < 1.0:
+        index, _ = stage_at(self._settings, self._progress)
+        self._run_stage(index)
+    finally:
+      self._save()
+      self._link.stop_actors()
+      self._drain_metrics()
+      self._log.close()
+
+  def close(self) -> None:
+    """Leaves the link."""
+    self._link.close()
+
+  def _wait_for_first_frames(self) -> None:
+    while self._data.frames < self._settings.first_frames and not self._stop.is_set():
+      self._check_link()
+      self._drain_metrics()
+      self._stop.wait(_WAIT)
+    if self._counters.updates or self._stop.is_set():
+      return
+    frames = self._training_frames(self._data.frames)
+    rows = {"state": self._data.arrays["state"][frames]}
+    layout = dataclasses.replace(self._layout, privileged_names=(), privileged_sizes=())
+    labels = self._data.arrays["label"][frames]
+    spread = np.maximum(labels.std(0), self._settings.min_action_spread)
+    self._state = self._state._replace(
+      scales=jax.tree.map(jnp.asarray, scaling.measure(rows, layout)), spread=jnp.asarray(spread)
+    )
+    # Before the first update the student does what the teacher does on average.
+    self._state.student["policy"]["mean"]["b"] = jnp.asarray(labels.mean(0))
+    _log.info("Training begins with %d frames.", self._data.frames)
+
+  # ---- stages ----
+
+  def _run_stage(self, index: int) -> None:
+    kind = self._settings.stages[index].kind
+    _log.info("Stage %d: %s.", index, kind)
+    begin = time.monotonic()
+    self._recent.clear()
+    done = 0
+    if kind == stages.POLICY:
+      self._cache.clear()
+    count = (
+      self._settings.end_to_end_streams if kind == stages.END_TO_END else self._settings.streams
+    )
+    streams = Streams(count, self._settings.unroll, rng=self._rng)
+    carried = student.initial_state(count, self._settings.agent.network)
+    while not self._stop.is_set() and self._progress < 1.0:
+      current, within = stage_at(self._settings, self._progress)
+      if current != index:
+        break
+      if kind == stages.ENCODER:
+        metrics = self._update_encoder(within)
+      else:
+        carried, metrics = self._update_unrolls(kind, streams, carried, within)
+      now = time.monotonic()
+      self._counters = dataclasses.replace(
+        self._counters,
+        updates=self._counters.updates + 1,
+        elapsed=self._counters.elapsed + now - begin,
+      )
+      begin = now
+      self._recent.append(metrics)
+      done += 1
+      # While the encoder learns, and until the policy knows its new features, the two do not fit.
+      self._is_fit = kind == stages.END_TO_END or (
+        kind == stages.POLICY and done >= self._settings.settling
+      )
+      if self._is_fit and self._counters.begun is None:
+        self._counters = dataclasses.replace(self._counters, begun=self._data.frames)
+        self._publish()
+      self._housekeeping(kind)
+    self._save()
+
+  def _update_encoder(self, within: float) -> dict[str, jax.Array]:
+    with self._times.stage("sampling"):
+      frames = self._training_frames(self._data.frames)
+      chosen = self._rng.choice(frames, self._settings.encoder_batch)
+      image, pose = (self._data.arrays[name][chosen] for name in ("image", "pose"))
+    with self._times.stage("update"):
+      rate = self._settings.learning_rate * cosine(within)
+      self._state, metrics = self._updates.encoder(self._state, image, pose, rate)
+      jax.block_until_ready(metrics)
+    return metrics
+
+  def _update_unrolls(
+    self, kind: str, streams: Streams, carried: Any, within: float
+  ) -> tuple[Any, dict[str, jax.Array]]:
+    cached = kind == stages.POLICY
+    if cached:
+      with self._times.stage("features"):
+        self._cache.extend(self._state.student["encoder"])
+    with self._times.stage("sampling"):
+      limit = self._cache.frames if cached else self._data.frames
+      spans = [s for s in self._data.spans(held_out=False) if s.end <= limit]
+      unroll = streams.next(spans)
+      batch = self._batch(unroll)
+      if cached:
+        batch["features"] = self._cache.take(unroll.frames, self._rng)
+      else:
+        batch["image"] = self._data.arrays["image"][unroll.frames]
+    with self._times.stage("update"):
+      update = self._updates.policy if cached else self._updates.end_to_end
+      settings = self._settings
+      rate = settings.learning_rate if cached else settings.end_to_end_learning_rate
+      self._state, carried, metrics = update(self._state, batch, carried, rate * cosine(within))
+      jax.block_until_ready(metrics)
+    return carried, metrics
+
+  def _batch(self, unroll: Unroll) -> dict[str, np.ndarray]:
+    batch = {name: self._data.arrays[name][unroll.frames] for name in _UNROLL_FIELDS}
+    return batch | {"begins": unroll.begins}
+
+  def _training_frames(self, limit: int) -> np.ndarray:
+    """Indices of the frames that are not held out."""
+    spans = [s for s in self._data.spans(held_out=False) if s.end <= limit]
+    return np.concatenate([np.arange(span.begin, span.end) for span in spans])
+
+  # ---- periodical work ----
+
+  def _due(self, name: str, period: float) -> bool:
+    now = time.monotonic()
+    if now - self._last.setdefault(name, now) < period:
+      return False
+    self._last[name] = now
+    return True
+
+  def _housekeeping(self, kind: str) -> None:
+    settings = self._settings
+    if self._is_fit and self._due("publish", settings.publish_period):
+      self._publish()
+    if self._due("save", settings.save_period):
+      with self._times.stage("saving"):
+        self._save()
+    if self._due("log", settings.log_period):
+      self._check_link()
+      self._drain_metrics()
+      values = {name: float(np.mean([m[name] for m in self._recent])) for name in self._recent[0]}
+      figures = {"stage": kind, "minutes": self._counters.elapsed / 60, "progress": self._progress}
+      self._write("learner", values | figures | self._times.take(len(self._recent)))
+      self._recent.clear()
+    if self._due("validate", _VALIDATION_PERIOD):
+      with self._times.stage("validation"):
+        self._write("validation", self._validate())
+
+  def _check_link(self) -> None:
+    if self._link.failure:
+      raise RuntimeError(f"Episodes are no longer taken in: {self._link.failure}")
+
+  def _write(self, source: str, values: Mapping[str, Any]) -> None:
+    self._log.write(source, values, steps=self._data.frames, updates=self._counters.updates)
+    if source in ("learner", "validation", "evaluator"):
+      shown = {n: round(v, 4) if isinstance(v, float) else v for n, v in values.items()}
+      _log.info("%d frames, %s: %s", self._data.frames, source, shown)
+
+  def _drain_metrics(self) -> None:
+    while not self._link.metrics.empty():
+      who, values = self._link.metrics.get()
+      self._write("evaluator" if who.startswith("evaluator") else who, values)
+
+  def _validate(self) -> dict[str, float]:
+    """Errors on episodes that were held out, clean pictures, student not driving."""
+    held = self._data.spans(held_out=True)
+    if not held:
+      return {}
+    chosen = [held[i] for i in np.linspace(0, len(held) - 1, _VALIDATION_EPISODES).astype(int)]
+    longest = max(span.end - span.begin for span in chosen)
+    length = -(-longest // _VALIDATION_ROUND) * _VALIDATION_ROUND
+    frames = np.stack([_padded(span, length) for span in chosen])
+    present = np.arange(length) < np.array([[s.end - s.begin] for s in chosen])
+    begins = np.zeros(frames.shape, np.float32)
+    begins[:, 0] = 1.0
+    batch = self._batch(Unroll(frames, begins))
+    features = self._cache.clean(self._state.student["encoder"], frames.ravel())
+    batch["features"] = features.reshape(*frames.shape, -1).astype(np.float32)
+    found = jax.device_get(self._updates.predict(self._state, batch))
+    return {name: float(np.median(values[present])) for name, values in found.items()}
+
+  def _publish(self) -> None:
+    arrays = student.served_parameters(self._state.student, self._state.scales)
+    # Version 0 stands for no student in the link.
+    self._link.publish_parameters(arrays, version=max(1, self._counters.updates))
+
+  def _save(self) -> None:
+    save_state(self._run / STATE, self._state, self._counters)
+    if not self._is_fit:
+      return
+    self._publish()
+    export_policy(
+      self._run / POLICY,
+      student.served_parameters(self._state.student, self._state.scales),
+      layout=self._layout,
+      environment=self._settings.environment,
+      settings=to_plain(self._settings.agent),
+      info={
+        "steps": self._data.frames,
+        "updates": self._counters.updates,
+        "teacher": self._settings.teacher,
+      },
+    )
+
+
+def _padded(span: Span, length: int) -> np.ndarray:
+  return np.minimum(np.arange(span.begin, span.begin + length), span.end - 1)
+
+
+def save_state(path: Path, state: TrainingState, counters: Counters) -> None:
+  """Writes a training state whole: its leaves in order, and the counters as JSON."""
+  leaves = {f"leaf{i:04d}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
+  about = np.frombuffer(json.dumps(to_plain(counters)).encode(), np.uint8)
+  buffer = io.BytesIO()
+  np.savez(buffer, counters=about, **leaves)  # type: ignore[arg-type]
+  files.write_atomically(path, buffer.getvalue())
+
+
+def load_state(path: Path, *, like: TrainingState) -> tuple[TrainingState, Counters]:
+  """Reads what `save_state` wrote.
+
+  Args:
+    path: the file.
+    like: a state of the same settings.
+
+  Raises:
+    ValueError: it is of other settings.
+  """
+  with np.load(path, allow_pickle=False) as stored:
+    counters = from_plain(json.loads(stored["counters"].tobytes()), Counters)
+    found = [stored[name] for name in sorted(n for n in stored.files if n.startswith("leaf"))]
+  expected, structure = jax.tree.flatten(like)
+  if [x.shape for x in found] != [x.shape for x in expected]:
+    raise ValueError(f"{path} is of other networks than the settings: take those it began with.")
+  return jax.tree.unflatten(structure, [jnp.asarray(x) for x in found]), counters
