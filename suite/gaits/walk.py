@@ -23,6 +23,8 @@ _HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")
 # rad by which `follow` corrects the phase in a control step; chosen: a third of what the gait
 # itself advances, so that half a period is caught up in 26 steps.
 _PHASE_CORRECTION = 0.12
+_ROVING = 8  # further phases that `follow` tries in turn
+_JUMP_SHARE = 0.5  # of the present mismatch below which it takes one of them; chosen
 _LOCKABLE = 0.5  # amplitude from which a phase can be told from the legs; chosen
 
 
@@ -97,13 +99,18 @@ class Gait:
 
   def reset(self) -> None:
     """Begins an episode: the robot stands in the reference pose."""
-    self._filter.reset((self._standing - self._middle) / self._half_range)
+    self._filter.reset(self._standing_control())
+    self._before = self._standing_control()  # filter's value before the last action
     self._phase = 0.0
+    self._roving = 0
     self._amplitude = 0.0
     self._forward = self._turn = 0.0
     self._crouched = 0.0  # share of the way from the reference pose to the gait's own
     self._head: tuple[float, float] | None = None
     self._feedback: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+
+  def _standing_control(self) -> np.ndarray:
+    return (self._standing - self._middle) / self._half_range
 
   @property
   def phase(self) -> float:
@@ -141,31 +148,38 @@ class Gait:
   def follow(self, control: np.ndarray) -> None:
     """Sets the hidden state to a control that was applied in place of this gait's own.
 
-    To be called after `act`. The filter takes the control's value. Phase and amplitude move
-    towards those whose pattern comes nearest to it in the legs, by one step of a search each: the
-    phase by up to 0.12 rad either way, the amplitude down by what `act` raises it twice over.
+    To be called after `act`. The filter takes the control's value. The phase is locked to it: of
+    the present phase, one a little before, one a little behind and one further away, a different
+    one at every call, that is kept from which this gait's own control would have come nearest in
+    the legs. The amplitude sinks, twice as fast as `act` raises it, while a lower one comes nearer.
 
     Args:
       control: Filtered control signal of the last control step [20], normalised.
     """
     control = np.asarray(control, np.float64)
+    before, self._before = self._before, control
     self._filter.reset(control)
     if self._amplitude < _LOCKABLE:
       return
-    applied = (self._middle + self._half_range * control)[legs.COLUMNS]
 
     def mismatch(phase: float, amplitude: float) -> float:
-      targets = self._clip(self._targets(phase, amplitude))[legs.COLUMNS]
-      return float(np.sum((targets - applied) ** 2))
+      wanted = self._wanted(self._targets(phase, amplitude))
+      own = before + (1 - self._filter.strength) * (self._inverse(wanted, before) - before)
+      return float(np.sum((own - control)[legs.COLUMNS] ** 2))
 
-    phase, amplitude = self._phase, self._amplitude
-    found = min(
-      (phase, phase - _PHASE_CORRECTION, phase + _PHASE_CORRECTION),
-      key=lambda candidate: mismatch(candidate, amplitude),
-    )
-    self._phase = found % (2 * np.pi)
-    lower = amplitude - 2 * _TIMESTEP / self.settings.stop_time
-    if mismatch(found, lower) < mismatch(found, amplitude):
+    phase, present = self._phase, mismatch(self._phase, self._amplitude)
+    self._roving = (self._roving + 1) % _ROVING
+    for step, share in (
+      (-_PHASE_CORRECTION, 1.0),
+      (_PHASE_CORRECTION, 1.0),
+      (2 * np.pi * (self._roving + 0.5) / _ROVING, _JUMP_SHARE),
+    ):
+      found = mismatch(self._phase + step, self._amplitude)
+      if found < share * present:
+        phase, present = self._phase + step, found
+    self._phase = phase % (2 * np.pi)
+    lower = self._amplitude - 2 * _TIMESTEP / self.settings.stop_time
+    if mismatch(phase, lower) < present:
       self._amplitude = lower
 
   def _targets(self, phase: float, amplitude: float) -> np.ndarray:
@@ -220,16 +234,20 @@ class Gait:
       angles.append(leg)
     return np.stack(angles)
 
-  def _clip(self, targets: np.ndarray) -> np.ndarray:
-    return np.clip(targets, self._middle - self._half_range, self._middle + self._half_range)
+  def _wanted(self, targets: np.ndarray) -> np.ndarray:
+    """Returns the control signal [20] that brings position targets about, within the limits."""
+    return np.clip((targets - self._middle) / self._half_range, -1.0, 1.0)
+
+  def _inverse(self, wanted: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Returns the action whose filtered value, from `before`, comes nearest to a control [20]."""
+    strength = self._filter.strength
+    return np.clip((wanted - strength * before) / (1 - strength), -1.0, 1.0)
 
   def _invert(self, targets: np.ndarray) -> np.ndarray:
     """Returns the action whose filtered value comes nearest to the targets."""
-    strength = self._filter.strength
-    wanted = (self._clip(targets) - self._middle) / self._half_range
     assert self._filter.value is not None
-    action = np.clip((wanted - strength * self._filter.value) / (1 - strength), -1.0, 1.0)
-    action = action.astype(np.float32)
+    self._before = self._filter.value
+    action = self._inverse(self._wanted(targets), self._before).astype(np.float32)
     self._filter(action)
     return action
 
