@@ -6,8 +6,6 @@ import yaml
 
 from nerf2real.core.cameras import Camera
 
-PIXEL_CENTRE = 0.5  # ROS and OpenCV have the first pixel's centre at 0, `Camera` at 0.5
-
 
 def read_camera_info(path: Path) -> Camera:
   """Reads a camera_info YAML as ROS and `real.camera.calibration` write it.
@@ -31,15 +29,4 @@ def read_camera_info(path: Path) -> Camera:
       f"{path} has the distortion {model!r} with k3 = {rest}, expected plumb_bob with k3 = 0: "
       "calibrate again with two radial terms."
     )
-  return Camera(
-    width=size[0],
-    height=size[1],
-    fx=float(matrix[0]),
-    fy=float(matrix[4]),
-    cx=float(matrix[2]) + PIXEL_CENTRE,
-    cy=float(matrix[5]) + PIXEL_CENTRE,
-    k1=k1,
-    k2=k2,
-    p1=p1,
-    p2=p2,
-  )
+  return Camera.from_opencv(*size, matrix, (k1, k2, p1, p2))

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from scipy import ndimage
 
 from nerf2real.core.rotations import yaw_quaternion
 from nerf2real.suite.op3 import constants
@@ -19,6 +18,7 @@ PERTURBATIONS = (NONE, BLOCKED_CAMERA, MOVED_OBJECT, PERSON)
 BLOCKED = (3.0, 6.0)  # s of an episode in which the camera sees nothing: ours
 PERSON_SPEED = 0.4  # m/s: a slow walk, ours
 _CLEAR = 0.5  # m that a moved object keeps from starts and goals: ours
+_GRID = 0.1  # m between the places that are looked at
 _PREFIX = "perturbation"
 ROBOT_PREFIX = "op3/"  # of the robot's geoms, in simulation and in the virtual robot's world
 _WOOD, _CLOTH, _SKIN = (0.45, 0.30, 0.18, 1.0), (0.20, 0.28, 0.45, 1.0), (0.80, 0.60, 0.48, 1.0)
@@ -156,7 +156,8 @@ def make_intruder(perturbation: str, scene: Any, *, keep_clear: np.ndarray) -> I
     raise ValueError(f"Unknown perturbation {perturbation!r}: expected one of {PERTURBATIONS}.")
   if perturbation in (NONE, BLOCKED_CAMERA):
     return None
-  points, clearance = _clearance(scene)
+  floor = scene.free_space.grid(scene.extent, _GRID)
+  points, clearance = floor.centres[floor.free], floor.clearance[floor.free]
   away = (
     np.linalg.norm(points[:, None] - keep_clear, axis=-1).min(axis=1) if len(keep_clear) else 9.0
   )
@@ -172,7 +173,7 @@ def make_intruder(perturbation: str, scene: Any, *, keep_clear: np.ndarray) -> I
   # The person crosses the room through that place along the longer free direction.
   free = {tuple(np.round(point, 3)) for point in points[away > _CLEAR]}
   lines = []
-  for direction in ((0.1, 0.0), (0.0, 0.1)):
+  for direction in ((_GRID, 0.0), (0.0, _GRID)):
     ends = []
     for sign in (-1, 1):
       end = middle
@@ -183,18 +184,6 @@ def make_intruder(perturbation: str, scene: Any, *, keep_clear: np.ndarray) -> I
   return Intruder(
     _PERSON, max(lines, key=lambda line: float(np.ptp(line, axis=0).max())), speed=PERSON_SPEED
   )
-
-
-def _clearance(scene: Any) -> tuple[np.ndarray, np.ndarray]:
-  """Returns free places [N, 2] on a grid of 0.1 m and their distance from what is not free [N]."""
-  lower, upper = (np.asarray(corner, np.float64)[:2] for corner in scene.extent)
-  x, y = (np.arange(lower[i] + 0.05, upper[i], 0.1) for i in range(2))
-  grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-  free = np.asarray(scene.free_space.is_reachable(grid.reshape(-1, 2)), bool).reshape(
-    grid.shape[:2]
-  )
-  distance = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * 0.1
-  return grid[free], distance[free]
 
 
 def is_blocked(perturbation: str, time: float) -> bool:

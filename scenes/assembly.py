@@ -1,10 +1,8 @@
-"""Puts a bundle together from finished stages: files, figures, report, and scene.json last."""
+"""Assembles a scene bundle from finished stages: files, figures, report, scene.json last."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,135 +11,98 @@ import trimesh
 from nerf2real.core import files
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
-from nerf2real.scenes.field.render.renderer import Renderer
-from nerf2real.scenes.geometry import align, collision, convex, free_space, fusion
-from nerf2real.scenes.poses import localise
-from nerf2real.scenes.quality import held_out as evaluate
-from nerf2real.scenes.quality import report
+from nerf2real.scenes.geometry import collision, convex, free_space, map_server, mesh
+from nerf2real.scenes.quality import held_out, report
+from nerf2real.scenes.results import Measure, Reconstruction, SceneResults
+from nerf2real.scenes.settings import SceneSettings
+from nerf2real.scenes.stages import StageResult
 
-if TYPE_CHECKING:
-  from nerf2real.scenes.pipeline import Job
-
-_NOTICEABLE_EXPOSURE = 1.25  # ours: a ratio above this is warned of
+_NOTICEABLE_EXPOSURE = 1.25  # a ratio above this is warned of
 _ROBOT_VIEWS = 8  # held-out views shown at robot resolution where no truth gives better ones
 _MAP_SCALE = 6  # pixels of the report's map per cell
 
-_FILES = (  # stage and what it gives to the bundle
-  ("poses", "sfm"),
-  ("field", "field.safetensors"),
-  ("surface", "visual.glb"),
-  ("contact", "collision"),
-  ("contact", "free_space.pgm"),
-  ("contact", "free_space.yaml"),
-)
 
-
-class Reconstruction(NamedTuple):
-  """What was made of a capture, for measurements against a truth."""
-
-  localisation: localise.Localisation
-  renderer: Renderer
-  alignment: align.Alignment
-  parts: list[convex.Part]
-  depth: fusion.DepthViews  # in the world frame
-  frame_times: np.ndarray  # of the registered keyframes in the video [N] [s]
-  collision_top: float  # height up to which contact geometry is made [m]
-
-
-class TruthFigures(NamedTuple):
-  """What a measurement against a known truth returns."""
-
-  figures: Mapping[str, Any]
-  robot_views: list[evaluate.ViewScore]
-
-
-Measure = Callable[[Reconstruction], TruthFigures]
-
-
-def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bundle.Bundle:
-  """Copies the results together, measures them against a truth and writes the report.
+def assemble(
+  results: SceneResults,
+  out: Path,
+  *,
+  name: str,
+  settings: SceneSettings,
+  stages: Mapping[str, StageResult],
+  measure: Measure | None,
+) -> bundle.Bundle:
+  """Copies the results together, measures them against a truth and writes report and scene.json.
 
   Args:
-    job: A job whose stages have all run.
+    results: What the stages made.
     out: The bundle's folder.
     name: The scene's name.
+    settings: Settings of the job.
+    stages: All stages that ran, for their keys and times.
     measure: Measures against a truth, or None.
   """
   (out / "scene.json").unlink(missing_ok=True)
-  for stage, item in _FILES:
-    files.copy_atomically(job.folder(stage) / item, out / item)
-  contact = job.load("contact", "contact.json")
+  _copy_files(results, out)
   parts = collision.read_parts(out / "collision")
-  figures = _figures(job, contact)
+  figures = _figures(results)
   if measure is not None:
-    truth = measure(
-      Reconstruction(
-        job.localisation,
-        job.renderer,
-        job.alignment,
-        parts,
-        job.world_depth,
-        _frame_times(job),
-        job.settings.collision.top,
-      )
-    )
+    truth = measure(_reconstruction(results, parts, collision_top=settings.collision.top))
     figures |= truth.figures
     robot_views = truth.robot_views
   else:
-    robot_views = _robot_views(job)
+    robot_views = _robot_views(results)
   baseline: Mapping[str, np.ndarray] = {}
-  if job.settings.baseline == "colmap":
-    baseline = np.load(job.folder("baseline") / "views.npz")
-    figures |= job.load("baseline", "figures.json")
-  results = job.stages.results
-  seconds = {stage: result.seconds for stage, result in results.items()}
-  warnings = [*job.capture.warnings, *job.localisation.warnings, *job.alignment.warnings]
+  if results.baseline is not None:
+    baseline = np.load(results.baseline.stage.folder / "views.npz")
+    figures |= results.baseline.value
+  capture, poses, alignment = results.capture.value, results.poses.value, results.world.value
+  seconds = {stage: result.seconds for stage, result in stages.items()}
+  warnings = [*capture.warnings, *poses.warnings, *alignment.warnings]
   ratio = figures.get("exposure_ratio", 1.0)
   if ratio > _NOTICEABLE_EXPOSURE:
     warnings.append(
       f"Exposure changed by a factor of {ratio:.1f} while filming. It was evened out, but clipped "
       "highlights stay; lock the phone's exposure."
     )
-  settings = to_plain(job.settings)
-  transform = job.alignment.world_from_unit
-  path = transform.apply(job.localisation.world_from_camera[:, :3, 3])
-  goals = np.array(contact["goals"])
-  space = free_space.read(out / "free_space.yaml")
+  goals = results.contact.value.goals
+  path = alignment.world_from_unit.apply(poses.world_from_camera[:, :3, 3])
   report.write(
     out / "report.html",
     report.ReportData(
       title=f"Scene {name}",
-      lead=f"Made from {job.source.name}: a radiance field, contact geometry and a world frame.",
+      lead=f"Made from {results.source.path.name}: a radiance field, contact geometry and a world "
+      "frame.",
       figures=figures,
       seconds=seconds,
       warnings=warnings,
-      settings=settings,
-      keyframes=job.capture.images,
-      strategy=job.localisation.strategy,
+      settings=to_plain(settings),
+      keyframes=capture.images,
+      strategy=poses.strategy,
       camera_path=path,
-      views=evaluate.load_scores(job.folder("figures")),
+      views=held_out.load_scores(results.figures.stage.folder),
       robot_views=robot_views,
       baseline=baseline,
-      visual=trimesh.load_mesh(out / "visual.glb"),
+      visual=mesh.load_glb(out / "visual.glb"),
       collision=[trimesh.Trimesh(part.vertices, part.faces) for part in parts],
-      free_space_picture=_map_picture(space, goals, path),
+      free_space_picture=_map_picture(map_server.read(out / "free_space.yaml"), goals, path),
     ),
   )
   scene = {
     "name": name,
-    "source": {"name": job.source.name, "kind": job.capture.kind, "sha256": job.source_key},
-    "settings": settings,
-    "hashes": {stage: result.key for stage, result in results.items()},
-    "world_from_unit": to_plain(transform),
-    "scale": job.alignment.scale_source,
-    "alignment": to_plain(job.alignment),
-    "extent": {
-      "lower": job.alignment.extent_lower.tolist(),
-      "upper": job.alignment.extent_upper.tolist(),
+    "source": {
+      "name": results.source.path.name,
+      "kind": capture.kind,
+      "sha256": results.source.sha256,
     },
-    "goals": contact["goals"],
-    "camera": to_plain(job.localisation.camera),
-    "collision_parts": sorted(path.name for path in (out / "collision").glob("part_*.obj")),
+    "settings": settings,
+    "hashes": {stage: result.key for stage, result in stages.items()},
+    "world_from_unit": alignment.world_from_unit,
+    "scale": alignment.scale_source,
+    "alignment": alignment,
+    "extent": {"lower": alignment.extent_lower, "upper": alignment.extent_upper},
+    "goals": goals,
+    "camera": poses.camera,
+    "collision_parts": sorted(file.name for file in (out / "collision").glob("part_*.obj")),
     "figures": figures,
     "seconds": seconds,
     "warnings": warnings,
@@ -150,42 +111,66 @@ def assemble(job: Job, out: Path, *, name: str, measure: Measure | None) -> bund
   return bundle.Bundle.load(out)
 
 
-def _figures(job: Job, contact: Mapping[str, Any]) -> dict[str, Any]:
-  held_out = job.load("figures", "figures.json")
-  camera = job.localisation.camera
+def _copy_files(results: SceneResults, out: Path) -> None:
+  for stage, item in (
+    (results.poses.stage, "sfm"),
+    (results.field.stage, "field.safetensors"),
+    (results.surface, "visual.glb"),
+    (results.contact.stage, "collision"),
+    (results.contact.stage, "free_space.pgm"),
+    (results.contact.stage, "free_space.yaml"),
+  ):
+    files.copy_atomically(stage.folder / item, out / item)
+
+
+def _figures(results: SceneResults) -> dict[str, Any]:
+  capture, poses, alignment = results.capture.value, results.poses.value, results.world.value
+  quality, contact = results.figures.value, results.contact.value
   return {
-    "keyframes": len(job.capture.images),
-    "registered_fraction": job.localisation.registered_fraction,
-    "reprojection_error_px": job.localisation.reprojection_error_px,
-    "focal_length_px": 0.5 * (camera.fx + camera.fy),
-    **held_out,
-    "robot_psnr_db": held_out["held_out_psnr_30x40_db"],
-    "collision_error_m": contact["collision_error_m"],
-    "collision_error": contact["collision_error"],
-    "collision_parts": contact["collision_parts"],
-    "free_area_m2": contact["free_area_m2"],
-    "floor_tilt_from_cameras_deg": job.alignment.floor_tilt_from_cameras_deg,
-    "scale_source": job.alignment.scale_source,
-    "scale_spread": job.alignment.scale_spread,
+    "keyframes": len(capture.images),
+    "registered_fraction": poses.registered_fraction,
+    "reprojection_error_px": poses.reprojection_error_px,
+    "focal_length_px": 0.5 * (poses.camera.fx + poses.camera.fy),
+    **quality,
+    "robot_psnr_db": quality["held_out_psnr_30x40_db"],
+    "collision_error_m": contact.collision_error_m,
+    "collision_error": to_plain(contact.collision_error),
+    "collision_parts": contact.collision_parts,
+    "free_area_m2": contact.free_area_m2,
+    "floor_tilt_from_cameras_deg": alignment.floor_tilt_from_cameras_deg,
+    "scale_source": alignment.scale_source,
+    "scale_spread": alignment.scale_spread,
   }
 
 
-def _frame_times(job: Job) -> np.ndarray:
-  """Times [N] of the registered keyframes [s]; empty where the capture was no video."""
-  if job.capture.times is None:
-    return np.zeros(0)
-  names = [path.name for path in job.capture.images]
-  return job.capture.times[[names.index(name) for name in job.localisation.names]]
+def _reconstruction(
+  results: SceneResults, parts: list[convex.Part], *, collision_top: float
+) -> Reconstruction:
+  """Gathers what is measured against a truth; no frame times where the capture was no video."""
+  capture, poses = results.capture.value, results.poses.value
+  times = np.zeros(0)
+  if capture.times is not None:
+    names = [path.name for path in capture.images]
+    times = capture.times[[names.index(name) for name in poses.names]]
+  return Reconstruction(
+    poses,
+    results.field.value.renderer,
+    results.world.value,
+    parts,
+    results.depth,
+    times,
+    collision_top,
+  )
 
 
-def _robot_views(job: Job) -> list[evaluate.ViewScore]:
+def _robot_views(results: SceneResults) -> list[held_out.ViewScore]:
   """Held-out views at the robot's resolution."""
-  _, held_out = job.views().split(job.settings.held_out_every)
-  shown = range(min(_ROBOT_VIEWS, len(held_out)))
-  return [evaluate.compare(job.renderer, held_out, k, *evaluate.ROBOT_SIZES[0]) for k in shown]
+  views, renderer = results.pictures.held_out(), results.field.value.renderer
+  shown = range(min(_ROBOT_VIEWS, len(views)))
+  return [held_out.compare(renderer, views, k, *held_out.ROBOT_SIZES[0]) for k in shown]
 
 
-def _map_picture(space: free_space.FreeSpace, goals: np.ndarray, path: np.ndarray) -> np.ndarray:
+def _map_picture(space: free_space.FreeSpaceMap, goals: np.ndarray, path: np.ndarray) -> np.ndarray:
   """Draws the map with goals [G, 2] and camera path [N, 3]: uint8 [H, W, 3], y upwards."""
   gray = np.full(space.cells.shape, 120, np.uint8)
   gray[space.cells == free_space.FREE] = 195

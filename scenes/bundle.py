@@ -16,7 +16,8 @@ import numpy as np
 
 from nerf2real.core.serialization import from_plain, write_json
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.geometry import free_space
+from nerf2real.scenes.geometry import map_server
+from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 
 FORMAT = "scene-bundle"
 FORMAT_VERSION = 1
@@ -123,9 +124,9 @@ class Bundle:
     return np.array(self.scene["goals"], np.float64).reshape(-1, 2)
 
   @functools.cached_property
-  def free_space(self) -> "free_space.FreeSpace":
+  def free_space(self) -> FreeSpaceMap:
     """The free floor area."""
-    return free_space.read(self.free_space_path)
+    return map_server.read(self.free_space_path)
 
   @property
   def figures(self) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""Stages of a long job: cached by the hash of what went in, resumed after an interruption.
+"""Caches the stages of a long job by the hash of their inputs; resumes interrupted ones.
 
 A stage writes into a work folder that carries its key. When it ends, the folder is renamed to its
 final name, so that a folder with that name is always whole. A second run with the same inputs and
@@ -14,11 +14,13 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from nerf2real.core import files
 from nerf2real.core.progress import Progress, progress_bar
 from nerf2real.core.serialization import to_plain
+
+T = TypeVar("T")
 
 _RECORD = "stage.json"
 _KEY_LENGTH = 16  # hexadecimal digits of the key in a folder's name
@@ -37,6 +39,18 @@ class StageResult:
   made: str  # drawn when it was made: two runs of equal settings may differ, as training does
   seconds: float  # how long it took, summed over interrupted runs
   cached: bool  # True where an earlier run had done it
+
+
+class Made(NamedTuple, Generic[T]):
+  """A stage's result and the folder that it was read from."""
+
+  value: T
+  stage: StageResult
+
+  @property
+  def stamp(self) -> str:
+    """Hash of this result as the input of other stages."""
+    return self.stage.made
 
 
 class Stages:

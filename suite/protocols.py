@@ -166,23 +166,12 @@ def scene_starts(scene: Any) -> np.ndarray:
   Raises:
     ValueError: The robot fits nowhere.
   """
-  lower, upper = (np.asarray(corner, np.float64)[:2] for corner in scene.extent)
-  x, y = (np.arange(lower[i] + _START_GRID / 2, upper[i], _START_GRID) for i in range(2))
-  points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-  free = points[np.asarray(scene.free_space.is_reachable(points), bool)]
+  floor = scene.free_space.grid(scene.extent, _START_GRID)
+  free = floor.centres[floor.free]
   goals = np.asarray(scene.goals, np.float64).reshape(-1, 2)
   for room in np.arange(START_ROOM, 0.0, -_START_ROOM_STEP):
-    wide = free[_has_room(scene.free_space, free, room)]
+    wide = free[scene.free_space.has_room(free, room)]
     far = np.linalg.norm(wide[:, None] - goals, axis=-1).min(axis=1, initial=np.inf)
     if np.count_nonzero(far >= MIN_GOAL_DISTANCE) >= NUM_POSITIONS:
       return navigation_starts(wide, goals)
   return navigation_starts(free, goals)
-
-
-def _has_room(free_space: Any, places: np.ndarray, room: float) -> np.ndarray:
-  """Returns whether the robot fits at places [N, 2] and all around them up to a distance [m]."""
-  angles = 2 * np.pi * np.arange(16) / 16
-  ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-  around = np.concatenate([room * ring, room / 2 * ring])
-  fits = np.asarray(free_space.is_reachable(places[:, None] + around), bool)
-  return np.all(fits, axis=1)

@@ -66,7 +66,7 @@ class RunSettings:
   """Environment steps between evaluations [steps]."""
   evaluation_episodes: int | None = None
   """Episodes of an evaluation; None: half of its protocol's trials, or 5 without a protocol."""
-  evaluation_environment: str | None = None
+  evaluation_env: str | None = None
   """The environment of the evaluations; None: `environments.evaluation_name` says."""
 
 
@@ -116,6 +116,8 @@ class Learner:
       self._init_from = info.get("init_from", "")
     elif settings.init_from is not None:
       self._state = _begin_with(settings.init_from, self._state, self.layout)
+    # Remembered: reading it from the state would wait for the update that the device works on.
+    self._scaled = scaling.is_measured(self._state.scaling)
     self.replay = self._open_replay(resume)
     limiter = self._make_limiter(info)
     self._log = MetricsLog(settings.run)
@@ -142,8 +144,7 @@ class Learner:
         "layout": to_plain(self.layout),
         "seed": settings.seed,
         "begin_steps": limiter.steps,
-        "evaluation_environment": settings.evaluation_environment
-        or evaluation_name(settings.environment),
+        "evaluation_environment": settings.evaluation_env or evaluation_name(settings.environment),
         "evaluation_period": settings.evaluation_period,
         "evaluation_episodes": settings.evaluation_episodes,
         "max_env_steps": settings.max_env_steps,
@@ -210,6 +211,11 @@ class Learner:
     self._stop.set()
 
   @property
+  def problem(self) -> str:
+    """What could not be written when it was last tried; empty if all could."""
+    return self._problem
+
+  @property
   def limiter(self) -> RateLimiter:
     """The run's counters; other threads write to them."""
     return self.link.limiter
@@ -258,7 +264,7 @@ class Learner:
     return minutes is not None and self._seconds >= 60 * minutes
 
   def _update(self, previous: dict[str, Any]) -> dict[str, Any]:
-    if not scaling.is_measured(self._state.scaling):
+    if not self._scaled:
       self._measure_scaling()
     with self._times.stage("sampling"):
       batch = self.replay.sample(self._random, self._config.batch_size)
@@ -280,6 +286,7 @@ class Learner:
       _SCALING_TRAJECTORIES,
       names=(*scaling.NAMES, "last"),
     )
+    self._scaled = True
     seen = np.arange(self._config.trajectory_length) <= sample["last"][:, None]
     scales = scaling.measure({name: sample[name][seen] for name in scaling.NAMES}, self.layout)
     self._state = learning.with_scaling(self._state, scales, keep_policy=bool(self._init_from))

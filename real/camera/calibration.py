@@ -17,8 +17,8 @@ from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-MIN_VIEWS = 8  # ours: eight numbers of the lens need well more than two views
-_OUTLIER = 2.5  # views with more than this times the median error are left out: ours
+MIN_VIEWS = 8  # chosen: eight numbers of the lens need well more than two views
+_OUTLIER = 2.5  # views with more than this times the median error are left out: chosen
 _BLOCKS = 10  # of the jackknife: neighbouring frames of a video err alike
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _FLAGS = cv2.CALIB_FIX_K3  # the OPENCV model has two radial terms
@@ -30,8 +30,11 @@ class View:
   """One picture in which the board was found."""
 
   name: str
-  corners: np.ndarray  # float32 [rows * columns, 2] pixel
-  size: tuple[int, int]  # width, height of the picture
+  """Of the file or frame."""
+  corners: np.ndarray
+  """float32 [rows * columns, 2] pixel."""
+  size: tuple[int, int]
+  """Width, height of the picture."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,13 +42,21 @@ class Calibration:
   """A calibrated camera."""
 
   width: int
+  """Of the pictures [pixel]."""
   height: int
-  values: np.ndarray  # [8] as NAMES; focal lengths and centre in pixels, OpenCV's convention
-  stddevs: np.ndarray  # [8] standard deviations, block jackknife over the views
-  rms: float  # of the reprojection error over the views kept [pixel]
-  views: tuple[str, ...]  # kept
-  rejected: tuple[str, ...]  # views that fitted badly
-  coverage: float  # share of the picture's 8 x 6 cells in which a corner was seen
+  """Of the pictures [pixel]."""
+  values: np.ndarray
+  """[8] as NAMES; focal lengths and centre in pixels, OpenCV's convention."""
+  stddevs: np.ndarray
+  """[8] standard deviations, block jackknife over the views."""
+  rms: float
+  """Of the reprojection error over the views kept [pixel]."""
+  views: tuple[str, ...]
+  """Kept."""
+  rejected: tuple[str, ...]
+  """Views that fitted badly."""
+  coverage: float
+  """Share of the picture's 8 x 6 cells in which a corner was seen."""
 
   @property
   def camera(self) -> Camera:

@@ -14,7 +14,7 @@ import numpy as np
 import plotly.offline
 
 from nerf2real.core.robot_logs import messages
-from nerf2real.core.robot_logs import playback as recording
+from nerf2real.core.robot_logs import streaming as recording
 
 _MAX_POINTS = 4000  # of a plotted line: more than a screen has pixels
 _JOINT_TOPICS = {
@@ -65,7 +65,8 @@ def load(path: Path | str) -> Replay:
       times.append(time)
       rows.append(values)
 
-  for topic, time, message in recording.read_messages(path):
+  for reading in recording.read_messages(path, recover=True):
+    topic, time, message = reading.topic, reading.time, reading.message
     if topic in _JOINT_TOPICS:
       field, name, unit = _JOINT_TOPICS[topic]
       names = tuple(message.name)

@@ -1,1 +1,1 @@
-"""The built-in room: a furnished room with known truth that measures reconstructions."""
+"""The built-in room: a furnished room with ground truth, to measure reconstructions with."""

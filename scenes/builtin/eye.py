@@ -1,4 +1,4 @@
-"""Pictures of a MuJoCo model through any OPENCV camera, with area-averaged pixels.
+"""Renders a MuJoCo model through any OPENCV camera, with area-averaged pixels.
 
 A larger pinhole picture is rendered, sampled where the lens looks, and averaged over each pixel.
 """

@@ -36,7 +36,7 @@ LENS = Camera(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FilmSettings:
-  """How the film is shot and stored."""
+  """Settings of the film's walk, camera and file."""
 
   camera: Camera = LENS
   """The phone's lens and picture size."""
@@ -149,7 +149,7 @@ def film(
 
 
 def truth(seed: int, settings: FilmSettings, world_from_camera: np.ndarray) -> dict:
-  """Returns what is known of the film as plain numbers; poses are [T, 4, 4]."""
+  """Returns the film's ground truth as plain numbers; poses are [T, 4, 4]."""
   plain = to_plain(settings)
   return {
     "version": TRUTH_VERSION,

@@ -1,4 +1,4 @@
-"""What stands in the built-in room, as lists of solids. World frame: z up, floor z = 0, metres.
+"""Furniture of the built-in room, as lists of solids. World frame: z up, floor z = 0, metres.
 
 The room spans x in [-2.5, 2.5], y in [-2, 2], z in [0, 2.5]. Furniture stands along the walls; the
 rectangle FREE_AREA of the floor stays empty for a robot and a ball.

@@ -1,4 +1,4 @@
-"""Placing solids in the built-in room. World frame: z up, floor z = 0, metres."""
+"""Places solids in the built-in room. World frame: z up, floor z = 0, metres."""
 
 from typing import Any
 

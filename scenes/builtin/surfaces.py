@@ -10,7 +10,7 @@ from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
 _PLANK_ROWS = 26
 _AO_HEIGHTS = (0.04, 0.10, 0.25, 0.5)  # where occlusion is probed above a surface [m]
-_AO_WEIGHTS = (0.16, 0.20, 0.24, 0.22)  # how dark each makes a corner; ours, by eye
+_AO_WEIGHTS = (0.16, 0.20, 0.24, 0.22)  # how dark each makes a corner; chosen by eye
 _AO_STEP = 0.04  # grid of the probes [m]
 _SHELL_PIXELS = 320  # texels per metre of floor and walls
 _POSTERS = (  # heights and widths [pixel]

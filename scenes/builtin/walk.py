@@ -1,4 +1,4 @@
-"""The path of a hand-held phone through the built-in room.
+"""Simulates the path of a hand-held phone through the built-in room.
 
 Four rounds: along the furniture at eye height looking across the room, near the middle looking
 outwards, and the same two at the height of a small robot. Between rounds the phone moves straight

@@ -1,4 +1,4 @@
-"""Capture: a video, pictures or a posed data set becomes a folder of sharp keyframes."""
+"""Selects the sharpest keyframes of a video, of pictures or of a posed data set."""
 
 import dataclasses
 import itertools
@@ -30,12 +30,12 @@ from nerf2real.scenes.capture.video import (
 
 __all__ = ["Capture", "CaptureError", "CaptureSettings", "read_capture"]
 
-MIN_IMAGES = 8  # fewer pictures do not make a room; ours
+MIN_IMAGES = 8  # fewer pictures do not cover a room
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CaptureSettings:
-  """What is kept of a capture and when it is doubted. Sources: ours, where not said otherwise."""
+  """Settings of the keyframes and of the warnings."""
 
   num_keyframes: int = 150  # parts of the capture; the sharpest frame of each is kept
   max_size: int = 1920  # long side of a keyframe; larger pictures are reduced [pixel]
@@ -66,7 +66,7 @@ class Capture:
 
 
 def source_kind(source: Path) -> str:
-  """Says what a source is: "video", "images", "colmap" or "transforms".
+  """Returns the kind of a source: "video", "images", "colmap" or "transforms".
 
   Raises:
     CaptureError: If it does not exist or is none of these.
@@ -252,7 +252,7 @@ def _write(
 
 
 def _quality_warnings(capture: Capture, settings: CaptureSettings) -> list[str]:
-  """Says what the keyframes themselves lack; parallax is judged after matching."""
+  """Returns warnings about the keyframes themselves; parallax is judged after matching."""
   found = []
   if min(capture.width, capture.height) < settings.warn_short_side:
     found.append(

@@ -1,4 +1,4 @@
-"""Keyframes on disk: what the first stage leaves for the others."""
+"""Reads and writes the record of the keyframes, capture.json."""
 
 import json
 from pathlib import Path

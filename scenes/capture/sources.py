@@ -19,8 +19,8 @@ from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.video import CaptureError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera; ours
-ROTATION_TOLERANCE = 1e-2  # of a pose's 3x3 part to a rotation; ours
+CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera
+ROTATION_TOLERANCE = 1e-2  # of a pose's 3x3 part to a rotation
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Videos: one streaming pass that keeps the sharpest frame of each part.
+"""Reads a video in one streaming pass and keeps the sharpest frame of each part.
 
 Memory holds one candidate picture, never the film: a video of any length streams through.
 """
@@ -17,7 +17,7 @@ from nerf2real.core.progress import Progress, no_progress
 
 STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; ours, so that
 # pictures of different resolution are comparable; pictures are never enlarged
-DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged; ours
+DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged
 
 
 class CaptureError(ValueError):
@@ -36,7 +36,7 @@ class Frame:
 
 @dataclasses.dataclass(frozen=True)
 class VideoInfo:
-  """What a video's header and packets say, before any decoding."""
+  """Facts of a video's header and packets, without decoding."""
 
   num_frames: int  # packets of the video stream
   declared_frames: int  # what the header promises; 0 where it does not say

@@ -1,1 +1,1 @@
-"""Geometry: depth fusion, surface mesh, world frame, contact geometry, free floor."""
+"""Geometry: depth fusion, surface mesh, contact geometry, free floor."""

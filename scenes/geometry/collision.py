@@ -1,4 +1,4 @@
-"""Contact geometry of a scene: crop, floor taken out, convex parts, files, physics cost.
+"""Makes the contact geometry of a scene: cropped, without floor, as convex parts in files.
 
 The floor itself is not among the parts: the arena adds a plane at z = 0 (paper, section "Collision
 mesh extraction": "we also replace the floor vertices in the mesh with a flat plane").
@@ -6,7 +6,6 @@ mesh extraction": "we also replace the floor vertices in the mesh with a flat pl
 
 import dataclasses
 import pathlib
-import time
 from collections.abc import Sequence
 
 import mujoco
@@ -153,41 +152,3 @@ def spec(parts: Sequence[convex.Part], *, floor: bool = True) -> mujoco.MjSpec:
     )
     model.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=0)
   return model
-
-
-def physics_cost(
-  parts: Sequence[convex.Part], positions: np.ndarray, *, steps: int = 400, timestep: float = 0.0025
-) -> float:
-  """Mean seconds of a physics step with a robot-sized puppet in contact with the scene.
-
-  The puppet (a trunk with four limbs, 0.5 m tall) is dropped at each position in turn.
-
-  Args:
-    parts: Convex parts.
-    positions: Places on the ground [K, 2] or [K, 3].
-    steps: Steps at each place.
-    timestep: Of the physics [s]; the paper's control step of 25 ms holds ten.
-  """
-  model = spec(parts)
-  model.option.timestep = timestep
-  trunk = model.worldbody.add_body(name="puppet", pos=[0, 0, 0.3])
-  trunk.add_freejoint()
-  trunk.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.05, 0.08, 0.1], mass=2.0)
-  for x, y in ((0.03, 0.06), (0.03, -0.06), (0.0, 0.12), (0.0, -0.12)):
-    limb = trunk.add_body(pos=[x, y, -0.08 if abs(y) < 0.1 else 0.08])
-    limb.add_joint(axis=[0, 1, 0])
-    limb.add_geom(
-      type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, 0, 0, -0.18], size=[0.02, 0, 0], mass=0.4
-    )
-  compiled = model.compile()
-  data = mujoco.MjData(compiled)
-  spent = 0.0
-  for position in positions:
-    mujoco.mj_resetData(compiled, data)
-    data.qpos[:2] = position[:2]
-    mujoco.mj_forward(compiled, data)
-    start = time.perf_counter()
-    for _ in range(steps):
-      mujoco.mj_step(compiled, data)
-    spent += time.perf_counter() - start
-  return spent / (steps * len(positions))

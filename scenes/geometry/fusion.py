@@ -208,7 +208,7 @@ def fuse(
     progress: Called with the fraction done and a text.
 
   Source: Curless and Levoy 1996, A volumetric method for building complex models from range images,
-  section 3; the tangent planes are ours.
+  section 3; the tangent planes are an addition.
   """
   lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
   shape = np.maximum(np.ceil((upper - lower) / voxel).astype(int), 1) + 1

@@ -1,9 +1,8 @@
-"""The scene's surface as a triangle mesh: marching cubes, without floaters, coloured, as glTF.
+"""Extracts the scene's surface mesh: marching cubes, without floaters, coloured, as glTF.
 
-Two sources give the same `Grid`: depth pictures fused (`scenes.geometry.fusion`) or the field's
-density at a threshold, as the paper does (section "Collision mesh extraction"). Fusion needs no
-threshold and keeps out of space that no ray reached; a density needs one that depends on how long
-the field was trained, and `density_to_grid` carves its floaters with fused depth.
+The surface is that of fused depth pictures (`scenes.geometry.fusion`). The paper takes the field's
+density at a threshold (section "Collision mesh extraction"); fusion needs no threshold, which
+depends on how long the field was trained, and keeps out of space that no ray reached.
 Shapes: V vertices, F faces, X, Y, Z voxels.
 """
 
@@ -29,14 +28,8 @@ class MeshSettings:
 
   voxel: float = 0.025  # edge of a voxel [m]; half of what the collision may be wrong by
   truncation: float = 0.075  # band in which views are averaged [m]; 3 voxels
-  source: str = "fusion"  # "fusion" of depth pictures or a "density" threshold
-  density_threshold: float = 25.0  # of the field [1/unit], where source is "density"
   min_component: float = 0.3  # smaller floating pieces are dropped [m], diagonal of their box
   visual_faces: int = 60_000  # faces of visual.glb after decimation
-
-  def __post_init__(self):
-    if self.source not in ("fusion", "density"):
-      raise ValueError(f'Mesh source must be "fusion" or "density", found "{self.source}".')
 
 
 class Mesh(NamedTuple):
@@ -76,41 +69,11 @@ def surface(grid: fusion.Grid) -> Mesh:
     cell &= shifted
   if not (cell.any() and grid.values[known].min() < 0 < grid.values[known].max()):
     raise ValueError(
-      "Found no surface in the grid: the depth pictures show nothing inside the extent, or the "
-      "density never crosses the threshold. Check the extent, the scale and the field."
+      "Found no surface in the grid: the depth pictures show nothing inside the extent. "
+      "Check the extent, the scale and the field."
     )
   vertices, faces, _, _ = measure.marching_cubes(grid.values, 0.0, mask=cell)
   return Mesh(vertices * grid.voxel + grid.lower, faces.astype(np.int64))
-
-
-def density_to_grid(
-  density: np.ndarray,
-  *,
-  lower: np.ndarray,
-  voxel: float,
-  threshold: float,
-  carved: fusion.Grid | None = None,
-) -> fusion.Grid:
-  """Makes a grid of a voxelised density: negative where it exceeds the threshold.
-
-  Args:
-    density: Density [X, Y, Z] at voxel centres.
-    lower: Centre of voxel (0, 0, 0) [3].
-    voxel: Edge of a voxel.
-    threshold: Density of the surface.
-    carved: Fused depth over the same voxels. Where rays passed through, density is a floater and
-      counts as free; where none came, as unknown.
-  """
-  values = np.clip(1 - density / threshold, -1, 1).astype(np.float32)
-  weights = np.ones_like(values)
-  if carved is not None:
-    if carved.values.shape != values.shape:
-      raise ValueError(f"Carving has {carved.values.shape} voxels, density {values.shape}.")
-    free = carved.observed & (carved.values > 0.99)
-    values = np.where(free, np.maximum(values, 1), values)
-    weights = carved.observed.astype(np.float32)
-    values[~carved.observed] = 1
-  return fusion.Grid(values, weights, np.asarray(lower, np.float64), voxel, voxel)
 
 
 def drop_floaters(grid: fusion.Grid, *, min_component: float) -> fusion.Grid:
@@ -185,10 +148,27 @@ def paint(mesh: Mesh, views: fusion.DepthViews) -> Mesh:
   return mesh._replace(colors=colors)
 
 
+_Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64)  # glTF's axes from the world's
+
+
 def save_glb(mesh: Mesh, path: pathlib.Path) -> None:
   """Writes a glTF binary with vertex colours; y up, as glTF prescribes."""
-  y_up = mesh.vertices @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
-  shown = trimesh.Trimesh(y_up, mesh.faces, vertex_colors=mesh.colors, process=False)
+  shown = trimesh.Trimesh(
+    mesh.vertices @ _Y_UP.T, mesh.faces, vertex_colors=mesh.colors, process=False
+  )
   content = shown.export(file_type="glb")
   assert isinstance(content, bytes)  # other formats give text or a mapping
   path.write_bytes(content)
+
+
+def load_glb(path: pathlib.Path) -> trimesh.Trimesh:
+  """Reads what `save_glb` wrote, turned back to z up.
+
+  Raises:
+    ValueError: No such file.
+  """
+  if not path.is_file():
+    raise ValueError(f"The surface mesh {path} does not exist: make the bundle again.")
+  shown = trimesh.load_mesh(path, process=False)
+  shown.vertices = shown.vertices @ _Y_UP
+  return shown

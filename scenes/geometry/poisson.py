@@ -20,7 +20,7 @@ from scipy import spatial
 from nerf2real.core import cameras
 from nerf2real.scenes.geometry.mesh import Mesh
 
-_NEIGHBOURS = 16  # points that a normal is estimated from; ours
+_NEIGHBOURS = 16  # points that a normal is estimated from
 _MIN_POINTS = 50
 _DEPTH = 9  # of the octree; sparse points fill no finer cells
 _FAR = 0.15  # faces farther from any point are removed; share of the points' median distance

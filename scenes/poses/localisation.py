@@ -1,4 +1,4 @@
-"""The result of localising, and its folder: a COLMAP model with its figures beside it.
+"""Camera, poses and points of a capture, and their folder: a COLMAP model with its figures.
 
 Shapes: N registered keyframes, P points.
 """

@@ -1,4 +1,4 @@
-"""Localise: keyframes become one camera, poses and sparse points in the unit frame.
+"""Localises keyframes by structure from motion: one camera, poses, points in the unit frame.
 
 `localise` leaves `sfm/` (a COLMAP model in the unit frame, and `localisation.json`); features and
 matches stay in `work/database.db`, so that an interrupted run continues. Shapes: N registered
@@ -42,7 +42,7 @@ _STAGE_SHARES = {"features": 0.25, "matching": 0.4, "mapping": 0.25, "refining":
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LocaliseSettings:
-  """How keyframes are localised. Sources: ours, where not said otherwise."""
+  """Settings of structure from motion."""
 
   features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
   pairs: PairSettings = dataclasses.field(default_factory=PairSettings)

@@ -1,4 +1,4 @@
-"""From verified matches to one refined COLMAP model."""
+"""Maps verified matches to one refined COLMAP model: incremental or global."""
 
 import os
 import shutil
@@ -13,15 +13,13 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
 from nerf2real.scenes.poses.matching import image_ids, quiet
 
-MIN_OBSERVATIONS = 20  # points a picture must see to count as registered; ours
+MIN_OBSERVATIONS = 20  # points a picture must see to count as registered
 MAX_ERROR = 4.0  # observations further off are dropped [pixel]; COLMAP
 MIN_ANGLE = 1.5  # points seen under a smaller angle are dropped [degree]; COLMAP
-_LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]; ours
-_MAX_PRINCIPAL_SHIFT = (
-  0.08  # of the principal point from the middle, times the picture's size; ours
-)
-_MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative; ours
-_MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels; ours
+_LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]
+_MAX_PRINCIPAL_SHIFT = 0.08  # of the principal point from the middle, times the picture's size
+_MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative
+_MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels
 _NOTHING = (ValueError, RuntimeError)  # what pycolmap raises
 
 
@@ -124,7 +122,7 @@ def _adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool
 
 
 def camera_fault(camera: Camera) -> str | None:
-  """Says what is impossible about an estimated camera, None if nothing is.
+  """Returns what is impossible about an estimated camera, None if nothing is.
 
   The radial polynomial r (1 + k1 r^2 + k2 r^4) must grow up to the farthest corner: where parallax
   is low, distortion trades against depth and folds the picture.

@@ -1,4 +1,4 @@
-"""Features and matches in a COLMAP database that survives interruption.
+"""Extracts and matches features into a COLMAP database that survives interruption.
 
 Every call does only what the database does not hold yet.
 """
@@ -26,10 +26,10 @@ _FATAL_ONLY = 3  # glog level
 class FeatureSettings:
   """Features and their matching."""
 
-  max_num_features: int = 1536  # of a picture, the largest first; time grows with the square; ours
-  few_num_features: int = 4096  # the same for captures of few pictures; ours
-  few_pictures: int = 40  # so many are few; ours
-  max_image_size: int = 1600  # long side at which features are sought [pixel]; ours
+  max_num_features: int = 1536  # of a picture, the largest first; time grows with the square
+  few_num_features: int = 4096  # the same for captures of few pictures
+  few_pictures: int = 40  # so many are few
+  max_image_size: int = 1600  # long side at which features are sought [pixel]
   affine_shape: bool = True  # paper, appendix A
   guided_matching: bool = True  # paper, appendix A
   focal_factor: float = 1.2  # first guess of the focal length, times the long side; COLMAP

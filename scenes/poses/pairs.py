@@ -1,4 +1,4 @@
-"""Which keyframes are matched with which: every pair where few, a bounded choice where many.
+"""Selects image pairs to match: all of few, sequential and loop-closure pairs of many.
 
 Matching costs time in proportion to the product of both numbers of features. A walk of N
 keyframes is therefore matched
@@ -24,13 +24,13 @@ Pair = tuple[int, int]  # indices of two keyframes, the smaller first
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairSettings:
-  """How keyframes are paired."""
+  """Settings of the pair selection."""
 
   exhaustive_cost: float = 1.6e10  # products of feature counts that may be compared exhaustively:
   # measured 5.2e-9 CPU s each on a 2-core machine, so 80 CPU s; 11,325 pairs of 1,090 features fit
-  overlap: int = 8  # following keyframes that each one is matched with; ours (COLMAP: 10)
-  loop_keyframes: int = 300  # at most this many keyframes are scored for loop closures; ours
-  loop_closures: int = 12  # partners that each scored keyframe is matched with; ours
+  overlap: int = 8  # following keyframes that each one is matched with (COLMAP: 10)
+  loop_keyframes: int = 300  # at most this many keyframes are scored for loop closures
+  loop_closures: int = 12  # partners that each scored keyframe is matched with
   score_features: int = 256  # largest features of a keyframe that take part in scoring
   score_ratio: float = 0.85  # nearest to second-nearest descriptor distance in scoring
   min_score: int = 5  # mutual matches of a pair worth matching: of the living room's verified pairs

@@ -1,4 +1,4 @@
-"""Whether the camera moved: matches that one homography explains show rotation, not translation."""
+"""Measures parallax: matches that one homography explains show rotation, not translation."""
 
 import contextlib
 import sqlite3
@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pycolmap
 
-MIN_MATCHES = 50  # of a pair that is judged; ours
-MIN_DISPLACEMENT = 0.05  # median movement of the matches, times the picture's width; ours
-MAX_PAIRS = 80  # judged pairs; ours
+MIN_MATCHES = 50  # of a pair that is judged
+MIN_DISPLACEMENT = 0.05  # median movement of the matches, times the picture's width
+MAX_PAIRS = 80  # judged pairs
 HOMOGRAPHY_TOLERANCE = 0.004  # reprojection error, times the picture's width: 2.5 of 640 pixels
 
 

@@ -1,4 +1,4 @@
-"""Distance between the convex parts' surface and the scene's surface, both ways.
+"""Measures the distance between the convex parts' surface and the scene's surface, both ways.
 
 Only what can be touched counts: the parts' surface is found by MuJoCo's own rays from where cameras
 were and from the free space, so the far side of a wall, which nobody sees, is not judged.

@@ -1,4 +1,4 @@
-"""Quality of a field on held-out pictures, at full and at robot resolution.
+"""Scores a field on held-out pictures, at full and at robot resolution.
 
 Shapes: N views, H height, W width.
 """

@@ -1,4 +1,4 @@
-"""How close a rendered picture is to the true one."""
+"""Image quality of a rendered picture against the true one: PSNR and SSIM."""
 
 import numpy as np
 import skimage.metrics

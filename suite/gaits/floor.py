@@ -4,20 +4,22 @@ import dataclasses
 
 import numpy as np
 
+from nerf2real.scenes.geometry.free_space import FreeSpace
+
 _HALF_SIZE = 10.0  # m
 
 
-class _Free:
-  """All of the floor is free; the interface of `scenes.geometry.free_space.FreeSpace`."""
+class _Free(FreeSpace):
+  """All of the floor is free."""
 
   def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
     """Draws x, y, yaw [count, 3] near the middle."""
     low, high = (-1, -1, -np.pi), (1, 1, np.pi)
     return rng.uniform(low, high, (count, 3))
 
-  def is_reachable(self, xy: np.ndarray) -> np.ndarray:
+  def is_reachable(self, points: np.ndarray) -> np.ndarray:
     """Returns whether points [..., 2] lie on the floor."""
-    return (np.abs(np.asarray(xy)) < _HALF_SIZE).all(axis=-1)
+    return (np.abs(np.asarray(points)) < _HALF_SIZE).all(axis=-1)
 
 
 @dataclasses.dataclass

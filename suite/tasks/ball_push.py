@@ -13,7 +13,7 @@ from nerf2real.core import rotations
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.camera import RobotCamera
-from nerf2real.suite.tasks import rewards, touch
+from nerf2real.suite.tasks import catalogue, rewards, touch
 from nerf2real.suite.tasks.ball import Ball
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.privileged import Quantity
@@ -21,14 +21,13 @@ from nerf2real.suite.tasks.settings import TaskSettings
 from nerf2real.suite.tasks.state import Start
 from nerf2real.suite.tasks.workspace import Workspace, find_workspace
 
-NAME = "ball_push"
-TIME_LIMIT = protocols.BALL_TIME_LIMIT  # s (paper)
+NAME = catalogue.BALL_PUSH
+TIME_LIMIT = catalogue.TIME_LIMITS[NAME]  # s
 FALL = "fall"
 BALL_IN_FRONT = 0.5  # share of episodes with the ball just in front of the robot (paper)
 # m ahead of and beside the robot's torso, when it starts in front: ours.
 _AHEAD, _ASIDE = (0.25, 0.45), 0.08
 _MAX_ATTEMPTS = 100
-_PLACE_GRID = 0.05  # m between the places that are looked at for a free one
 
 
 class BallPush(RobotTask):
@@ -72,9 +71,7 @@ class BallPush(RobotTask):
 
     Where the room's furniture stands in the way, robot and ball start at the nearest free place.
     """
-    center = self.workspace.center
-    robot = self._nearest_free(center + trial.robot_xy)
-    ball = self._nearest_free(center + trial.ball_xy)
+    robot, ball = self.workspace.starts(trial, self.scene.free_space)
     self.set_start(
       Start((float(robot[0]), float(robot[1])), trial.robot_yaw),
       ball_xy=(float(ball[0]), float(ball[1])),
@@ -124,22 +121,16 @@ class BallPush(RobotTask):
     """Draws a free place of the workspace [2]."""
     for _ in range(_MAX_ATTEMPTS):
       xy = random_state.uniform(self.workspace.lower, self.workspace.upper)
-      if self.scene.free_space.is_reachable(xy[None])[0]:
+      if self.scene.free_space.is_reachable(xy):
         return xy
-    return self._free_grid[random_state.randint(len(self._free_grid))]
+    places = self._free_places
+    return places[random_state.randint(len(places))]
 
   @functools.cached_property
-  def _free_grid(self) -> np.ndarray:
+  def _free_places(self) -> np.ndarray:
     """The places [N, 2] of a grid over the workspace at which a robot can stand."""
-    side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2
-    points = self.workspace.lower + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
-    return points[np.asarray(self.scene.free_space.is_reachable(points), bool)]
-
-  def _nearest_free(self, xy: np.ndarray) -> np.ndarray:
-    """Returns the point [2] itself if a robot can stand there, or else the nearest such place."""
-    if self.scene.free_space.is_reachable(xy[None])[0]:
-      return xy
-    return self._free_grid[np.argmin(np.linalg.norm(self._free_grid - xy, axis=1))]
+    places = self.workspace.places()
+    return places[np.asarray(self.scene.free_space.is_reachable(places), bool)]
 
   def _in_front(self, random_state: np.random.RandomState) -> np.ndarray:
     root = self._indices.root_qpos

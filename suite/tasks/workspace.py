@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.scenes.geometry.free_space import FreeSpace
 from nerf2real.suite import protocols
 
 _STEP = 0.1  # m between the places that are tried, and between the points that are counted
+_PLACE_GRID = 0.05  # m between the places that a start blocked by furniture may move to
 _MIN_FREE = 0.25  # share of the workspace that a robot must be able to stand on: ours
 
 
@@ -40,6 +42,23 @@ class Workspace:
     """Returns whether a point [2] lies in the target cell."""
     return bool((np.abs(xy - self.target) <= protocols.CELL_SIZE / 2).all())
 
+  def places(self) -> np.ndarray:
+    """Returns a grid of places over the workspace [N, 2] [m]."""
+    side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2
+    return self.lower + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+
+  def starts(
+    self, trial: protocols.BallTrial, free_space: FreeSpace
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where robot [2] and ball [2] start in a trial [m].
+
+    Where furniture stands in the way, that is the nearest free place.
+    """
+    places = self.places()
+    robot = free_space.nearest_reachable(self.center + trial.robot_xy, places)
+    ball = free_space.nearest_reachable(self.center + trial.ball_xy, places)
+    return robot, ball
+
 
 def _window_sums(values: np.ndarray, size: int) -> np.ndarray:
   """Returns sums over all size x size windows of an array."""
@@ -63,11 +82,8 @@ def find_workspace(scene: Any) -> Workspace:
       f"Ball pushing needs a workspace of {size:g} x {size:g} m, found a scene of "
       f"{upper[0] - lower[0]:.2f} x {upper[1] - lower[1]:.2f} m: use a larger scene."
     )
-  x, y = (np.arange(lower[i] + _STEP / 2, upper[i], _STEP) for i in range(2))
-  points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-  free = np.asarray(scene.free_space.is_reachable(points.reshape(-1, 2)), float).reshape(
-    points.shape[:2]
-  )
+  floor = scene.free_space.grid(scene.extent, _STEP)
+  free = floor.free.astype(float)
   cells = round(size / _STEP)
   target_cells = round(protocols.CELL_SIZE / _STEP)
   whole = _window_sums(free, cells) / cells**2
@@ -83,4 +99,4 @@ def find_workspace(scene: Any) -> Workspace:
       f"Ball pushing needs a workspace of {size:g} x {size:g} m with at least {_MIN_FREE:.0%} free "
       f"floor, found {whole[best]:.0%} at best: use a scene with more room."
     )
-  return Workspace(np.array([x[best[0]], y[best[1]]]) - _STEP / 2 + size / 2)
+  return Workspace(floor.centres[best] - _STEP / 2 + size / 2)

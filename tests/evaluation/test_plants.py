@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.evaluation import operated, perturbations, plants, runner, starts
+from nerf2real.evaluation import operated, perturbations, plants, runner
 from nerf2real.evaluation.policies import GaitPolicy
 from nerf2real.evaluation.rehearsed import RehearsedPlant
 from nerf2real.evaluation.simulated import SimulatedPlant
@@ -42,8 +42,8 @@ def test_trials_start_where_the_simulations_tasks_have_them(scene, simulated):
   assert workspace.center == pytest.approx(ball.task.workspace.center)
   for trial in (protocols.ball_center()[3], protocols.ball_wall()[-1], protocols.ball_center()[-1]):
     ball.task.set_trial(trial)
-    pose, place = starts.ball_start(scene, workspace, trial)
-    assert pose == pytest.approx((*ball.task.start.xy, ball.task.start.yaw))
+    robot, place = workspace.starts(trial, scene.free_space)
+    assert robot == pytest.approx(ball.task.start.xy)
     assert place == pytest.approx(ball.task.ball_start)
 
 

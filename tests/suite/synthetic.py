@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.geometry.free_space import FreeSpace
 
 # Boxes (lower, upper) [m]: walls of a 6 x 5 m room and furniture.
 BOXES = (
@@ -21,14 +22,14 @@ BOXES = (
 FREE = ((-2.6, -2.1), (1.6, 2.1))  # lower and upper corner of the free floor
 
 
-class FreeFloor:
-  """A rectangle of free floor, with the interface of `scenes.geometry.free_space.FreeSpace`."""
+class FreeFloor(FreeSpace):
+  """A rectangle of free floor."""
 
   def sample(self, rng, count):
     return np.column_stack([rng.uniform(*FREE, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
 
-  def is_reachable(self, xy):
-    xy = np.asarray(xy)
+  def is_reachable(self, points):
+    xy = np.asarray(points)
     return ((xy >= FREE[0]) & (xy <= FREE[1])).all(axis=-1)
 
 

@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 
+from nerf2real.scenes.geometry.free_space import FreeSpace
 from nerf2real.suite import protocols
 
 
@@ -53,19 +54,24 @@ def test_navigation_starts_are_spread_and_fixed():
   assert near.shape == (3, 2)
 
 
-def _room(half_width, *, goals):
-  """A floor 6 m long whose narrow bays at both ends hold the places farthest apart."""
+class _Bays(FreeSpace):
+  """A square floor in a room 6 m long whose narrow bays at both ends are farthest apart."""
 
-  def is_reachable(xy):
-    x, y = np.moveaxis(np.asarray(xy), -1, 0)
+  def __init__(self, half_width):
+    self._half_width = half_width
+
+  def sample(self, rng, count):
+    return rng.uniform(-self._half_width, self._half_width, (count, 3))
+
+  def is_reachable(self, points):
+    x, y = np.moveaxis(np.asarray(points), -1, 0)
     bay = (np.abs(y - 1.0) < 0.06) & (np.abs(x) < 3.0)
-    return bay | ((np.abs(x) < half_width) & (np.abs(y) < half_width))
+    return bay | ((np.abs(x) < self._half_width) & (np.abs(y) < self._half_width))
 
-  return types.SimpleNamespace(
-    extent=(np.full(2, -3.0), np.full(2, 3.0)),
-    goals=np.array(goals),
-    free_space=types.SimpleNamespace(is_reachable=is_reachable),
-  )
+
+def _room(half_width, *, goals):
+  extent = (np.full(2, -3.0), np.full(2, 3.0))
+  return types.SimpleNamespace(extent=extent, goals=np.array(goals), free_space=_Bays(half_width))
 
 
 def test_starts_have_room_to_turn():

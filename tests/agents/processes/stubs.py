@@ -1,6 +1,8 @@
 """An environment whose task knows success, and a link that grants all and keeps what it got."""
 
+import re
 import types
+from pathlib import Path
 
 import dm_env
 import numpy as np
@@ -68,6 +70,14 @@ def description(environment, name, **changes):
     "evaluation_period": 100,
     "evaluation_episodes": None,
   } | changes
+
+
+def documented(source):
+  """Names in the README's table of what a source logs."""
+  readme = (Path(config.__file__).parent / "README.md").read_text()
+  table = readme.partition(f"| {source} | |\n")[2].partition("\n\n")[0]
+  cells = [line.split("|")[1] for line in table.splitlines()[1:]]
+  return {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
 
 
 class StubLink:

@@ -7,7 +7,7 @@ import pytest
 from dm_control.rl import control
 
 from nerf2real.agents.processes import actor, environments, trials
-from tests.agents.processes.stubs import Reach, StubLink, description
+from tests.agents.processes.stubs import Reach, StubLink, description, documented
 
 CARTPOLE = "dm_control:cartpole:swingup"
 Trial = collections.namedtuple("Trial", "wins seed")
@@ -94,7 +94,9 @@ def test_times_of_the_stages_are_reported(reach):
   reach.step = step
   link = StubLink(description(reach, "reach"), limit=2)
   _act(link)
+  seldom = {"localisation_error", "physics_error", "failed_episode"}
   assert {"env_ms", "render_ms", "inference_ms", "waiting_ms"} <= set(link.reports[0])
+  assert set(link.reports[0]) | seldom == documented("actor")
   assert link.reports[0]["render_ms"] == pytest.approx(1.0)
 
 
@@ -110,6 +112,8 @@ def test_success_is_measured_on_the_protocol_and_confirmed_on_fresh_trials(reach
   process, link = _evaluator(reach, monkeypatch, listed)
   process._evaluate(700)
   first, confirmed = link.reports
+  seldom = {"localisation_error", "failed_episode"}
+  assert (set(first) - {"at_steps"}) | seldom == documented("evaluator")
   assert (first["success"], first["episodes"], first["confirmation"]) == (0.5, 4, 0)
   assert first["success_low"] == pytest.approx(0.0676, abs=1e-4)  # Clopper and Pearson, 2 of 4
   assert first["success_high"] == pytest.approx(0.9324, abs=1e-4)

@@ -6,15 +6,26 @@ import socket
 import threading
 import time
 
+import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import config, export, networks, scaling
+from nerf2real.agents.dmpo import (
+  config,
+  export,
+  learning,
+  networks,
+  scaling,
+  specs,
+)
+from nerf2real.agents.dmpo.replay import trajectory_fields
+from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.processes import actor
 from nerf2real.agents.processes.checkpoints import read_info
 from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+from tests.agents.processes.stubs import documented
 
 ENVIRONMENT = "dm_control:cartpole:swingup"
 CONFIG = config.override(
@@ -184,3 +195,25 @@ def test_best_without_success_is_the_highest_mean_return(tmp_path):
     _report(run.learner, confirmation=0, version=0, **{"return": result})
     assert run.learner._best == expected
   run.close()
+
+
+def _update_metrics():
+  """Names that an update gives with pictures and a belief."""
+  layout = Layout("camera", (6, 8, 3), ("s",), (3,), (specs.POSITION, specs.ROTATION), (3, 9), 2)
+  settings = config.preset("vision_small")
+  functions = learning.make_learning(settings, layout)
+  fields = trajectory_fields(layout, lstm_size=settings.network.lstm_size)
+  batch = {
+    name: jax.ShapeDtypeStruct((2, 6, *f.shape) if f.per_step else (2, *f.shape), f.dtype)
+    for name, f in fields.items()
+  } | {"last": jax.ShapeDtypeStruct((2,), "int32")}
+  state = jax.eval_shape(functions.init, jax.ShapeDtypeStruct((2,), "uint32"))
+  return set(jax.eval_shape(functions.update, state, batch)[1])
+
+
+ROW = {"time", "source", "steps", "updates"}
+
+
+def test_the_readme_explains_what_the_learner_logs(finished):
+  logged = set().union(*_rows(finished[0])) - ROW
+  assert logged | _update_metrics() == documented("learner")

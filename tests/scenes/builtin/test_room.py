@@ -1,6 +1,9 @@
 """Tests of the built-in room: its truth, its pictures and its film."""
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import av
 import cv2
@@ -255,3 +258,19 @@ def test_shipped_film_and_truth_belong_together():
   assert (frame.width, frame.height) == (truth["camera"].width, truth["camera"].height)
   assert truth["room_size"] == list(ROOM_SIZE)
   np.testing.assert_allclose(truth["marker"]["corners"], furniture.marker_corners())
+
+
+def test_making_a_scene_loads_no_robot():
+  """The room and the script that makes scenes need nothing above scenes."""
+  root = Path(__file__).parents[3]
+  program = (
+    "import sys, runpy; runpy.run_path(sys.argv[1], run_name='loaded');"
+    "print(*(name for name in sys.modules if name.startswith('nerf2real.')))"
+  )
+  script = root / "launch" / "make_scene.py"
+  result = subprocess.run(
+    [sys.executable, "-c", program, script], cwd=root, capture_output=True, text=True, check=True
+  )
+  packages = {name.split(".")[1] for name in result.stdout.split()}
+  assert packages == {"core", "scenes"}
+  assert "nerf2real.scenes.builtin.yardstick" in result.stdout.split()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerf2real.scenes.geometry import convex, free_space
+from nerf2real.scenes.geometry import convex, floor_plan, free_space, map_server
 
 
 def box(centre, half):
@@ -22,7 +22,7 @@ def ground():
     box([-1.0, 0.0, 1.5], [0.5, 0.5, 0.2]),  # a lamp overhead
     box([-1.5, 1.2, 0.005], [0.3, 0.1, 0.005]),  # a rug
   ]
-  return free_space.free_space(parts, lower=LOWER, upper=UPPER)
+  return floor_plan.floor_plan(parts, lower=LOWER, upper=UPPER)
 
 
 def test_only_matter_at_the_robots_height_blocks(ground):
@@ -39,7 +39,7 @@ def test_slanted_part_blocks_only_where_it_is_low():
   wedge = convex.hull(
     np.array([[0, -0.5, 0], [0, 0.5, 0], [2, -0.5, 2.0], [2, 0.5, 2.0], [2, 0, 2.1], [0, 0, 0.1]])
   )
-  ground = free_space.free_space([wedge], lower=np.array([-1, -1]), upper=np.array([3, 1]))
+  ground = floor_plan.floor_plan([wedge], lower=np.array([-1, -1]), upper=np.array([3, 1]))
   at = lambda x: ground.cells[tuple(ground.cell_of(np.array([x, 0.0])))]  # noqa: E731
   assert at(0.3) == at(0.5) == free_space.OCCUPIED
   assert at(0.7) == at(1.5) == free_space.FREE
@@ -55,7 +55,7 @@ def test_clearance_and_reach(ground):
 
 def test_rooms_without_door_are_not_mixed():
   wall = box([0.5, 0.2, 0.5], [0.05, 2.0, 0.5])
-  ground = free_space.free_space([wall], lower=LOWER, upper=UPPER)
+  ground = floor_plan.floor_plan([wall], lower=LOWER, upper=UPPER)
   assert ground.is_reachable(np.array([-1.0, 0.0])) and not ground.is_reachable(
     np.array([1.5, 0.0])
   )
@@ -63,8 +63,8 @@ def test_rooms_without_door_are_not_mixed():
 
 def test_map_server_files_round_trip(ground, tmp_path):
   path = tmp_path / "free_space.pgm"
-  ground.write(path)
-  again = free_space.read(tmp_path / "free_space.yaml")
+  map_server.write(ground, path)
+  again = map_server.read(tmp_path / "free_space.yaml")
   np.testing.assert_array_equal(again.cells, ground.cells)
   np.testing.assert_array_equal(again.origin, ground.origin)
   assert (again.resolution, again.radius) == (ground.resolution, ground.radius)
@@ -78,7 +78,7 @@ def test_map_server_files_round_trip(ground, tmp_path):
   assert pixels[-1, 0] == 254
   path.with_suffix(".yaml").write_text("image: free_space.pgm\n")
   with pytest.raises(ValueError, match="lacks origin, resolution"):
-    free_space.read(path)
+    map_server.read(path)
 
 
 def test_samples_are_uniform_over_the_reachable_area(ground):
@@ -104,9 +104,34 @@ def test_goals_are_free_and_far_apart(ground):
   assert apart.min() > 1.2
 
 
+def test_a_grid_samples_the_reachable_floor(ground):
+  floor = ground.grid((LOWER, UPPER), 0.1)
+  assert floor.free.shape == (44, 24)
+  np.testing.assert_allclose(floor.centres[3, 5], [-1.65, -0.45])
+  np.testing.assert_array_equal(floor.free, ground.is_reachable(floor.centres))
+  np.testing.assert_array_equal(floor.index_of(floor.centres[7, 2]), (7, 2))
+  np.testing.assert_array_equal(floor.index_of(np.array([[-9, 9], [9, -9]])), [(0, 43), (23, 0)])
+  assert floor.clearance[floor.free].min() == pytest.approx(0.1)
+  assert (floor.clearance[~floor.free] == 0).all()
+  path = floor.path(np.array([0.0, 0.7]), np.array([1.9, 0.7]), np.where(floor.free, 1.0, 99.0))
+  np.testing.assert_allclose(path[[0, -1]], [[0.0, 0.7], [1.9, 0.7]])
+  assert ground.is_reachable(path).all()  # around the chest
+
+
+def test_room_around_places_and_the_nearest_place(ground):
+  places = np.array([[1.0, 0.0], [-1.0, 0.0]])
+  assert ground.has_room(places, 0.15).tolist() == [True, True]
+  assert ground.has_room(places, 0.35).tolist() == [False, True]
+  others = np.array([[1.0, 0.5], [1.0, 0.1], [1.0, 0.0]])
+  np.testing.assert_array_equal(ground.nearest_reachable(np.array([1.0, 0.6]), others), [1.0, 0.1])
+  np.testing.assert_array_equal(ground.nearest_reachable(np.array([0.0, 0.0]), others), [0.0, 0.0])
+  with pytest.raises(free_space.FreeSpaceError, match="among 1 around"):
+    ground.nearest_reachable(np.array([1.0, 0.6]), others[:1])
+
+
 def test_no_place_to_stand_is_said():
   block = box([0.2, 0.2, 0.5], [3.0, 3.0, 0.5])
-  ground = free_space.free_space([block], lower=LOWER, upper=UPPER)
+  ground = floor_plan.floor_plan([block], lower=LOWER, upper=UPPER)
   with pytest.raises(free_space.FreeSpaceError, match="no place where a robot"):
     ground.sample(np.random.default_rng(0), 1)
   with pytest.raises(free_space.FreeSpaceError):
@@ -118,5 +143,5 @@ def test_a_damaged_map_is_one_clear_line(tmp_path, text):
   path = tmp_path / "free_space.yaml"
   path.write_text(text)
   with pytest.raises(ValueError, match=r"^The map .* (is no YAML file|holds)") as error:
-    free_space.read(path)
+    map_server.read(path)
   assert "\n" not in str(error.value)

@@ -8,6 +8,7 @@ import trimesh
 from scipy import ndimage
 
 from nerf2real.core import cameras, similarity
+from nerf2real.scenes import bundle
 from nerf2real.scenes.geometry import fusion, mesh
 from tests.scenes import furnished_room
 
@@ -79,20 +80,18 @@ def test_units_do_not_matter(views, grid):
   assert np.percentile(np.abs(again.values - grid.values)[both], 99) < 0.02
 
 
-def test_density_with_floaters_is_carved(grid):
-  """A density with floaters in front of the cameras: carving removes them, a threshold does not."""
-  places = centres(grid).reshape(-1, 3)
-  rng = np.random.default_rng(0)
-  density = np.where(furnished_room.distance(places) < 0.05, 60.0, 1.0)
-  for floater in rng.uniform([-1, -1, 0.8], [1, 0.3, 1.6], (12, 3)):
-    density += 80 * (np.linalg.norm(places - floater, axis=-1) < 0.12)
-  density = density.reshape(grid.values.shape)
-  plain = mesh.density_to_grid(density, lower=grid.lower, voxel=VOXEL, threshold=25)
-  carved = mesh.density_to_grid(density, lower=grid.lower, voxel=VOXEL, threshold=25, carved=grid)
-  far = [(furnished_room.distance(mesh.surface(g).vertices) > 0.15).sum() for g in (plain, carved)]
-  assert far[0] > 500 and far[1] < 0.05 * far[0]
-  cleaned = mesh.drop_floaters(plain, min_component=0.6)
-  assert ndimage.label(cleaned.solid)[1] < ndimage.label(plain.solid)[1]
+def test_floaters_are_dropped(grid):
+  """A ball of matter in the air goes, the furniture stays."""
+  places = centres(grid)
+  ball = np.linalg.norm(places - [0.0, -0.4, 1.2], axis=-1) < 0.12
+  values = np.where(ball, np.float32(-1), grid.values)
+  dirty = grid._replace(values=values, weights=np.where(ball, np.float32(1), grid.weights))
+  assert dirty.solid[ball].all()
+  cleaned = mesh.drop_floaters(dirty, min_component=0.6)
+  assert not cleaned.solid[ball].any()
+  assert ndimage.label(cleaned.solid)[1] < ndimage.label(dirty.solid)[1]
+  error = furnished_room.distance(mesh.surface(cleaned).vertices)
+  assert (error > 0.15).sum() <= (furnished_room.distance(mesh.surface(grid).vertices) > 0.15).sum()
 
 
 def test_paint_simplify_and_glb(views, grid, tmp_path):
@@ -115,6 +114,20 @@ def test_paint_simplify_and_glb(views, grid, tmp_path):
   loaded = trimesh.load(path, force="mesh", process=False)
   np.testing.assert_allclose(loaded.vertices[:, 1], small.vertices[:, 2], atol=1e-5)
   np.testing.assert_allclose(loaded.vertices[:, 2], -small.vertices[:, 1], atol=1e-5)
+  back = mesh.load_glb(path)
+  np.testing.assert_allclose(back.vertices, small.vertices, atol=1e-5)
+  np.testing.assert_array_equal(back.visual.vertex_colors[:, :3], painted.colors)
+  with pytest.raises(ValueError, match="does not exist"):
+    mesh.load_glb(tmp_path / "none.glb")
+
+
+def test_the_visual_mesh_lies_within_the_bundles_extent():
+  scene = bundle.Bundle.load()
+  found = mesh.load_glb(scene.visual_path)
+  lower, upper = scene.extent
+  voxel = scene.scene["settings"]["mesh"]["voxel"]
+  assert (found.bounds[0] > lower - voxel).all() and (found.bounds[1] < upper + voxel).all()
+  assert (np.ptp(found.bounds, axis=0) > 0.8 * (upper - lower)).all()
 
 
 def test_nothing_seen_is_said(views):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
+from nerf2real.scenes.geometry.free_space import FreeSpace
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.planner import Planner
 from nerf2real.suite.gaits.walker import Pose, Walker
@@ -14,7 +15,7 @@ QUIET = RandomisationSettings(pushes=False)
 GOALS = ((0.6, 0.0), (0.6, 0.5), (0.0, 0.5), (-0.3, 0.0), (0.2, -0.3))
 
 
-class WallWithDoor:
+class WallWithDoor(FreeSpace):
   """A floor of 4 x 4 m with a wall at x = 0 that has a door at y in (1, 1.6)."""
 
   extent = (np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.0]))
@@ -23,8 +24,11 @@ class WallWithDoor:
   def free_space(self):
     return self
 
-  def is_reachable(self, xy):
-    xy = np.asarray(xy)
+  def sample(self, rng, count):
+    return rng.uniform([-2, -2, -np.pi], [-0.2, 2, np.pi], (count, 3))
+
+  def is_reachable(self, points):
+    xy = np.asarray(points)
     wall = np.abs(xy[..., 0]) < 0.15
     door = (xy[..., 1] > 1.0) & (xy[..., 1] < 1.6)
     return ~wall | door

@@ -329,8 +329,9 @@ def test_protocol_trials_can_be_set(nav, ball):
   center = ball.task.workspace.center
   np.testing.assert_allclose(ball.task.ball_position[:2] - center, trial.ball_xy, atol=1e-9)
   np.testing.assert_allclose(ball.task.state.position[:2] - center, trial.robot_xy, atol=1e-3)
-  taken = ball.task._nearest_free(np.array([2.5, -1.9]))  # in a piece of furniture
-  assert ball.task.scene.free_space.is_reachable(taken[None])[0]
+  in_furniture = trial._replace(robot_xy=tuple(np.array([2.5, -1.9]) - center))
+  taken, _ = ball.task.workspace.starts(in_furniture, ball.task.scene.free_space)
+  assert ball.task.scene.free_space.is_reachable(taken)
   assert ball.task.workspace.contains(taken)
   places = set()
   for trial in protocols.navigation():

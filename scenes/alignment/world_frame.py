@@ -1,0 +1,158 @@
+"""Aligns the model with the world frame: metres, z up, floor at z = 0, walls along the axes.
+
+Does automatically what the paper does by hand in Blender (section "Collision mesh extraction");
+every choice can be overridden (`scenes.alignment.overrides`). Shapes: N cameras, P points.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from nerf2real.core import rotations, similarity
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.extent import choose_extent
+from nerf2real.scenes.alignment.floor import (
+  Floor,
+  FloorSettings,
+  choose_floor,
+  refine_floor,
+  rough_up,
+)
+from nerf2real.scenes.alignment.overrides import Overrides
+from nerf2real.scenes.alignment.scale import Scale, choose_scale
+from nerf2real.scenes.alignment.yaw import choose_yaw
+
+_ABOVE_FLOOR = 0.1  # m: points above belong to the room, not to its floor
+_MAX_TILT_DEG = 15.0  # of the floor against the cameras' mean up direction, without a warning
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AlignSettings:
+  """Settings of the alignment; lengths in metres unless said otherwise."""
+
+  guessed_camera_height: float = 1.4  # of a phone held by a standing adult, if nothing gives scale
+  camera_height: float | None = None  # known median height of the camera above the floor
+  max_marker_spread: float = 0.03  # a marker whose scale is less certain (relative) is not used
+  margin: float = 0.15  # added around the extent, so that walls are inside
+  camera_margin: float = 0.4  # the extent holds every camera with this much room around it
+  max_height: float = 2.6  # top of the extent; a ceiling seldom touches a robot
+  outliers: float = 0.01  # share of surface cells outside the extent, on each side
+  floor: FloorSettings = dataclasses.field(default_factory=FloorSettings)
+  floor_threshold: float = 0.04  # matter below this height counts as floor
+  max_floor_gap: float = 0.1  # dense above sparse floor, share of the cameras' height: a bad field
+  refine_tolerance: float = 0.04  # of dense points about the floor
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Alignment:
+  """The world frame and the sources of its parts."""
+
+  world_from_unit: similarity.Similarity
+  extent_lower: np.ndarray  # [3] m, world frame; z is the floor, 0
+  extent_upper: np.ndarray  # [3] m, world frame
+  scale_source: str  # "marker", "points", "camera_height", "manual" or "unknown"
+  scale_spread: float | None  # relative standard deviation, where it is known
+  floor_source: str  # "plane", "manual_points" or "manual_up"
+  floor_residual: float  # root mean square distance of the floor's points [m]
+  floor_points: int  # points that carry the floor
+  floor_tilt_from_cameras_deg: float  # floor's normal against the cameras' mean up direction
+  floor_threshold: float  # m
+  yaw_source: str  # "walls", "points" or "manual"
+  camera_height: float  # median height of the cameras above the floor [m]
+  warnings: tuple[str, ...] = ()
+
+  def tilt_deg(self, true_up: np.ndarray) -> float:
+    """Angle between the world's z axis and a true up direction [3] of the unit frame."""
+    up = self.world_from_unit.rotation @ (true_up / np.linalg.norm(true_up))
+    return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
+
+
+def align(
+  evidence: Evidence,
+  *,
+  settings: AlignSettings | None = None,
+  override: Overrides | None = None,
+  progress: Progress = no_progress,
+) -> Alignment:
+  """Finds the world frame: floor, scale, yaw and extent.
+
+  Args:
+    evidence: Points, cameras and marker in the unit frame.
+    settings: Settings.
+    override: Values given by hand.
+    progress: Called with the fraction done and a text.
+
+  Raises:
+    ValueError: No floor was found, or the extent is empty.
+  """
+  settings, override = settings or AlignSettings(), override or Overrides()
+  evidence = evidence.thinned()
+  progress(0.0, "floor")
+  found = choose_floor(evidence, override, settings=settings.floor, max_gap=settings.max_floor_gap)
+  floor = found.value.floor
+  if not found.value.dense_trusted:
+    evidence = evidence.sparse()
+
+  def scale_above(floor: Floor) -> Choice[Scale]:
+    return choose_scale(
+      evidence,
+      override,
+      floor=floor,
+      camera_height=settings.camera_height,
+      guessed_camera_height=settings.guessed_camera_height,
+      max_marker_spread=settings.max_marker_spread,
+    )
+
+  if found.source == "plane" and evidence.surface_points is not None:
+    rough = scale_above(floor).value.metres_per_unit
+    floor = refine_floor(
+      floor, evidence.surface_points, tolerance=settings.refine_tolerance / rough
+    )
+  scale = scale_above(floor)
+  metres = scale.value.metres_per_unit
+
+  progress(0.4, "yaw")
+  heights = floor.heights(evidence.densest) * metres
+  rotation = choose_yaw(
+    evidence,
+    override,
+    upright=rotations.rotation_to_up(floor.normal),
+    in_room=(heights > _ABOVE_FLOOR) & (heights < settings.max_height),
+  )
+
+  progress(0.7, "extent")
+  extent = choose_extent(
+    evidence,
+    override,
+    metric=similarity.Similarity(metres, rotation.value, np.zeros(3)),
+    floor_height=floor.offset * metres,
+    max_height=settings.max_height,
+    outliers=settings.outliers,
+    margin=settings.margin,
+    camera_margin=settings.camera_margin,
+  )
+  progress(1.0, "aligned")
+  cosine = np.clip(floor.normal @ rough_up(evidence, override), -1, 1)
+  tilt = float(np.degrees(np.arccos(cosine)))
+  warnings = found.warnings + scale.warnings + rotation.warnings + extent.warnings
+  if tilt > _MAX_TILT_DEG:
+    warnings += (
+      f"The floor tilts {tilt:.0f} degrees against the cameras' mean up direction: check it in the "
+      "report, and give floor_points in the override file if it is wrong.",
+    )
+  return Alignment(
+    world_from_unit=similarity.Similarity(metres, rotation.value, -extent.value.origin),
+    extent_lower=extent.value.lower,
+    extent_upper=extent.value.upper,
+    scale_source=scale.source,
+    scale_spread=scale.value.spread,
+    floor_source=found.source,
+    floor_residual=floor.residual * metres,
+    floor_points=floor.points,
+    floor_tilt_from_cameras_deg=tilt,
+    floor_threshold=override.floor_threshold or settings.floor_threshold,
+    yaw_source=rotation.source,
+    camera_height=float(np.median(floor.heights(evidence.positions))) * metres,
+    warnings=warnings,
+  )

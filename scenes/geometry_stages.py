@@ -1,0 +1,160 @@
+"""Stages that make geometry of depth: world frame, surface mesh, contact geometry with free floor.
+
+Each runs, or finds done, one stage of the cache: a function of earlier results and settings.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from nerf2real.core.progress import Progress, part
+from nerf2real.core.serialization import read_json, write_json
+from nerf2real.scenes.alignment import markers, world_frame
+from nerf2real.scenes.alignment.evidence import Evidence
+from nerf2real.scenes.alignment.overrides import Overrides
+from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.geometry import collision, convex, floor_plan, fusion, map_server, mesh
+from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.quality import collision_error
+from nerf2real.scenes.results import Contact
+from nerf2real.scenes.stages import Made, StageResult, Stages
+
+_WORLD_VERSION = 2  # 2: the axes are unique
+
+
+def world(
+  cache: Stages,
+  capture: Made[Capture],
+  poses: Made[Localisation],
+  depth: Made[fusion.DepthViews],
+  settings: world_frame.AlignSettings,
+  *,
+  marker_side: float | None,
+  override: Overrides,
+  override_key: str,
+) -> Made[world_frame.Alignment]:
+  """Finds floor, scale, yaw and extent.
+
+  Args:
+    cache: The stages of the job.
+    capture: The keyframes, in which markers are looked for.
+    poses: Cameras and sparse points, unit frame.
+    depth: Rendered depth, unit frame.
+    settings: Of the alignment.
+    marker_side: Side of the black square of a marker in the room [m], or None.
+    override: What a person fixed.
+    override_key: Hash of the file that says so.
+  """
+  found = poses.value
+
+  def write(folder: Path, progress: Progress) -> None:
+    marker = None
+    if marker_side is not None:
+      images = [capture.value.folder / name for name in found.names]
+      marker = markers.marker_scale(
+        markers.detect(images, progress=part(progress, 0.0, 0.6)),
+        camera=found.camera,
+        frame_from_camera=found.world_from_camera,
+        side=marker_side,
+      )
+    points, normals = depth.value.surface_points(stride=2)
+    result = world_frame.align(
+      Evidence(found.points, found.world_from_camera, points, normals, marker),
+      settings=settings,
+      override=override,
+      progress=part(progress, 0.6, 1.0),
+    )
+    if marker_side is not None and marker is None:
+      missing = (
+        f"No marker of side {marker_side} m was read consistently in three pictures or more: "
+        "print it larger, lay it flat, film it from nearer."
+      )
+      result = dataclasses.replace(result, warnings=(*result.warnings, missing))
+    write_json(folder / "alignment.json", result)
+
+  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
+  inputs = {"depth": depth.stamp}
+  stage = cache.run("world", write, settings=everything, inputs=inputs, version=_WORLD_VERSION)
+  return Made(read_json(stage.folder / "alignment.json", world_frame.Alignment), stage)
+
+
+def surface(
+  cache: Stages,
+  world: Made[world_frame.Alignment],
+  depth: fusion.DepthViews,
+  settings: mesh.MeshSettings,
+) -> StageResult:
+  """Makes the coloured surface mesh of depth in the world frame."""
+
+  def write(folder: Path, progress: Progress) -> None:
+    grid = fusion.fuse(
+      depth,
+      lower=world.value.extent_lower,
+      upper=world.value.extent_upper,
+      voxel=settings.voxel,
+      truncation=settings.truncation,
+      progress=part(progress, 0.0, 0.5),
+    )
+    grid = mesh.drop_floaters(grid, min_component=settings.min_component)
+    found = mesh.drop_small_pieces(mesh.surface(grid), min_component=settings.min_component)
+    progress(0.7, "fewer faces")
+    found = mesh.simplify(found, faces=settings.visual_faces)
+    progress(0.8, "colours")
+    mesh.save_glb(mesh.paint(found, depth), folder / "visual.glb")
+
+  return cache.run("surface", write, settings=settings, inputs={"world": world.stamp})
+
+
+def contact(
+  cache: Stages,
+  world: Made[world_frame.Alignment],
+  depth: fusion.DepthViews,
+  collision_settings: collision.CollisionSettings,
+  floor_settings: floor_plan.FreeSpaceSettings,
+) -> Made[Contact]:
+  """Makes the convex parts and the map of the free floor of depth in the world frame."""
+  place = world.value
+
+  def write(folder: Path, progress: Progress) -> None:
+    shape = dataclasses.replace(collision_settings, floor_threshold=place.floor_threshold)
+    grid = collision.solid_grid(
+      depth,
+      lower=place.extent_lower,
+      upper=place.extent_upper,
+      settings=shape,
+      progress=part(progress, 0.0, 0.2),
+    )
+    parts = convex.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
+    collision.write_parts(parts, folder / "collision")
+    progress(0.8, "free space")
+    space = floor_plan.floor_plan(
+      parts,
+      lower=place.extent_lower,
+      upper=place.extent_upper,
+      seen=grid,
+      settings=floor_settings,
+    )
+    map_server.write(space, folder / "free_space.pgm")
+    goals = space.default_goals(count=floor_settings.goals, clearance=floor_settings.goal_clearance)
+    progress(0.85, "distance to the seen surface")
+    error = collision_error.collision_error(
+      parts,
+      depth.surface_points(stride=2)[0],
+      eyes=depth.positions,
+      lower=place.extent_lower,
+      upper=np.minimum(place.extent_upper, [np.inf, np.inf, shape.top]),
+      floor_threshold=place.floor_threshold,
+    )
+    figures = Contact(
+      goals=goals,
+      free_area_m2=space.area,
+      collision_parts=len(parts),
+      collision_error_m=error.p95,
+      collision_error=error,
+    )
+    write_json(folder / "contact.json", figures)
+
+  everything = [collision_settings, floor_settings]
+  stage = cache.run("contact", write, settings=everything, inputs={"world": world.stamp})
+  return Made(read_json(stage.folder / "contact.json", Contact), stage)

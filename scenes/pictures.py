@@ -1,0 +1,57 @@
+"""Reads the keyframes with their poses, for training and scoring."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pycolmap
+
+from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.field import anchors, photometry
+from nerf2real.scenes.field.views import Views
+from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.stages import Made
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedPictures:
+  """The registered keyframes at training size; read anew by every call, as they fill the memory."""
+
+  capture: Made[Capture]
+  poses: Made[Localisation]
+  width: int  # wider pictures are reduced to it [pixel]
+  held_out_every: int  # every so many are kept from training
+
+  def views(self) -> Views:
+    """Reads all pictures.
+
+    Raises:
+      ValueError: A keyframe is damaged.
+    """
+    found = self.poses.value
+    camera = found.camera
+    if camera.width > self.width:
+      camera = camera.resized(self.width, round(camera.height * self.width / camera.width))
+    images = []
+    for name in found.names:
+      path = self.capture.value.folder / name
+      image = cv2.imread(str(path))
+      if image is None:
+        raise ValueError(f"The keyframe {path} cannot be read: delete {path.parent.parent}.")
+      if image.shape[:2] != (camera.height, camera.width):
+        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+      images.append(image[..., ::-1])
+    model = pycolmap.Reconstruction(str(self.poses.stage.folder / "sfm"))
+    pictures = np.stack(images)
+    seen = photometry.point_colors(model, found.names, pictures)
+    gains = photometry.picture_gains(*seen, count=len(images))
+    known = anchors.known_points(model, found.names, found.world_from_camera, camera=camera)
+    return Views(camera, pictures, found.world_from_camera, found.names, gains, anchors=known)
+
+  def training(self) -> Views:
+    """Reads the pictures that are trained on."""
+    return self.views().split(self.held_out_every)[0]
+
+  def held_out(self) -> Views:
+    """Reads the pictures that are kept from training."""
+    return self.views().split(self.held_out_every)[1]

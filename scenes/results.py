@@ -1,0 +1,90 @@
+"""Types of the stages' results."""
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerf2real.scenes.alignment.world_frame import Alignment
+from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.geometry.convex import Part
+from nerf2real.scenes.geometry.fusion import DepthViews
+from nerf2real.scenes.pictures import PosedPictures
+from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.quality.collision_error import CollisionError
+from nerf2real.scenes.quality.held_out import ViewScore
+from nerf2real.scenes.stages import Made, StageResult
+
+
+class Source(NamedTuple):
+  """The capture that a scene is made from."""
+
+  path: Path
+  sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainedField:
+  """The radiance field on disk."""
+
+  path: Path
+
+  @functools.cached_property
+  def renderer(self) -> Renderer:
+    """The field, loaded and ready to render."""
+    return Renderer(Field.load(self.path), threads=os.cpu_count() or 1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Contact:
+  """Figures of the convex parts and of the free floor; their files lie beside them."""
+
+  goals: np.ndarray  # [G, 2] m
+  free_area_m2: float
+  collision_parts: int
+  collision_error_m: float
+  collision_error: CollisionError
+
+
+class SceneResults(NamedTuple):
+  """All that a bundle is assembled from."""
+
+  source: Source
+  capture: Made[Capture]
+  poses: Made[Localisation]
+  pictures: PosedPictures
+  field: Made[TrainedField]
+  figures: Made[dict[str, float]]
+  world: Made[Alignment]
+  depth: DepthViews  # in the world frame
+  surface: StageResult
+  contact: Made[Contact]
+  baseline: Made[dict[str, float]] | None
+
+
+class Reconstruction(NamedTuple):
+  """A reconstructed scene, for measurements against a truth."""
+
+  localisation: Localisation
+  renderer: Renderer
+  alignment: Alignment
+  parts: list[Part]
+  depth: DepthViews  # in the world frame
+  frame_times: np.ndarray  # of the registered keyframes in the video [N] [s]
+  collision_top: float  # height up to which contact geometry is made [m]
+
+
+class TruthFigures(NamedTuple):
+  """Figures against a known truth."""
+
+  figures: Mapping[str, Any]
+  robot_views: list[ViewScore]
+
+
+Measure = Callable[[Reconstruction], TruthFigures]

@@ -1,0 +1,66 @@
+"""Settings of the whole job from a capture to a scene bundle, and their presets."""
+
+import dataclasses
+
+from nerf2real.scenes.alignment.world_frame import AlignSettings
+from nerf2real.scenes.capture.capture import CaptureSettings
+from nerf2real.scenes.field import settings as training
+from nerf2real.scenes.field.settings import TrainSettings
+from nerf2real.scenes.geometry.collision import CollisionSettings
+from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
+from nerf2real.scenes.geometry.mesh import MeshSettings
+from nerf2real.scenes.poses.localise import LocaliseSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+  """Settings of the whole job; each part is a stage's own settings."""
+
+  capture: CaptureSettings = CaptureSettings()
+  """Keyframes."""
+  localise: LocaliseSettings = LocaliseSettings()
+  """Poses."""
+  train: TrainSettings = TrainSettings()
+  """Radiance field."""
+  train_width: int = 1280
+  """Wider pictures are reduced to this width for training [pixel], for memory."""
+  held_out_every: int = 8
+  """Every so many keyframes one is kept from training. Mip-NeRF 360's convention."""
+  depth_width: int = 320
+  """Width of the depth pictures that geometry is made from [pixel]."""
+  align: AlignSettings = AlignSettings()
+  """World frame."""
+  marker_side: float | None = None
+  """Side of the black square of ArUco or AprilTag markers in the room [m]; None: no marker."""
+  mesh: MeshSettings = MeshSettings()
+  """Surface mesh."""
+  collision: CollisionSettings = CollisionSettings()
+  """Contact geometry."""
+  free_space: FreeSpaceSettings = FreeSpaceSettings()
+  """Map of the free floor."""
+  baseline: str = "none"
+  """"colmap" adds the Poisson mesh of the COLMAP points to the report, as the paper compares."""
+
+  def __post_init__(self):
+    if self.baseline not in ("none", "colmap"):
+      raise ValueError(f"Unknown baseline {self.baseline!r}; expected 'none' or 'colmap'.")
+
+
+PRESETS = ("fast", "demo", "paper")
+
+
+def preset(name: str) -> SceneSettings:
+  """Returns settings: "fast" for two CPU cores, "demo" quicker, "paper" the paper's tables."""
+  if name == "fast":
+    return SceneSettings()
+  if name == "demo":
+    return SceneSettings(
+      capture=CaptureSettings(num_keyframes=110),
+      train=dataclasses.replace(training.preset("fast"), max_seconds=150.0),
+      baseline="colmap",
+    )
+  if name == "paper":
+    return SceneSettings(
+      capture=CaptureSettings(num_keyframes=1000), train=training.preset("paper"), train_width=1920
+    )
+  raise ValueError(f"Unknown preset {name!r}; expected one of {', '.join(PRESETS)}.")
