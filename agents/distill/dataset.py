@@ -20,6 +20,7 @@ from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core import files
 
 POSE_SIZE = 3  # x [m], y [m], yaw [rad]
+UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance")  # besides the pictures
 
 
 class Span(NamedTuple):

@@ -1,13 +1,11 @@
 """The learner of a distillation: takes labelled episodes in, trains the student stage by stage.
 
-What a run leaves in its folder: `data/` (episodes), `state.npz` (the learner's state),
-`settings.json`, `policy/newest` (the exported student) and `metrics.jsonl`. All of it is written
+What a run leaves in its folder: `data/` (episodes), `checkpoints/` (the learner's state),
+`settings.json`, `policy/newest` (the exported student) and `metrics.jsonl`. Files are written
 whole; a killed run goes on from its last state with all its episodes.
 """
 
 import dataclasses
-import io
-import json
 import logging
 import threading
 import time
@@ -18,60 +16,32 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import zenoh
 
 from nerf2real.agents.distill import settings as stages
 from nerf2real.agents.distill import student
-from nerf2real.agents.distill.dataset import Dataset, Span, Streams, Unroll
+from nerf2real.agents.distill.checkpoint import STATE, Counters, load_state, save_state
+from nerf2real.agents.distill.dataset import UNROLL_FIELDS, Dataset, Streams, Unroll
 from nerf2real.agents.distill.features import FeatureCache
-from nerf2real.agents.distill.learning import TrainingState, make_updates
+from nerf2real.agents.distill.learning import make_updates
+from nerf2real.agents.distill.schedule import cosine, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
+from nerf2real.agents.distill.validation import validate
 from nerf2real.agents.dmpo import scaling
 from nerf2real.agents.dmpo.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.link import sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink
-from nerf2real.agents.link.sessions import LinkSettings
 from nerf2real.agents.processes.environments import make_environment
 from nerf2real.agents.processes.logs import MetricsLog
 from nerf2real.agents.processes.timings import StageTimes
-from nerf2real.core import files
-from nerf2real.core.serialization import from_plain, to_plain, write_json
+from nerf2real.core.serialization import to_plain, write_json
 
 _log = logging.getLogger(__name__)
-STATE = "state.npz"
 POLICY = Path("policy") / "newest"
 _WAIT = 0.5  # s between looks for the first frames
 _SLACK = 10_000  # frames that collectors may be on the way with when the run has all
-_FINAL_RATE = 0.02  # of the learning rate, at a stage's end
-_VALIDATION_EPISODES = 8
 _VALIDATION_PERIOD = 120.0  # s
-_VALIDATION_ROUND = 200  # steps: lengths are padded to multiples of it, so that few are compiled
-_UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Counters:
-  """What a saved state says besides arrays."""
-
-  updates: int = 0
-  elapsed: float = 0.0  # s of training, over all parts of the run
-  begun: int | None = None  # frames at which the first student was published
-
-
-def stage_at(settings: DistillSettings, progress: float) -> tuple[int, float]:
-  """Returns the stage's index and the progress within it, at a progress of the run in [0, 1]."""
-  begin = 0.0
-  for index, stage in enumerate(settings.stages):
-    if progress < begin + stage.share or index == len(settings.stages) - 1:
-      return index, min(1.0, (progress - begin) / stage.share)
-    begin += stage.share
-  raise AssertionError("a distillation has at least one stage")
-
-
-def cosine(progress: float) -> float:
-  """The learning rate's factor: from 1 to `_FINAL_RATE` along half a cosine."""
-  return _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + float(np.cos(np.pi * progress)))
 
 
 class Learner:
@@ -82,8 +52,8 @@ class Learner:
     settings: DistillSettings,
     run: Path,
     *,
-    session: zenoh.Session,
-    link: LinkSettings,
+    endpoint: str,
+    link: sessions.LinkSettings,
     seed: int,
     minutes: float,
     resume: bool,
@@ -93,7 +63,7 @@ class Learner:
     Args:
       settings: of the distillation.
       run: the run's folder.
-      session: from `sessions.listen`.
+      endpoint: where to listen.
       link: the link's settings.
       seed: of first weights, augmentation and sampling.
       minutes: training time over all parts of the run [min].
@@ -101,9 +71,10 @@ class Learner:
 
     Raises:
       ValueError: the folder holds a run already, or none to continue.
+      LinkError: the endpoint is taken, or open to the network without users.
     """
     self._settings, self._run, self._minutes = settings, run, minutes
-    if (run / SETTINGS).exists() != resume:
+    if (run / STATE).exists() != resume:
       raise ValueError(
         f"{run} holds no run to continue: leave --resume out."
         if resume
@@ -121,9 +92,10 @@ class Learner:
     self._updates = make_updates(settings, self._layout)
     self._state = self._updates.init(jax.random.PRNGKey(seed))
     self._counters = Counters()
-    if (run / STATE).exists():
+    if resume:
       self._state, self._counters = load_state(run / STATE, like=self._state)
     write_json(run / SETTINGS, settings)
+    save_state(run / STATE, self._state, self._counters)
     self._rng = np.random.default_rng((seed, self._data.frames))
     self._cache = FeatureCache(
       self._updates.features, self._data, copies=settings.copies, width=self._width, seed=seed
@@ -141,10 +113,14 @@ class Learner:
     self._times = StageTimes()
     self._stop = threading.Event()
     self._last: dict[str, float] = {}  # times of the last periodical work
+    self._evaluation: dict[str, Any] = {}  # the last one
     self._is_fit = False  # whether encoder and policy belong together now
+    self._compiled: set[str] = set()  # kinds of stages whose update was called
     self._recent: list[dict[str, jax.Array]] = []
+    self._last_figures = (time.monotonic(), self._data.frames, self._counters.updates)
+    self._session = sessions.listen(endpoint, link)
     self._link = LearnerLink(
-      session,
+      self._session,
       link,
       limiter=limiter,
       insert=self._data.insert,
@@ -156,6 +132,7 @@ class Learner:
         "begun": self._counters.begun,
       },
     )
+    self._set_status()
     if (run / POLICY).exists():
       self._link.publish_parameters(
         load_arrays(run / POLICY), version=max(1, self._counters.updates)
@@ -193,11 +170,13 @@ class Learner:
   def close(self) -> None:
     """Leaves the link."""
     self._link.close()
+    sessions.close(self._session)
 
   def _wait_for_first_frames(self) -> None:
     while self._data.frames < self._settings.first_frames and not self._stop.is_set():
       self._check_link()
       self._drain_metrics()
+      self._set_status()
       self._stop.wait(_WAIT)
     if self._counters.updates or self._stop.is_set():
       return
@@ -237,12 +216,14 @@ class Learner:
       else:
         carried, metrics = self._update_unrolls(kind, streams, carried, within)
       now = time.monotonic()
+      # An update that was compiled for minutes is no minute of training.
+      counted = now - begin if kind in self._compiled else 0.0
+      begin, self._compiled = now, self._compiled | {kind}
       self._counters = dataclasses.replace(
         self._counters,
         updates=self._counters.updates + 1,
-        elapsed=self._counters.elapsed + now - begin,
+        elapsed=self._counters.elapsed + counted,
       )
-      begin = now
       self._recent.append(metrics)
       done += 1
       # While the encoder learns, and until the policy knows its new features, the two do not fit.
@@ -291,7 +272,7 @@ class Learner:
     return carried, metrics
 
   def _batch(self, unroll: Unroll) -> dict[str, np.ndarray]:
-    batch = {name: self._data.arrays[name][unroll.frames] for name in _UNROLL_FIELDS}
+    batch = {name: self._data.arrays[name][unroll.frames] for name in UNROLL_FIELDS}
     return batch | {"begins": unroll.begins}
 
   def _training_frames(self, limit: int) -> np.ndarray:
@@ -321,10 +302,12 @@ class Learner:
       values = {name: float(np.mean([m[name] for m in self._recent])) for name in self._recent[0]}
       figures = {"stage": kind, "minutes": self._counters.elapsed / 60, "progress": self._progress}
       self._write("learner", values | figures | self._times.take(len(self._recent)))
+      self._set_status()
       self._recent.clear()
     if self._due("validate", _VALIDATION_PERIOD):
       with self._times.stage("validation"):
-        self._write("validation", self._validate())
+        found = validate(self._state, self._updates, data=self._data, cache=self._cache)
+      self._write("validation", found)
 
   def _check_link(self) -> None:
     if self._link.failure:
@@ -339,25 +322,30 @@ class Learner:
   def _drain_metrics(self) -> None:
     while not self._link.metrics.empty():
       who, values = self._link.metrics.get()
-      self._write("evaluator" if who.startswith("evaluator") else who, values)
+      if who.startswith("evaluator"):
+        self._evaluation = values
+      self._write(who.partition("-")[0], values)
 
-  def _validate(self) -> dict[str, float]:
-    """Errors on episodes that were held out, clean pictures, student not driving."""
-    held = self._data.spans(held_out=True)
-    if not held:
-      return {}
-    chosen = [held[i] for i in np.linspace(0, len(held) - 1, _VALIDATION_EPISODES).astype(int)]
-    longest = max(span.end - span.begin for span in chosen)
-    length = -(-longest // _VALIDATION_ROUND) * _VALIDATION_ROUND
-    frames = np.stack([_padded(span, length) for span in chosen])
-    present = np.arange(length) < np.array([[s.end - s.begin] for s in chosen])
-    begins = np.zeros(frames.shape, np.float32)
-    begins[:, 0] = 1.0
-    batch = self._batch(Unroll(frames, begins))
-    features = self._cache.clean(self._state.student["encoder"], frames.ravel())
-    batch["features"] = features.reshape(*frames.shape, -1).astype(np.float32)
-    found = jax.device_get(self._updates.predict(self._state, batch))
-    return {name: float(np.median(values[present])) for name, values in found.items()}
+  def _set_status(self) -> None:
+    """Offers the figures that `agents.processes.status_view` shows."""
+    now, frames, updates = time.monotonic(), self._data.frames, self._counters.updates
+    then, frames_then, updates_then = self._last_figures
+    self._last_figures = (now, frames, updates)
+    period = max(now - then, 1e-3)
+    status = {
+      "steps": frames,
+      "steps_per_second": (frames - frames_then) / period,
+      "updates": updates,
+      "updates_per_second": (updates - updates_then) / period,
+      "filled": frames >= self._settings.first_frames,
+      "return": None,
+      "evaluation": None,
+      "best": None,
+      "success": self._evaluation.get("success"),
+      "localisation_error": self._evaluation.get("localisation_error"),
+      "replay_steps": frames,
+    }
+    self._link.set_status(status)
 
   def _publish(self) -> None:
     arrays = student.served_parameters(self._state.student, self._state.scales)
@@ -381,35 +369,3 @@ class Learner:
         "teacher": self._settings.teacher,
       },
     )
-
-
-def _padded(span: Span, length: int) -> np.ndarray:
-  return np.minimum(np.arange(span.begin, span.begin + length), span.end - 1)
-
-
-def save_state(path: Path, state: TrainingState, counters: Counters) -> None:
-  """Writes a training state whole: its leaves in order, and the counters as JSON."""
-  leaves = {f"leaf{i:04d}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
-  about = np.frombuffer(json.dumps(to_plain(counters)).encode(), np.uint8)
-  buffer = io.BytesIO()
-  np.savez(buffer, counters=about, **leaves)  # type: ignore[arg-type]
-  files.write_atomically(path, buffer.getvalue())
-
-
-def load_state(path: Path, *, like: TrainingState) -> tuple[TrainingState, Counters]:
-  """Reads what `save_state` wrote.
-
-  Args:
-    path: the file.
-    like: a state of the same settings.
-
-  Raises:
-    ValueError: it is of other settings.
-  """
-  with np.load(path, allow_pickle=False) as stored:
-    counters = from_plain(json.loads(stored["counters"].tobytes()), Counters)
-    found = [stored[name] for name in sorted(n for n in stored.files if n.startswith("leaf"))]
-  expected, structure = jax.tree.flatten(like)
-  if [x.shape for x in found] != [x.shape for x in expected]:
-    raise ValueError(f"{path} is of other networks than the settings: take those it began with.")
-  return jax.tree.unflatten(structure, [jnp.asarray(x) for x in found]), counters

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill import collecting, evaluating, settings
+from nerf2real.agents.distill import episodes, evaluating, schedule, settings
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Label
 from nerf2real.agents.dmpo.inference import PolicyState, PolicyStep
@@ -14,19 +14,19 @@ from nerf2real.suite import protocols
 
 def test_the_teacher_gives_way_to_the_student():
   mixture = MixtureSettings(first_share=1.0, last_share=0.2, anneal_frames=100, belief_share=0.5)
-  assert collecting.mixture_at(mixture, 5_000, begun=None) == (1.0, 0.0)
-  assert collecting.mixture_at(mixture, 5_000, begun=5_000) == (1.0, 0.0)
-  assert collecting.mixture_at(mixture, 5_050, begun=5_000) == pytest.approx((0.6, 0.25))
-  assert collecting.mixture_at(mixture, 9_999, begun=5_000) == pytest.approx((0.2, 0.5))
+  assert schedule.mixture_at(mixture, 5_000, begun=None) == (1.0, 0.0)
+  assert schedule.mixture_at(mixture, 5_000, begun=5_000) == (1.0, 0.0)
+  assert schedule.mixture_at(mixture, 5_050, begun=5_000) == pytest.approx((0.6, 0.25))
+  assert schedule.mixture_at(mixture, 9_999, begun=5_000) == pytest.approx((0.2, 0.5))
 
 
 def test_pushes_come_in_steps():
   tiny = settings.preset("tiny")
-  assert collecting.push_level(tiny, 39) == (0.0, 0.0)
-  assert collecting.push_level(tiny, 40) == (5.0, 15.0)
+  assert schedule.push_level(tiny, 39) == (0.0, 0.0)
+  assert schedule.push_level(tiny, 40) == (5.0, 15.0)
   name = "suite:nerf_nav?scene=out/room"
-  assert collecting.pushed(name, (0.0, 0.0)) == "suite:nerf_nav?scene=out/room&pushes=false"
-  assert collecting.pushed("suite:nerf_nav", (1.0, 3.0)) == (
+  assert schedule.pushed(name, (0.0, 0.0)) == "suite:nerf_nav?scene=out/room&pushes=false"
+  assert schedule.pushed("suite:nerf_nav", (1.0, 3.0)) == (
     "suite:nerf_nav?pushes=true&push_force=1.0,3.0"
   )
 
@@ -85,7 +85,7 @@ def world():
 def _run(world, mixture, *, policy=None, detours=0.0):
   environment, layout = world
   teacher = _Teacher()
-  runner = collecting.EpisodeRunner(
+  runner = episodes.EpisodeRunner(
     environment,
     layout,
     teacher=teacher,
@@ -99,10 +99,10 @@ def _run(world, mixture, *, policy=None, detours=0.0):
 def test_every_state_is_labelled_whoever_drives(world):
   environment, _ = world
   student = _Still(environment._environment.task.standing_action)
-  arrays, figures, teacher = _run(world, collecting.Mixture(0.5, 0.0), policy=student)
+  arrays, figures, teacher = _run(world, schedule.Mixture(0.5, 0.0), policy=student)
   frames = len(arrays["state"])
   assert figures["length"] == frames == student.calls == len(teacher.poses)
-  assert set(arrays["driver"]) == {collecting.TEACHER, collecting.STUDENT}
+  assert set(arrays["driver"]) == {episodes.TEACHER, episodes.STUDENT}
   assert (arrays["label"] == 0.5).all() and (arrays["command"] == [1.0, -1.0]).all()
   assert arrays["pose"] == pytest.approx(np.array(teacher.poses), abs=1e-6)
   goal = environment._environment.task.goal
@@ -114,12 +114,12 @@ def test_every_state_is_labelled_whoever_drives(world):
 def test_a_teacher_by_belief_is_given_the_likeliest_pose_and_the_truth_is_kept(world):
   environment, _ = world
   student = _Still(environment._environment.task.standing_action)
-  arrays, _, teacher = _run(world, collecting.Mixture(0.0, 1.0), policy=student)
+  arrays, _, teacher = _run(world, schedule.Mixture(0.0, 1.0), policy=student)
   assert set(teacher.poses[1:]) == {(9.0, 8.0, 7.0)}
   assert np.abs(arrays["pose"]).max() < 7.0
 
 
 def test_without_a_student_the_teacher_drives_and_detours_are_marked(world):
-  arrays, figures, _ = _run(world, collecting.Mixture(1.0, 0.0), detours=0.5)
+  arrays, figures, _ = _run(world, schedule.Mixture(1.0, 0.0), detours=0.5)
   assert figures["student_share"] == 0
-  assert set(arrays["driver"]) == {collecting.TEACHER, collecting.DETOUR}
+  assert set(arrays["driver"]) == {episodes.TEACHER, episodes.DETOUR}
