@@ -97,14 +97,13 @@ class EpisodeRunner:
           student, state, believed = self._step_student(policy, flat, state)
         pose = believed if by_belief and believed is not None else truth
       with self.times.stage("teacher"):
-        label = self._teacher.label(observation, goal=goal, pose=pose)
         if segment.left <= 0:
           segment = self._draw_segment(policy is not None, mixture)
         segment.left -= 1
+        label = self._teacher.label(observation, goal=goal, pose=pose)
         action = self._choose(segment, label.action, student, observation, pose)
-      image = flat.image
       values = (
-        image,
+        flat.image,
         flat.state,
         label.action,
         label.command,

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from nerf2real.agents.distill import settings as stages
@@ -22,11 +21,10 @@ from nerf2real.agents.distill import student
 from nerf2real.agents.distill.checkpoint import STATE, Counters, load_state, save_state
 from nerf2real.agents.distill.dataset import UNROLL_FIELDS, Dataset, Streams, Unroll
 from nerf2real.agents.distill.features import FeatureCache
-from nerf2real.agents.distill.learning import make_updates
+from nerf2real.agents.distill.learning import make_updates, standardised
 from nerf2real.agents.distill.schedule import cosine, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
 from nerf2real.agents.distill.validation import validate
-from nerf2real.agents.dmpo import scaling
 from nerf2real.agents.dmpo.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
@@ -180,16 +178,14 @@ class Learner:
       self._stop.wait(_WAIT)
     if self._counters.updates or self._stop.is_set():
       return
-    frames = self._training_frames(self._data.frames)
-    rows = {"state": self._data.arrays["state"][frames]}
-    layout = dataclasses.replace(self._layout, privileged_names=(), privileged_sizes=())
-    labels = self._data.arrays["label"][frames]
-    spread = np.maximum(labels.std(0), self._settings.min_action_spread)
-    self._state = self._state._replace(
-      scales=jax.tree.map(jnp.asarray, scaling.measure(rows, layout)), spread=jnp.asarray(spread)
+    frames = self._training_frames()
+    self._state = standardised(
+      self._state,
+      state_rows=self._data.arrays["state"][frames],
+      labels=self._data.arrays["label"][frames],
+      layout=self._layout,
+      min_spread=self._settings.min_action_spread,
     )
-    # Before the first update the student does what the teacher does on average.
-    self._state.student["policy"]["mean"]["b"] = jnp.asarray(labels.mean(0))
     _log.info("Training begins with %d frames.", self._data.frames)
 
   # ---- stages ----
@@ -238,7 +234,7 @@ class Learner:
 
   def _update_encoder(self, within: float) -> dict[str, jax.Array]:
     with self._times.stage("sampling"):
-      frames = self._training_frames(self._data.frames)
+      frames = self._training_frames()
       chosen = self._rng.choice(frames, self._settings.encoder_batch)
       image, pose = (self._data.arrays[name][chosen] for name in ("image", "pose"))
     with self._times.stage("update"):
@@ -275,9 +271,9 @@ class Learner:
     batch = {name: self._data.arrays[name][unroll.frames] for name in UNROLL_FIELDS}
     return batch | {"begins": unroll.begins}
 
-  def _training_frames(self, limit: int) -> np.ndarray:
+  def _training_frames(self) -> np.ndarray:
     """Indices of the frames that are not held out."""
-    spans = [s for s in self._data.spans(held_out=False) if s.end <= limit]
+    spans = self._data.spans(held_out=False)
     return np.concatenate([np.arange(span.begin, span.end) for span in spans])
 
   # ---- periodical work ----

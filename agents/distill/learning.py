@@ -4,11 +4,13 @@ Shape letters: N pictures, B streams, T steps of an unroll, F features, U units 
 augmented copies.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from nerf2real.agents.distill import losses, student
@@ -160,6 +162,36 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
     end_to_end=jax.jit(end_to_end, donate_argnums=0),
     features=jax.jit(features),
     predict=jax.jit(predict),
+  )
+
+
+def standardised(
+  state: TrainingState,
+  *,
+  state_rows: np.ndarray,
+  labels: np.ndarray,
+  layout: Layout,
+  min_spread: float,
+) -> TrainingState:
+  """Returns a state that has seen no update, with the inputs' and actions' scales of first data.
+
+  Its student does what the teacher does on average.
+
+  Args:
+    state: the state.
+    state_rows: proprioception [N, S].
+    labels: the teacher's actions [N, A].
+    layout: the environment's layout.
+    min_spread: smallest spread of an action.
+  """
+  public = dataclasses.replace(layout, privileged_names=(), privileged_sizes=())
+  scales = scaling.measure({"state": state_rows}, public)
+  policy = state.student["policy"]
+  mean = policy["mean"] | {"b": jnp.asarray(labels.mean(0))}
+  return state._replace(
+    student=state.student | {"policy": policy | {"mean": mean}},
+    scales=jax.tree.map(jnp.asarray, scales),
+    spread=jnp.asarray(np.maximum(labels.std(0), min_spread)),
   )
 
 

@@ -23,7 +23,7 @@ LAYOUT = Layout(
 TINY = settings.preset("tiny")
 
 
-def _state(seed=0):
+def make_state(seed=0):
   updates = learning.make_updates(TINY, LAYOUT)
   state = updates.init(jax.random.PRNGKey(seed))
   rows = {"state": np.random.default_rng(0).normal(3.0, [1, 5, 0.1, 2, 9], (50, 5))}
@@ -46,7 +46,7 @@ def _batch(size=2, time=6, seed=1):
 
 
 def test_the_export_acts_as_the_training_network(tmp_path):
-  _, state = _state()
+  _, state = make_state()
   batch = _batch()
   batch["begins"][1, 3] = 1.0
   network = TINY.agent.network
@@ -84,7 +84,7 @@ def test_the_export_acts_as_the_training_network(tmp_path):
 
 
 def test_an_unroll_in_two_parts_is_the_unroll_in_one():
-  _, state = _state()
+  _, state = make_state()
   rng = np.random.default_rng(2)
   features = rng.normal(size=(2, 6, 8)).astype(np.float32)
   inputs = rng.normal(size=(2, 6, 5)).astype(np.float32)
@@ -105,9 +105,26 @@ def test_an_unroll_in_two_parts_is_the_unroll_in_one():
   assert np.asarray(second.action) == pytest.approx(np.asarray(whole.action[:, 4:]), abs=1e-5)
 
 
+def test_a_fresh_student_does_what_the_teacher_does_on_average():
+  updates = learning.make_updates(TINY, LAYOUT)
+  labels = np.random.default_rng(0).normal([0.5, -0.5, 0.0, 0.2], [0.3, 0.001, 0.1, 0.2], (99, 4))
+  rows = np.random.default_rng(1).normal(3.0, 2.0, (99, 5))
+  state = learning.standardised(
+    updates.init(jax.random.PRNGKey(0)),
+    state_rows=rows,
+    labels=labels.astype(np.float32),
+    layout=LAYOUT,
+    min_spread=0.05,
+  )
+  assert state.student["policy"]["mean"]["b"] == pytest.approx(labels.mean(0), abs=1e-6)
+  assert state.spread == pytest.approx(np.maximum(labels.std(0), 0.05), abs=1e-6)
+  assert state.scales["state"]["mean"] == pytest.approx(rows.mean(0), abs=1e-5)
+  assert set(state.scales) == {"state"}
+
+
 @pytest.mark.parametrize("kind", ["encoder", "policy", "end_to_end"])
 def test_updates_lower_the_loss_and_reach_their_own_parameters(kind):
-  updates, state = _state()
+  updates, state = make_state()
   before = jax.device_get(state.student)
   batch = _batch()
   batch["features"] = np.random.default_rng(3).normal(size=(2, 6, 8)).astype(np.float32)

@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
+from nerf2real.agents.distill import student
 from nerf2real.agents.distill import teacher as teachers
+from nerf2real.agents.dmpo import export
+from nerf2real.agents.dmpo.specs import POSITION, ROTATION
+from nerf2real.core.serialization import to_plain
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.tasks.base import Start
+from tests.agents.distill.test_student import LAYOUT, TINY, make_state
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +89,35 @@ def test_a_label_says_the_command_and_stays_within_the_actions(environment):
 def test_the_quick_teacher_walks_under_noise(environment):
   teacher = teachers.make_teacher("quick", environment.task.scene)
   assert _walk(environment, teacher, noise=0.05, steps=200) == 200
+
+
+def test_an_exported_policy_is_a_teacher_without_commands(tmp_path):
+  _, state = make_state()
+  arrays = student.served_parameters(state.student, state.scales)
+  settings = to_plain(TINY.agent)
+  export.export_policy(
+    tmp_path, arrays, layout=LAYOUT, environment="suite:nerf_nav", settings=settings, info={}
+  )
+  teacher, policy = (
+    teachers.make_teacher(str(tmp_path), None),
+    export.load_policy(tmp_path).policy,
+  )
+  rng, carried = np.random.default_rng(0), policy.initial_state()
+  teacher.reset(Pose(0.0, 0.0, 0.0))
+  for _ in range(3):
+    observation = {
+      "camera": rng.integers(0, 256, (12, 16, 3), np.uint8),
+      "goal": rng.normal(size=2),
+      "gyroscope": rng.normal(size=3),
+      POSITION: np.zeros(3),
+      ROTATION: np.eye(3),
+    }
+    flat = LAYOUT.flatten(observation)
+    step = policy.step(flat.image, flat.state, carried)
+    carried = step.state
+    label = teacher.label(observation, goal=np.zeros(2), pose=Pose(0.0, 0.0, 0.0))
+    assert label.action == pytest.approx(np.clip(step.mean, -1, 1), abs=1e-6)
+    assert np.isnan(label.command).all()
 
 
 def test_an_unknown_teacher_is_refused():
