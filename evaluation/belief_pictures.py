@@ -11,21 +11,10 @@ from nerf2real.agents.dmpo.acting import task_of
 from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
 from nerf2real.agents.dmpo.specs import planar_pose
 from nerf2real.agents.processes.environments import make_environment
+from nerf2real.scenes.geometry import floor_picture
 
-_CELL = 0.05  # m
-_FREE, _OTHER = 235, 60  # grey levels of the floor where the robot fits, and of all else
+_SCALE = 80  # pixel/m
 _COLUMNS = 4  # moments in a row of the picture
-
-
-def floor_map(task: Any, extent: belief_plot.Extent) -> np.ndarray:
-  """The free floor from above over an extent, uint8 [rows, columns, 3]."""
-  x_from, x_to, y_from, y_to = extent
-  x = np.arange(x_from + _CELL / 2, x_to, _CELL)
-  y = np.arange(y_from + _CELL / 2, y_to, _CELL)[::-1]
-  grid = np.stack(np.meshgrid(x, y), axis=-1)
-  free = np.asarray(task.scene.free_space.is_reachable(grid.reshape(-1, 2)))
-  grey = np.where(free.reshape(grid.shape[:2]), _FREE, _OTHER).astype(np.uint8)
-  return np.repeat(grey[..., None], 3, axis=-1)
 
 
 def run_episode(
@@ -35,9 +24,9 @@ def run_episode(
   task, layout, policy = task_of(environment), loaded.layout, loaded.policy
   if layout.pose_columns is None or not policy.has_belief:
     raise ValueError("The policy has no belief: it needs pictures and the true pose in training.")
-  lower, upper = (np.asarray(corner, float)[:2] for corner in task.scene.extent)
-  extent = (lower[0], upper[0], lower[1], upper[1])
-  background = floor_map(task, extent)
+  scene = task.scene
+  height = round(_SCALE * float(scene.extent[1][1] - scene.extent[0][1]))
+  floor = floor_picture.draw(scene.free_space, scene.extent, height=height)
   timestep, state = environment.reset(), policy.initial_state()
   goal = getattr(task, "goal", None)
   frames: list[np.ndarray] = []
@@ -48,12 +37,7 @@ def run_episode(
     state = step.state
     truth = planar_pose(flat.privileged, layout.pose_columns)[:2]
     errors.append(float(np.linalg.norm(policy.believed_position(step.embedding) - truth)))
-    density = belief_plot.position_density(
-      *policy.belief(step.embedding), extent=extent, cell=_CELL
-    )
-    heat = belief_plot.draw_heat_map(
-      density, extent=extent, truth=truth, target=goal, background=background, pixels_per_cell=4
-    )
+    heat = belief_plot.draw(floor, *policy.belief(step.embedding), truth=truth, target=goal)
     frames.append(_beside(flat.image, heat, f"{len(errors) - 1}: {errors[-1]:.2f} m"))
     timestep = environment.step(step.mean)
   chosen = np.unique(np.linspace(0, len(frames) - 1, moments).round().astype(int))

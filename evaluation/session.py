@@ -12,15 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.dmpo import belief_plot
-from nerf2real.evaluation import episodes, maps, plants, report, runner, tables
+from nerf2real.evaluation import episodes, plants, report, runner, tables
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
 from nerf2real.evaluation.settings import GAIT, EvaluationSettings
 from nerf2real.suite import loading
-
-_HEAT_CELL = 0.05  # m
 
 
 def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
@@ -97,26 +94,6 @@ def choose(listed: tuple[Any, ...], count: int | None) -> list[tuple[int, Any]]:
   return [(int(index), listed[index]) for index in indices]
 
 
-def draw_belief(moment: episodes.Moment, goal: tuple[float, float], floor: maps.Map) -> np.ndarray:
-  """Draws what a policy believed over the map."""
-  density = belief_plot.position_density(
-    np.array(moment.logits),
-    np.array(moment.means),
-    np.array(moment.stddevs),
-    extent=floor.extent,
-    cell=_HEAT_CELL,
-  )
-  truth = None if moment.position is None else np.array(moment.position)
-  return belief_plot.draw_heat_map(
-    density,
-    extent=floor.extent,
-    truth=truth,
-    target=np.array(goal),
-    background=floor.background,
-    pixels_per_cell=3,
-  )
-
-
 def _line(episode: episodes.Episode, number: int, count: int) -> str:
   took = f"{episode.time:.1f} s" if episode.time is not None else f"after {episode.duration:.1f} s"
   error = episode.localisation_error
@@ -152,7 +129,6 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
         path,
         store.episodes,
         scene=scene,
-        draw_belief=draw_belief,
         settings=dataclasses.asdict(settings),
       )
   shown = [*tables.paper_tables(store.episodes), tables.outcome_table(store.episodes)]

@@ -31,11 +31,12 @@ class Arguments:
 
 def run(arguments: Arguments) -> None:
   """Writes the page, or serves it until interrupted."""
+  from nerf2real.core.files import write_atomically
   from nerf2real.real.recorder import replay, replay_server
 
   shown = replay.load(arguments.log)
   if arguments.html is not None:
-    arguments.html.write_text(replay.page(shown, embed=True))
+    write_atomically(arguments.html, replay.page(shown, embed=True))
     print(f"wrote {arguments.html}")
     return
   server = replay_server.make_server(shown, host=arguments.host, port=arguments.port)

@@ -7,7 +7,7 @@ import trimesh
 import viser
 from viser import transforms
 
-from nerf2real.core.pages.parts import part_color
+from nerf2real.core import palette
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render import browser as field_view
@@ -25,13 +25,12 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
   parts = []
   for index, path in enumerate(bundle.collision_parts):
     part = trimesh.load_mesh(path)
-    red, green, blue = (int(part_color(index)[k : k + 2], 16) for k in (1, 3, 5))
     parts.append(
       server.scene.add_mesh_simple(
         f"/parts/{index:03d}",
         part.vertices,
         part.faces,
-        color=(red, green, blue),
+        color=palette.rgb(palette.cycle(index)),
         opacity=0.85,
         flat_shading=True,
       )

@@ -147,7 +147,7 @@ def test_learned_policy_needs_nothing_privileged_and_its_belief_is_drawn(exporte
   assert found.localisation_error > 0 and len(found.moments) == 3 and found.moments[0].picture
   again = runner.run_trial(plant, policy, TRIAL, group="navigation", index=0)
   assert again == found  # nothing of the last episode is left in the policy
-  report.write(tmp_path / "r.html", [found], scene=EmptyFloor(), draw_belief=session.draw_belief)
+  report.write(tmp_path / "r.html", [found], scene=EmptyFloor())
   page = (tmp_path / "r.html").read_text()
   assert "Where the policy believed to be" in page and "episode 1 (lost), 1.0 s" in page
   assert page.count("data:image/jpeg") == 1 + 3
