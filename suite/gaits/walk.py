@@ -5,6 +5,9 @@ upright over the floor, and `legs` turns them into joint positions. Because the 
 and the control signal is filtered, the targets lead the pattern; the filter is inverted exactly
 within its bounds. Feedback of the turning rates and the tilt acts on ankles and hips. Parameters
 were searched for with `launch/tune_gait.py`.
+
+Where something else than this gait drives the robot, `follow` keeps its hidden state (filter, phase
+and amplitude) at what was really applied, so that its next action fits the robot's motion.
 """
 
 import dataclasses
@@ -16,6 +19,13 @@ from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
 
 _TIMESTEP = constants.CONTROL_TIMESTEP
+_HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")]
+# rad by which `follow` corrects the phase in a control step; chosen: a third of what the gait
+# itself advances, so that half a period is caught up in 26 steps.
+_PHASE_CORRECTION = 0.12
+_ROVING = 8  # further phases that `follow` tries in turn
+_JUMP_SHARE = 0.5  # of the present mismatch below which it takes one of them; chosen
+_LOCKABLE = 0.5  # amplitude from which a phase can be told from the legs; chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,6 +77,7 @@ class Command:
   forward: float = 0.0  # -1 to 1: share of the full stride
   turn: float = 0.0  # -1 to 1: share of the full turning step, positive to the left
   step: bool = True  # False: come to a stand
+  head: tuple[float, float] | None = None  # pan, tilt [rad]; None: as in the reference pose
 
 
 class Gait:
@@ -88,11 +99,18 @@ class Gait:
 
   def reset(self) -> None:
     """Begins an episode: the robot stands in the reference pose."""
-    self._filter.reset((self._standing - self._middle) / self._half_range)
+    self._filter.reset(self._standing_control())
+    self._before = self._standing_control()  # filter's value before the last action
     self._phase = 0.0
+    self._roving = 0
     self._amplitude = 0.0
     self._forward = self._turn = 0.0
     self._crouched = 0.0  # share of the way from the reference pose to the gait's own
+    self._head: tuple[float, float] | None = None
+    self._feedback: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+
+  def _standing_control(self) -> np.ndarray:
+    return (self._standing - self._middle) / self._half_range
 
   @property
   def phase(self) -> float:
@@ -124,15 +142,55 @@ class Gait:
       self._phase = (self._phase + 2 * np.pi * _TIMESTEP / settings.period) % (2 * np.pi)
     else:
       self._phase = 0.0
-    targets = self._targets(self._phase, gyroscope, gravity)
-    return self._invert(targets)
+    self._head, self._feedback = command.head, (gyroscope, gravity)
+    return self._invert(self._targets(self._phase, self._amplitude))
 
-  def _targets(self, phase, gyroscope, gravity) -> np.ndarray:
+  def follow(self, control: np.ndarray) -> None:
+    """Sets the hidden state to a control that was applied in place of this gait's own.
+
+    To be called after `act`. The filter takes the control's value. The phase is locked to it: of
+    the present phase, one a little before, one a little behind and one further away, a different
+    one at every call, that is kept from which this gait's own control would have come nearest in
+    the legs. The amplitude sinks, twice as fast as `act` raises it, while a lower one comes nearer.
+
+    Args:
+      control: Filtered control signal of the last control step [20], normalised.
+    """
+    control = np.asarray(control, np.float64)
+    before, self._before = self._before, control
+    self._filter.reset(control)
+    if self._amplitude < _LOCKABLE:
+      return
+
+    def mismatch(phase: float, amplitude: float) -> float:
+      wanted = self._wanted(self._targets(phase, amplitude))
+      own = before + (1 - self._filter.strength) * (self._inverse(wanted, before) - before)
+      return float(np.sum((own - control)[legs.COLUMNS] ** 2))
+
+    phase, present = self._phase, mismatch(self._phase, self._amplitude)
+    self._roving = (self._roving + 1) % _ROVING
+    for step, share in (
+      (-_PHASE_CORRECTION, 1.0),
+      (_PHASE_CORRECTION, 1.0),
+      (2 * np.pi * (self._roving + 0.5) / _ROVING, _JUMP_SHARE),
+    ):
+      found = mismatch(self._phase + step, self._amplitude)
+      if found < share * present:
+        phase, present = self._phase + step, found
+    self._phase = phase % (2 * np.pi)
+    lower = self._amplitude - 2 * _TIMESTEP / self.settings.stop_time
+    if mismatch(phase, lower) < present:
+      self._amplitude = lower
+
+  def _targets(self, phase: float, amplitude: float) -> np.ndarray:
     """Returns the position targets [20] that shall leave the action filter."""
     settings = self.settings
+    gyroscope, gravity = self._feedback
     ahead = phase + 2 * np.pi * settings.lead / settings.period
-    pattern = self.pattern(ahead, self._forward, self._turn, self._amplitude)
+    pattern = self.pattern(ahead, self._forward, self._turn, amplitude)
     targets = self._standing.copy()
+    if self._head is not None:
+      targets[_HEAD] += self._crouched * (np.asarray(self._head) - targets[_HEAD])
     if gyroscope is not None:
       roll = settings.roll_rate_gain * gyroscope[0]
       pitch = settings.pitch_rate_gain * gyroscope[1]
@@ -176,16 +234,20 @@ class Gait:
       angles.append(leg)
     return np.stack(angles)
 
+  def _wanted(self, targets: np.ndarray) -> np.ndarray:
+    """Returns the control signal [20] that brings position targets about, within the limits."""
+    return np.clip((targets - self._middle) / self._half_range, -1.0, 1.0)
+
+  def _inverse(self, wanted: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Returns the action whose filtered value, from `before`, comes nearest to a control [20]."""
+    strength = self._filter.strength
+    return np.clip((wanted - strength * before) / (1 - strength), -1.0, 1.0)
+
   def _invert(self, targets: np.ndarray) -> np.ndarray:
     """Returns the action whose filtered value comes nearest to the targets."""
-    strength = self._filter.strength
-    wanted = (
-      np.clip(targets, self._middle - self._half_range, self._middle + self._half_range)
-      - self._middle
-    ) / self._half_range
     assert self._filter.value is not None
-    action = np.clip((wanted - strength * self._filter.value) / (1 - strength), -1.0, 1.0)
-    action = action.astype(np.float32)
+    self._before = self._filter.value
+    action = self._inverse(self._wanted(targets), self._before).astype(np.float32)
     self._filter(action)
     return action
 

@@ -53,6 +53,8 @@ class SteeringSettings:
   """m beside the line through ball and target within which it pushes."""
   detour: float = 0.38
   """m from the ball's centre at which it walks around it."""
+  head_tilt: float | None = None
+  """rad of the head's tilt; None: as in the reference pose, which sees the floor ahead."""
 
 
 class Walker:
@@ -89,6 +91,15 @@ class Walker:
     self._time = 0.0
     self._pushing = False
 
+  @property
+  def command(self) -> Command:
+    """What the gait was last commanded to do."""
+    return self._command
+
+  def follow(self, control: np.ndarray) -> None:
+    """Takes the gait to a control [20] that was applied in place of its own; see `Gait.follow`."""
+    self._gait.follow(control)
+
   def act(
     self,
     observation: Mapping[str, np.ndarray],
@@ -112,6 +123,8 @@ class Walker:
       self._command = self._walk_to(goal)
     else:
       self._command = self._push(np.asarray(ball, np.float64)[:2], goal)
+    if self.steering.head_tilt is not None:
+      self._command = dataclasses.replace(self._command, head=(0.0, self.steering.head_tilt))
     self._time += _TIMESTEP
     return self._gait.act(self._command, gyroscope=gyroscope, gravity=gravity)
 

@@ -129,7 +129,85 @@ def test_action_filter_is_inverted():
   for _ in range(200):
     action = gait.act(walk.Command(0.3))
     filtered = strength * filtered + (1 - strength) * action
-    wanted = gait._targets(gait.phase, None, None)
+    wanted = gait._targets(gait.phase, gait._amplitude)
     held = np.abs(action) < 1
     error = np.abs(middle + half * filtered - np.clip(wanted, lower, upper))
     assert held.mean() > 0.5 and error[held].max() < 1e-6
+
+
+def _march(gait, command, steps):
+  """Steps a gait without a robot; returns actions and the controls that leave the filter."""
+  control = (constants.standing_targets() - gait_middle()) / gait_half_range()
+  actions, controls = [], []
+  for _ in range(steps):
+    actions.append(gait.act(command))
+    control = constants.ACTION_FILTER * control + (1 - constants.ACTION_FILTER) * actions[-1]
+    controls.append(control)
+  return actions, controls
+
+
+def gait_middle():
+  return sum(constants.joint_limits()) / 2
+
+
+def gait_half_range():
+  lower, upper = constants.joint_limits()
+  return (upper - lower) / 2
+
+
+@pytest.mark.parametrize("offset", [7, 11])
+def test_a_gait_that_follows_another_agrees_with_it(offset):
+  command = walk.Command(forward=1.0, turn=0.3)
+  driver, follower, idle = walk.Gait(), walk.Gait(), walk.Gait()
+  _, controls = _march(driver, command, 80)
+  for gait in (follower, idle):
+    _march(gait, command, 80 + offset)  # walks, but out of step with the driver
+  control, apart = controls[-1], []
+  for _ in range(60):
+    labels = [gait.act(command) for gait in (driver, follower, idle)]
+    control = constants.ACTION_FILTER * control + (1 - constants.ACTION_FILTER) * labels[0]
+    follower.follow(control)
+    apart.append([np.abs(label - labels[0])[legs.COLUMNS].mean() for label in labels[1:]])
+  apart = np.array(apart)
+  assert apart[:2].mean(0).min() > 0.3  # both begin out of step
+  assert apart[-40:, 0].max() < 0.1 < 0.3 < apart[-40:, 1].mean()
+  difference = (follower.phase - driver.phase + np.pi) % (2 * np.pi) - np.pi
+  assert abs(difference) < 0.13  # one correction of the search
+
+
+def test_a_gait_follows_its_own_control_without_a_change():
+  command = walk.Command(forward=0.5)
+  alone, followed = walk.Gait(), walk.Gait()
+  control = (constants.standing_targets() - gait_middle()) / gait_half_range()
+  for _ in range(100):
+    expected, action = alone.act(command), followed.act(command)
+    control = constants.ACTION_FILTER * control + (1 - constants.ACTION_FILTER) * action
+    followed.follow(control)
+    assert action == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_amplitude_sinks_where_the_robot_does_not_step():
+  gait, standing = walk.Gait(), walk.Gait()
+  command = walk.Command(forward=1.0)
+  _march(gait, command, 80)
+  _, controls = _march(standing, walk.Command(step=False), 80)
+
+  def swing(gait):
+    """Spread of the legs' targets over a period."""
+    pattern = [gait.pattern(p, 1.0, 0.0, 1.0) for p in np.linspace(0, 2 * np.pi, 20)]
+    return np.std(pattern, axis=0).max()
+
+  labels = []
+  for _ in range(60):
+    labels.append(gait.act(command))
+    gait.follow(controls[-1])
+  first, last = (np.std(part, axis=0)[legs.COLUMNS].max() for part in (labels[:17], labels[-17:]))
+  assert swing(gait) > 0 and last < first  # it begins to step gently, not in full swing
+
+
+def test_the_head_is_held_where_the_command_says():
+  gait = walk.Gait()
+  _, controls = _march(gait, walk.Command(step=False, head=(0.2, -0.3)), 80)
+  targets = gait_middle() + gait_half_range() * controls[-1]
+  head = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")]
+  assert targets[head] == pytest.approx([0.2, -0.3], abs=1e-3)

@@ -1,0 +1,55 @@
+"""The learner's saved state: one file, written whole."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerf2real.agents.distill.learning import TrainingState
+from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain
+
+# The supervisor resumes a learner that left a `newest-*` among its run's checkpoints.
+STATE = Path("checkpoints") / "newest-student.npz"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Counters:
+  """What a saved state says besides arrays."""
+
+  updates: int = 0
+  elapsed: float = 0.0  # s of training, over all parts of the run
+  begun: int | None = None  # frames at which the first student was published
+
+
+def save_state(path: Path, state: TrainingState, counters: Counters) -> None:
+  """Writes a training state whole: its leaves in order, and the counters as JSON."""
+  leaves = {f"leaf{i:04d}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
+  about = np.frombuffer(json.dumps(to_plain(counters)).encode(), np.uint8)
+  buffer = io.BytesIO()
+  np.savez(buffer, counters=about, **leaves)  # type: ignore[arg-type]
+  path.parent.mkdir(parents=True, exist_ok=True)
+  files.write_atomically(path, buffer.getvalue())
+
+
+def load_state(path: Path, *, like: TrainingState) -> tuple[TrainingState, Counters]:
+  """Reads what `save_state` wrote.
+
+  Args:
+    path: the file.
+    like: a state of the same settings.
+
+  Raises:
+    ValueError: it is of other settings.
+  """
+  with np.load(path, allow_pickle=False) as stored:
+    counters = from_plain(json.loads(stored["counters"].tobytes()), Counters)
+    found = [stored[name] for name in sorted(n for n in stored.files if n.startswith("leaf"))]
+  expected, structure = jax.tree.flatten(like)
+  if [x.shape for x in found] != [x.shape for x in expected]:
+    raise ValueError(f"{path} is of other networks than the settings: take those it began with.")
+  return jax.tree.unflatten(structure, [jnp.asarray(x) for x in found]), counters

@@ -1,0 +1,168 @@
+"""Labelled episodes: teacher and student drive in turns, the teacher labels every state."""
+
+import copy
+import dataclasses
+from typing import Any
+
+import dm_env
+import numpy as np
+
+from nerf2real.agents.distill.dataset import fields
+from nerf2real.agents.distill.schedule import Mixture
+from nerf2real.agents.distill.settings import MixtureSettings
+from nerf2real.agents.distill.teacher import Teacher
+from nerf2real.agents.dmpo.acting import episode_success, task_of
+from nerf2real.agents.dmpo.inference import Policy, PolicyState
+from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
+from nerf2real.agents.processes.timings import StageTimes
+from nerf2real.suite.gaits.walker import Pose
+
+TEACHER, STUDENT, DETOUR = 0, 1, 2  # drivers, as `dataset.fields` counts them
+
+
+def pose_of(layout: Layout, observation: FlatObservation) -> Pose:
+  """Returns the true pose; raises ValueError where the environment does not give it."""
+  if layout.pose_columns is None:
+    raise ValueError("A teacher needs the true pose: the environment gives no privileged state.")
+  return Pose(*(float(v) for v in planar_pose(observation.privileged, layout.pose_columns)))
+
+
+def likeliest_pose(policy: Policy, embedding: np.ndarray) -> Pose:
+  """Returns the mean of the likeliest component of a student's belief."""
+  logits, means, _ = policy.belief(embedding)
+  return Pose(*(float(value) for value in means[int(np.argmax(logits))]))
+
+
+@dataclasses.dataclass
+class _Segment:
+  """Who drives for how long."""
+
+  driver: int = TEACHER
+  left: int = 0
+  noise: float = 0.0
+  place: np.ndarray | None = None  # of a detour [2] [m]
+  guide: Teacher | None = None  # drives the detour
+
+
+class EpisodeRunner:
+  """Runs labelled episodes in an environment."""
+
+  def __init__(
+    self,
+    environment: dm_env.Environment,
+    layout: Layout,
+    *,
+    teacher: Teacher,
+    settings: MixtureSettings,
+    rng: np.random.Generator,
+  ):
+    """Creates the runner.
+
+    Args:
+      environment: from `make_environment`, with pictures and privileged state.
+      layout: its layout.
+      teacher: labels the states.
+      settings: of the mixture.
+      rng: of drivers, noise and detours.
+    """
+    self._environment, self._layout = environment, layout
+    self._teacher, self._settings, self._rng = teacher, settings, rng
+    self._free_space = task_of(environment).scene.free_space
+    self.times = StageTimes()
+
+  def run(
+    self, policy: Policy | None, mixture: Mixture
+  ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Runs an episode; returns its arrays (`dataset.fields`) and its figures.
+
+    Args:
+      policy: the student; None while there is none.
+      mixture: who drives how often.
+    """
+    rows: dict[str, list[Any]] = {name: [] for name in fields(self._layout)}
+    with self.times.stage("env"):
+      timestep = self._environment.reset()
+    segment, state = _Segment(), policy.initial_state() if policy else None
+    flat = self._layout.flatten(timestep.observation)
+    self._teacher.reset(pose_of(self._layout, flat))
+    by_belief = policy is not None and self._rng.random() < mixture.belief
+    since_success = 0
+    while not timestep.last() and since_success <= self._settings.after_success:
+      observation = timestep.observation
+      goal = np.asarray(observation["goal"], np.float64)
+      truth = pose = pose_of(self._layout, flat)
+      student: np.ndarray | None = None
+      if policy is not None:
+        with self.times.stage("student"):
+          student, state, believed = self._step_student(policy, flat, state)
+        pose = believed if by_belief and believed is not None else truth
+      with self.times.stage("teacher"):
+        if segment.left <= 0:
+          segment = self._draw_segment(policy is not None, mixture)
+        segment.left -= 1
+        label = self._teacher.label(observation, goal=goal, pose=pose)
+        action = self._choose(segment, label.action, student, observation, pose)
+      values = (
+        flat.image,
+        flat.state,
+        label.action,
+        label.command,
+        np.array(truth),
+        float(np.linalg.norm(goal - truth.xy)),
+        segment.driver,
+      )
+      for row, value in zip(rows.values(), values, strict=True):
+        row.append(value)
+      with self.times.stage("env"):
+        timestep = self._environment.step(action)
+      flat = self._layout.flatten(timestep.observation)
+      since_success += bool(episode_success(self._environment))
+    arrays: dict[str, np.ndarray] = {
+      name: np.asarray(rows[name], dtype) for name, (_, dtype) in fields(self._layout).items()
+    }
+    ending = getattr(task_of(self._environment), "ending", None)
+    figures = {
+      "length": len(arrays["state"]),
+      "success": float(since_success > 0),
+      "fell": float(ending == "fall"),
+      "collided": float(ending == "collision"),
+      "student_share": float(np.mean(arrays["driver"] == STUDENT)),
+    }
+    return arrays, figures
+
+  def _step_student(
+    self, policy: Policy, flat: FlatObservation, state: PolicyState | None
+  ) -> tuple[np.ndarray, PolicyState, Pose | None]:
+    assert state is not None
+    step = policy.step(flat.image, flat.state, state)
+    believed = likeliest_pose(policy, step.embedding) if policy.has_belief else None
+    return np.clip(step.mean, -1.0, 1.0), step.state, believed
+
+  def _draw_segment(self, has_student: bool, mixture: Mixture) -> _Segment:
+    settings, rng = self._settings, self._rng
+    left = int(rng.integers(settings.segment[0], settings.segment[1] + 1))
+    if rng.random() < settings.detour_share:
+      place = np.asarray(self._free_space.sample(rng, 1))[0, :2]
+      # A copy has the hidden state of the one that was followed so far.
+      return _Segment(DETOUR, left, place=place, guide=copy.deepcopy(self._teacher))
+    if has_student and rng.random() >= mixture.teacher:
+      return _Segment(STUDENT, left)
+    noise = settings.noise * rng.random() if rng.random() < settings.noisy_share else 0.0
+    return _Segment(TEACHER, left, noise=noise)
+
+  def _choose(
+    self,
+    segment: _Segment,
+    label: np.ndarray,
+    student: np.ndarray | None,
+    observation: Any,
+    pose: Pose,
+  ) -> np.ndarray:
+    """Returns the action [A] of whoever drives."""
+    if segment.driver == STUDENT and student is not None:
+      return student
+    if segment.guide is not None and segment.place is not None:
+      seen = {**observation, "goal": segment.place.astype(np.float32)}
+      return segment.guide.label(seen, goal=segment.place, pose=pose).action
+    noise = segment.noise * self._rng.standard_normal(label.shape)
+    return np.clip(label + noise, -1.0, 1.0)

@@ -1,0 +1,109 @@
+"""The evaluator of a distillation: success of the student alone, on trials that nobody reports.
+
+Its trials are those of the protocol with the robot turned half way between the protocol's headings
+and with other draws; what is published is measured on the protocol itself (`launch/evaluate.py`).
+"""
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from nerf2real.agents.distill.collecting import student_policy, wait_for_description
+from nerf2real.agents.distill.settings import DistillSettings
+from nerf2real.agents.dmpo.acting import Agent, run_episode, task_of
+from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.processes.environments import (
+  evaluation_name,
+  make_environment,
+  trials_of,
+)
+from nerf2real.agents.processes.trials import clopper_pearson
+from nerf2real.core.serialization import from_plain
+
+_POLL = 1.0  # s
+_TURN = np.pi / 3  # rad: half of the protocol's 120 degrees between headings
+_SEED_SHIFT = 1_000  # beyond the seeds of the protocol's trials
+
+
+def other_trials(trials: list[Any]) -> list[Any]:
+  """Returns trials that differ from those given in heading and draws."""
+  turned = "yaw" if hasattr(trials[0], "yaw") else "robot_yaw"
+  return [
+    trial._replace(**{turned: getattr(trial, turned) + _TURN, "seed": trial.seed + _SEED_SHIFT})
+    for trial in trials
+  ]
+
+
+class Evaluator:
+  """Measures the newest student at regular times."""
+
+  def __init__(self, link: ActorLink, *, seed: int):
+    """Joins the run that the link leads to.
+
+    Args:
+      link: a link of the role "evaluator".
+      seed: of what the episodes draw.
+    """
+    self._link, self._seed = link, seed
+    self._stop = threading.Event()
+    description = wait_for_description(link, self._stop)["description"]
+    self._settings = from_plain(description["settings"], DistillSettings)
+    self._layout = from_plain(description["layout"], Layout)
+    self._environment = make_environment(evaluation_name(self._settings.environment), seed=seed)
+    found = trials_of(self._environment)
+    if found is None:
+      raise ValueError(f"{self._settings.environment} has no protocol to evaluate on.")
+    self._trials = found
+    self._chosen = other_trials(found.spread(self._settings.evaluation_trials))
+
+  def stop(self) -> None:
+    """Ends `run`; safe in a signal handler."""
+    self._stop.set()
+
+  def run(self) -> None:
+    """Evaluates until the run is over or `stop` is called."""
+    due = -np.inf
+    while not self._stop.is_set():
+      grant = self._link.request(0)
+      if grant is not None and grant["stop"]:
+        return
+      if grant is not None and grant["version"] > 0 and time.monotonic() >= due:
+        # Without a first student the period does not begin.
+        due = time.monotonic() + self._settings.evaluation_period
+        answer = self._link.parameters()
+        if answer is not None:
+          self._evaluate(*answer)
+      self._stop.wait(_POLL)
+
+  def _evaluate(self, version: int, parameters: dict[str, np.ndarray]) -> None:
+    agent = Agent(
+      student_policy(parameters, self._settings), self._layout, seed=self._seed, deterministic=True
+    )
+    self._trials.choose(self._chosen, seed=self._seed)
+    figures, times, endings = [], [], []
+    for _ in self._chosen:
+      if self._stop.is_set():
+        return
+      figures.append(run_episode(agent, self._environment))
+      task = task_of(self._environment)
+      endings.append(task.ending)
+      if task.success:
+        times.append(task.success_time)
+    count, successes = len(figures), sum(bool(f["success"]) for f in figures)
+    interval = clopper_pearson(successes, count)
+    self._link.report(
+      {
+        "version": version,
+        "episodes": count,
+        "success": successes / count,
+        "success_low": interval.low,
+        "success_high": interval.high,
+        "median_time": float(np.median(times)) if times else None,
+        "falls": endings.count("fall"),
+        "collisions": endings.count("collision"),
+        "localisation_error": float(np.mean([f["localisation_error"] for f in figures])),
+      }
+    )

@@ -1,0 +1,367 @@
+"""The learner of a distillation: takes labelled episodes in, trains the student stage by stage.
+
+What a run leaves in its folder: `data/` (episodes), `checkpoints/` (the learner's state),
+`settings.json`, `policy/newest` (the exported student) and `metrics.jsonl`. Files are written
+whole; a killed run goes on from its last state with all its episodes.
+"""
+
+import dataclasses
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from nerf2real.agents.distill import settings as stages
+from nerf2real.agents.distill import student
+from nerf2real.agents.distill.checkpoint import STATE, Counters, load_state, save_state
+from nerf2real.agents.distill.dataset import UNROLL_FIELDS, Dataset, Streams, Unroll
+from nerf2real.agents.distill.features import FeatureCache
+from nerf2real.agents.distill.learning import make_updates, standardised
+from nerf2real.agents.distill.schedule import cosine, stage_at
+from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
+from nerf2real.agents.distill.validation import validate
+from nerf2real.agents.dmpo.export import export_policy, load_arrays
+from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
+from nerf2real.agents.link.server import LearnerLink
+from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.processes.logs import MetricsLog
+from nerf2real.agents.processes.timings import StageTimes
+from nerf2real.core.serialization import to_plain, write_json
+
+_log = logging.getLogger(__name__)
+POLICY = Path("policy") / "newest"
+_WAIT = 0.5  # s between looks for the first frames
+_SLACK = 10_000  # frames that collectors may be on the way with when the run has all
+_VALIDATION_PERIOD = 120.0  # s
+
+
+class Learner:
+  """Owns data set, student and link; `run` trains until its minutes are over."""
+
+  def __init__(
+    self,
+    settings: DistillSettings,
+    run: Path,
+    *,
+    endpoint: str,
+    link: sessions.LinkSettings,
+    seed: int,
+    minutes: float,
+    resume: bool,
+  ):
+    """Begins a run or continues one.
+
+    Args:
+      settings: of the distillation.
+      run: the run's folder.
+      endpoint: where to listen.
+      link: the link's settings.
+      seed: of first weights, augmentation and sampling.
+      minutes: training time over all parts of the run [min].
+      resume: continues the run in the folder.
+
+    Raises:
+      ValueError: the folder holds a run already, or none to continue.
+      LinkError: the endpoint is taken, or open to the network without users.
+    """
+    self._settings, self._run, self._minutes = settings, run, minutes
+    if (run / STATE).exists() != resume:
+      raise ValueError(
+        f"{run} holds no run to continue: leave --resume out."
+        if resume
+        else f"{run} holds a run already: continue it with --resume, or take another folder."
+      )
+    environment = make_environment(settings.environment, seed=seed)
+    self._layout = Layout.of(environment)
+    environment.close()
+    self._data = Dataset(
+      run / "data",
+      self._layout,
+      capacity=settings.max_frames + _SLACK,
+      holdout=settings.holdout,
+    )
+    self._updates = make_updates(settings, self._layout)
+    self._state = self._updates.init(jax.random.PRNGKey(seed))
+    self._counters = Counters()
+    if resume:
+      self._state, self._counters = load_state(run / STATE, like=self._state)
+    write_json(run / SETTINGS, settings)
+    save_state(run / STATE, self._state, self._counters)
+    self._rng = np.random.default_rng((seed, self._data.frames))
+    self._cache = FeatureCache(
+      self._updates.features, self._data, copies=settings.copies, width=self._width, seed=seed
+    )
+    limiter = RateLimiter(
+      LimiterSettings(
+        steps_per_update=1.0,
+        min_replay_steps=settings.max_frames,
+        trajectory_steps=1,
+        max_steps=settings.max_frames,
+      ),
+      steps=self._data.frames,
+    )
+    self._log = MetricsLog(run, tensorboard=False)
+    self._times = StageTimes()
+    self._stop = threading.Event()
+    self._last: dict[str, float] = {}  # times of the last periodical work
+    self._evaluation: dict[str, Any] = {}  # the last one
+    self._is_fit = False  # whether encoder and policy belong together now
+    self._compiled: set[str] = set()  # kinds of stages whose update was called
+    self._recent: list[dict[str, jax.Array]] = []
+    self._last_figures = (time.monotonic(), self._data.frames, self._counters.updates)
+    self._session = sessions.listen(endpoint, link)
+    self._link = LearnerLink(
+      self._session,
+      link,
+      limiter=limiter,
+      insert=self._data.insert,
+      known=self._data.origins,
+      description={
+        "settings": to_plain(settings),
+        "layout": to_plain(self._layout),
+        "begin_frames": self._data.frames,
+        "begun": self._counters.begun,
+      },
+    )
+    self._set_status()
+    if (run / POLICY).exists():
+      self._link.publish_parameters(
+        load_arrays(run / POLICY), version=max(1, self._counters.updates)
+      )
+
+  @property
+  def _width(self) -> int:
+    return self._settings.agent.network.image_features
+
+  @property
+  def _progress(self) -> float:
+    return self._counters.elapsed / (60.0 * self._minutes)
+
+  def stop(self) -> None:
+    """Ends `run` with a saved state; safe in a signal handler."""
+    self._stop.set()
+
+  def run(self) -> None:
+    """Trains until the minutes are over or `stop` is called.
+
+    Raises:
+      RuntimeError: episodes can no longer be taken in.
+    """
+    try:
+      self._wait_for_first_frames()
+      while not self._stop.is_set() and self._progress < 1.0:
+        index, _ = stage_at(self._settings, self._progress)
+        self._run_stage(index)
+    finally:
+      self._save()
+      self._link.stop_actors()
+      self._drain_metrics()
+      self._log.close()
+
+  def close(self) -> None:
+    """Leaves the link."""
+    self._link.close()
+    sessions.close(self._session)
+
+  def _wait_for_first_frames(self) -> None:
+    while self._data.frames < self._settings.first_frames and not self._stop.is_set():
+      self._check_link()
+      self._drain_metrics()
+      self._set_status()
+      self._stop.wait(_WAIT)
+    if self._counters.updates or self._stop.is_set():
+      return
+    frames = self._training_frames()
+    self._state = standardised(
+      self._state,
+      state_rows=self._data.arrays["state"][frames],
+      labels=self._data.arrays["label"][frames],
+      layout=self._layout,
+      min_spread=self._settings.min_action_spread,
+    )
+    _log.info("Training begins with %d frames.", self._data.frames)
+
+  # ---- stages ----
+
+  def _run_stage(self, index: int) -> None:
+    kind = self._settings.stages[index].kind
+    _log.info("Stage %d: %s.", index, kind)
+    begin = time.monotonic()
+    self._recent.clear()
+    done = 0
+    if kind == stages.POLICY:
+      self._cache.clear()
+    count = (
+      self._settings.end_to_end_streams if kind == stages.END_TO_END else self._settings.streams
+    )
+    streams = Streams(count, self._settings.unroll, rng=self._rng)
+    carried = student.initial_state(count, self._settings.agent.network)
+    while not self._stop.is_set() and self._progress < 1.0:
+      current, within = stage_at(self._settings, self._progress)
+      if current != index:
+        break
+      if kind == stages.ENCODER:
+        metrics = self._update_encoder(within)
+      else:
+        carried, metrics = self._update_unrolls(kind, streams, carried, within)
+      now = time.monotonic()
+      # An update that was compiled for minutes is no minute of training.
+      counted = now - begin if kind in self._compiled else 0.0
+      begin, self._compiled = now, self._compiled | {kind}
+      self._counters = dataclasses.replace(
+        self._counters,
+        updates=self._counters.updates + 1,
+        elapsed=self._counters.elapsed + counted,
+      )
+      self._recent.append(metrics)
+      done += 1
+      # While the encoder learns, and until the policy knows its new features, the two do not fit.
+      self._is_fit = kind == stages.END_TO_END or (
+        kind == stages.POLICY and done >= self._settings.settling
+      )
+      if self._is_fit and self._counters.begun is None:
+        self._counters = dataclasses.replace(self._counters, begun=self._data.frames)
+        self._publish()
+      self._housekeeping(kind)
+    self._save()
+
+  def _update_encoder(self, within: float) -> dict[str, jax.Array]:
+    with self._times.stage("sampling"):
+      frames = self._training_frames()
+      chosen = self._rng.choice(frames, self._settings.encoder_batch)
+      image, pose = (self._data.arrays[name][chosen] for name in ("image", "pose"))
+    with self._times.stage("update"):
+      rate = self._settings.learning_rate * cosine(within)
+      self._state, metrics = self._updates.encoder(self._state, image, pose, rate)
+      jax.block_until_ready(metrics)
+    return metrics
+
+  def _update_unrolls(
+    self, kind: str, streams: Streams, carried: Any, within: float
+  ) -> tuple[Any, dict[str, jax.Array]]:
+    cached = kind == stages.POLICY
+    if cached:
+      with self._times.stage("features"):
+        self._cache.extend(self._state.student["encoder"])
+    with self._times.stage("sampling"):
+      limit = self._cache.frames if cached else self._data.frames
+      spans = [s for s in self._data.spans(held_out=False) if s.end <= limit]
+      unroll = streams.next(spans)
+      batch = self._batch(unroll)
+      if cached:
+        batch["features"] = self._cache.take(unroll.frames, self._rng)
+      else:
+        batch["image"] = self._data.arrays["image"][unroll.frames]
+    with self._times.stage("update"):
+      update = self._updates.policy if cached else self._updates.end_to_end
+      settings = self._settings
+      rate = settings.learning_rate if cached else settings.end_to_end_learning_rate
+      self._state, carried, metrics = update(self._state, batch, carried, rate * cosine(within))
+      jax.block_until_ready(metrics)
+    return carried, metrics
+
+  def _batch(self, unroll: Unroll) -> dict[str, np.ndarray]:
+    batch = {name: self._data.arrays[name][unroll.frames] for name in UNROLL_FIELDS}
+    return batch | {"begins": unroll.begins}
+
+  def _training_frames(self) -> np.ndarray:
+    """Indices of the frames that are not held out."""
+    spans = self._data.spans(held_out=False)
+    return np.concatenate([np.arange(span.begin, span.end) for span in spans])
+
+  # ---- periodical work ----
+
+  def _due(self, name: str, period: float) -> bool:
+    now = time.monotonic()
+    if now - self._last.setdefault(name, now) < period:
+      return False
+    self._last[name] = now
+    return True
+
+  def _housekeeping(self, kind: str) -> None:
+    settings = self._settings
+    if self._is_fit and self._due("publish", settings.publish_period):
+      self._publish()
+    if self._due("save", settings.save_period):
+      with self._times.stage("saving"):
+        self._save()
+    if self._due("log", settings.log_period):
+      self._check_link()
+      self._drain_metrics()
+      values = {name: float(np.mean([m[name] for m in self._recent])) for name in self._recent[0]}
+      figures = {"stage": kind, "minutes": self._counters.elapsed / 60, "progress": self._progress}
+      self._write("learner", values | figures | self._times.take(len(self._recent)))
+      self._set_status()
+      self._recent.clear()
+    if self._due("validate", _VALIDATION_PERIOD):
+      with self._times.stage("validation"):
+        found = validate(self._state, self._updates, data=self._data, cache=self._cache)
+      self._write("validation", found)
+
+  def _check_link(self) -> None:
+    if self._link.failure:
+      raise RuntimeError(f"Episodes are no longer taken in: {self._link.failure}")
+
+  def _write(self, source: str, values: Mapping[str, Any]) -> None:
+    self._log.write(source, values, steps=self._data.frames, updates=self._counters.updates)
+    if source in ("learner", "validation", "evaluator"):
+      shown = {n: round(v, 4) if isinstance(v, float) else v for n, v in values.items()}
+      _log.info("%d frames, %s: %s", self._data.frames, source, shown)
+
+  def _drain_metrics(self) -> None:
+    while not self._link.metrics.empty():
+      who, values = self._link.metrics.get()
+      if who.startswith("evaluator"):
+        self._evaluation = values
+      self._write(who.partition("-")[0], values)
+
+  def _set_status(self) -> None:
+    """Offers the figures that `agents.processes.status_view` shows."""
+    now, frames, updates = time.monotonic(), self._data.frames, self._counters.updates
+    then, frames_then, updates_then = self._last_figures
+    self._last_figures = (now, frames, updates)
+    period = max(now - then, 1e-3)
+    status = {
+      "steps": frames,
+      "steps_per_second": (frames - frames_then) / period,
+      "updates": updates,
+      "updates_per_second": (updates - updates_then) / period,
+      "filled": frames >= self._settings.first_frames,
+      "return": None,
+      "evaluation": None,
+      "best": None,
+      "success": self._evaluation.get("success"),
+      "localisation_error": self._evaluation.get("localisation_error"),
+      "replay_steps": frames,
+    }
+    self._link.set_status(status)
+
+  def _publish(self) -> None:
+    arrays = student.served_parameters(self._state.student, self._state.scales)
+    # Version 0 stands for no student in the link.
+    self._link.publish_parameters(arrays, version=max(1, self._counters.updates))
+
+  def _save(self) -> None:
+    save_state(self._run / STATE, self._state, self._counters)
+    if not self._is_fit:
+      return
+    self._publish()
+    export_policy(
+      self._run / POLICY,
+      student.served_parameters(self._state.student, self._state.scales),
+      layout=self._layout,
+      environment=self._settings.environment,
+      settings=to_plain(self._settings.agent),
+      info={
+        "steps": self._data.frames,
+        "updates": self._counters.updates,
+        "teacher": self._settings.teacher,
+      },
+    )

@@ -1,0 +1,190 @@
+"""Settings of a distillation, and its presets.
+
+A unit is given where there is one; everything else is a pure number. Where no source is named, the
+value is chosen and the reason is given.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+from nerf2real.agents.dmpo.config import AugmentationConfig, DmpoConfig, NetworkConfig
+
+ENCODER, POLICY, END_TO_END = "encoder", "policy", "end_to_end"
+STAGES = (ENCODER, POLICY, END_TO_END)
+SETTINGS = "settings.json"  # in a run's folder
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stage:
+  """A part of the training."""
+
+  kind: str
+  """"encoder": pictures to poses, single frames; "policy": LSTM and MLP on cached features of the
+  frozen encoder; "end_to_end": everything on recurrent unrolls."""
+  share: float
+  """Of the run's time."""
+
+  def __post_init__(self):
+    if self.kind not in STAGES:
+      raise ValueError(f"kind must be one of {', '.join(STAGES)}, found {self.kind!r}.")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MixtureSettings:
+  """Who drives while data are collected: DAgger's mixture (Ross et al. 2011), in segments."""
+
+  first_share: float = 1.0
+  """The teacher's share of the segments when the first student is there."""
+  last_share: float = 0.15
+  """And in the end; not 0, so that the data keep showing how it should be done."""
+  anneal_frames: int = 60_000
+  """Frames over which the share falls [steps]: about three of the usual rounds of DAgger."""
+  segment: tuple[int, int] = (30, 120)
+  """Shortest and longest segment with one driver [steps]."""
+  detour_share: float = 0.15
+  """Of the segments that a second teacher drives to another place: what follows is turning."""
+  noise: float = 0.15
+  """Standard deviation of the noise on a driving teacher's actions; drawn up to this value. From
+  0.2 on most episodes of the walker end in a fall."""
+  noisy_share: float = 0.6
+  """Of the teacher's segments that are noisy at all."""
+  belief_share: float = 0.4
+  """Of the episodes, in the end, whose teacher is given the student's belief in place of the true
+  pose: labels that a student can follow, for it knows all that they depend on. Grows from 0 as the
+  teacher's share falls."""
+  after_success: int = 20
+  """Steps that an episode goes on after its success: data close to the goal [steps]."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DistillSettings:
+  """What is distilled, and how."""
+
+  environment: str
+  """Where data are collected, as `agents.processes.environments` names it, without pushes."""
+  teacher: str = "quick"
+  """One of `teacher.TEACHERS`, or the folder of an exported policy."""
+  agent: DmpoConfig = DmpoConfig(network=NetworkConfig(init_stddev=0.1))
+  """The student's networks and augmentation; the exported policy carries them. Noise of 0.1 leaves
+  a walking robot on its feet, so that DMPO may go on from the student."""
+  mixture: MixtureSettings = MixtureSettings()
+  """Who drives."""
+  push_forces: tuple[tuple[int, float, float], ...] = ((0, 0.0, 0.0),)
+  """From which frame on pushes of which forces are drawn [steps, N, N]; no pushes below 1e-6 N."""
+  stages: tuple[Stage, ...] = (
+    Stage(kind=ENCODER, share=0.13),
+    Stage(kind=POLICY, share=0.17),
+    Stage(kind=ENCODER, share=0.15),
+    Stage(kind=POLICY, share=0.27),
+    Stage(kind=END_TO_END, share=0.28),
+  )
+  """Parts of the run, one after another; the encoder learns again when the student's own paths are
+  in the data."""
+
+  settling: int = 600
+  """Updates of a policy stage before its student is given out: it has to get used to the encoder
+  first [updates]."""
+  first_frames: int = 8_000
+  """Frames before training begins [steps]: some 15 episodes; inputs are standardised on them."""
+  max_frames: int = 400_000
+  """Frames collected at most [steps]: 5 kB each in memory."""
+  holdout: int = 10
+  """Every episode of that number is held out for validation."""
+  learning_rate: float = 1e-3
+  """Adam's step in the encoder and policy stages, falling along a cosine to 2 % in each."""
+  end_to_end_learning_rate: float = 3e-4
+  """Adam's first step end to end: smaller, all is trained already."""
+  max_gradient_norm: float = 1.0
+  """Clip of the gradient's global norm."""
+  encoder_batch: int = 128
+  """Pictures in an update of the encoder stage."""
+  unroll: int = 24
+  """Steps of a recurrent unroll [steps]; the state is carried from one to the next."""
+  streams: int = 64
+  """Unrolls in an update on cached features."""
+  end_to_end_streams: int = 12
+  """Unrolls in an update end to end."""
+  copies: int = 2
+  """Augmented copies of which features are cached."""
+  pose_weight: float = 0.3
+  """Of the pose's loss beside the actions'. As in a trial that gave 56 % (README)."""
+  command_weight: float = 0.1
+  """Of the loss of the teacher's command (forward, turn)."""
+  belief_weight: float = 0.02
+  """Of the belief's negative log-likelihood, some nats; its gradient stays in its own head."""
+  turn_emphasis: float = 1.0
+  """Weight that a full turning command adds to a frame's action loss."""
+  min_action_spread: float = 0.05
+  """Smallest spread by which an action is scaled in the loss: a head that never moves must not be
+  magnified without bound."""
+  blind_radius: float = 0.13
+  """Distance from the goal within which labels count nothing [m]: the teacher halts where a student
+  whose localisation errs by as much cannot know that it should."""
+
+  publish_period: float = 15.0
+  """Time between students given to the collectors [s]."""
+  save_period: float = 60.0
+  """Time between saved states of the learner [s]."""
+  log_period: float = 15.0
+  """Time between rows of metrics [s]."""
+  evaluation_period: float = 480.0
+  """Time between evaluations during the run [s]."""
+  evaluation_trials: int = 18
+  """Trials of an evaluation during the run; none of them is a trial of the protocol."""
+
+  def __post_init__(self):
+    total = sum(stage.share for stage in self.stages)
+    if abs(total - 1.0) > 1e-6:
+      raise ValueError(f"The stages' shares must sum to 1, found {total:g}.")
+
+
+def nerf_nav() -> DistillSettings:
+  """Navigation: the walker distilled into the paper's policy network."""
+  return DistillSettings(
+    environment="suite:nerf_nav",
+    # The suite's usual 5 to 15 N fell two of three of the walker's own episodes.
+    push_forces=((0, 0.0, 0.0), (80_000, 1.0, 3.0), (160_000, 2.0, 6.0)),
+  )
+
+
+def tiny() -> DistillSettings:
+  """Everything very small: to try the machinery in seconds."""
+  network = NetworkConfig(
+    policy_layers=(16, 16),
+    image_channels=(2, 2),
+    image_blocks=1,
+    image_features=8,
+    lstm_size=8,
+    belief_layers=(8,),
+    belief_components=2,
+    init_stddev=0.1,
+  )
+  return DistillSettings(
+    environment="suite:nerf_nav?image_size=12x16&time_limit=1",
+    agent=DmpoConfig(network=network, augmentation=AugmentationConfig()),
+    mixture=MixtureSettings(anneal_frames=100, segment=(5, 10)),
+    push_forces=((0, 0.0, 0.0), (40, 5.0, 15.0)),
+    settling=5,
+    first_frames=40,
+    max_frames=2_000,
+    holdout=3,
+    encoder_batch=8,
+    unroll=6,
+    streams=4,
+    end_to_end_streams=2,
+    publish_period=1.0,
+    save_period=2.0,
+    log_period=1.0,
+    evaluation_period=4.0,
+    evaluation_trials=1,
+  )
+
+
+PRESETS: Mapping[str, Callable[[], DistillSettings]] = {"nerf_nav": nerf_nav, "tiny": tiny}
+
+
+def preset(name: str) -> DistillSettings:
+  """Returns the settings called name; raises ValueError for an unknown one."""
+  if name not in PRESETS:
+    raise ValueError(f"Unknown preset {name!r}: expected one of {', '.join(PRESETS)}.")
+  return PRESETS[name]()

@@ -1,0 +1,149 @@
+"""Teachers: policies that may read privileged state and label every state that is visited.
+
+DAgger (Ross, Gordon and Bagnell 2011, https://arxiv.org/abs/1011.0686) wants the expert's action at
+the states that the student reaches. A teacher with a hidden state, such as a gait's phase, must
+therefore follow what the robot really did, or its labels contradict what the student sees.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.suite.gaits.walk import GaitSettings
+from nerf2real.suite.gaits.walker import Pose, SteeringSettings, Walker
+
+COMMAND_SIZE = 2  # forward, turn
+# rad, the upper end of the paper's range: at the reference -0.47 the camera sees little but floor.
+_HEAD_TILT = -0.157
+
+
+class Label(NamedTuple):
+  """A teacher's answer at one state."""
+
+  action: np.ndarray  # [A], in [-1, 1]
+  command: np.ndarray  # [2] forward and turn, -1 to 1; NaN where the teacher has none
+
+
+class Teacher(Protocol):
+  """Labels the states of an episode one after another, whoever drives."""
+
+  def reset(self, pose: Pose) -> None:
+    """Begins an episode at a pose."""
+
+  def label(self, observation: Mapping[str, Any], *, goal: np.ndarray, pose: Pose) -> Label:
+    """Returns what the teacher would do.
+
+    Args:
+      observation: the environment's; `previous_control` says what was applied before.
+      goal: where to go [2] [m].
+      pose: where the robot is, the truth or a student's belief.
+    """
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WalkerSettings:
+  """A scripted walker by name."""
+
+  gait: GaitSettings
+  """Parameters of the gait."""
+  steering: SteeringSettings
+  """And of its steering."""
+
+
+def _steady() -> WalkerSettings:
+  """The walker of the published figures, its head raised."""
+  return WalkerSettings(gait=GaitSettings(), steering=SteeringSettings(head_tilt=_HEAD_TILT))
+
+
+def _quick() -> WalkerSettings:
+  """Longer steps and larger turns, searched for by CMA-ES over gait and steering (README)."""
+  gait = GaitSettings(
+    stop_time=0.3668,
+    max_turn=0.2875,
+    period=0.4502,
+    spread=0.0413,
+    sway=0.0132,
+    sway_lead=0.8899,
+    lift=0.0364,
+    swing=0.4738,
+    stride=0.0707,
+    backset=0.027,
+    lean=0.075,
+    tilt=0.0395,
+    lead=0.0191,
+    pitch_rate_gain=0.0051,
+    roll_rate_gain=-0.0317,
+    pitch_gain=0.0174,
+    roll_gain=-0.2068,
+  )
+  steering = SteeringSettings(
+    lookahead=0.3066, turn_gain=1.1875, turn_first=0.7726, head_tilt=_HEAD_TILT
+  )
+  return WalkerSettings(gait=gait, steering=steering)
+
+
+TEACHERS = {"steady": _steady, "quick": _quick}
+
+
+class WalkerTeacher:
+  """The scripted walker; its gait follows the control that was applied."""
+
+  def __init__(self, scene: Any, settings: WalkerSettings):
+    """Creates the teacher.
+
+    Args:
+      scene: the bundle, for its free space.
+      settings: of gait and steering.
+    """
+    self._walker = Walker(scene, gait=settings.gait, steering=settings.steering)
+    self._begun = False
+
+  def reset(self, pose: Pose) -> None:
+    self._walker.reset(pose)
+    self._begun = False
+
+  def label(self, observation: Mapping[str, Any], *, goal: np.ndarray, pose: Pose) -> Label:
+    if self._begun:
+      self._walker.follow(observation["previous_control"][-1])
+    self._begun = True
+    action = self._walker.act(observation, goal=goal, pose=pose)
+    command = self._walker.command
+    return Label(action, np.array([command.forward, command.turn], np.float32))
+
+
+class PolicyTeacher:
+  """An exported policy, such as one that was trained from state; its LSTM sees what it is shown."""
+
+  def __init__(self, loaded: ExportedPolicy):
+    self._policy, self._layout = loaded.policy, loaded.layout
+    self._state = self._policy.initial_state()
+
+  def reset(self, pose: Pose) -> None:
+    self._state = self._policy.initial_state()
+
+  def label(self, observation: Mapping[str, Any], *, goal: np.ndarray, pose: Pose) -> Label:
+    flat = self._layout.flatten(observation)
+    step = self._policy.step(flat.image, flat.state, self._state)
+    self._state = step.state
+    unknown = np.full(COMMAND_SIZE, np.nan, np.float32)
+    return Label(np.clip(step.mean, -1.0, 1.0).astype(np.float32), unknown)
+
+
+def make_teacher(name: str, scene: Any) -> Teacher:
+  """Returns a teacher by its name in TEACHERS, or from the folder of an exported policy.
+
+  Raises:
+    ValueError: it is neither.
+  """
+  if name in TEACHERS:
+    return WalkerTeacher(scene, TEACHERS[name]())
+  if not Path(name).is_dir():
+    raise ValueError(
+      f"Unknown teacher {name!r}: expected one of {', '.join(TEACHERS)}, or the folder of an "
+      "exported policy."
+    )
+  return PolicyTeacher(load_policy(name))

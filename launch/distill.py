@@ -1,0 +1,61 @@
+"""Distils a scripted or privileged teacher into a vision policy, by DAgger, on one machine.
+
+  python launch/distill.py --run runs/walk --preset nerf_nav --minutes 120 --actors 1
+  python launch/evaluate.py --policy runs/walk/policy/newest --plant sim --protocol navigation
+
+Learner, collectors and evaluator are supervised processes; those that die are replaced. Ctrl-C ends
+the run with its state saved; --resume goes on, also with more --minutes. Arguments that are not
+listed here go to the learner (see `launch/distill_learner.py --help`), such as --teacher steady.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+from nerf2real.agents.processes import training
+from nerf2real.launch import command
+
+_HERE = Path(__file__).resolve().parent
+SCRIPTS = training.Scripts(
+  learner=_HERE / "distill_learner.py", actor=_HERE / "distill_collector.py"
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Arguments(training.TrainingSettings):
+  """Distils a teacher into a vision policy."""
+
+  env: str | None = None
+  """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
+  actors: int = 1
+  """Number of collectors."""
+  max_env_steps: int | None = None
+  """Frames collected at most [steps]; the preset's if not given."""
+  preset: str | None = None
+  """Settings of the distillation: nerf_nav, or tiny to try the machinery; "nerf_nav" if not
+  given."""
+
+
+def run(arguments: Arguments, forwarded: list[str]) -> None:
+  """Distils; forwards arguments to the learner.
+
+  Raises:
+    CommandError: The run cannot start, or it failed.
+  """
+  try:
+    failure = training.train(
+      arguments, SCRIPTS, forwarded=forwarded, command=command.command_line()
+    )
+  except training.RunRefusedError as error:
+    raise command.CommandError(error, status=command.WRONG_ARGUMENTS) from error
+  if failure:
+    raise command.CommandError(failure)
+
+
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run, errors=(), forwards=True)
+
+
+if __name__ == "__main__":
+  sys.exit(main())

@@ -1,0 +1,109 @@
+"""Starts the learner of a distillation, which owns its data set and the student.
+
+  python launch/distill_learner.py --run runs/walk --preset nerf_nav --minutes 120
+
+Listens on this machine only, unless --listen names another address; then --users is needed.
+Collectors join with `launch/distill_collector.py --connect`.
+"""
+
+import dataclasses
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from nerf2real.agents.link import sessions
+from nerf2real.agents.processes.statuses import REFUSED
+from nerf2real.core.serialization import read_json
+from nerf2real.launch import command
+from nerf2real.launch.learner import DEFAULT_ENDPOINT, set_threads
+
+_ENVIRONMENT = {**command.NOT_DRAWING, **command.ONE_THREAD}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Arguments:
+  """Starts the learner of a distillation."""
+
+  run: Path
+  """The run's folder."""
+  listen: str = DEFAULT_ENDPOINT
+  """Where to listen, such as tcp/0.0.0.0:7447."""
+  preset: str = "nerf_nav"
+  """Settings to start from: nerf_nav, or tiny to try the machinery."""
+  env: str | None = None
+  """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
+  teacher: str | None = None
+  """quick, steady, or the folder of an exported policy; the preset's if not given."""
+  max_env_steps: int | None = None
+  """Frames collected at most [steps]; the preset's if not given."""
+  minutes: float = 60.0
+  """Training time over all parts of the run [min]."""
+  seed: int = 0
+  """Seed of first weights, augmentation and sampling."""
+  threads: int = 1
+  """Processor threads of the updates."""
+  resume: bool = False
+  """Continue from the last saved state, with the settings that the run began with."""
+  link: tyro.conf.OmitArgPrefixes[sessions.LinkSettings] = sessions.LinkSettings()
+  """The link's settings."""
+
+
+def settings_of(arguments: Arguments) -> Any:
+  """Returns the settings of a run: the preset's with changes, or those it began with."""
+  from nerf2real.agents.distill import settings
+
+  if arguments.resume:
+    return read_json(arguments.run / settings.SETTINGS, settings.DistillSettings)
+  changes: dict[str, Any] = {
+    "environment": arguments.env,
+    "teacher": arguments.teacher,
+    "max_frames": arguments.max_env_steps,
+  }
+  given = {name: value for name, value in changes.items() if value is not None}
+  return dataclasses.replace(settings.preset(arguments.preset), **given)
+
+
+def run(arguments: Arguments) -> None:
+  """Distils until the minutes are over or it is stopped.
+
+  Raises:
+    CommandError: It cannot start with these arguments, or episodes can no longer be taken in.
+  """
+  from nerf2real.agents.distill.learner import Learner
+
+  logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s", force=True)
+  set_threads(arguments.threads)
+  try:
+    arguments.run.mkdir(parents=True, exist_ok=True)
+    learner = Learner(
+      settings_of(arguments),
+      arguments.run,
+      endpoint=arguments.listen,
+      link=arguments.link,
+      seed=arguments.seed,
+      minutes=arguments.minutes,
+      resume=arguments.resume,
+    )
+  except (ValueError, OSError, sessions.LinkError) as error:
+    raise command.CommandError(error, status=REFUSED) from error
+  for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda *_: learner.stop())
+  try:
+    learner.run()
+  except RuntimeError as error:
+    raise command.CommandError(error) from error
+  finally:
+    learner.close()
+
+
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run, environment=_ENVIRONMENT, errors=())
+
+
+if __name__ == "__main__":
+  sys.exit(main())

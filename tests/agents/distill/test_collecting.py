@@ -1,0 +1,125 @@
+"""The collector: the mixture over a run, pushes in steps, and labelled episodes."""
+
+import numpy as np
+import pytest
+
+from nerf2real.agents.distill import episodes, evaluating, schedule, settings
+from nerf2real.agents.distill.settings import MixtureSettings
+from nerf2real.agents.distill.teacher import Label
+from nerf2real.agents.dmpo.inference import PolicyState, PolicyStep
+from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.processes.environments import make_environment
+from nerf2real.suite import protocols
+
+
+def test_the_teacher_gives_way_to_the_student():
+  mixture = MixtureSettings(first_share=1.0, last_share=0.2, anneal_frames=100, belief_share=0.5)
+  assert schedule.mixture_at(mixture, 5_000, begun=None) == (1.0, 0.0)
+  assert schedule.mixture_at(mixture, 5_000, begun=5_000) == (1.0, 0.0)
+  assert schedule.mixture_at(mixture, 5_050, begun=5_000) == pytest.approx((0.6, 0.25))
+  assert schedule.mixture_at(mixture, 9_999, begun=5_000) == pytest.approx((0.2, 0.5))
+
+
+def test_pushes_come_in_steps():
+  tiny = settings.preset("tiny")
+  assert schedule.push_level(tiny, 39) == (0.0, 0.0)
+  assert schedule.push_level(tiny, 40) == (5.0, 15.0)
+  name = "suite:nerf_nav?scene=out/room"
+  assert schedule.pushed(name, (0.0, 0.0)) == "suite:nerf_nav?scene=out/room&pushes=false"
+  assert schedule.pushed("suite:nerf_nav", (1.0, 3.0)) == (
+    "suite:nerf_nav?pushes=true&push_force=1.0,3.0"
+  )
+
+
+def test_trials_during_a_run_are_not_those_that_are_reported():
+  reported = protocols.navigation()
+  others = evaluating.other_trials(list(reported))
+  assert not {t.seed for t in others} & {t.seed for t in reported}
+  headings = np.array([[o.yaw - t.yaw for t in reported] for o in others])
+  assert np.abs((headings + np.pi) % (2 * np.pi) - np.pi).min() > 1.0
+  pushed = evaluating.other_trials(list(protocols.ball_center()))
+  assert pushed[0].robot_yaw != protocols.ball_center()[0].robot_yaw
+
+
+class _Still:
+  """A student that stands, and says in which states it was asked."""
+
+  has_belief = True
+
+  def __init__(self, action):
+    self._action = action
+    self.calls = 0
+
+  def initial_state(self):
+    return PolicyState(np.zeros(0), np.zeros(0))
+
+  def belief(self, embedding):
+    means = np.array([[0.0, 0.0, 0.0], [9.0, 8.0, 7.0]])
+    return np.array([0.0, 1.0]), means, np.ones((2, 3))
+
+  def step(self, image, state, carried):
+    self.calls += 1
+    return PolicyStep(self._action, self._action, np.zeros(0), carried)
+
+
+class _Teacher:
+  """Labels with a constant and notes the poses it is given."""
+
+  def __init__(self):
+    self.poses = []
+
+  def reset(self, pose):
+    self.poses = []
+
+  def label(self, observation, *, goal, pose):
+    self.poses.append(pose)
+    return Label(np.full(20, 0.5, np.float32), np.array([1.0, -1.0], np.float32))
+
+
+@pytest.fixture(scope="module")
+def world():
+  environment = make_environment(settings.preset("tiny").environment + "&pushes=false", seed=0)
+  return environment, Layout.of(environment)
+
+
+def _run(world, mixture, *, policy=None, detours=0.0):
+  environment, layout = world
+  teacher = _Teacher()
+  runner = episodes.EpisodeRunner(
+    environment,
+    layout,
+    teacher=teacher,
+    settings=MixtureSettings(detour_share=detours, segment=(5, 9)),
+    rng=np.random.default_rng(0),
+  )
+  arrays, figures = runner.run(policy, mixture)
+  return arrays, figures, teacher
+
+
+def test_every_state_is_labelled_whoever_drives(world):
+  environment, _ = world
+  student = _Still(environment._environment.task.standing_action)
+  arrays, figures, teacher = _run(world, schedule.Mixture(0.5, 0.0), policy=student)
+  frames = len(arrays["state"])
+  assert figures["length"] == frames == student.calls == len(teacher.poses)
+  assert set(arrays["driver"]) == {episodes.TEACHER, episodes.STUDENT}
+  assert (arrays["label"] == 0.5).all() and (arrays["command"] == [1.0, -1.0]).all()
+  assert arrays["pose"] == pytest.approx(np.array(teacher.poses), abs=1e-6)
+  goal = environment._environment.task.goal
+  expected = np.linalg.norm(arrays["pose"][:, :2] - goal, axis=1)
+  assert arrays["goal_distance"] == pytest.approx(expected, abs=1e-4)
+  assert arrays["image"].shape == (frames, 12, 16, 3) and arrays["image"].std() > 0
+
+
+def test_a_teacher_by_belief_is_given_the_likeliest_pose_and_the_truth_is_kept(world):
+  environment, _ = world
+  student = _Still(environment._environment.task.standing_action)
+  arrays, _, teacher = _run(world, schedule.Mixture(0.0, 1.0), policy=student)
+  assert set(teacher.poses[1:]) == {(9.0, 8.0, 7.0)}
+  assert np.abs(arrays["pose"]).max() < 7.0
+
+
+def test_without_a_student_the_teacher_drives_and_detours_are_marked(world):
+  arrays, figures, _ = _run(world, schedule.Mixture(1.0, 0.0), detours=0.5)
+  assert figures["student_share"] == 0
+  assert set(arrays["driver"]) == {episodes.TEACHER, episodes.DETOUR}

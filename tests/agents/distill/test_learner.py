@@ -1,0 +1,86 @@
+"""The learner: stages over a run, a state that is resumed, and a tiny run end to end."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from nerf2real.agents.distill import checkpoint, learning, schedule, settings
+from nerf2real.agents.distill.settings import Stage
+from nerf2real.agents.dmpo.export import load_policy
+from tests.agents.distill.test_student import LAYOUT, TINY
+
+SCRIPT = Path(__file__).parents[3] / "launch" / "distill.py"
+
+
+def test_stages_take_their_shares():
+  found = dataclasses.replace(
+    TINY, stages=(Stage(kind="encoder", share=0.25), Stage(kind="policy", share=0.75))
+  )
+  assert schedule.stage_at(found, 0.0) == (0, 0.0)
+  assert schedule.stage_at(found, 0.125) == (0, 0.5)
+  assert schedule.stage_at(found, 0.25) == (1, 0.0)
+  assert schedule.stage_at(found, 1.5) == (1, 1.0)
+  assert schedule.cosine(0.0) == 1.0 and schedule.cosine(1.0) == pytest.approx(0.02)
+  with pytest.raises(ValueError, match="must sum to 1, found 0.5"):
+    dataclasses.replace(TINY, stages=(Stage(kind="policy", share=0.5),))
+
+
+def test_a_state_is_read_as_it_was_written(tmp_path):
+  updates = learning.make_updates(TINY, LAYOUT)
+  state = updates.init(jax.random.PRNGKey(3))
+  counters = checkpoint.Counters(updates=7, elapsed=12.5, begun=900)
+  checkpoint.save_state(tmp_path / "state.npz", state, counters)
+  fresh = updates.init(jax.random.PRNGKey(4))
+  found, read = checkpoint.load_state(tmp_path / "state.npz", like=fresh)
+  assert read == counters
+  assert jax.tree.structure(found) == jax.tree.structure(state)
+  for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(state), strict=True):
+    assert np.array_equal(a, b)
+  other = learning.make_updates(settings.nerf_nav(), LAYOUT).init(jax.random.PRNGKey(0))
+  with pytest.raises(ValueError, match="of other networks"):
+    checkpoint.load_state(tmp_path / "state.npz", like=other)
+
+
+def _start(run, *extra):
+  command = [sys.executable, str(SCRIPT), "--run", str(run), "--preset", "tiny", *extra]
+  environment = os.environ | {"PYTHONPATH": str(SCRIPT.parents[1])}
+  return subprocess.Popen(
+    command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+  )
+
+
+@pytest.mark.slow
+def test_a_tiny_run_survives_a_kill_and_its_policy_loads(tmp_path):
+  run = tmp_path / "run"
+  first = _start(run, "--minutes", "0.15")
+  deadline = time.monotonic() + 240
+  while not (run / "policy").exists() and time.monotonic() < deadline:
+    assert first.poll() is None, first.communicate()[0]
+    time.sleep(0.2)
+  first.send_signal(signal.SIGKILL)
+  first.wait()
+  time.sleep(2)  # its processes end with it
+  kept = sorted(path.name for path in (run / "data").glob("[0-9]*.npz"))
+  assert kept
+  refused = _start(run, "--minutes", "0.15")
+  assert (
+    "holds a run: add --resume" in refused.communicate(timeout=240)[0] and refused.returncode == 2
+  )
+  second = _start(run, "--minutes", "0.15", "--resume")
+  output = second.communicate(timeout=400)[0]
+  assert second.returncode == 0, output
+  assert set(kept) <= {path.name for path in (run / "data").glob("[0-9]*.npz")}
+  loaded = load_policy(run / "policy" / "newest")
+  assert loaded.policy.has_belief and loaded.info["updates"] > 0
+  rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+  assert {row["stage"] for row in rows if "stage" in row} >= {"policy"}
+  assert {"learner"} <= {row["source"] for row in rows}
