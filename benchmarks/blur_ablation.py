@@ -12,18 +12,12 @@ Source: NeRF2Real, section NeRF training (31.5 against 35.4 dB) and the figure o
 """
 
 import dataclasses
-import datetime
-import json
-import platform
-from pathlib import Path
 
 import av
 import cv2
 import numpy as np
-import rich.console
-import rich.table
-import tyro
 
+from benchmarks import harness
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import filming, yardstick
 from nerf2real.scenes.field import training as train
@@ -37,7 +31,7 @@ _CENTRE = (0.0, 0.0, 1.25)  # of the room [m]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Settings:
+class Settings(harness.Options):
   """Settings of the ablation."""
 
   seconds: float = 240.0
@@ -50,8 +44,6 @@ class Settings:
   """At full size one of so many held-out views is scored, which takes the longest."""
   seed: int = 0
   """Seed of the training."""
-  out: Path = Path("benchmarks/results/blur_ablation.json")
-  """Where the figures are kept."""
 
 
 def unit_from_room() -> Similarity:
@@ -99,7 +91,7 @@ def robot_views() -> dict[str, Views]:
   }
 
 
-def score(evaluator: FusedField, views: Views, *, told_angle: float) -> dict[str, float]:
+def score(evaluator: FusedField, views: Views, *, told_angle: float) -> dict[str, harness.Value]:
   """Mean PSNR [dB] and SSIM over views; the field is told that pixels span `told_angle` [rad]."""
   pairs = [
     (evaluator.render(views.camera, pose, pixel_angle=told_angle)[0], truth)
@@ -112,59 +104,37 @@ def score(evaluator: FusedField, views: Views, *, told_angle: float) -> dict[str
 
 
 def main(settings: Settings) -> None:
-  """Trains twice, prints the table and keeps the figures."""
-  console = rich.console.Console()
+  """Trains twice and prints the table."""
   training, held_out = film_views(settings).split(8)
-  sets = {"held out": held_out.select(range(0, len(held_out), settings.full_every))}
+  sets = {"held_out": held_out.select(range(0, len(held_out), settings.full_every))}
   for height, width in SIZES:
-    sets[f"held out {height}x{width}"] = held_out.resized(width, height)
+    sets[f"held_out {height}x{width}"] = held_out.resized(width, height)
   sets.update(robot_views())
-  columns: dict[str, dict[str, dict]] = {}
-  runs = {}
-  for name, blur_max in (("without blur", 0.0), ("with blur", train.preset("fast").blur_max)):
+  figures: dict[str, dict[str, harness.Value]] = {}
+  scores: dict[str, dict[str, list[float]]] = {name: {} for name in sets}  # PSNR by set and blur
+  for name, blur_max in (("without_blur", 0.0), ("with_blur", train.preset("fast").blur_max)):
     chosen = dataclasses.replace(
       train.preset("fast"), max_seconds=settings.seconds, blur_max=blur_max
     )
     field, report = train.train(training, chosen, seed=settings.seed)
-    runs[name] = {
+    figures[f"{name} training"] = {
       "steps": report.steps,
-      "seconds": round(report.seconds, 1),
-      "samples_per_second": round(report.samples_per_second),
+      "training_s": report.seconds,
+      "samples_per_s": report.samples_per_second,
     }
-    speed = report.samples_per_second / 1e6
-    console.print(f"{name}: {report.steps} steps, {speed:.2f} M samples/s")
     evaluator = FusedField(field, settings=chosen)
-    columns[name] = {
-      key: score(evaluator, views, told_angle=views.camera.pixel_angle)
-      for key, views in sets.items()
-    }
-    if blur_max == 0.0:
-      columns[f"{name}, told the training pixel"] = {
-        key: score(evaluator, views, told_angle=field.training_pixel_angle)
-        for key, views in sets.items()
-        if views.camera.pixel_angle > field.training_pixel_angle
-      }
-  table = rich.table.Table("PSNR [dB]", *columns, "gain")
-  gains = {}
-  for name in sets:
-    figures = {key: column[name]["psnr_db"] for key, column in columns.items() if name in column}
-    best = max(value for key, value in figures.items() if key != "with blur")
-    gains[name] = figures["with blur"] - best
-    cells = [f"{figures[key]:.2f}" if key in figures else "" for key in columns]
-    table.add_row(name, *cells, f"{gains[name]:+.2f}")
-  console.print(table)
-  settings.out.parent.mkdir(parents=True, exist_ok=True)
-  record = {
-    "date": datetime.date.today().isoformat(),
-    "machine": platform.processor() or "unknown",
-    "seconds": settings.seconds,
-    "runs": runs,
-    "figures": columns,
-    "gain_db": gains,
-  }
-  settings.out.write_text(json.dumps(record, indent=1))
-  console.print(f"kept in {settings.out}")
+    for key, views in sets.items():
+      angles = {"": views.camera.pixel_angle}
+      if not blur_max and views.camera.pixel_angle > field.training_pixel_angle:
+        angles[" told the training pixel"] = field.training_pixel_angle
+      for told, angle in angles.items():
+        figures[f"{name} {key}{told}"] = row = score(evaluator, views, told_angle=angle)
+        scores[key].setdefault(name, []).append(float(row["psnr_db"]))  # type: ignore[arg-type]
+  for key, by_blur in scores.items():
+    gain = max(by_blur["with_blur"]) - max(by_blur["without_blur"])
+    figures[f"gain {key}"] = {"gain_db": gain}
+  harness.finish("blur_ablation", figures, settings, seed=settings.seed)
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings))
+  harness.run(main, Settings, __doc__)

@@ -6,15 +6,17 @@ settings, time, hardware), its evaluations (means over some episodes with the po
 its acting returns and localisation errors as means over blocks of episodes. --target draws a line.
 """
 
-import argparse
+import dataclasses
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+import tyro
 
+from benchmarks import harness
 from nerf2real.agents.processes.checkpoints import read_info
 
 WIDTH, HEIGHT = 960, 540  # pixels
@@ -25,12 +27,34 @@ GREY = (110, 110, 110)
 Point = tuple[float, float]
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+  """What to draw."""
+
+  runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+  """Folders of runs, one a seed."""
+  name: str
+  """Name of the files."""
+  target: float | None = None
+  """Draws a dashed line at this return."""
+  note: str = ""
+  """A remark kept with the rows, such as the load."""
+  out: Path = Path("benchmarks/results")
+  """Folder of the curves."""
+  write: bool = False
+  """Keep the best returns as records in benchmarks/results/records/."""
+
+
 def read_run(folder: Path) -> dict[str, Any]:
   """Reads a run's rows: {"about", "evaluations", "acting", "localisation"}."""
   rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
   launches = [json.loads(line) for line in (folder / "launches.jsonl").read_text().splitlines()]
   info = read_info(folder) or {}
-  evaluations = [r for r in rows if r["source"].startswith("evaluator")]
+  evaluations = [
+    r
+    for r in rows
+    if r["source"].startswith("evaluator") and "return" in r and not r.get("confirmation")
+  ]
   episodes = [r for r in rows if r["source"].startswith("actor") and "return" in r]
   seconds = sum(_span([r["time"] for r in rows], launches, i) for i in range(len(launches)))
   last = rows[-1]
@@ -160,40 +184,34 @@ def _ticks(low: float, high: float) -> np.ndarray:
   return np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step
 
 
-def main() -> None:
-  parser = argparse.ArgumentParser(
-    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-  )
-  parser.add_argument("runs", type=Path, nargs="+", help="folders of runs, one a seed")
-  parser.add_argument("--name", required=True, help="name of the files")
-  parser.add_argument("--target", type=float, help="draws a dashed line at this return")
-  parser.add_argument("--note", default="", help="a remark kept with the rows, such as the load")
-  parser.add_argument("--out", type=Path, default=Path("benchmarks/results"))
-  arguments = parser.parse_args()
-  runs = [read_run(folder) for folder in arguments.runs]
-  arguments.out.mkdir(parents=True, exist_ok=True)
-  path = arguments.out / f"curves_{arguments.name}.jsonl"
+def main(settings: Settings) -> None:
+  """Writes the rows and the picture, prints the best returns."""
+  runs = [read_run(folder) for folder in settings.runs]
+  settings.out.mkdir(parents=True, exist_ok=True)
+  path = settings.out / f"curves_{settings.name}.jsonl"
   with path.open("w") as stream:
     for run in runs:
-      about = run["about"] | ({"note": arguments.note} if arguments.note else {})
+      about = run["about"] | ({"note": settings.note} if settings.note else {})
       for row in (about, *run["evaluations"], *run["acting"], *run["localisation"]):
         stream.write(json.dumps(row) + "\n")
   title = f"{runs[0]['about']['environment']}, return"
-  pictures = [draw(runs, title=title, target=arguments.target)]
+  pictures = [draw(runs, title=title, target=settings.target)]
   if any(run["localisation"] for run in runs):
     title = f"{runs[0]['about']['environment']}, error of the believed position [m]"
     pictures.append(draw(runs, title=title, kind="localisation_error"))
   picture = np.concatenate(pictures)
   cv2.imwrite(os.fspath(path.with_suffix(".png")), picture[..., ::-1])
+  figures: dict[str, dict[str, harness.Value]] = {}
   for run in runs:
     best = max((r["return"] for r in run["evaluations"]), default=float("nan"))
     about = run["about"]
-    print(
-      f"seed {about['seed']}: best {best:.1f}, {about['steps']:,} steps in "
-      f"{about['seconds'] / 60:.1f} min ({about['steps_per_second']} steps/s, "
-      f"{about['updates_per_second']} updates/s)"
-    )
+    names = ("steps", "seconds", "steps_per_second", "updates_per_second")
+    figures[f"{settings.name} seed {about['seed']}"] = {
+      "best_return": float(best),
+      **{name: about[name] for name in names},
+    }
+  harness.finish("curves", figures, harness.Options(write=settings.write), words=settings.note)
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Settings, __doc__)

@@ -5,7 +5,13 @@ all of them together, and of mj_step beside them. The model is a chain of 20 joi
 servos, as many as OP3 has.
 """
 
-import time
+# ruff: noqa: E402  (threads are chosen before numpy is imported)
+
+import dataclasses
+
+from benchmarks import harness
+
+harness.one_thread()
 
 import mujoco
 import numpy as np
@@ -13,7 +19,14 @@ import numpy as np
 from nerf2real.suite.effects import KINDS, Effect, EffectStack
 
 NUM_JOINTS = 20
-STEPS = 2000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """What to measure."""
+
+  steps: int = 2000
+  """Physics steps of each."""
 
 
 def chain() -> mujoco.MjModel:
@@ -48,33 +61,43 @@ def strong(name: str) -> Effect:
   return Effect(name, "f3" if name == "payload" else None, values)
 
 
-def measure(names: list[str]) -> tuple[float, float]:
-  """Returns the median times of before_step and mj_step, microseconds."""
-  model = chain()
-  stack = EffectStack([strong(name) for name in names]).bind(model)
-  data = mujoco.MjData(model)
-  phase = np.arange(model.nu)
-  ours, theirs = np.empty(STEPS), np.empty(STEPS)
-  for index in range(STEPS):
-    ctrl = 0.3 * np.sin(0.02 * index + phase)
-    start = time.perf_counter()
-    stack.before_step(data, ctrl)
-    middle = time.perf_counter()
-    mujoco.mj_step(model, data)
-    ours[index], theirs[index] = middle - start, time.perf_counter() - middle
-  return float(np.median(ours)) * 1e6, float(np.median(theirs)) * 1e6
+class Stepping:
+  """The chain with effects of some kinds on it."""
+
+  def __init__(self, names: list[str], steps: int):
+    self._model = chain()
+    self._stack = EffectStack([strong(name) for name in names]).bind(self._model)
+    self._data = mujoco.MjData(self._model)
+    phase = np.arange(self._model.nu)
+    self._controls = [0.3 * np.sin(0.02 * index + phase) for index in range(steps)]
+
+  def before_step(self, index: int) -> None:
+    """Applies the effects."""
+    self._stack.before_step(self._data, self._controls[index])
+
+  def step(self, _: int) -> None:
+    """Steps the physics."""
+    mujoco.mj_step(self._model, self._data)
 
 
-def main() -> None:
-  """Prints the table."""
+def measure(names: list[str], steps: int) -> dict[str, harness.Value]:
+  """Returns the median times of before_step and mj_step [us]."""
+  stepping = Stepping(names, steps)
+  calls = {"before_step_us": stepping.before_step, "mj_step_us": stepping.step}
+  times = harness.interleave(calls, rounds=steps)
+  return {name: 1e6 * harness.percentile(t.elapsed, 50) for name, t in times.items()}
+
+
+def main(settings: Settings) -> None:
+  """Measures every kind."""
   kinds = [name for name, kind in KINDS.items() if kind.target != "geom"]
   acting = [name for name in kinds if KINDS[name].acts in ("command", "force", "actuator")]
-  print(f"{'effects on 20 joints':28s} before_step [us]  mj_step [us]")
-  rows = [("none", []), *((name, [name]) for name in acting), ("all kinds", kinds)]
-  for label, names in rows:
-    ours, theirs = measure(names)
-    print(f"{label:28s} {ours:16.1f} {theirs:13.1f}")
+  rows = {"none": [], **{name: [name] for name in acting}, "all_kinds": kinds}
+  figures = {name: measure(kinds_of, settings.steps) for name, kinds_of in rows.items()}
+  single = [float(figures[name]["before_step_us"]) for name in acting if name != "backlash"]  # type: ignore[arg-type]
+  figures["one_kind"] = {"smallest_us": min(single), "largest_us": max(single)}
+  harness.finish("effects", figures, settings)
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Settings, __doc__)

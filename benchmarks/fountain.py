@@ -7,22 +7,27 @@ for high resolution imagery. Exit code 1 if a figure is missed.
 """
 
 import dataclasses
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
-import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+from benchmarks import harness
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import read_capture
 from nerf2real.scenes.poses.localise import Localisation, localise
 
 MAX_POSITION_RMSE = 0.01  # [m]
 MAX_ROTATION_RMSE = 0.1  # [degree]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """Where the data is."""
+
+  data: Path
+  """Folder of fountain-P11, with images/ and gt_dense_cameras/."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,45 +111,30 @@ def measure(data: Path, work: Path) -> tuple[PoseErrors, Localisation, float]:
   return pose_errors(result.world_from_camera, truth[rows]), result, seconds
 
 
-def main(data: Path) -> int:
-  """Measures and prints a table.
-
-  Args:
-    data: Folder of fountain-P11, with images/ and gt_dense_cameras/.
-  """
+def main(settings: Settings) -> int:
+  """Measures and prints; returns 1 if a figure is missed."""
   with tempfile.TemporaryDirectory() as folder:
-    errors, result, seconds = measure(data, Path(folder))
-  complete = result.registered_fraction == 1.0
-  rows = (
-    ("registered pictures", f"{result.registered_fraction:.0%}", "100%", complete),
-    (
-      "position RMSE [mm]",
-      f"{1e3 * errors.position_rmse:.2f}",
-      f"{1e3 * MAX_POSITION_RMSE:.0f}",
-      errors.position_rmse <= MAX_POSITION_RMSE,
-    ),
-    ("position, largest [mm]", f"{1e3 * errors.position.max():.2f}", "", True),
-    (
-      "rotation RMSE [degree]",
-      f"{errors.rotation_rmse:.4f}",
-      f"{MAX_ROTATION_RMSE}",
-      errors.rotation_rmse <= MAX_ROTATION_RMSE,
-    ),
-    (
-      "rotation, largest [degree]",
-      f"{errors.rotation.max():.4f}",
-      f"{MAX_ROTATION_RMSE}",
-      errors.rotation.max() <= MAX_ROTATION_RMSE,
-    ),
-    ("reprojection error [px]", f"{result.reprojection_error_px:.3f}", "", True),
-    ("wall time [s]", f"{seconds:.1f}", "", True),
-  )
-  print(f"fountain-P11: {result.strategy}")
-  print(f"{'figure':<28}{'found':>10}{'at most':>10}")
-  for name, found, limit, passed in rows:
-    print(f"{name:<28}{found:>10}{limit:>10}  {'' if passed else 'MISSED'}")
-  return 0 if all(row[3] for row in rows) else 1
+    errors, result, seconds = measure(settings.data, Path(folder))
+  figures: dict[str, harness.Value] = {
+    "registered_percent": 100 * result.registered_fraction,
+    "position_rmse_mm": 1e3 * errors.position_rmse,
+    "position_largest_mm": 1e3 * float(errors.position.max()),
+    "rotation_rmse_degrees": errors.rotation_rmse,
+    "rotation_largest_degrees": float(errors.rotation.max()),
+    "reprojection_error_px": result.reprojection_error_px,
+    "wall_time_s": seconds,
+  }
+  limits = {
+    "position_rmse_mm": 1e3 * MAX_POSITION_RMSE,
+    "rotation_rmse_degrees": MAX_ROTATION_RMSE,
+    "rotation_largest_degrees": MAX_ROTATION_RMSE,
+  }
+  missed = [name for name, limit in limits.items() if float(figures[name]) > limit]  # type: ignore[arg-type]
+  missed += ["registered_percent"] * (result.registered_fraction < 1)
+  words = f"{result.strategy}; missed: {', '.join(missed) or 'nothing'}"
+  harness.finish("fountain", {"poses": figures}, settings, words=words)
+  return 1 if missed else 0
 
 
 if __name__ == "__main__":
-  sys.exit(tyro.cli(main))
+  harness.run(main, Settings, __doc__)

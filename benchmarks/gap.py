@@ -7,29 +7,27 @@ gravity, pictures at 30x40. The simulation is the nominal one, without randomisa
 the virtual camera's, as a calibration would find it. `picture, same pose` shows the difference of
 field and sensor alone: the simulation's picture from where the virtual robot's camera was.
 
-python benchmarks/gap.py --out benchmarks/results/gap.md
+  python benchmarks/gap.py --out benchmarks/results/gap.md
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
 
 import dataclasses
-import os
-from pathlib import Path
 from typing import Any
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-  os.environ.setdefault(_name, "1")
-os.environ.setdefault("MUJOCO_GL", "egl")
+from benchmarks import harness
+
+harness.one_thread()
 
 import cv2
 import mujoco
 import numpy as np
-import tyro
 
 from nerf2real import real, suite
 from nerf2real.core import rotations
 from nerf2real.real.virtual.body import Truth
-from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
+from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.scenes.quality.image_quality import psnr
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants
@@ -45,8 +43,8 @@ _NOMINAL = RandomisationSettings(
 MOTIONS = ("sway", "walk")
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
   """Settings of the comparison."""
 
   seconds: float = 6.0
@@ -59,8 +57,6 @@ class Settings:
   """Where the robot starts: x [m], y [m], heading [rad]."""
   seed: int = 0
   """Of the swaying's frequencies."""
-  out: Path | None = None
-  """Where to write the table (Markdown)."""
 
 
 @dataclasses.dataclass
@@ -176,7 +172,8 @@ def run_virtual(
   """Runs every motion on a virtual robot in the true room; returns the traces by motion."""
   found = {}
   camera = settings.picture_steps > 0
-  with VirtualRobot(world="room", seed=seed, stepped=True, camera=camera) as robot:
+  eye = VirtualCamera() if camera else None
+  with VirtualRobot(world="room", seed=seed, stepped=True, camera=eye) as robot:
     environment = real.load(
       "nerf_nav",
       robot=robot.connection(),
@@ -242,29 +239,16 @@ def compare(simulated: Trace, virtual: Trace) -> dict[str, float]:
   return figures
 
 
-def table(results: dict[str, list[dict[str, float]]], settings: Settings) -> str:
-  """Returns the table in Markdown: mean over the robots, and their spread."""
-  motions = list(results)
-  robots = ", ".join(str(seed) for seed in settings.robots)
-  lines = [
-    "# The gap between simulation and virtual robot",
-    "",
-    "`python benchmarks/gap.py --out benchmarks/results/gap.md`",
-    "",
-    f"Simulation against virtual robots {robots}, {settings.seconds:g} s of each motion; RMS over "
-    "control steps, mean over the robots (smallest to largest).",
-    "",
-    "| observed | " + " | ".join(motions) + " |",
-    "| --- |" + " --- |" * len(motions),
-  ]
-  for name in results[motions[0]][0]:
-    cells = []
-    for motion in motions:
-      values = np.array([figures[name] for figures in results[motion]])
-      spread = f" ({values.min():.3g} to {values.max():.3g})" if len(values) > 1 else ""
-      cells.append(f"{values.mean():.3g}{spread}")
-    lines.append(f"| {name} | " + " | ".join(cells) + " |")
-  return "\n".join(lines) + "\n"
+def summary(rows: list[dict[str, float]]) -> dict[str, dict[str, harness.Value]]:
+  """Returns, by figure, mean, smallest and largest over the robots."""
+  return {
+    name: {
+      "mean": float(np.mean(values := [row[name] for row in rows])),
+      "smallest": min(values),
+      "largest": max(values),
+    }
+    for name in rows[0]
+  }
 
 
 def main(settings: Settings) -> None:
@@ -278,12 +262,18 @@ def main(settings: Settings) -> None:
     virtual = run_virtual(simulation, actions, settings, seed=seed)
     for name, trace in virtual.items():
       results[name].append(compare(simulated[name], trace))
-  text = table(results, settings)
-  print(text)
-  if settings.out is not None:
-    settings.out.parent.mkdir(parents=True, exist_ok=True)
-    settings.out.write_text(text)
+  figures = {
+    f"{motion}: {name}": row
+    for motion, rows in results.items()
+    for name, row in summary(rows).items()
+  }
+  robots = ", ".join(str(seed) for seed in settings.robots)
+  words = (
+    f"Simulation against virtual robots {robots}, {settings.seconds:g} s of each motion; RMS over "
+    "control steps, over the robots."
+  )
+  harness.finish("gap", figures, settings, seed=settings.seed, words=words)
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings, description=__doc__))
+  harness.run(main, Settings, __doc__)

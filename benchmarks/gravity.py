@@ -4,23 +4,22 @@ The gait walks straight ahead on virtual robots and in simulation; the policy's 
 compared with the truth. On the virtual robots three ways: as it is, without the gyroscope's zero
 that is measured while the robot stands, and with an accelerometer whose range never ends.
 
-python benchmarks/gravity.py
+  python benchmarks/gravity.py
 """
 
 # ruff: noqa: E402  (threads are chosen before numpy is imported)
 
 import dataclasses
-import os
 from typing import Any
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-  os.environ.setdefault(_name, "1")
+from benchmarks import harness
+
+harness.one_thread()
 
 import numpy as np
-import tyro
 
 from nerf2real import real, suite
-from nerf2real.real.loop.motion import RobotSettings
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walk import Command, Gait
@@ -30,8 +29,8 @@ from nerf2real.suite.tasks.base import Start
 _STANDARD_GRAVITY = 9.80665  # m/s^2
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
   """How well the direction of gravity is known while the robot walks."""
 
   seconds: float = 20.0
@@ -52,9 +51,10 @@ class Errors:
     """Notes two unit vectors [3]."""
     self.degrees.append(float(np.rad2deg(np.arccos(np.clip(estimate @ truth, -1, 1)))))
 
-  def row(self, name: str) -> str:
-    """Returns a line of the table."""
-    return f"| {name} | {np.sqrt(np.mean(np.square(self.degrees))):.1f} | {self.degrees[-1]:.1f} |"
+  def figures(self) -> dict[str, harness.Value]:
+    """Returns RMS and last error."""
+    rms = float(np.sqrt(np.mean(np.square(self.degrees))))
+    return {"rms_degrees": rms, "end_degrees": self.degrees[-1]}
 
 
 def _walk(environment: Any, truth: Any) -> Errors:
@@ -95,14 +95,12 @@ def rehearsed(seed: int, seconds: float, *, zeroed: bool, endless: bool) -> tupl
 
 def main(settings: Settings) -> None:
   """Walks everywhere and prints the table."""
-  print("| walk | RMS error [degrees] | at its end |\n| --- | --- | --- |")
-  ways = {"": (True, False), ", zero not measured": (False, False), ", endless range": (True, True)}
-  peaks = []
+  ways = {"": (True, False), "_zero_not_measured": (False, False), "_endless_range": (True, True)}
+  figures: dict[str, dict[str, harness.Value]] = {}
   for seed in settings.robots:
     for name, (zeroed, endless) in ways.items():
       errors, peak = rehearsed(seed, settings.seconds, zeroed=zeroed, endless=endless)
-      print(errors.row(f"virtual robot {seed}{name}"), flush=True)
-      peaks.append(peak)
+      figures[f"virtual_robot_{seed}{name}"] = errors.figures() | {"largest_force_g": peak}
   environment = suite.load(
     "nerf_nav",
     scene=EmptyFloor(),
@@ -116,9 +114,13 @@ def main(settings: Settings) -> None:
   task.set_start(Start((0.0, 0.0), 0.0))
   for episode in range(settings.episodes):
     errors = _walk(environment, lambda: -task.state.rotation[2])
-    print(errors.row(f"simulation, episode {episode}"), flush=True)
-  print(f"\nlargest specific force in the chip of the virtual robots: {max(peaks):.1f} g")
+    figures[f"simulation_episode_{episode}"] = errors.figures()
+  for plant in ("virtual_robot", "simulation"):
+    names = [n for n in figures if n.startswith(plant) and "range" not in n and "zero" not in n]
+    rms = [float(figures[name]["rms_degrees"]) for name in names]  # type: ignore[arg-type]
+    figures[f"{plant}s"] = {"smallest_rms_degrees": min(rms), "largest_rms_degrees": max(rms)}
+  harness.finish("gravity", figures, settings, seed=0)
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings, description=__doc__))
+  harness.run(main, Settings, __doc__)

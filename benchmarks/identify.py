@@ -8,24 +8,19 @@ stopped and run on. Seeds 100 to 199 are for development; figures are reported o
 
 import concurrent.futures
 import dataclasses
-import datetime
 import json
 import os
 import pathlib
-import platform
 import resource
 import subprocess
 import sys
 import time
 from typing import Any
 
-import tyro
-
-# One name for the package whoever imports it: numba's cache keeps the name.
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+from benchmarks import harness
 from benchmarks.blind_sets import scoring
+from benchmarks.ledger import ROOT
 
-ROOT = pathlib.Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 
 
@@ -55,6 +50,8 @@ class Settings:
   """Of the files in benchmarks/results."""
   results: pathlib.Path = RESULTS
   """Folder of the table and the scores."""
+  write: bool = False
+  """Keep the figures as records in benchmarks/results/records/."""
 
 
 def main(settings: Settings) -> None:
@@ -86,7 +83,7 @@ def main(settings: Settings) -> None:
       rows.append({"set": name, "plant": answers[name]["plant"], "used": used, "score": score})
       print(f"{name} {answers[name]['plant']}: {score.truth} -> {score.said}", flush=True)
   rows.sort(key=lambda row: row["set"])
-  text = render(rows, answers, settings)
+  text = render(rows, answers)
   print(text)
   settings.results.mkdir(parents=True, exist_ok=True)
   (settings.results / f"{settings.name}.md").write_text(text)
@@ -97,6 +94,28 @@ def main(settings: Settings) -> None:
     "answers": {name: answers[name] for name in names},
   }
   (settings.results / f"{settings.name}.json").write_text(json.dumps(record, indent=1) + "\n")
+  seeds = ", ".join(sorted({name.split("_")[0] for name in names}))
+  options = harness.Options(write=settings.write)
+  harness.finish(settings.name, figures_of(rows), options, seed=seeds)
+
+
+def figures_of(rows: list[dict[str, Any]]) -> dict[str, dict[str, harness.Value]]:
+  """Returns the figures of the table; shares as rates with their number of cases."""
+  figures: dict[str, dict[str, harness.Value]] = {}
+  for figure in scoring.table([row["score"] for row in rows]):
+    if figure.value is None:
+      continue
+    value: harness.Value = figure.value
+    if "%" in figure.target:
+      value = harness.Rate(round(figure.value * figure.of), figure.of)
+    figures[figure.question] = {"value": value, "of": figure.of}
+    if "relative" in figure.question:
+      figures[figure.question]["percent"] = 100 * figure.value
+  for plant in sorted({row["plant"] for row in rows}):
+    used = [row["used"]["wall_s"] for row in rows if row["plant"] == plant]
+    times = {"median_s": harness.percentile(used, 50), "longest_s": max(used), "sets": len(used)}
+    figures[f"seconds {plant}"] = dict(times)
+  return figures
 
 
 def _analyse(settings: Settings, name: str) -> tuple[dict[str, Any], dict[str, float]]:
@@ -141,8 +160,9 @@ def _run(command: list[str]) -> None:
   subprocess.run(command, check=True)
 
 
-def render(rows: list[dict[str, Any]], answers: dict[str, Any], settings: Settings) -> str:
+def render(rows: list[dict[str, Any]], answers: dict[str, Any]) -> str:
   """Returns the table, the confusions and how they came about, as Markdown."""
+  origin = harness.provenance()
   scores: list[scoring.Score] = [row["score"] for row in rows]
   mixes = {
     mix: sum(s.mix == mix for s in scores) for mix in ("single", "pair", "outside", "healthy")
@@ -151,8 +171,8 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any], settings: Settin
   lines = [
     "# The analyser on blind sets",
     "",
-    f"`python benchmarks/identify.py`, {datetime.date.today()}, {platform.machine()}, "
-    f"{os.cpu_count()} cores. {len(rows)} of {len(answers)} sets of seeds "
+    f"`python benchmarks/identify.py`, {origin['date']}, {origin['machine']}, commit "
+    f"{origin['commit']}. {len(rows)} of {len(answers)} sets of seeds "
     f"{', '.join(sorted({name.split('_')[0] for name in answers}))}: "
     + ", ".join(f"{n} {mix}" for mix, n in mixes.items())
     + "; "
@@ -200,4 +220,4 @@ def _right(score: scoring.Score) -> bool | None:
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings, description=__doc__))
+  harness.run(main, Settings, __doc__)

@@ -8,23 +8,26 @@ once at half the gain, judged beside the first log. On a plane that slopes it st
 turned and put down three times. Prints a table in Markdown.
 """
 
+# ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
+
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("MUJOCO_GL", "egl")
+from benchmarks import harness
+
+harness.one_thread()
 
 import mujoco
 import numpy as np
-import tyro
 from scipy.spatial.transform import Rotation
 
 from nerf2real import real
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.rotations import yaw_quaternion
 from nerf2real.real.recorder.recorder import Recorder
-from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
+from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.op3.op3 import OP3
 from nerf2real.sysid.sensors import floor, sensing
@@ -48,6 +51,8 @@ class Arguments:
   """Of the robots' hidden properties."""
   seconds: float = 10.0
   """Length of a filmed motion."""
+  write: bool = False
+  """Keep what is found as records in benchmarks/results/records/."""
 
 
 class Gate:
@@ -103,9 +108,8 @@ def film(
   path: Path, arguments: Arguments, seed: int, *, wave: int, late: float, scale: float, gain: float
 ) -> None:
   """Records a held robot that moves and films."""
-  with VirtualRobot(
-    stepped=True, seed=seed, world="room", camera=True, latency=_LATE, gain=gain
-  ) as robot:
+  camera = VirtualCamera(latency=_LATE, gain=gain)
+  with VirtualRobot(stepped=True, seed=seed, world="room", camera=camera) as robot:
     connection = dataclasses.replace(robot.connection(), camera=Arrival(robot.camera, late))
     actions = motion(wave, round(arguments.seconds / _STEP))
     lifting = round(2.0 / _STEP)
@@ -176,26 +180,33 @@ def standing_model() -> mujoco.MjModel:
   return spec.compile()
 
 
-def found(parts: dict[str, Part], *names: str) -> str:
-  """Returns what parts of a finding name, in a line."""
+def found(parts: dict[str, Part], *names: str) -> dict[str, harness.Value]:
+  """Returns what parts of a finding name: in a line with intervals, and every value."""
+  rows = [row for name in names for row in (parts[name].rows if name in parts else ())]
   texts = [
     f"{row['kind']} "
     + ", ".join(
       f"{name} {p['value']:.4f} ({p['low']:.4f} to {p['high']:.4f})"
       for name, p in row["parameters"].items()
     )
-    for name in names
-    for row in (parts[name].rows if name in parts else ())
+    for row in rows
   ]
-  return "; ".join(texts) or "nothing"
+  values = {
+    f"{row['kind']}_{name}": p["value"] for row in rows for name, p in row["parameters"].items()
+  }
+  return {"found": "; ".join(texts) or "nothing", **values}
 
 
-def main() -> None:
+def main(arguments: Arguments) -> None:
   """Records what is missing in the folder, identifies, prints."""
-  arguments = tyro.cli(Arguments, description=__doc__)
   arguments.out.mkdir(parents=True, exist_ok=True)
   model, free = held_model(), standing_model()
-  print("| seed | what is so | found |\n| --- | --- | --- |")
+  figures: dict[str, dict[str, harness.Value]] = {}
+
+  def note(name: str, truth: str, what: dict[str, harness.Value]) -> None:
+    figures[name] = {"truth": truth, **what}
+    print(f"{name}: {truth}: {what['found']}", flush=True)
+
   level = _GAIN ** (1 / _GAMMA)
   cases: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("healthy", "nothing", {"wave": 1, "late": 0.0, "scale": 1.0, "gain": 1.0}),
@@ -217,15 +228,18 @@ def main() -> None:
         film(path, arguments, seed, **settings)
       reference = [read_log(arguments.out / f"healthy_{seed}.mcap")] if name == "dark" else []
       parts = sensing.find(model, [read_log(path)], reference).parts
-      print(f"| {seed} | camera: {truth} | {found(parts, 'camera', 'brightness')} |", flush=True)
+      note(f"seed_{seed}_camera_{name}", truth, found(parts, "camera", "brightness"))
     for slope in _SLOPES:
       path = arguments.out / f"slope_{slope[0]}_{slope[1]}_{seed}.mcap"
       if not path.exists():
         stand(path, seed, slope)
       part = floor.find(free, [read_log(path)])
       parts = {} if part is None else {"floor": part}
-      print(f"| {seed} | floor: {slope[0]}, {slope[1]} rad | {found(parts, 'floor')} |", flush=True)
+      truth = f"{slope[0]}, {slope[1]} rad"
+      note(f"seed_{seed}_floor_{truth}", truth, found(parts, "floor"))
+  options = harness.Options(write=arguments.write)
+  harness.finish("identify_sensors", figures, options, seed=str(arguments.seeds))
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Arguments, __doc__)

@@ -3,27 +3,22 @@
 State-only settings (preset "state") on cartpole's sizes. The reference is DMPO as the public one is
 written, with rlax (the test extra): single transitions with n-step rewards summed beforehand, in a
 batch of as many transitions, the same networks, samples and optimisers. Both take turns in one run.
---pictures 30x40 60x80 measures the paper's settings instead (no reference), for a GPU. Writes
-benchmarks/results/learner.json, or learner_pictures.json.
+--pictures 30x40 60x80 measures the paper's settings instead (no reference), for a GPU.
 """
 
-import argparse
+import dataclasses
 import functools
 import json
-import os
-import platform
-import shlex
-import sys
-import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import tyro
 
+from benchmarks import harness
 from nerf2real.agents.dmpo import config, learning, losses, networks
 from nerf2real.agents.dmpo.config import DmpoConfig
 from nerf2real.agents.dmpo.replay import trajectory_fields
@@ -31,6 +26,19 @@ from nerf2real.agents.dmpo.specs import Layout
 
 STATE_LAYOUT = Layout(None, None, ("position", "velocity"), (3, 2), (), (), 1)
 PROPRIOCEPTION, PRIVILEGED, ACTIONS = 247, 70, 20  # about the suite's
+_MOST_UPDATES = 100_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """What to measure."""
+
+  seconds: float = 10.0
+  """Time for each."""
+  pictures: tuple[str, ...] = ()
+  """The paper's settings at these sizes, such as 30x40 60x80."""
+  set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+  """NAME=VALUE changes a setting of the agent, such as batch_size=4."""
 
 
 def random_batch(settings: DmpoConfig, layout: Layout) -> dict[str, Any]:
@@ -49,7 +57,7 @@ def random_batch(settings: DmpoConfig, layout: Layout) -> dict[str, Any]:
   return batch | {"last": np.full(size, time_steps - 1, np.int32)}
 
 
-def ours(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
+def updates(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
   """A function that does one update of this learner."""
   functions = learning.make_learning(settings, layout)
   state = [jax.jit(functions.init)(jax.random.PRNGKey(0))]
@@ -152,83 +160,38 @@ def reference(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
   return step
 
 
-def rates(steps: dict[str, Callable[[], None]], seconds: float) -> dict[str, float]:
-  """Updates a second of each, in turns of about a tenth of the time."""
-  for step in steps.values():
-    step()  # compiles
-  spent, done = dict.fromkeys(steps, 0.0), dict.fromkeys(steps, 0)
-  while min(spent.values()) < seconds:
-    for name, step in steps.items():
-      begin = time.perf_counter()
-      while time.perf_counter() - begin < seconds / 10:
-        step()
-        done[name] += 1
-      spent[name] += time.perf_counter() - begin
-  return {name: done[name] / spent[name] for name in steps}
-
-
-def main() -> None:
-  parser = argparse.ArgumentParser(
-    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-  )
-  parser.add_argument("--seconds", type=float, default=10.0, help="time for each")
-  parser.add_argument(
-    "--pictures",
-    metavar="HxW",
-    nargs="+",
-    help="the paper's settings at these sizes, such as 30x40 60x80",
-  )
-  parser.add_argument(
-    "--set",
-    action="append",
-    default=[],
-    metavar="NAME=VALUE",
-    help="changes a setting of the agent, such as batch_size=4",
-  )
-  parser.add_argument("--out", type=Path)
-  arguments = parser.parse_args()
-  changes = {
-    name: json.loads(value) for name, _, value in (a.partition("=") for a in arguments.set)
-  }
-  out = arguments.out or Path(
-    f"benchmarks/results/learner{'_pictures' if arguments.pictures else ''}.json"
-  )
-  if arguments.pictures:
-    settings = config.override(config.preset("paper"), changes)
+def steps_to_time(settings: Settings) -> dict[str, Callable[[], None]]:
+  """Returns the updates to time, by name."""
+  pairs = (change.partition("=") for change in settings.set)
+  changes = {name: json.loads(value) for name, _, value in pairs}
+  if settings.pictures:
+    agent = config.override(config.preset("paper"), changes)
     steps = {}
-    for size in arguments.pictures:
+    for size in settings.pictures:
       height, width = map(int, size.split("x"))
+      shape, privileged = (height, width, 3), ("privileged/p",)
       layout = Layout(
-        "camera",
-        (height, width, 3),
-        ("s",),
-        (PROPRIOCEPTION,),
-        ("privileged/p",),
-        (PRIVILEGED,),
-        ACTIONS,
+        "camera", shape, ("s",), (PROPRIOCEPTION,), privileged, (PRIVILEGED,), ACTIONS
       )
-      steps[size] = ours(settings, layout)
-  else:
-    settings = config.override(config.preset("state"), changes)
-    steps = {"ours": ours(settings, STATE_LAYOUT)}
-    try:
-      steps["reference"] = reference(settings, STATE_LAYOUT)
-    except ImportError:
-      print("rlax (the test extra) is not installed: no reference.")
-  result = rates(steps, arguments.seconds)
-  for name, rate in result.items():
-    print(f"{name:>10}: {rate:.2f} updates/s")
-  record = {
-    "command": shlex.join(["python", *sys.argv]),
-    "device": jax.devices()[0].device_kind,
-    "machine": platform.machine(),
-    "cores": os.cpu_count(),
-    "load": os.getloadavg()[0],
-    "updates_per_second": result,
-  }
-  out.parent.mkdir(parents=True, exist_ok=True)
-  out.write_text(json.dumps(record, indent=1) + "\n")
+      steps[size] = updates(agent, layout)
+    return steps
+  agent = config.override(config.preset("state"), changes)
+  steps = {"ours": updates(agent, STATE_LAYOUT)}
+  try:
+    steps["reference"] = reference(agent, STATE_LAYOUT)
+  except ImportError:
+    print("rlax (the test extra) is not installed: no reference.")
+  return steps
+
+
+def main(settings: Settings) -> None:
+  """Runs the benchmark."""
+  calls = {name: lambda _, step=step: step() for name, step in steps_to_time(settings).items()}
+  times = harness.interleave(calls, rounds=_MOST_UPDATES, seconds=settings.seconds)
+  figures = {name: {"updates_per_second": t.rate(), **t.figures()} for name, t in times.items()}
+  details = {"device": jax.devices()[0].device_kind}
+  harness.finish("learner", figures, settings, seed=0, details=details)
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Settings, __doc__)

@@ -3,30 +3,40 @@
 Sends 48-step trajectories with 30x40 pictures (173 KB) from one process to another; in the middle
 the receiver is stopped for 20 s (SIGSTOP), as a long compilation or a checkpoint on a starved
 machine would. Counted: messages lost and repeated, MB/s and messages/s before it. "zenoh"
-is a plain put with congestion control BLOCK and default settings, "link" this project's. Writes
-benchmarks/results/link.json.
+is a plain put with congestion control BLOCK and default settings, "link" this project's.
 """
 
-import argparse
+import dataclasses
 import json
 import multiprocessing
 import os
-import platform
 import signal
 import socket
 import time
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zenoh
 
+from benchmarks import harness
 from nerf2real.agents.link import client, sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink
 
 STEPS = 48
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """What to send."""
+
+  messages: int = 4000
+  """Trajectories of each."""
+  stall: float = 20.0
+  """How long the receiver is stopped [s]."""
+
+
 _QUIET = 3.0  # s without a message after which the receiver has all that will come
 
 
@@ -134,7 +144,7 @@ def send_raw(endpoint: str, messages: int, half: Any) -> None:
   sessions.close(session)
 
 
-def run(name: str, messages: int, stall: float) -> dict[str, Any]:
+def run(name: str, messages: int, stall: float) -> dict[str, harness.Value]:
   """Runs one of the two; rates are those before the stall."""
   receive, send = {"zenoh": (receive_raw, send_raw), "link": (receive_link, send_link)}[name]
   with socket.socket() as probe:
@@ -167,12 +177,11 @@ def run(name: str, messages: int, stall: float) -> dict[str, Any]:
   rate = (len(before) - 1) / (before[-1] - before[0]) if len(before) > 1 else 0.0
   size = sum(a.nbytes for a in make_trajectory(0).values())
   return {
-    "messages": messages,
     "stall_s": stall,
-    "lost": messages - len(set(numbers)),
+    "lost": harness.Rate(messages - len(set(numbers)), messages),
     "repeated": len(numbers) - len(set(numbers)),
-    "messages_per_second": rate,
-    "mb_per_second": rate * size / 1e6,
+    "messages_per_s": rate,
+    "mb_per_s": rate * size / 1e6,
   }
 
 
@@ -181,31 +190,11 @@ def _wake(pid: int, seconds: float) -> None:
   os.kill(pid, signal.SIGCONT)
 
 
-def main() -> None:
-  parser = argparse.ArgumentParser(
-    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-  )
-  parser.add_argument("--messages", type=int, default=4000)
-  parser.add_argument("--stall", type=float, default=20.0, help="s")
-  parser.add_argument("--out", type=Path, default=Path("benchmarks/results/link.json"))
-  arguments = parser.parse_args()
-  results = {}
-  for name in ("zenoh", "link"):
-    results[name] = result = run(name, arguments.messages, arguments.stall)
-    print(
-      f"{name:>6}: {result['lost']} of {result['messages']} lost, {result['repeated']} repeated, "
-      f"{result['messages_per_second']:.0f} messages/s, {result['mb_per_second']:.0f} MB/s"
-    )
-  record = {
-    "command": "python benchmarks/link.py",
-    "machine": platform.machine(),
-    "cores": os.cpu_count(),
-    "load": os.getloadavg()[0],
-    "results": results,
-  }
-  arguments.out.parent.mkdir(parents=True, exist_ok=True)
-  arguments.out.write_text(json.dumps(record, indent=1) + "\n")
+def main(settings: Settings) -> None:
+  """Runs both."""
+  figures = {name: run(name, settings.messages, settings.stall) for name in ("zenoh", "link")}
+  harness.finish("link", figures, settings)
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Settings, __doc__)

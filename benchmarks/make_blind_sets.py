@@ -10,15 +10,11 @@ import dataclasses
 import json
 import multiprocessing
 import pathlib
-import sys
 import time
 from collections.abc import Iterable
 from typing import Literal
 
-import tyro
-
-# One name for the package whoever imports it: numba's cache keeps the name.
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+from benchmarks import harness
 from benchmarks.blind_sets import sets
 
 
@@ -90,4 +86,4 @@ def _make(job: tuple[Settings, int]) -> tuple[str, dict, float]:
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings, description=__doc__))
+  harness.run(main, Settings, __doc__)

@@ -8,15 +8,11 @@ There are no answers: what was named, how sure it is and what it lowers is told 
 import dataclasses
 import json
 import pathlib
-import sys
 from typing import Any
 
-import tyro
-
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+from benchmarks import harness
+from benchmarks.ledger import ROOT
 from nerf2real import sysid
-
-ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,11 +25,14 @@ class Settings:
   """Folder of reports."""
   results: pathlib.Path = ROOT / "benchmarks/results"
   """Folder of the figures."""
+  write: bool = False
+  """Keep the errors as records in benchmarks/results/records/."""
 
 
 def main(settings: Settings) -> None:
   """Analyses every set and keeps the figures."""
   rows: dict[str, Any] = {}
+  figures: dict[str, dict[str, harness.Value]] = {}
   for folder in sorted(p for p in settings.data.iterdir() if (p / "model.xml").is_file()):
     content = sysid.identify(
       folder / "model.xml",
@@ -45,14 +44,22 @@ def main(settings: Settings) -> None:
     details = json.loads((settings.out / folder.name / "details.json").read_text())
     rows[folder.name] = {name: content[name] for name in kept}
     rows[folder.name] |= {name: details[name] for name in ("calibration", "clocks")}
-    held = content["error"]["held"]
-    print(
-      f"{folder.name}: {content['verdict']}"
-      f" {[e['kind'] for e in content['effects']]}, held-out {1e3 * held['before']:.3f} ->"
-      f" {1e3 * held['after']:.3f} mrad (mm), {content['seconds']} s"
-    )
+    error = content["error"]
+    figures[folder.name] = {
+      "verdict": content["verdict"],
+      **{
+        f"{name}_{side}": 1e3 * error[name][side]
+        for name in ("train", "held")
+        if name in error
+        for side in ("before", "after")
+      },
+      "seconds": content["seconds"],
+    }
+    print(folder.name, figures[folder.name], flush=True)
   (settings.results / "measured.json").write_text(json.dumps(rows, indent=1) + "\n")
+  words = "Errors in mrad (positioning: mm)."
+  harness.finish("measured", figures, harness.Options(write=settings.write), words=words)
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings, description=__doc__))
+  harness.run(main, Settings, __doc__)

@@ -10,14 +10,13 @@ far below it cannot matter to a policy. The results are in suite/README.md.
 """
 
 import dataclasses
-import time
 from typing import Any
 
 import mujoco
 import numpy as np
-import tyro
 from dm_control import composer, mjcf
 
+from benchmarks import harness
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.randomisation import inertia
 from nerf2real.suite.sensors import filters
@@ -31,8 +30,8 @@ INTEGRATORS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
   """Settings of the study."""
 
   episodes: int = 24
@@ -87,44 +86,47 @@ def differences(states: np.ndarray, reference: np.ndarray) -> np.ndarray:
   return np.stack([joints, position, tilt, rate])
 
 
-def print_row(name: str, errors: np.ndarray, milliseconds: float) -> None:
-  """Prints medians and 90th percentiles."""
-  middle, high = np.median(errors, axis=1), np.percentile(errors, 90, axis=1)
-  cells = [f"{m:8.2f} {h:8.2f}" for m, h in zip(middle, high, strict=True)]
-  print(f"{name:26s}" + "  ".join(cells) + f"  {milliseconds:8.3f}")
+def figures_of(errors: np.ndarray) -> dict[str, harness.Value]:
+  """Returns medians and 90th percentiles of differences [4, N]."""
+  names = ("joints_{}_degrees", "torso_{}_mm", "tilt_{}_degrees", "turning_rate_{}_degrees_per_s")
+  return {
+    name.format(word): float(np.percentile(row, share))
+    for name, row in zip(names, errors, strict=True)
+    for word, share in (("median", 50), ("p90", 90))
+  }
 
 
 def main(settings: Settings) -> None:
   """Runs the study."""
   model = make_physics().model.ptr
   commands = [targets(seed, settings.control_steps) for seed in range(settings.episodes)]
-  euler = INTEGRATORS["Euler"]
 
   def run(step: float, integrator: int) -> tuple[np.ndarray, float]:
-    begin = time.perf_counter()
-    states = [simulate(model, c, step=step, integrator=integrator) for c in commands]
-    count = settings.episodes * settings.control_steps
-    return np.array(states), 1e3 * (time.perf_counter() - begin) / count
+    states: list[np.ndarray] = []
 
-  reference, _ = run(REFERENCE, euler)
-  print(f"{settings.episodes} motions of {settings.control_steps * 25} ms; median and 90 %")
-  print(
-    f"{'':26s}{'joints deg':>17s}  {'torso mm':>17s}  {'tilt deg':>17s}  {'rate deg/s':>17s}"
-    "  ms/control step"
-  )
+    def motion(index: int) -> None:
+      states.append(simulate(model, commands[index], step=step, integrator=integrator))
+
+    times = harness.interleave({"motion": motion}, rounds=settings.episodes, warm_up=0)["motion"]
+    return np.array(states), times.figures(per=settings.control_steps)["median_ms"]
+
+  reference, _ = run(REFERENCE, INTEGRATORS["Euler"])
+  figures: dict[str, dict[str, harness.Value]] = {}
   for name, integrator in INTEGRATORS.items():
     for step in STEPS:
       states, cost = run(step, integrator)
-      print_row(f"{name} {1e3 * step:g} ms", differences(states, reference), cost)
+      row = {**figures_of(differences(states, reference)), "control_step_ms": cost}
+      figures[f"{name}_{1e3 * step:g}_ms"] = row
   torso = model.body("op3/body_link").id
   for added in (0.05, 0.25):
     snapshot = inertia.Snapshot(model)
     inertia.attach_mass(model, torso, added=added, position=(0.0, 0.0, 0.06))
     inertia.refresh(model, mujoco.MjData(model))
-    states, cost = run(REFERENCE, euler)
+    states, _ = run(REFERENCE, INTEGRATORS["Euler"])
     snapshot.restore(model)
-    print_row(f"yardstick: +{added:g} kg", differences(states, reference), cost)
+    figures[f"torso_heavier_{1e3 * added:g}_g"] = figures_of(differences(states, reference))
+  harness.finish("physics_step", figures, settings, seed=f"0 to {settings.episodes - 1}")
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings))
+  harness.run(main, Settings, __doc__)

@@ -1,24 +1,19 @@
 """Time of a policy step on one core: `python benchmarks/policy.py [--policy runs/x/policy/best]`.
 
 Without --policy, a policy of the paper's shape with random parameters is exported and loaded, once
-for 30x40 and once for 60x80 pictures. Targets: p99 below 10 ms at 30x40, 25 ms at 60x80. Writes
-benchmarks/results/policy.json. Steps take turns, so that sizes see the same machine; under other
-load the column of processor time is the one to read.
+for 30x40 and once for 60x80 pictures. Targets: p99 below 10 ms at 30x40, 25 ms at 60x80. Steps take
+turns, so that sizes see the same machine; under other load processor time is what to read.
 """
 
-import os
+# ruff: noqa: E402  (threads are chosen before numpy is imported)
 
-os.environ["OMP_NUM_THREADS"] = "1"
-os.environ["OPENBLAS_NUM_THREADS"] = "1"
-os.environ["MKL_NUM_THREADS"] = "1"
-
-import argparse
-import json
-import platform
+import dataclasses
 import tempfile
-import time
 from pathlib import Path
-from typing import Any
+
+from benchmarks import harness
+
+harness.one_thread()
 
 import numpy as np
 
@@ -30,6 +25,17 @@ TARGETS = {(30, 40): 10.0, (60, 80): 25.0}  # ms
 # accelerometer and 3 gravity numbers, and a goal of 2.
 PROPRIOCEPTION = 5 * (20 + 20 + 3 + 3 + 3) + 2
 ACTIONS = 20
+_WARM_UP = 20  # steps
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """What to measure."""
+
+  policy: Path | None = None
+  """Folder of an exported policy."""
+  steps: int = 1000
+  """Steps of each."""
 
 
 def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
@@ -59,76 +65,41 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
   return load_policy(folder)
 
 
-def measure(exported: list[ExportedPolicy], steps: int) -> list[dict[str, float]]:
-  """Runs the policies in turns; times in ms."""
-  rng = np.random.default_rng(0)
-  runs: list[list[Any]] = []
-  for loaded in exported:
-    shape = loaded.layout.image_shape
-    image = None if shape is None else rng.integers(0, 256, shape, dtype=np.uint8)
-    state = rng.standard_normal(loaded.layout.state_size, np.float32)
-    runs.append([loaded.policy, image, state, loaded.policy.initial_state()])
-  wall, processor = np.zeros((len(runs), steps)), np.zeros((len(runs), steps))
-  for step in range(-20, steps):  # the first 20 warm up
-    for index, run in enumerate(runs):
-      policy, image, state, memory = run
-      begin, begin_cpu = time.perf_counter(), time.process_time()
-      run[3] = policy.step(image, state, memory).state
-      if step >= 0:
-        wall[index, step] = 1e3 * (time.perf_counter() - begin)
-        processor[index, step] = 1e3 * (time.process_time() - begin_cpu)
-  return [
-    {
-      "median_ms": float(np.median(w)),
-      "p99_ms": float(np.percentile(w, 99)),
-      "max_ms": float(w.max()),
-      "median_cpu_ms": float(np.median(c)),
-    }
-    for w, c in zip(wall, processor, strict=True)
-  ]
+class Stepping:
+  """A policy that is stepped on random observations of its own shape."""
+
+  def __init__(self, exported: ExportedPolicy):
+    rng = np.random.default_rng(0)
+    layout, self._policy = exported.layout, exported.policy
+    shape = layout.image_shape
+    self.name = "state_only" if shape is None else f"{shape[0]}x{shape[1]}"
+    self._image = None if shape is None else rng.integers(0, 256, shape, dtype=np.uint8)
+    self._state = rng.standard_normal(layout.state_size, np.float32)
+    self._memory = self._policy.initial_state()
+
+  def step(self, _: int) -> None:
+    """Steps once."""
+    self._memory = self._policy.step(self._image, self._state, self._memory).state
 
 
-def main() -> None:
-  parser = argparse.ArgumentParser(
-    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-  )
-  parser.add_argument("--policy", type=Path, help="folder of an exported policy")
-  parser.add_argument("--steps", type=int, default=1000)
-  parser.add_argument("--out", type=Path, default=Path("benchmarks/results/policy.json"))
-  arguments = parser.parse_args()
+def main(settings: Settings) -> None:
+  """Runs the benchmark."""
   with tempfile.TemporaryDirectory() as folder:
-    if arguments.policy:
-      exported = [load_policy(arguments.policy)]
-    else:
-      exported = [random_policy(size, Path(folder) / str(size[0])) for size in TARGETS]
-    results = measure(exported, arguments.steps)
-  rows = []
-  for policy, result in zip(exported, results, strict=True):
-    shape = policy.layout.image_shape
-    name = "state only" if shape is None else f"{shape[0]}x{shape[1]}"
-    target = TARGETS.get(shape[:2]) if shape else None
-    rows.append({"picture": name, "target_p99_ms": target, **result})
-    print(
-      f"{name:>10}: median {result['median_ms']:.2f} ms (processor {result['median_cpu_ms']:.2f}), "
-      f"p99 {result['p99_ms']:.2f} ms, longest {result['max_ms']:.2f} ms, target {target} ms"
+    exported = (
+      [load_policy(settings.policy)]
+      if settings.policy
+      else [random_policy(size, Path(folder) / str(size[0])) for size in TARGETS]
     )
-  arguments.out.parent.mkdir(parents=True, exist_ok=True)
-  record = {
-    "command": "python benchmarks/policy.py",
-    "machine": platform.machine(),
-    "processor": _processor(),
-    "steps": arguments.steps,
-    "load": os.getloadavg()[0],
-    "rows": rows,
+  policies = [Stepping(policy) for policy in exported]
+  times = harness.interleave(
+    {policy.name: policy.step for policy in policies}, rounds=settings.steps, warm_up=_WARM_UP
+  )
+  figures = {
+    name: {**t.figures(), "p99_ms": 1e3 * harness.percentile(t.elapsed, 99)}
+    for name, t in times.items()
   }
-  arguments.out.write_text(json.dumps(record, indent=1) + "\n")
-
-
-def _processor() -> str:
-  path = Path("/proc/cpuinfo")
-  lines = path.read_text().splitlines() if path.exists() else []
-  return next((n.partition(":")[2].strip() for n in lines if n.startswith("model name")), "")
+  harness.finish("policy", figures, settings, seed=0)
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Settings, __doc__)

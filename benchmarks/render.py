@@ -9,24 +9,19 @@ true textures: what it lacks in PSNR is aliasing, what the field lacks is recons
   python benchmarks/render.py --field F --room-from-unit S.json
 """
 
-import os
-
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
+# ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
 
 import dataclasses
-import datetime
-import json
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+from benchmarks import harness
+
+harness.one_thread()
 
 import mujoco
 import numpy as np
-import rich.console
-import rich.table
-import tyro
 
 from nerf2real.core import rotations
 from nerf2real.core.cameras import Camera
@@ -44,13 +39,14 @@ FIELD_OF_VIEW = np.deg2rad(43.3)  # vertical, Logitech C920
 EYE_HEIGHT = 0.44  # of the robot's camera [m]
 LOOK_DOWN = 0.3  # [rad]
 WALL_DISTANCE = 0.2  # from the border of the free area [m]
+POSE_SEED = 7
 PAPER_MS = 6.0  # NeRF2Real, section NeRF training: a frame on a V100
 
 Draw = Callable[[int], np.ndarray]  # number of the view -> uint8 [H, W, 3]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Settings:
+class Settings(harness.Options):
   """Settings of the benchmark."""
 
   bundle: Path | None = None
@@ -62,13 +58,11 @@ class Settings:
   views: int = 40
   """Views that are drawn."""
   jax_views: int = 3
-  """Views that the slow JAX render draws."""
+  """Views that the slow JAX render draws; 0: leave it out."""
   repeats: int = 3
   """Times that each view is drawn."""
   core: int = 0
   """The processor core that everything runs on."""
-  out: Path = Path(__file__).parent / "results"
-  """Folder of the results (Markdown and JSON)."""
 
 
 def load_field(settings: Settings) -> tuple[Field, Similarity]:
@@ -87,7 +81,7 @@ def load_field(settings: Settings) -> tuple[Field, Similarity]:
   return Field.load(scene.field_path), from_plain(placed, Similarity) @ scene.world_from_unit
 
 
-def robot_poses(count: int, *, seed: int = 7) -> np.ndarray:
+def robot_poses(count: int, *, seed: int = POSE_SEED) -> np.ndarray:
   """Draws poses [N, 4, 4] of the robot's camera in the room."""
   random = np.random.default_rng(seed)
   lower, upper = (np.array(corner) for corner in furniture.FREE_AREA)
@@ -137,55 +131,37 @@ class MujocoDrawer:
     self._renderer.close()
 
 
-def measure(draws: dict[str, Draw], limits: dict[str, int], truth: list[np.ndarray], repeats: int):
-  """Lets the drawers take turns.
+def measure(
+  draws: dict[str, Draw], limits: dict[str, int], truth: list[np.ndarray], repeats: int
+) -> dict[str, dict[str, harness.Value]]:
+  """Lets the drawers take turns; returns their times and PSNR by name.
 
-  Times are the process's processor time, all threads, because everything shares one core: on an
-  idle core that is the time that passes, on a busy one it leaves out the others' turns.
-
-  Returns:
-    One dict a drawer: name, median_ms, p95_ms, elapsed_ms (median), psnr_db, views.
+  Median and p95 are processor time, all threads, because everything shares one core: on an idle
+  core that is the time that passes, on a busy one it leaves out the others' turns. `elapsed_ms` is
+  the median by the clock.
   """
-  times: dict[str, list[float]] = {name: [] for name in draws}
-  elapsed: dict[str, list[float]] = {name: [] for name in draws}
-  quality: dict[str, list[float]] = {name: [] for name in draws}
-  for draw in draws.values():
-    draw(0)  # compiles, allocates
-  for repeat in range(repeats):
-    for view, picture in enumerate(truth):
-      for name, draw in draws.items():
-        if view >= limits.get(name, len(truth)):
-          continue
-        start, start_elapsed = time.process_time(), time.perf_counter()
-        drawn = draw(view)
-        times[name].append((time.process_time() - start) * 1e3)
-        elapsed[name].append((time.perf_counter() - start_elapsed) * 1e3)
-        if repeat == 0:
-          quality[name].append(psnr(drawn, picture))
-  return [
-    {
-      "name": name,
-      "median_ms": float(np.median(times[name])),
-      "p95_ms": float(np.percentile(times[name], 95)),
-      "elapsed_ms": float(np.median(elapsed[name])),
-      "psnr_db": float(np.mean(quality[name])),
-      "views": len(quality[name]),
+  count = len(truth)
+
+  def quality(draw: Draw, views: int) -> float:
+    return float(np.mean([psnr(draw(view), truth[view]) for view in range(views)]))
+
+  calls = {name: lambda i, draw=draw: draw(i % count) for name, draw in draws.items()}
+  times = harness.interleave(calls, rounds=count * repeats, limits=limits)
+  return {
+    name: {
+      "median_ms": (spread := times[name].figures())["processor_median_ms"],
+      "p95_ms": spread["processor_p95_ms"],
+      "elapsed_ms": spread["median_ms"],
+      "psnr_db": quality(draw, views := min(limits.get(name, count), count)),
+      "views": views,
     }
-    for name in draws
-  ]
+    for name, draw in draws.items()
+  }
 
 
-def processor() -> str:
-  """Returns the processor's name."""
-  try:
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-  except (OSError, StopIteration):
-    return platform.processor() or platform.machine()
-
-
-def run(settings: Settings) -> dict[str, Any]:
-  """Measures all sizes."""
+def main(settings: Settings) -> None:
+  """Runs the benchmark."""
+  harness.one_core(settings.core)
   field, room_from_unit = load_field(settings)
   unit_from_room = room_from_unit.inverse()
   poses = robot_poses(settings.views)
@@ -194,22 +170,14 @@ def run(settings: Settings) -> dict[str, Any]:
   start = time.perf_counter()
   renderer = render.Renderer(field)
   ready = time.perf_counter() - start
-  result: dict[str, Any] = {
-    "date": datetime.date.today().isoformat(),
-    "processor": processor(),
-    "system": platform.platform(),
-    "renderer_ready_s": ready,
-    "render_settings": dataclasses.asdict(renderer.settings),
-    "field_settings": dataclasses.asdict(field.settings),
-    "sizes": {},
-  }
+  figures: dict[str, dict[str, harness.Value]] = {"start": {"ready_s": ready}}
   for height, width in SIZES:
     camera = Camera.from_vertical_fov(FIELD_OF_VIEW, width, height)
     with room.room_eye() as eye:
       truth = [room.true_view(camera, pose, eye=eye)[0] for pose in poses]
     fast, standard = (MujocoDrawer(camera, poses, fast=fast) for fast in (True, False))
 
-    def ours(view: int, camera: Camera = camera) -> np.ndarray:
+    def fused(view: int, camera: Camera = camera) -> np.ndarray:
       return renderer.render(camera, unit_poses[view])[0]
 
     def plain(view: int, camera: Camera = camera) -> np.ndarray:
@@ -218,72 +186,29 @@ def run(settings: Settings) -> dict[str, Any]:
       )[0]
 
     draws: dict[str, Draw] = {
-      "field, Warp": ours,
-      "field, plain JAX": plain,
-      "MuJoCo, fast flags": fast.draw,
-      "MuJoCo, default flags": standard.draw,
+      "field_warp": fused,
+      **({"field_plain_jax": plain} if settings.jax_views else {}),
+      "mujoco_fast_flags": fast.draw,
+      "mujoco_default_flags": standard.draw,
     }
-    limits = {"field, plain JAX": settings.jax_views}
-    result["sizes"][f"{height}x{width}"] = measure(draws, limits, truth, settings.repeats)
+    limits = {"field_plain_jax": settings.jax_views}
+    for name, row in measure(draws, limits, truth, settings.repeats).items():
+      figures[f"{height}x{width}_{name}"] = row
     fast.close()
     standard.close()
-  return result
-
-
-def markdown(result: dict[str, Any]) -> str:
-  """Returns the results as a Markdown page."""
-  lines = [
-    "# Rendering a robot camera's frame on one core",
-    "",
-    f"{result['processor']}, {result['date']}. Views of the built-in room from the robot's height; "
-    "Median and p95 are processor time, elapsed is by the clock; PSNR against the true picture. "
-    "`python benchmarks/render.py` makes this page.",
-    "",
-    "| size | renderer | median ms | p95 ms | elapsed ms | PSNR dB | views |",
-    "|---|---|---|---|---|---|---|",
-  ]
-  for size, rows in result["sizes"].items():
-    for row in rows:
-      lines.append(
-        f"| {size} | {row['name']} | {row['median_ms']:.2f} | {row['p95_ms']:.2f} | "
-        f"{row['elapsed_ms']:.2f} | {row['psnr_db']:.1f} | {row['views']} |"
-      )
-  lines += [
-    "",
-    f"For comparison: the paper's renderer takes {PAPER_MS:.0f} ms a frame on a V100. Making the "
-    f"renderer ready (kernels from the cache, occupancy) took {result['renderer_ready_s']:.1f} s.",
-    "MuJoCo draws the true model with the true textures; the field was reconstructed from video.",
-    "",
-  ]
-  return "\n".join(lines)
-
-
-def main(settings: Settings) -> None:
-  """Runs the benchmark, prints a table and writes the results."""
-  if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {settings.core})
-  result = run(settings)
-  table = rich.table.Table(title=f"One core of {result['processor']}")
-  for column in ("size", "renderer", "median ms", "p95 ms", "elapsed ms", "PSNR dB", "views"):
-    table.add_column(column)
-  for size, rows in result["sizes"].items():
-    for row in rows:
-      table.add_row(
-        size,
-        row["name"],
-        f"{row['median_ms']:.2f}",
-        f"{row['p95_ms']:.2f}",
-        f"{row['elapsed_ms']:.2f}",
-        f"{row['psnr_db']:.1f}",
-        str(row["views"]),
-      )
-  rich.console.Console().print(table)
-  settings.out.mkdir(parents=True, exist_ok=True)
-  name = "render_" + "_".join(result["processor"].lower().split())
-  (settings.out / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
-  (settings.out / f"{name}.md").write_text(markdown(result))
-  print(f"Written to {settings.out / name}.md and .json")
+  details = {
+    "render": dataclasses.asdict(renderer.settings),
+    "field": dataclasses.asdict(field.settings),
+  }
+  harness.finish(
+    "render",
+    figures,
+    settings,
+    seed=POSE_SEED,
+    details=details,
+    words=f"For comparison: the paper's renderer takes {PAPER_MS:.0f} ms a frame on a V100.",
+  )
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings, description=__doc__))
+  harness.run(main, Settings, __doc__)

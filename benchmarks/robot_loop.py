@@ -15,34 +15,32 @@ time that jumps from event to event.
 
 import contextlib
 import dataclasses
-import json
 import os
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("MUJOCO_GL", "egl")
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # idle OpenBLAS threads spin on a core
-  os.environ.setdefault(_name, "1")
+from benchmarks import harness
+
+harness.one_thread()  # idle OpenBLAS threads spin on a core
 
 import numpy as np
-import tyro
 
 from nerf2real import real
-from nerf2real.real.loop.clock import SteppedClock, prefer_this_thread
+from nerf2real.real.clock import SteppedClock, prefer_this_thread
 from nerf2real.real.loop.environment import RobotEnvironment
 from nerf2real.real.safety.monitor import SafetyError
+from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.process import VirtualRobotProcess
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants
 
-RESULTS = Path(__file__).parent / "results" / "robot_loop.json"
+_SEED = 0  # of the virtual robot
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Arguments(harness.Options):
   """How well the robot's loop keeps its time."""
 
   seconds: float = 600.0
@@ -55,8 +53,6 @@ class Arguments:
   """Whether pictures are streamed and read, too."""
   stepped: bool = False
   """Whether time is the wire's alone."""
-  write: bool = False
-  """Whether to keep the figures in benchmarks/results/robot_loop.json."""
 
 
 def think(milliseconds: float) -> None:
@@ -79,11 +75,12 @@ def wave(step: int, standing: np.ndarray) -> np.ndarray:
 @contextlib.contextmanager
 def robot_for(arguments: Arguments) -> Iterator[Any]:
   """Starts the robot."""
+  camera = VirtualCamera() if arguments.camera else None
   if arguments.stepped:
-    with VirtualRobot(seed=0, camera=arguments.camera, stepped=True) as robot:
+    with VirtualRobot(seed=_SEED, camera=camera, stepped=True) as robot:
       yield robot
   else:
-    with VirtualRobotProcess(seed=0, camera=arguments.camera) as robot:
+    with VirtualRobotProcess(seed=_SEED, camera=camera) as robot:
       yield robot
 
 
@@ -114,9 +111,8 @@ def run_steps(environment: RobotEnvironment, arguments: Arguments) -> list[float
   return durations
 
 
-def measure(arguments: Arguments) -> dict[str, Any]:
-  """Returns the figures of a run."""
-  load = os.getloadavg()[0]
+def measure(arguments: Arguments) -> tuple[dict[str, harness.Value], dict[str, Any]]:
+  """Returns the figures of a run, and how its durations spread."""
   with robot_for(arguments) as robot:
     environment = real.load(
       "nerf_nav",
@@ -138,50 +134,45 @@ def measure(arguments: Arguments) -> dict[str, Any]:
       after = environment.bus.counts
       stop = environment.stop
       set_loss(robot, 0.0)
-      return {
-        "arguments": dataclasses.asdict(arguments),
-        "stopped by": None if stop is None else f"{stop.reason}: {stop.detail}",
-        "control steps": len(durations),
-        "missed control deadlines": environment.timing.counts["missed control deadlines"],
-        "bus cycles": round(elapsed / constants.BUS_PERIOD),
-        "bus cycles not begun": environment.missed_bus_cycles - missed,
-        "joint readings lost": after.joint_losses - before.joint_losses,
-        "imu readings lost": after.imu_losses - before.imu_losses,
-        "loop time [ms]": _spread(1e3 * np.array(durations)),
+      steps, cycles = len(durations), round(elapsed / constants.BUS_PERIOD)
+      times = {"loop time": durations, **environment.timing.values}
+      spreads = {name: _spread(1e3 * np.array(values)) for name, values in times.items()}
+      figures: dict[str, harness.Value] = {
+        "missed_deadlines": harness.Rate(
+          environment.timing.counts["missed control deadlines"], steps
+        ),
+        "joint_readings_lost": harness.Rate(after.joint_losses - before.joint_losses, cycles),
+        "imu_readings_lost": harness.Rate(after.imu_losses - before.imu_losses, cycles),
+        "bus_cycles_not_begun": environment.missed_bus_cycles - missed,
         **{
-          f"{name} [ms]": _spread(1e3 * np.array(values))
-          for name, values in environment.timing.values.items()
+          f"{name}_{mark}_ms".replace(" ", "_"): value
+          for name, spread in spreads.items()
+          for mark, value in spread.items()
         },
-        "processor, host [share of a core]": round(used / elapsed, 3),
-        "processor, virtual robot [share of a core]": round(theirs / elapsed, 3),
-        "load average before": round(load, 2),
-        "cores": os.cpu_count(),
+        "host_cores": round(used / elapsed, 3),
+        "virtual_robot_cores": round(theirs / elapsed, 3),
       }
+      details = {"stopped by": None if stop is None else f"{stop.reason}: {stop.detail}"}
+      return figures, details | spreads
 
 
 def _spread(values: np.ndarray) -> dict[str, float]:
-  marks = {"median": 50, "p99": 99, "p99.9": 99.9, "max": 100}
+  marks = {"median": 50, "p99": 99, "p99_9": 99.9, "max": 100}
   return {name: round(float(np.percentile(values, mark)), 3) for name, mark in marks.items()}
 
 
-def main() -> None:
+def main(arguments: Arguments) -> None:
   """Measures and prints."""
-  arguments = tyro.cli(Arguments, description=__doc__)
   try:
-    found = measure(arguments)
+    figures, details = measure(arguments)
   except (SafetyError, OSError) as error:
     sys.exit(f"error: {error}\nIs the machine too busy? Load average {os.getloadavg()[0]:.1f}.")
-  for name, value in found.items():
-    if isinstance(value, dict):
-      value = "  ".join(f"{key} {number}" for key, number in value.items())
-    print(f"{name:42s} {value}")
-  if arguments.write:
-    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    kind = "wire alone" if arguments.stepped else "real time"
-    kept[f"{kind}, loss {arguments.loss:g}, camera {arguments.camera}"] = found
-    RESULTS.write_text(json.dumps(kept, indent=1) + "\n")
-    print(f"wrote {RESULTS}")
+  name = f"{'wire_alone' if arguments.stepped else 'real_time'}_loss_{arguments.loss:g}"
+  name += "_camera" if arguments.camera else ""
+  words = harness.table({key: {"value": value} for key, value in figures.items()}, first=name)
+  print(f"{words}\n")
+  harness.finish("robot_loop", {name: figures}, arguments, seed=_SEED, details=details)
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Arguments, __doc__)

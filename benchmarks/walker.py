@@ -4,48 +4,49 @@ Straight ahead only the gait acts, without being told where it is. The goals are
 another, steered by the true pose. Simulation: episodes as in training, without pushes. Virtual
 robots: what is hidden in each is drawn from its seed; "data sheet" has nothing hidden.
 
-python benchmarks/walker.py --out benchmarks/results/walker.md
+  python benchmarks/walker.py --out benchmarks/results/walker.md
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
 
 import dataclasses
-import itertools
-import os
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-  os.environ.setdefault(_name, "1")
-os.environ.setdefault("MUJOCO_GL", "egl")
+from benchmarks import harness
+
+harness.one_thread()
 
 import numpy as np
-import tyro
 
 from nerf2real import real, suite
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.gaits.walker import Pose, Walker
+from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT, Start
+from nerf2real.suite.tasks.base import Start
 
-GOALS = ((0.6, 0.0), (0.6, 0.5), (0.0, 0.5), (-0.3, 0.0), (0.2, -0.3))  # m, ours
+GOALS = (
+  (0.6, 0.0),
+  (0.6, 0.5),
+  (0.0, 0.5),
+  (-0.3, 0.0),
+  (0.2, -0.3),
+)  # m
 _REACHED = 0.15  # m
 _STRAIGHT_LIMIT, _GOALS_LIMIT = 15.0, 60.0  # s
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
   """Settings of the benchmark."""
 
   episodes: int = 10
   """Episodes in simulation, of different draws."""
   robots: int = 10
   """Virtual robots."""
-  out: Path | None = None
-  """Where to write the table (Markdown)."""
 
 
 class Seen(NamedTuple):
@@ -147,25 +148,35 @@ def rehearsed(count: int) -> Iterator[tuple[str, Result]]:
         yield f"virtual robot, {name}", walk(environment, see)
 
 
+def summary(results: list[Result]) -> dict[str, harness.Value]:
+  """Returns the figures of a plant."""
+  metres = [r.metre for r in results if np.isfinite(r.metre)]
+  return {
+    "first_metre": harness.Rate(sum(not r.fell for r in results), len(results)),
+    "all_goals": harness.Rate(sum(r.goals == len(GOALS) for r in results), len(results)),
+    "fastest_metre_s": min(metres, default=float("nan")),
+    "slowest_metre_s": max(metres, default=float("nan")),
+    "sideways_largest_m": max((r.sideways for r in results), default=float("nan")),
+  }
+
+
 def main(settings: Settings) -> None:
   """Walks everywhere and prints the table."""
-  lines = [
-    "| plant | first metre [s] | sideways [m] | fell | goals of 5 | fell on the way |",
-    "| --- | --- | --- | --- | --- | --- |",
-  ]
-  for line in lines:
-    print(line)
-  for name, result in itertools.chain(simulated(settings.episodes), rehearsed(settings.robots)):
-    fell = ["no", "yes"]
-    lines.append(
-      f"| {name} | {result.metre:.1f} | {result.sideways:.2f} | {fell[result.fell]} | "
-      f"{result.goals} | {fell[result.goals_fell]} |"
-    )
-    print(lines[-1], flush=True)
-  if settings.out is not None:
-    settings.out.parent.mkdir(parents=True, exist_ok=True)
-    settings.out.write_text("\n".join(lines) + "\n")
+  figures: dict[str, dict[str, harness.Value]] = {}
+  walks: dict[str, dict[str, harness.Value]] = {}
+  plants = {
+    "simulation": simulated(settings.episodes),
+    "virtual_robot": rehearsed(settings.robots),
+  }
+  for plant, runs in plants.items():
+    results = []
+    for name, result in runs:
+      results.append(result)
+      walks[name] = result._asdict()
+      print(name, *(f"{key} {value}" for key, value in walks[name].items()), flush=True)
+    figures[plant] = summary(results)
+  harness.finish("walker", figures, settings, seed=0, words=harness.table(walks, first="plant"))
 
 
 if __name__ == "__main__":
-  main(tyro.cli(Settings, description=__doc__))
+  harness.run(main, Settings, __doc__)

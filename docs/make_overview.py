@@ -9,7 +9,8 @@ import cv2
 import mujoco
 import numpy as np
 
-from nerf2real.core.pages import parts as report_parts
+from nerf2real.core import palette
+from nerf2real.core.pages import pictures
 from nerf2real.core.serialization import from_plain
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import room, yardstick
@@ -28,8 +29,7 @@ def _contact_model(bundle: Bundle) -> mujoco.MjModel:
   """The convex parts in colours, lit from above."""
   spec = collision.spec(collision.read_parts(bundle.folder / "collision"))
   for index, geom in enumerate(spec.geoms):
-    color = report_parts.part_color(index)
-    geom.rgba = [*(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)), 1]
+    geom.rgba = [*(level / 255 for level in palette.rgb(palette.cycle(index))), 1]
     geom.group = 0
     if geom.name == "floor":
       geom.rgba = [0.82, 0.82, 0.80, 1]
@@ -58,7 +58,7 @@ def main() -> None:
   rows = []
   for index, pose in enumerate(poses):
     color, depth = renderer.render(camera, unit_from_truth.apply_pose(pose))
-    rows.append(np.hstack([true[index], color, report_parts.depth_map(depth), parts[index]]))
+    rows.append(np.hstack([true[index], color, pictures.depth_map(depth), parts[index]]))
   picture = np.vstack(rows)[..., ::-1]
   target = Path(__file__).with_name("overview.jpg")
   cv2.imwrite(str(target), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])

@@ -13,8 +13,9 @@ from nerf2real import real
 from nerf2real.evaluation import episodes, perturbations
 from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
 from nerf2real.real.camera.device import Controls
+from nerf2real.real.clock import RealClock, prefer_this_thread
 from nerf2real.real.loading import Connection
-from nerf2real.real.loop.clock import RealClock, prefer_this_thread
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.safety.monitor import Reason
 from nerf2real.real.safety.operator import Terminal
@@ -78,6 +79,9 @@ class OperatedPlant(Plant):
     super().__init__(scene, protocol, perturbation)
     self.plant_id = robot_name
     connection = Connection(port=robot) if isinstance(robot, str) else robot
+    own = {"camera": camera, "offsets": offsets, "lens": lens}
+    given = {name: value for name, value in own.items() if value is not None}
+    connection = dataclasses.replace(connection, **given)
     if ask is None:  # through the terminal that the stop key is read from, never beside it
       terminal = Terminal()
       connection = dataclasses.replace(connection, operator=terminal)
@@ -89,14 +93,11 @@ class OperatedPlant(Plant):
     self._environment = real.load(
       TASKS[protocol],
       robot=connection,
-      camera=camera,
       scene=scene,
       image_size=image_size,
       time_limit=time_limit,
+      settings=RobotSettings(dry_run=dry_run),
       recorder=self._recorder,
-      offsets=offsets,
-      lens=lens,
-      dry_run=dry_run,
     )
     if isinstance(self._environment.bus.clock, RealClock):
       prefer_this_thread(acting=True)

@@ -1,5 +1,6 @@
 """The virtual robot as a plant: reached over its wires, placed and watched as by an observer."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +10,14 @@ import numpy as np
 from nerf2real import real
 from nerf2real.evaluation import perturbations
 from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial, make_intruder
-from nerf2real.real.loading import Connection
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.safety.monitor import Reason
+from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
 from nerf2real.suite.protocols import BallTrial, NavigationTrial
-from nerf2real.suite.tasks.base import MIN_HEIGHT, MIN_UPRIGHT
 from nerf2real.suite.tasks.workspace import find_workspace
 
 
@@ -75,7 +76,7 @@ class RehearsedPlant(Plant):
       world=world,
       seed=robot_seed,
       stepped=True,
-      camera=image_size is not None,
+      camera=None if image_size is None else VirtualCamera(),
       ball=protocol == BALL,
       furnish=None if self._intruder is None else self._intruder.add_to_spec,
     )
@@ -93,12 +94,7 @@ class RehearsedPlant(Plant):
     connection = self.robot.connection()
     if image_size is not None:
       self._camera = CoveredCamera(connection.camera)
-      connection = Connection(
-        port=connection.port,
-        camera=self._camera,
-        operator=connection.operator,
-        clock=connection.clock,
-      )
+      connection = dataclasses.replace(connection, camera=self._camera)
     return real.load(
       TASKS[self.protocol],
       robot=connection,

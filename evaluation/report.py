@@ -3,24 +3,34 @@
 import base64
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from nerf2real.core import files
-from nerf2real.core.pages import parts
+from nerf2real.agents.dmpo import belief_plot
+from nerf2real.core.floor_map import FloorMap
+from nerf2real.core.pages import page
+from nerf2real.core.pages.blocks import (
+  Block,
+  Details,
+  Grid,
+  Legend,
+  Picture,
+  Preformatted,
+  Table,
+  Text,
+)
+from nerf2real.core.pages.page import Section
 from nerf2real.evaluation import maps, tables
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Moment
 
 _MOMENTS = 5  # shown of an episode's belief
 _BELIEF_EPISODES = 4  # shown of a setting
+_PATHS_HEIGHT, _BELIEF_HEIGHT = 420, 240  # of maps [pixel]
 _WIDE = 8  # columns of a table that is set smaller
-
-# Draws a belief: (moment, goal, map) -> picture uint8 [H, W, 3].
-DrawBelief = Callable[[Moment, tuple[float, float], maps.Map], np.ndarray]
 
 
 def write(
@@ -28,7 +38,6 @@ def write(
   found: Sequence[Episode],
   *,
   scene: Any,
-  draw_belief: DrawBelief | None = None,
   settings: Mapping[str, Any] | None = None,
 ) -> None:
   """Writes the page.
@@ -37,27 +46,21 @@ def write(
     path: The file.
     found: All episodes.
     scene: The bundle, for the map.
-    draw_belief: Draws a heat map; without it none are shown.
     settings: Of the run, shown at the end.
   """
-  floor = maps.Map(scene)
   sections = [_table(table) for table in tables.paper_tables(found)]
   sections.append(_table(tables.outcome_table(found), _OUTCOME_TEXT))
-  sections.append(_paths(found, floor))
-  if draw_belief is not None:
-    sections.append(_beliefs(found, floor, draw_belief))
+  sections += _paths(found, maps.draw_floor(scene, height=_PATHS_HEIGHT))
+  sections += _beliefs(found, maps.draw_floor(scene, height=_BELIEF_HEIGHT))
   sections.append(_episodes(found))
   if settings is not None:
     text = json.dumps(dict(settings), indent=1, default=str)
-    sections.append(parts.section("Settings", "", parts.details("all settings", text)))
+    sections.append(Section("Settings", "", [Details("all settings", [Preformatted(text)])]))
   lead = (
     f"{len(found)} episodes. What is called virtual robot is a program behind the robot's wires, "
     "with physics, pictures and faults of its own; no figure marked so is of hardware."
   )
-  page = parts.page(
-    "Evaluation", lead, [section for section in sections if section], with_plots=False
-  )
-  files.write_atomically(path, page)
+  page.write(path, page.Page("Evaluation", lead, sections))
 
 
 _OUTCOME_TEXT = (
@@ -67,16 +70,13 @@ _OUTCOME_TEXT = (
 )
 
 
-def _table(table: tables.Table, text: str = "") -> str:
+def _table(table: tables.Table, text: str = "") -> Section:
   # No line break between a figure and its unit.
   rows = [
     (row.name, *(re.sub(r"(?<=\d) (?=sec|m$)", "\u00a0", cell) for cell in row.cells))
     for row in table.rows
   ]
-  found = parts.table(table.header, rows)
-  if len(table.header) > _WIDE:
-    found = f"<div style='font-size:13px'>{found}</div>"
-  return parts.section(table.title, text, found)
+  return Section(table.title, text, [Table(table.header, rows, small=len(table.header) > _WIDE)])
 
 
 def _title(episode: Episode) -> str:
@@ -95,52 +95,60 @@ def _groups(found: Sequence[Episode]) -> dict[str, list[Episode]]:
   return groups
 
 
-def _paths(found: Sequence[Episode], floor: maps.Map) -> str:
-  pictures = []
-  for title, chosen in _groups(found).items():
-    if any(episode.path for episode in chosen):
-      pictures.append(parts.picture(maps.draw_paths(floor, chosen), title))
+def _paths(found: Sequence[Episode], floor: FloorMap) -> list[Section]:
+  pictures = [
+    Picture(maps.draw_paths(floor, chosen), title)
+    for title, chosen in _groups(found).items()
+    if any(episode.path for episode in chosen)
+  ]
   if not pictures:
-    return ""
-  swatch = "<span style='display:inline-block;width:22px;height:8px;background:rgb{}'></span> {}"
-  legend = " &nbsp; ".join(swatch.format(maps.COLORS[name], name) for name in OUTCOMES)
-  return parts.section(
-    "Where the robot went",
-    "Seen from above: light is floor where the robot fits, dark is matter. Black dots are starts, "
-    "circles and squares are goals, a coloured dot is where a failure ended, a thin orange line is "
-    "the ball.",
-    f"<p>{legend}</p>",
-    parts.grid(pictures, 2),
-  )
+    return []
+  return [
+    Section(
+      "Where the robot went",
+      "Seen from above: light is floor where the robot fits, dark is matter. Black dots are "
+      "starts, circles and squares are goals, a coloured dot is where a failure ended, a thin "
+      "orange line is the ball.",
+      [Legend({name: maps.COLORS[name] for name in OUTCOMES}), Grid(pictures, 2)],
+    )
+  ]
 
 
-def _beliefs(found: Sequence[Episode], floor: maps.Map, draw_belief: DrawBelief) -> str:
-  blocks = []
+def _beliefs(found: Sequence[Episode], floor: FloorMap) -> list[Section]:
+  blocks: list[Block] = []
   for title, chosen in _groups(found).items():
     believing = [episode for episode in chosen if episode.moments]
     if not believing:
       continue
-    cells = []
+    cells: list[Block | None] = []
     for episode in _telling(believing):
       count = len(episode.moments)
       shown = np.unique(np.linspace(0, count - 1, min(_MOMENTS, count)).astype(int))
       for index in shown:
         moment = episode.moments[index]
-        heat = draw_belief(moment, episode.goal, floor)
+        heat = _draw_belief(moment, episode.goal, floor)
         seen = _decode(moment.picture, heat.shape[1])
         picture = heat if seen is None else np.concatenate([seen, heat])
         text = f"episode {episode.index + 1} ({episode.outcome}), {moment.time:.1f} s"
-        cells.append(parts.picture(picture, text))
-      cells += ["<div></div>"] * (_MOMENTS - len(shown))
-    blocks.append(f"<p style='margin-top:14px'>{title}</p>" + parts.grid(cells, _MOMENTS))
+        cells.append(Picture(picture, text))
+      cells += [None] * (_MOMENTS - len(shown))
+    blocks += [Text(title), Grid(cells, _MOMENTS)]
   if not blocks:
-    return ""
-  return parts.section(
-    "Where the policy believed to be",
-    "What the robot saw, and below it the density of its belief over the floor: white X the truth, "
-    "green triangle the goal. Each row is an episode.",
-    *blocks,
-  )
+    return []
+  return [
+    Section(
+      "Where the policy believed to be",
+      "What the robot saw, and below it the density of its belief over the floor: white X the "
+      "truth, green triangle the goal. Each row is an episode.",
+      blocks,
+    )
+  ]
+
+
+def _draw_belief(moment: Moment, goal: tuple[float, float], floor: FloorMap) -> np.ndarray:
+  mixture = (np.array(part) for part in (moment.logits, moment.means, moment.stddevs))
+  truth = None if moment.position is None else np.array(moment.position)
+  return belief_plot.draw(floor, *mixture, truth=truth, target=np.array(goal))
 
 
 def _telling(found: Sequence[Episode]) -> list[Episode]:
@@ -161,7 +169,7 @@ def _decode(picture: str, width: int) -> np.ndarray | None:
   return np.asarray(cv2.resize(image[..., ::-1], (width, height), interpolation=cv2.INTER_NEAREST))
 
 
-def _episodes(found: Sequence[Episode]) -> str:
+def _episodes(found: Sequence[Episode]) -> Section:
   rows = [
     (
       _title(episode),
@@ -187,10 +195,4 @@ def _episodes(found: Sequence[Episode]) -> str:
     "localisation",
     "detail",
   )
-  return parts.section(
-    "Episodes",
-    "",
-    "<details><summary>all episodes</summary>",
-    parts.table(header, rows),
-    "</details>",
-  )
+  return Section("Episodes", "", [Details("all episodes", [Table(header, rows)])])

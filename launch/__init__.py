@@ -1,1 +1,1 @@
-"""Commands that a person runs: arguments in, one call, words out."""
+"""Commands that a person runs: arguments in, one call, words out. See README.md."""

@@ -1,48 +1,59 @@
-"""Starts an actor, or the evaluator: `python launch/actor.py --connect tcp/host:7447`.
+"""Starts an actor, or the evaluator.
 
-It learns from the learner which environment to run. --evaluate makes it the evaluator.
+  python launch/actor.py --connect tcp/host:7447
+
+The learner says which environment to run. --evaluate makes it the evaluator.
 """
 
-import argparse
+import dataclasses
 import logging
-import os
 import signal
 import sys
 import uuid
 
-# One core an actor: its matrices are small, and threads of BLAS would fight over the machine.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("MKL_NUM_THREADS", "1")
-os.environ.setdefault("MUJOCO_GL", "disabled")  # no environment here draws with GL
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the accelerator is the learner's
+import tyro
 
 from nerf2real.agents.link import sessions
-from nerf2real.agents.link.arguments import add_link_arguments, link_settings
-from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.link.schema import MessageError
-from nerf2real.agents.processes.actor import ActorProcess, EvaluatorProcess
+from nerf2real.agents.processes.statuses import REFUSED
+from nerf2real.launch import command
 
 _EVALUATOR_SEED = 1_000_000  # far from the actors' seeds
+_ENVIRONMENT = {
+  **command.NOT_DRAWING,
+  **command.ONE_THREAD,
+  "JAX_PLATFORMS": "cpu",  # the accelerator is the learner's
+}
 
 
-def parse() -> argparse.Namespace:
-  parser = argparse.ArgumentParser(
-    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-  )
-  parser.add_argument("--connect", required=True, help="the learner, such as tcp/127.0.0.1:7447")
-  parser.add_argument("--index", type=int, default=0, help="number of this actor, for its seed")
-  parser.add_argument("--seed", type=int, default=0, help="the run's seed")
-  parser.add_argument("--evaluate", action="store_true", help="evaluate instead of acting")
-  parser.add_argument(
-    "--wait", type=float, default=120.0, help="time to wait for the learner to appear [s]"
-  )
-  add_link_arguments(parser, side="actor")
-  return parser.parse_args()
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Arguments:
+  """Starts an actor, or the evaluator."""
+
+  connect: str
+  """The learner or router to join, such as tcp/127.0.0.1:7447."""
+  index: int = 0
+  """Number of this actor, for its seed."""
+  seed: int = 0
+  """The run's seed."""
+  evaluate: bool = False
+  """Evaluate instead of acting."""
+  wait: float = 120.0
+  """Time to wait for the learner to appear [s]."""
+  link: tyro.conf.OmitArgPrefixes[sessions.LinkSettings] = sessions.LinkSettings()
+  """The link's settings."""
 
 
-def main() -> int:
-  arguments = parse()
+def run(arguments: Arguments) -> None:
+  """Acts or evaluates until the run is over or it is stopped.
+
+  Raises:
+    CommandError: It cannot join with these arguments (only this ends with `REFUSED`), the learner
+      refuses a question, or several episodes in a row failed.
+  """
+  from nerf2real.agents.link.client import ActorLink
+  from nerf2real.agents.link.schema import MessageError
+  from nerf2real.agents.processes.actor import ActorProcess, EpisodesFailed, EvaluatorProcess
+
   role = "evaluator" if arguments.evaluate else "actor"
   name = f"{role}-{arguments.index}-{uuid.uuid4().hex[:8]}"
   logging.basicConfig(level=logging.INFO, format=f"%(asctime)s {name}: %(message)s")
@@ -55,23 +66,26 @@ def main() -> int:
 
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, stop)
-  settings = link_settings(arguments)
   try:
-    session = sessions.connect(arguments.connect, settings, timeout=arguments.wait)
-    link = ActorLink(session, settings, actor=name, role=role)
+    session = sessions.connect(arguments.connect, arguments.link, timeout=arguments.wait)
+    link = ActorLink(session, arguments.link, actor=name, role=role)
     if arguments.evaluate:
       process = EvaluatorProcess(link, seed=arguments.seed + _EVALUATOR_SEED)
     else:
-      # The process id makes a replaced actor draw other episodes than its predecessor.
-      process = ActorProcess(
-        link, seed=arguments.seed + 1000 * arguments.index + os.getpid() % 1000
-      )
-    process.run()
-    link.close()
+      process = ActorProcess(link, seed=arguments.seed, index=arguments.index)
   except (sessions.LinkError, MessageError, ValueError) as error:
-    print(f"error: {error}", file=sys.stderr)
-    return 2
-  return 0
+    raise command.CommandError(error, status=REFUSED) from error
+  try:
+    process.run()
+  except (EpisodesFailed, MessageError) as error:
+    raise command.CommandError(error) from error
+  finally:
+    link.close()
+
+
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run, environment=_ENVIRONMENT, errors=())
 
 
 if __name__ == "__main__":

@@ -6,17 +6,17 @@ python launch/calibrate_camera.py board.mp4 --corners 7 7 --out camera_info.yaml
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
-from nerf2real.real.camera import calibration
+from nerf2real.launch import command
+
+if TYPE_CHECKING:
+  from nerf2real.real.camera.calibration import Calibration
 
 _PIXELS = ("fx", "fy", "cx", "cy")
-_MIN_COVERAGE = 0.4  # of the picture's cells: ours; below it the distortion is a guess at the rim
+_MIN_COVERAGE = 0.4  # of the picture's cells; chosen: below it the distortion is a guess at the rim
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +35,12 @@ class Arguments:
   """Where to write the camera_info YAML; nothing is written if not given."""
 
 
-def run(arguments: Arguments) -> calibration.Calibration:
-  """Finds the boards and fits the lens."""
+def run(arguments: Arguments) -> None:
+  """Finds the boards, fits the lens, prints and writes it."""
+  from rich.progress import track
+
+  from nerf2real.real.camera import calibration
+
   every = 1 if arguments.source.is_dir() else arguments.every
   pictures = calibration.read_pictures(arguments.source, every=every)
   found = []
@@ -44,11 +48,21 @@ def run(arguments: Arguments) -> calibration.Calibration:
     view = calibration.find_board(name, picture, corners=arguments.corners)
     if view is not None:
       found.append(view)
-  return calibration.calibrate(found, corners=arguments.corners)
+  result = calibration.calibrate(found, corners=arguments.corners)
+  show(result)
+  if arguments.out is not None:
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    calibration.write_camera_info(arguments.out, result, name=arguments.name)
+    print(f"wrote {arguments.out}")
 
 
-def show(result: calibration.Calibration) -> None:
+def show(result: "Calibration") -> None:
   """Prints the result as a table."""
+  from rich.console import Console
+  from rich.table import Table
+
+  from nerf2real.real.camera import calibration
+
   table = Table("", "value", "+-", "unit")
   for name, value, stddev in zip(calibration.NAMES, result.values, result.stddevs, strict=True):
     unit = "pixel" if name in _PIXELS else ""
@@ -67,19 +81,10 @@ def show(result: calibration.Calibration) -> None:
     )
 
 
-def main() -> None:
-  """Parses the command line and calibrates."""
-  arguments = tyro.cli(Arguments, description=__doc__)
-  try:
-    result = run(arguments)
-    show(result)
-    if arguments.out is not None:
-      arguments.out.parent.mkdir(parents=True, exist_ok=True)
-      calibration.write_camera_info(arguments.out, result, name=arguments.name)
-      print(f"wrote {arguments.out}")
-  except (ValueError, OSError) as error:
-    sys.exit(f"error: {error}")
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run)
 
 
 if __name__ == "__main__":
-  main()
+  sys.exit(main())

@@ -7,12 +7,10 @@ import dataclasses
 import sys
 from pathlib import Path
 
-import rich.console
 import tyro
 
-from nerf2real.core.progress import progress_bar
+from nerf2real.launch import command
 from nerf2real.scenes.builtin import filming
-from nerf2real.scenes.builtin.eye import EglMissingError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,18 +27,26 @@ class Arguments:
   """How it is filmed."""
 
 
-def main(arguments: Arguments) -> int:
-  """Films; returns the exit status."""
+def run(arguments: Arguments) -> None:
+  """Films, with a bar of progress."""
+  import rich.console
+
+  from nerf2real.core.progress import progress_bar
+  from nerf2real.scenes.builtin.eye import EglMissingError
+
   console = rich.console.Console(stderr=True)
   try:
     with progress_bar("filming", console=console) as progress:
       filming.film(arguments.out, seed=arguments.seed, settings=arguments.film, progress=progress)
-  except (EglMissingError, OSError, ValueError) as error:
-    console.print(f"[red]{error}[/red]")
-    return 1
+  except EglMissingError as error:
+    raise command.CommandError(error) from error
   console.print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB")
-  return 0
+
+
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run)
 
 
 if __name__ == "__main__":
-  sys.exit(main(tyro.cli(Arguments)))
+  sys.exit(main())

@@ -1,4 +1,4 @@
-"""Finds the effect that a model lacks, from measured logs.
+"""Finds the effects that a model lacks, from measured logs.
 
   python launch/identify.py --model model.xml --logs train_*.mcap --held held_*.mcap --out out/x
   python launch/identify.py --evaluate out/x --held other.mcap
@@ -8,19 +8,16 @@ Writes report.json, report.html, effects.json (for suite.load), model_extended.x
 
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import rich
-import tyro
-from rich.table import Table
-
-from nerf2real import sysid
+from nerf2real.launch import command
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Arguments:
-  """Finds the effect that a model lacks, from measured logs."""
+  """Finds the effects that a model lacks, from measured logs."""
 
   model: Path | None = None
   """Declared MuJoCo model (.xml)."""
@@ -37,21 +34,26 @@ class Arguments:
   """A folder that was written before: print its models' errors on the --held logs."""
 
 
-def main() -> int:
-  """Runs the command line; a wrong input is one line on stderr."""
-  arguments = tyro.cli(Arguments, description=__doc__)
-  try:
-    if arguments.evaluate is not None:
-      return _evaluate(arguments)
-    return _identify(arguments)
-  except (OSError, ValueError) as error:
-    print(f"error: {error}", file=sys.stderr)
-    return 2
+def run(arguments: Arguments) -> None:
+  """Identifies or evaluates, and prints tables.
 
-
-def _identify(arguments: Arguments) -> int:
+  Raises:
+    CommandError: Options are missing.
+  """
+  if arguments.evaluate is not None:
+    if not arguments.held:
+      raise command.CommandError(
+        "Found no --held log, expected at least one to evaluate on.", status=command.WRONG_ARGUMENTS
+      )
+    _print_errors(arguments.evaluate, arguments.held)
+    return
   if arguments.model is None or not arguments.logs or arguments.out is None:
-    raise ValueError("Found no --model, --logs or --out, expected all three (see --help).")
+    raise command.CommandError(
+      "Found no --model, --logs or --out, expected all three (see --help).",
+      status=command.WRONG_ARGUMENTS,
+    )
+  from nerf2real import sysid
+
   content = sysid.identify(
     arguments.model,
     list(arguments.logs),
@@ -59,6 +61,15 @@ def _identify(arguments: Arguments) -> int:
     reference=arguments.reference,
     out=arguments.out,
   )
+  _print_content(content, arguments.out)
+
+
+def _print_content(content: dict[str, Any], out: Path) -> None:
+  import rich
+  from rich.table import Table
+
+  from nerf2real.sysid.model import simulation as evaluation
+
   rich.print(f"[bold]{content['verdict']}[/bold] in {content['seconds']:.0f} s")
   table = Table("effect", "where", "parameter", "value", "95 %", "unit")
   for effect in content["effects"]:
@@ -69,8 +80,6 @@ def _identify(arguments: Arguments) -> int:
       table.add_row(
         effect["kind"], _place(effect), name, _number(value["value"]), interval, value["unit"]
       )
-  from nerf2real.sysid.model import simulation as evaluation
-
   if table.rows:
     rich.print(table)
   for note in content["notes"]:
@@ -80,8 +89,7 @@ def _identify(arguments: Arguments) -> int:
     if error:
       worse = " (worse: do not use it)" if evaluation.is_worse(error) else ""
       rich.print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE{worse}")
-  rich.print(f"floor: {content['error']['floor']:.5f}; report: {arguments.out / 'report.html'}")
-  return 0
+  rich.print(f"floor: {content['error']['floor']:.5f}; report: {out / 'report.html'}")
 
 
 def _place(effect: dict[str, Any]) -> str:
@@ -92,16 +100,22 @@ def _number(value: float | None) -> str:
   return "-" if value is None else f"{value:.4g}"
 
 
-def _evaluate(arguments: Arguments) -> int:
-  if not arguments.held:
-    raise ValueError("Found no --held log, expected at least one to evaluate on.")
-  assert arguments.evaluate is not None
+def _print_errors(folder: Path, held: Sequence[Path]) -> None:
+  import rich
+  from rich.table import Table
+
+  from nerf2real import sysid
+
   table = Table("log", "declared", "extended", "lower by")
-  for row in sysid.evaluate(arguments.evaluate, arguments.held):
+  for row in sysid.evaluate(folder, held):
     ratio = row["before"] / max(row["after"], 1e-12)
     table.add_row(row["log"], f"{row['before']:.6f}", f"{row['after']:.6f}", f"{ratio:.2f} times")
   rich.print(table)
-  return 0
+
+
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run)
 
 
 if __name__ == "__main__":

@@ -1,93 +1,117 @@
-"""Starts a learner: `python launch/learner.py --env suite:nerf_nav --run runs/x`.
+"""Starts a learner, which owns a run's replay and parameters.
+
+  python launch/learner.py --env suite:nerf_nav --run runs/x
 
 Listens on this machine only, unless --listen names another address; then --users is needed. Actors
 join with `launch/actor.py --connect`. With --connect it joins a router (`launch/router.py`)
 instead, with the login of that router's first user.
 """
 
-import argparse
+import dataclasses
 import json
 import logging
 import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-os.environ.setdefault("MUJOCO_GL", "disabled")  # the environment is only asked for its specs
+import tyro
 
 from nerf2real.agents.dmpo import config as configs
-from nerf2real.agents.link.arguments import add_link_arguments, link_settings
-from nerf2real.agents.link.sessions import LinkError
-from nerf2real.agents.processes.checkpoints import CheckpointError, read_info
-from nerf2real.agents.processes.learner import Learner, RunSettings
+from nerf2real.agents.link import sessions
+from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
 from nerf2real.core.serialization import from_plain
+from nerf2real.launch import command
 
+# NumPy only samples here; XLA has --threads.
+_ENVIRONMENT = {**command.NOT_DRAWING, **command.ONE_THREAD}
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+_ASSIGNMENT = tyro.conf.arg(metavar="NAME=VALUE")
+_WHERE = tyro.conf.create_mutex_group(required=False)
 
 
-def parse() -> argparse.Namespace:
-  parser = argparse.ArgumentParser(
-    description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-  )
-  parser.add_argument("--env", help="such as suite:nerf_nav or dm_control:cartpole:swingup")
-  parser.add_argument("--run", type=Path, required=True, help="the run's folder")
-  where = parser.add_mutually_exclusive_group()
-  where.add_argument("--listen", default=DEFAULT_ENDPOINT, help="such as tcp/0.0.0.0:7447")
-  where.add_argument("--connect", help="a router to join, such as tcp/head:7447")
-  parser.add_argument("--preset", default=None, choices=sorted(configs.PRESETS))
-  parser.add_argument(
-    "--set",
-    action="append",
-    default=[],
-    metavar="NAME=VALUE",
-    help="changes a setting of the agent, such as network.vmax=10",
-  )
-  parser.add_argument("--seed", type=int, default=0)
-  parser.add_argument("--max-env-steps", type=int, help="environment steps of the run")
-  parser.add_argument("--resume", action="store_true", help="continue from the newest checkpoint")
-  parser.add_argument(
-    "--checkpoint-period",
-    type=float,
-    default=RunSettings.checkpoint_period,
-    help="time between checkpoints [s]",
-  )
-  parser.add_argument(
-    "--log-period",
-    type=float,
-    default=RunSettings.log_period,
-    help="time between rows of the log [s]",
-  )
-  parser.add_argument(
-    "--replay-on-disk",
-    action="store_true",
-    help="keep the replay in files, so that it survives the learner",
-  )
-  parser.add_argument(
-    "--evaluation-period",
-    type=int,
-    default=RunSettings.evaluation_period,
-    help="environment steps between evaluations",
-  )
-  parser.add_argument("--evaluation-episodes", type=int, default=RunSettings.evaluation_episodes)
-  add_link_arguments(parser, side="learner")
-  return parser.parse_args()
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Arguments:
+  """Starts a learner."""
+
+  env: str | None = None
+  """What to learn, such as suite:nerf_nav or dm_control:cartpole:swingup; a resumed run's own if
+  not given."""
+  run: Path
+  """The run's folder."""
+  listen: Annotated[str, _WHERE] = DEFAULT_ENDPOINT
+  """Where to listen, such as tcp/0.0.0.0:7447."""
+  connect: Annotated[str | None, _WHERE] = None
+  """A router to join instead, such as tcp/head:7447."""
+  preset: str | None = None
+  """Settings of the agent to start from: paper, state, ... (a wrong name lists all); "paper" if not
+  given."""
+  set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], _ASSIGNMENT] = ()
+  """Changes a setting of the agent, such as network.vmax=10; may be repeated."""
+  seed: int = 0
+  """Seed of parameters, sampling and, with an actor's number, of its episodes."""
+  max_env_steps: int | None = None
+  """Environment steps of the run; until it is stopped if not given."""
+  minutes: float | None = None
+  """Time of the run, over all its parts [min]; until it is stopped if not given."""
+  init_from: Path | None = None
+  """Folder of an exported policy to begin with, with fresh optimisers and critic; random weights if
+  not given."""
+  threads: int = max(1, _CORES // 2)
+  """Processor threads of the updates: half of the cores, the rest is for actors."""
+  resume: bool = False
+  """Continue from the newest checkpoint."""
+  checkpoint_period: float = 300.0
+  """Time between checkpoints [s]."""
+  log_period: float = 10.0
+  """Time between the learner's rows in the log [s]."""
+  replay_on_disk: bool = False
+  """Keep the replay in files, so that it survives the learner."""
+  evaluation_period: int = 10_000
+  """Environment steps between evaluations [steps]."""
+  evaluation_episodes: int | None = None
+  """Episodes of an evaluation; half of the protocol's trials, or 5 without a protocol, if not
+  given."""
+  evaluation_env: str | None = None
+  """Environment of the evaluations; for suite:... the protocol of the paper's table I if not
+  given."""
+  link: tyro.conf.OmitArgPrefixes[sessions.LinkSettings] = sessions.LinkSettings()
+  """The link's settings."""
 
 
-def agent_settings(arguments: argparse.Namespace) -> tuple[str, configs.DmpoConfig]:
-  """The environment and the agent's settings: those of the checkpoint when a run is resumed."""
+def agent_settings(arguments: Arguments) -> tuple[str, configs.DmpoConfig]:
+  """Returns the environment and the agent's settings; a resumed run's are in its checkpoint.
+
+  Raises:
+    ValueError: A setting is unknown, or the run is one of another environment.
+  """
+  from nerf2real.agents.processes.checkpoints import read_info
+
   info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
   if info is not None:
     environment, config = info["environment"], from_plain(info["config"], configs.DmpoConfig)
-    if arguments.env not in (None, environment):
+    given = arguments.env or environment
+    if given.partition("?")[0] != environment.partition("?")[0]:
       raise ValueError(
-        f"{arguments.run} was trained on {environment}, found --env {arguments.env}."
+        f"{arguments.run} was trained on {environment}, found --env {arguments.env}: only the "
+        "options after the question mark may change."
       )
+    environment = given
   elif arguments.env is None:
     raise ValueError("Say what to learn, such as --env suite:nerf_nav.")
   else:
     environment, config = arguments.env, configs.preset(arguments.preset or "paper")
   return environment, configs.override(config, dict(map(_assignment, arguments.set)))
+
+
+def set_threads(count: int) -> None:
+  """Limits XLA's threads on the processor; to be called before the first computation."""
+  os.environ.setdefault("NPROC", str(count))  # size of XLA's thread pool
+  if count == 1:
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
 
 
 def _assignment(text: str) -> tuple[str, Any]:
@@ -102,37 +126,49 @@ def _assignment(text: str) -> tuple[str, Any]:
     ) from None
 
 
-def main() -> int:
-  arguments = parse()
+def run(arguments: Arguments) -> None:
+  """Learns until the run is over or it is stopped.
+
+  Raises:
+    CommandError: It cannot start with these arguments, trajectories can no longer be taken in, or
+      what was learned was not saved.
+  """
+  from nerf2real.agents.processes.checkpoints import CheckpointError
+  from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
+  set_threads(arguments.threads)
   try:
     environment, config = agent_settings(arguments)
+    names = {field.name for field in dataclasses.fields(RunSettings)} - {"environment"}
     settings = RunSettings(
-      environment=environment,
-      run=arguments.run,
-      seed=arguments.seed,
-      max_env_steps=arguments.max_env_steps,
-      checkpoint_period=arguments.checkpoint_period,
-      log_period=arguments.log_period,
-      replay_on_disk=arguments.replay_on_disk,
-      evaluation_period=arguments.evaluation_period,
-      evaluation_episodes=arguments.evaluation_episodes,
+      environment=environment, **{name: getattr(arguments, name) for name in names}
     )
     learner = Learner(
       settings,
       config,
       endpoint=arguments.connect or arguments.listen,
-      link=link_settings(arguments),
+      link=arguments.link,
       resume=arguments.resume,
       join=arguments.connect is not None,
     )
-  except (ValueError, LinkError, CheckpointError) as error:
-    print(f"error: {error}", file=sys.stderr)
-    return 2
+  except (ValueError, OSError, sessions.LinkError, CheckpointError) as error:
+    raise command.CommandError(error, status=REFUSED) from error
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())
-  learner.run()
-  return 0
+  try:
+    learner.run()
+  except LearnerError as error:
+    raise command.CommandError(error) from error
+  if learner.problem:
+    raise command.CommandError(
+      f"The run ended and was not saved: {learner.problem}", status=NOT_SAVED
+    )
+
+
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run, environment=_ENVIRONMENT, errors=())
 
 
 if __name__ == "__main__":

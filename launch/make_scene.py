@@ -9,16 +9,13 @@ A second run with the same --out continues where the first one stopped.
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import rich
-import tyro
-from rich.table import Table
+from nerf2real.launch import command
 
-from nerf2real.scenes import pipeline
-from nerf2real.scenes.builtin import yardstick
-from nerf2real.scenes.bundle import Bundle
-from nerf2real.scenes.settings import SceneSettings, preset
+if TYPE_CHECKING:
+  from nerf2real.scenes.bundle import Bundle
+  from nerf2real.scenes.settings import SceneSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,15 +38,17 @@ class Arguments:
   camera_height: float | None = None
   """Median height of the camera above the floor [m]: gives the scale where there is no marker."""
   override: Path | None = None
-  """YAML or JSON that fixes floor, scale, yaw or extent; see scenes/alignment/overrides.py."""
+  """YAML or JSON that fixes floor, scale, yaw, extent by hand; see scenes/geometry/overrides.py."""
   baseline: Literal["none", "colmap"] | None = None
   """"colmap" adds the Poisson mesh of the COLMAP points to the report."""
   name: str | None = None
   """The scene's name; the output folder's if not given."""
 
 
-def settings_of(arguments: Arguments) -> SceneSettings:
+def settings_of(arguments: Arguments) -> "SceneSettings":
   """Applies the arguments to their preset."""
+  from nerf2real.scenes.settings import preset
+
   settings = preset(arguments.preset)
   if arguments.keyframes is not None:
     taken = dataclasses.replace(settings.capture, num_keyframes=arguments.keyframes)
@@ -67,7 +66,10 @@ def settings_of(arguments: Arguments) -> SceneSettings:
   return settings
 
 
-def _print_figures(scene: Bundle) -> None:
+def _print_figures(scene: "Bundle") -> None:
+  import rich
+  from rich.table import Table
+
   table = Table("figure", "value", title=f"scene {scene.name}")
   for key, value in scene.figures.items():
     if isinstance(value, (int, float)):
@@ -80,31 +82,38 @@ def _print_figures(scene: Bundle) -> None:
     rich.print(f"[yellow]warning:[/] {warning}")
 
 
-def main() -> None:
-  """Parses the command line and makes the scene."""
-  arguments = tyro.cli(Arguments, description=__doc__)
-  try:
-    settings = settings_of(arguments)
-    source, measure = Path(arguments.capture), None
-    if arguments.capture == "builtin":
-      source, measure = yardstick.VIDEO, yardstick.measure
-      if settings.marker_side is None:
-        settings = dataclasses.replace(settings, marker_side=yardstick.MARKER_SIDE)
-    scene = pipeline.make_scene(
-      source,
-      arguments.out,
-      settings=settings,
-      override=arguments.override,
-      name=arguments.name,
-      measure=measure,
-    )
-  except (ValueError, OSError, FloatingPointError) as error:
-    sys.exit(f"error: {error}")
-  except KeyboardInterrupt:
-    sys.exit("interrupted: run the same command again, it continues where it stopped")
+def run(arguments: Arguments) -> None:
+  """Makes the scene and prints its figures."""
+  from nerf2real.scenes import pipeline
+  from nerf2real.scenes.builtin import yardstick
+
+  settings = settings_of(arguments)
+  source, measure = Path(arguments.capture), None
+  if arguments.capture == "builtin":
+    source, measure = yardstick.VIDEO, yardstick.measure
+    if settings.marker_side is None:
+      settings = dataclasses.replace(settings, marker_side=yardstick.MARKER_SIDE)
+  scene = pipeline.make_scene(
+    source,
+    arguments.out,
+    settings=settings,
+    override=arguments.override,
+    name=arguments.name,
+    measure=measure,
+  )
   _print_figures(scene)
   print(f"report: {arguments.out / 'report.html'}")
 
 
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(
+    Arguments,
+    run,
+    errors=(ValueError, OSError, FloatingPointError),
+    interrupted="interrupted: run the same command again, it continues where it stopped",
+  )
+
+
 if __name__ == "__main__":
-  main()
+  sys.exit(main())

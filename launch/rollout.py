@@ -6,26 +6,10 @@ python launch/rollout.py --task ball_push --scene out/livingroom --policy random
 
 import dataclasses
 import sys
-from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 from typing import Literal
 
-import av
-import cv2
-import numpy as np
-import tyro
-from rich.progress import track
-
-from nerf2real import suite
-from nerf2real.suite.op3 import constants
-from nerf2real.suite.views.overview import TopDown
-from nerf2real.suite.views.third_person import ThirdPerson
-
-_HEIGHT, _WIDTH = 360, 480  # pixels of the third person's picture and of the enlarged robot's view
-_FRAME_STEPS = 2  # control steps between frames: 20 frames/s
-_INK, _PAPER = (29, 35, 48), (255, 255, 255)
-_STRIP = 44  # pixels of text under the pictures
+from nerf2real.launch import command
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +25,7 @@ class Arguments:
   policy: Literal["stand", "random"] = "stand"
   """What the robot does: hold the reference pose, or random motions about it."""
   seconds: float = 10.0
-  """Length of the run, over as many episodes as it takes."""
+  """Length of the run, over as many episodes as it takes [s]."""
   image_height: int = 60
   """Height of the robot's picture [pixel]; its width is 4/3 of it."""
   effects: Path | None = None
@@ -50,113 +34,30 @@ class Arguments:
   """Seed of the episodes."""
 
 
-def make_policy(name: str, standing: np.ndarray, seed: int) -> Callable[[], np.ndarray]:
-  """Returns a function that gives the next action."""
-  rng = np.random.default_rng(seed)
-  if name == "stand":
-    return lambda: standing
-  return lambda: np.clip(standing + rng.normal(0, 0.5, standing.shape), -1, 1).astype(np.float32)
+def run(arguments: Arguments) -> None:
+  """Runs the episodes and prints how they ended."""
+  from nerf2real.suite.views.rollout import run_episodes
 
-
-def compose(pictures: list[np.ndarray], text: str) -> np.ndarray:
-  """Returns the pictures side by side above a line of text; width and height are even."""
-  row = np.hstack(pictures)
-  strip = np.full((_STRIP, row.shape[1], 3), _PAPER, np.uint8)
-  cv2.putText(strip, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.52, _INK, 1, cv2.LINE_AA)
-  frame = np.vstack([row, strip])
-  return np.ascontiguousarray(frame[:, : frame.shape[1] // 2 * 2])
-
-
-class Video:
-  """An H.264 file that grows frame by frame."""
-
-  def __init__(self, path: Path):
-    rate = Fraction(1 / (constants.CONTROL_TIMESTEP * _FRAME_STEPS)).limit_denominator(1000)
-    self._container = av.open(str(path), "w")
-    self._stream = self._container.add_stream("libx264", rate=rate, options={"crf": "23"})
-    self._stream.pix_fmt = "yuv420p"
-
-  def add(self, frame: np.ndarray) -> None:
-    """Adds a frame, RGB uint8 [H, W, 3]."""
-    if not self._stream.codec_context.is_open:
-      self._stream.height, self._stream.width = frame.shape[:2]
-    for packet in self._stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")):
-      self._container.mux(packet)
-
-  def close(self) -> None:
-    """Writes what is left."""
-    for packet in self._stream.encode():
-      self._container.mux(packet)
-    self._container.close()
-
-
-def describe(task_name: str, environment: suite.environment.Environment) -> str:
-  """Returns the line of text under a frame."""
-  task = environment.task
-  terms = "  ".join(f"{name} {value:+.2f}" for name, value in task.reward_terms.items())
-  return f"{task_name}  {task.outcome.duration:5.2f} s   {terms}"
-
-
-def run(arguments: Arguments) -> list[str]:
-  """Runs the episodes; returns a line for each that ended."""
-  environment = suite.load(
+  lines = run_episodes(
     arguments.task,
     scene=arguments.scene,
     effects=arguments.effects,
-    random=arguments.seed,
-    image_size=(arguments.image_height, arguments.image_height * 4 // 3),
+    policy=arguments.policy,
+    seconds=arguments.seconds,
+    image_height=arguments.image_height,
+    seed=arguments.seed,
+    video=arguments.video,
   )
-  timestep = environment.reset()
-  task = environment.task
-  policy = make_policy(arguments.policy, task.standing_action, arguments.seed)
-  views = video = None
-  if arguments.video is not None:
-    arguments.video.parent.mkdir(parents=True, exist_ok=True)
-    third = ThirdPerson(task, environment.physics, height=_HEIGHT, width=_WIDTH)
-    views = (third, TopDown(task, _HEIGHT))
-    video = Video(arguments.video)
-  try:
-    return _run_steps(arguments, environment, timestep, policy, views, video)
-  finally:  # an interrupted run leaves a video that plays
-    if views is not None and video is not None:
-      video.close()
-
-
-def _run_steps(arguments, environment, timestep, policy, views, video) -> list[str]:
-  task = environment.task
-  lines = []
-  steps = round(arguments.seconds / constants.CONTROL_TIMESTEP)
-  for step in track(range(steps), description=arguments.task, disable=not sys.stderr.isatty()):
-    if timestep.first() and views is not None:
-      for view in views:
-        view.restart()
-    timestep = environment.step(policy())
-    if timestep.last():
-      outcome = task.outcome
-      ending = outcome.ending or "time limit"
-      success = f"success after {outcome.success_time:.2f} s" if outcome.success else "no success"
-      lines.append(f"episode of {outcome.duration:.2f} s: {success}, ended by {ending}")
-    if views is not None and video is not None and step % _FRAME_STEPS == 0:
-      own = cv2.resize(
-        timestep.observation["camera"], (_WIDTH, _HEIGHT), interpolation=cv2.INTER_NEAREST
-      )
-      pictures = [views[0].draw(), own, views[1].draw()]
-      video.add(compose(pictures, describe(arguments.task, environment)))
-  return lines
-
-
-def main() -> None:
-  """Parses the command line and runs."""
-  arguments = tyro.cli(Arguments, description=__doc__)
-  try:
-    lines = run(arguments)
-  except (ValueError, OSError) as error:
-    sys.exit(f"error: {error}")
   for line in lines or [f"no episode ended within {arguments.seconds:g} s"]:
     print(line)
   if arguments.video is not None:
     print(f"wrote {arguments.video}")
 
 
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(Arguments, run)
+
+
 if __name__ == "__main__":
-  main()
+  sys.exit(main())

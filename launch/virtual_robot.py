@@ -1,28 +1,29 @@
-"""Starts a virtual OP3: prints its serial port and the address of its camera, runs until Ctrl-C.
+"""Starts a virtual OP3; prints its serial port and its camera's address, runs until Ctrl-C.
 
-python launch/virtual_robot.py --world room --seed 1
-python launch/virtual_robot.py --loss 0.05          # a bad cable
-python launch/virtual_robot.py --link /tmp/op3      # the port under a name that stays
+  python launch/virtual_robot.py --world room --seed 1
+  python launch/virtual_robot.py --loss 0.05          # a bad cable
+  python launch/virtual_robot.py --link /tmp/op3      # the port under a name that stays
 
 Keys, each followed by Enter: h takes hold of the robot, l lets it go, p pushes it, q quits.
 """
 
 import contextlib
 import dataclasses
-import os
+import math
+import random
 import select
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-os.environ.setdefault("MUJOCO_GL", "egl")
+from nerf2real.launch import command
 
-import numpy as np
-import tyro
+if TYPE_CHECKING:
+  from nerf2real.real.virtual.robot import VirtualRobot
 
-from nerf2real.real.virtual.robot import VirtualRobot
-
+_BALL_AHEAD = 0.6  # m
 _PUSH = 10.0  # N
 _PUSH_TIME = 0.2  # s
 _REPORT_INTERVAL = 10.0  # s
@@ -56,14 +57,23 @@ class Arguments:
 
 def run(arguments: Arguments) -> None:
   """Starts the robot and waits."""
-  with VirtualRobot(
-    world=arguments.world, seed=arguments.seed, camera=arguments.camera, ball=arguments.ball
-  ) as robot:
+  from nerf2real.real.virtual.camera import VirtualCamera
+  from nerf2real.real.virtual.robot import VirtualRobot
+
+  camera = VirtualCamera() if arguments.camera else None
+  with (
+    contextlib.suppress(KeyboardInterrupt),
+    VirtualRobot(
+      world=arguments.world, seed=arguments.seed, camera=camera, ball=arguments.ball
+    ) as robot,
+  ):
     robot.faults.loss = arguments.loss
     robot.place(arguments.x, arguments.y, arguments.yaw)
     if arguments.ball:
-      ahead = 0.6 * np.array([np.cos(arguments.yaw), np.sin(arguments.yaw)])
-      robot.place_ball(arguments.x + ahead[0], arguments.y + ahead[1])
+      robot.place_ball(
+        arguments.x + _BALL_AHEAD * math.cos(arguments.yaw),
+        arguments.y + _BALL_AHEAD * math.sin(arguments.yaw),
+      )
     print(f"port: {robot.port}", flush=True)
     if robot.stream is not None:
       print(f"camera: {robot.stream.url}", flush=True)
@@ -72,7 +82,7 @@ def run(arguments: Arguments) -> None:
 
 
 @contextlib.contextmanager
-def _linked(link: Path | None, port: str):
+def _linked(link: Path | None, port: str) -> Iterator[None]:
   if link is None:
     yield
     return
@@ -83,7 +93,7 @@ def _linked(link: Path | None, port: str):
     link.unlink(missing_ok=True)
 
 
-def _wait(robot: VirtualRobot, seconds: float | None) -> None:
+def _wait(robot: "VirtualRobot", seconds: float | None) -> None:
   end = float("inf") if seconds is None else time.monotonic() + seconds
   report = time.monotonic() + _REPORT_INTERVAL
   keys = [sys.stdin] if sys.stdin.isatty() else []
@@ -102,28 +112,26 @@ def _wait(robot: VirtualRobot, seconds: float | None) -> None:
       print(f"torso at {x:+.2f} {y:+.2f} {z:.2f} m, yaw {truth.yaw:+.2f} rad{held}", flush=True)
 
 
-def _do(robot: VirtualRobot, key: str) -> None:
+def _do(robot: "VirtualRobot", key: str) -> None:
+  import numpy as np
+
   if key in ("h", "l"):
     robot.hold(key == "h")
   elif key == "p":
-    angle = np.random.default_rng().uniform(0, 2 * np.pi)
-    robot.push(_PUSH * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    angle = random.uniform(0, 2 * math.pi)
+    robot.push(np.array([_PUSH * math.cos(angle), _PUSH * math.sin(angle), 0.0]))
     time.sleep(_PUSH_TIME)
     robot.push(np.zeros(3))
   else:
     print("h: hold, l: let go, p: push, q: quit", flush=True)
 
 
-def main() -> None:
-  """Parses the command line and runs."""
-  arguments = tyro.cli(Arguments, description=__doc__)
-  try:
-    run(arguments)
-  except KeyboardInterrupt:
-    pass
-  except (ValueError, OSError, RuntimeError) as error:
-    sys.exit(f"error: {error}")
+def main() -> int:
+  """Runs the command line; returns the exit status."""
+  return command.main(
+    Arguments, run, environment=command.DRAWING, errors=(ValueError, OSError, RuntimeError)
+  )
 
 
 if __name__ == "__main__":
-  main()
+  sys.exit(main())

@@ -1,18 +1,21 @@
 """The real robot behind the specification of the simulation, and a virtual one for rehearsals.
 
-`real.load("nerf_nav", robot="/dev/ttyUSB0", camera=0)` is to the robot what `suite.load` is to the
-simulation.
+`real.load("nerf_nav", robot=real.Connection(port="/dev/ttyUSB0", camera=0))` is to the robot what
+`suite.load` is to the simulation.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["load"]
+if TYPE_CHECKING:
+  from nerf2real.real.loading import Connection, load
+
+__all__ = ["Connection", "load"]
 
 
 def __getattr__(name: str) -> Any:
-  # Loaded when asked for: the virtual room and the recorder's process need no environment.
-  if name == "load":
-    from nerf2real.real.loading import load
+  # Loaded when asked for: the recorder's process needs no environment.
+  if name in __all__:
+    from nerf2real.real import loading
 
-    return load
+    return getattr(loading, name)
   raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

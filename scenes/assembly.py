@@ -4,14 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
 
 from nerf2real.core import files
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
-from nerf2real.scenes.geometry import collision, convex, free_space, map_server, mesh
+from nerf2real.scenes.geometry import collision, convex, floor_picture, map_server, mesh
 from nerf2real.scenes.quality import held_out, report
 from nerf2real.scenes.results import Measure, Reconstruction, SceneResults
 from nerf2real.scenes.settings import SceneSettings
@@ -19,7 +18,7 @@ from nerf2real.scenes.stages import StageResult
 
 _NOTICEABLE_EXPOSURE = 1.25  # a ratio above this is warned of
 _ROBOT_VIEWS = 8  # held-out views shown at robot resolution where no truth gives better ones
-_MAP_SCALE = 6  # pixels of the report's map per cell
+_MAP_HEIGHT = 600  # of the report's map [pixel]
 
 
 def assemble(
@@ -84,7 +83,12 @@ def assemble(
       baseline=baseline,
       visual=mesh.load_glb(out / "visual.glb"),
       collision=[trimesh.Trimesh(part.vertices, part.faces) for part in parts],
-      free_space_picture=_map_picture(map_server.read(out / "free_space.yaml"), goals, path),
+      floor=floor_picture.draw(
+        map_server.read(out / "free_space.yaml"),
+        (alignment.extent_lower, alignment.extent_upper),
+        height=_MAP_HEIGHT,
+      ),
+      goals=goals,
     ),
   )
   scene = {
@@ -168,24 +172,3 @@ def _robot_views(results: SceneResults) -> list[held_out.ViewScore]:
   views, renderer = results.pictures.held_out(), results.field.value.renderer
   shown = range(min(_ROBOT_VIEWS, len(views)))
   return [held_out.compare(renderer, views, k, *held_out.ROBOT_SIZES[0]) for k in shown]
-
-
-def _map_picture(space: free_space.FreeSpaceMap, goals: np.ndarray, path: np.ndarray) -> np.ndarray:
-  """Draws the map with goals [G, 2] and camera path [N, 3]: uint8 [H, W, 3], y upwards."""
-  gray = np.full(space.cells.shape, 120, np.uint8)
-  gray[space.cells == free_space.FREE] = 195
-  gray[space.cells == free_space.OCCUPIED] = 30
-  gray[space.reachable] = 255
-  picture = cv2.cvtColor(gray[::-1].copy(), cv2.COLOR_GRAY2RGB)
-  size = (picture.shape[1] * _MAP_SCALE, picture.shape[0] * _MAP_SCALE)
-  picture = cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST)
-
-  def pixel(point: np.ndarray) -> tuple[int, int]:
-    column, row = (np.asarray(point)[:2] - space.origin) / space.resolution * _MAP_SCALE
-    return round(column), round(size[1] - row)
-
-  line = np.array([pixel(point) for point in path], np.int32)
-  cv2.polylines(picture, [line], False, (213, 94, 0), 2, cv2.LINE_AA)
-  for goal in goals:
-    cv2.drawMarker(picture, pixel(goal), (0, 114, 178), cv2.MARKER_TILTED_CROSS, 24, 4)
-  return picture

@@ -76,7 +76,17 @@ def make_scene(
   baseline = image_stages.baseline(cache, pictures) if settings.baseline == "colmap" else None
 
   results = SceneResults(
-    film, capture, poses, pictures, field, figures, world, metric_depth, surface, contact, baseline
+    source=film,
+    capture=capture,
+    poses=poses,
+    pictures=pictures,
+    field=field,
+    figures=figures,
+    world=world,
+    depth=metric_depth,
+    surface=surface,
+    contact=contact,
+    baseline=baseline,
   )
   return assembly.assemble(
     results, out, name=name or out.name, settings=settings, stages=cache.results, measure=measure

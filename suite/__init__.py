@@ -1,14 +1,27 @@
 """The simulated world: a robot with its sensors and tasks in a scene bundle.
 
-`suite.load("nerf_nav")` returns a dm_control environment in the built-in room.
+`suite.load("nerf_nav")` returns a dm_control environment in the built-in room. The simulator is
+imported when `load` is: constants, specifications and filters are for a robot's host, too.
 """
 
 import warnings
+from typing import TYPE_CHECKING, Any
+
+from nerf2real.suite.tasks.catalogue import ALL_TASKS
+
+if TYPE_CHECKING:
+  from nerf2real.suite.loading import load
+
+__all__ = ["ALL_TASKS", "load"]
 
 # Without MUJOCO_GL, dm_control tries GLFW when it is imported, which warns if there is no display.
 # The simulation needs none.
 warnings.filterwarnings("ignore", ".*DISPLAY environment variable is missing", module="glfw")
 
-from nerf2real.suite.loading import ALL_TASKS, load  # noqa: E402  (the filter must come first)
 
-__all__ = ["ALL_TASKS", "load"]
+def __getattr__(name: str) -> Any:
+  if name == "load":
+    from nerf2real.suite.loading import load
+
+    return load
+  raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,20 +8,20 @@ from nerf2real.core import errors
 from nerf2real.suite.effects import Effect, read_effects
 from nerf2real.suite.environment import Environment
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.scene import open_scene
 from nerf2real.suite.sensors.camera import CameraSettings, FieldRenderer, RobotCamera
 from nerf2real.suite.tasks import ball_push, nerf_nav
 from nerf2real.suite.tasks.base import RobotTask
+from nerf2real.suite.tasks.catalogue import ALL_TASKS, TIME_LIMITS
 from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP, TaskSettings
 
 if TYPE_CHECKING:
   from nerf2real.scenes.field.render.renderer import Renderer
 
-# Name to (class, length of an episode [s]).
-_TASKS: dict[str, tuple[type[RobotTask], float]] = {
-  nerf_nav.NAME: (nerf_nav.NerfNav, nerf_nav.TIME_LIMIT),
-  ball_push.NAME: (ball_push.BallPush, ball_push.TIME_LIMIT),
+_TASKS: dict[str, type[RobotTask]] = {
+  nerf_nav.NAME: nerf_nav.NerfNav,
+  ball_push.NAME: ball_push.BallPush,
 }
-ALL_TASKS: tuple[str, ...] = tuple(_TASKS)
 
 
 def load(
@@ -74,35 +74,20 @@ def load(
       world_from_unit=bundle.world_from_unit,
       settings=camera,
     )
-  task_class, default_limit = _TASKS[task]
   settings = TaskSettings(
-    time_limit=default_limit if time_limit is None else time_limit,
+    time_limit=TIME_LIMITS[task] if time_limit is None else time_limit,
     physics_timestep=physics_timestep,
     privileged=privileged,
     randomisation=randomisation or RandomisationSettings(),
     effects=_effects(effects),
   )
-  built = task_class(bundle, camera=robot_camera, settings=settings)
+  built = _TASKS[task](bundle, camera=robot_camera, settings=settings)
   if furnish is not None:
     furnish(built.root_entity.mjcf_model)
   try:
     return Environment(built, time_limit=settings.time_limit, random_state=random)
   except ValueError as error:
     raise ValueError(errors.not_compiled(error, getattr(bundle, "folder", "the scene"))) from error
-
-
-def open_scene(scene: Any) -> Any:
-  """Returns an opened bundle from a folder, None (the built-in room) or a bundle."""
-  if scene is None or isinstance(scene, str | Path):
-    from nerf2real.scenes.bundle import Bundle
-
-    return Bundle.load(scene)
-  if not hasattr(scene, "collision_parts"):
-    raise ValueError(
-      f"scene must be the folder of a scene bundle, an opened bundle, or None for the built-in "
-      f"room; found {scene!r}."
-    )
-  return scene
 
 
 def _effects(effects: Any) -> tuple[Effect, ...]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.core.files import write_atomically
+from nerf2real.core.pages import page
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.suite.effects.files import from_list, to_list
@@ -129,8 +130,8 @@ def identify(
   details = _details(found, Path(model), whole, sensed)
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
   content["seconds"] = round(time.perf_counter() - began, 1)
-  page = report.page(found, content, details, others, whole, settings.window_s)
-  write_atomically(out / "report.html", page)
+  made = report.page(found, content, details, others, whole, settings.window_s)
+  page.write(out / "report.html", made)
   content["seconds"] = round(time.perf_counter() - began, 1)
   write_atomically(out / "report.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
   return content

@@ -157,9 +157,14 @@ def episode_figures(
   return figures
 
 
-def episode_success(environment: Any) -> bool | None:
-  """Whether the task says that its goal was reached in this episode; None if it does not say."""
+def task_of(environment: Any) -> Any:
+  """The task below the wrappers of an environment; None if it has none."""
   while hasattr(environment, "_environment"):
     environment = environment._environment
-  success = getattr(getattr(environment, "task", None), "success", None)
+  return getattr(environment, "task", None)
+
+
+def episode_success(environment: Any) -> bool | None:
+  """Whether the task says that its goal was reached in this episode; None if it does not say."""
+  success = getattr(task_of(environment), "success", None)
   return None if success is None else bool(success() if callable(success) else success)

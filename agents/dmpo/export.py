@@ -77,7 +77,24 @@ def load_policy(folder: Path | str) -> ExportedPolicy:
   Raises:
     ValueError: if the folder holds none, one of another format, or files that do not match.
   """
-  folder = Path(folder)
+  record, parameters = _read(Path(folder))
+  network = record["settings"]["network"]
+  policy = Policy(parameters, init_stddev=network["init_stddev"], min_stddev=network["min_stddev"])
+  return ExportedPolicy(
+    policy=policy,
+    layout=from_plain(record["layout"], Layout),
+    environment=record["environment"],
+    history=record["settings"]["history"],
+    info=record["info"],
+  )
+
+
+def load_arrays(folder: Path | str) -> dict[str, np.ndarray]:
+  """Loads the flat named arrays of a policy; raises ValueError as `load_policy` does."""
+  return _read(Path(folder))[1]
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
   if not (folder / _RECORD).exists():
     raise ValueError(f"{folder} holds no {_RECORD}: give the folder of an exported policy.")
   record = json.loads((folder / _RECORD).read_text())
@@ -90,13 +107,4 @@ def load_policy(folder: Path | str) -> ExportedPolicy:
   if hashlib.sha256(data).hexdigest() != record["sha256"]:
     raise ValueError(f"{folder}: the arrays are not those of {_RECORD}; export it again.")
   with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-    parameters = {name: arrays[name] for name in arrays.files}
-  network = record["settings"]["network"]
-  policy = Policy(parameters, init_stddev=network["init_stddev"], min_stddev=network["min_stddev"])
-  return ExportedPolicy(
-    policy=policy,
-    layout=from_plain(record["layout"], Layout),
-    environment=record["environment"],
-    history=record["settings"]["history"],
-    info=record["info"],
-  )
+    return record, {name: arrays[name] for name in arrays.files}

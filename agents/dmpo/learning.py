@@ -1,8 +1,9 @@
 """One update of the agent: the training state, and the jitted function that advances it.
 
-Data flow: batch of trajectories -> augmentation -> policy and target policy over time -> N actions
-of the target policy at every state -> the target critic's distributions -> n-step categorical loss
-for the critic, MPO for the policy, likelihood for the belief -> Adam -> target copies.
+Data flow: batch of trajectories -> augmentation, scaling -> policy and target policy over time ->
+N actions of the target policy at every state -> the target critic's distributions -> n-step
+categorical loss for the critic, MPO for the policy, likelihood for the belief -> Adam -> target
+copies.
 
 Shape letters: B trajectories, T time, N samples, A action, K atoms, E = B * T states.
 """
@@ -15,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from nerf2real.agents.dmpo import augmentation, belief, losses, networks, returns
+from nerf2real.agents.dmpo import augmentation, belief, losses, networks, returns, scaling
 from nerf2real.agents.dmpo.config import DmpoConfig
+from nerf2real.agents.dmpo.inference import nest
 from nerf2real.agents.dmpo.networks import LstmState, Params
 from nerf2real.agents.dmpo.specs import Layout, planar_pose
 
@@ -36,6 +38,7 @@ class TrainingState(NamedTuple):
   critic_optimiser: optax.OptState
   dual_optimiser: optax.OptState
   belief_optimiser: optax.OptState
+  scaling: Params  # of the observations; empty without scaling
   steps: jax.Array  # [] int32, updates done
   key: jax.Array  # random key
 
@@ -52,8 +55,15 @@ def has_belief(layout: Layout) -> bool:
   return layout.image_shape is not None and layout.pose_columns is not None
 
 
-def make_learning(config: DmpoConfig, layout: Layout) -> Learning:
+def make_learning(
+  config: DmpoConfig, layout: Layout, *, first_action: np.ndarray | None = None
+) -> Learning:
   """Builds the learner's functions for an environment.
+
+  Args:
+    config: the agent's settings.
+    layout: the environment's layout.
+    first_action: what the policy's mean is about at the start [A]; zero if None.
 
   `update(state, batch)` takes a batch as `Replay.sample` gives it and is jitted; it gives the new
   state and metrics with fixed names. The state passed in must not be used again (donated).
@@ -63,6 +73,8 @@ def make_learning(config: DmpoConfig, layout: Layout) -> Learning:
   def init(key: jax.Array) -> TrainingState:
     key, policy_key, critic_key, belief_key = jax.random.split(key, 4)
     policy = networks.init_policy(policy_key, config.network, layout)
+    if first_action is not None:
+      policy["mean"]["b"] = jnp.asarray(first_action, jnp.float32)
     critic = networks.init_critic(critic_key, config.network, layout)
     duals = losses.init_duals(
       layout.action_size,
@@ -86,6 +98,9 @@ def make_learning(config: DmpoConfig, layout: Layout) -> Learning:
       critic_optimiser=optimisers["critic"].init(critic),
       dual_optimiser=optimisers["dual"].init(duals),
       belief_optimiser=optimisers["belief"].init(beliefs),
+      scaling=jax.tree.map(jnp.asarray, scaling.identity(layout))
+      if config.scale_observations
+      else {},
       steps=jnp.zeros((), jnp.int32),
       key=key,
     )
@@ -101,6 +116,7 @@ def make_learning(config: DmpoConfig, layout: Layout) -> Learning:
       key=loss_key,
       config=config,
       layout=layout,
+      scales=state.scaling,
     )
     new, optimiser_states = [], []
     states = (
@@ -130,6 +146,7 @@ def make_learning(config: DmpoConfig, layout: Layout) -> Learning:
       critic_optimiser=optimiser_states[1],
       dual_optimiser=optimiser_states[2],
       belief_optimiser=optimiser_states[3],
+      scaling=state.scaling,
       steps=steps,
       key=key,
     ), metrics
@@ -146,6 +163,7 @@ def total_loss(
   key: jax.Array,
   config: DmpoConfig,
   layout: Layout,
+  scales: Params | None = None,
 ) -> tuple[jax.Array, Metrics]:
   """Sum of the losses of policy, duals, critic and belief; each reaches its own parameters only.
 
@@ -158,10 +176,13 @@ def total_loss(
     key: random key.
     config: the agent's settings.
     layout: the environment's layout.
+    scales: of the observations, from `scaling`; none if empty.
   """
   policy, critic, duals, beliefs = trained
   augment_key, sample_key = jax.random.split(key)
-  state, last = batch["state"], batch["last"]
+  state = scaling.apply(scales or {}, "state", batch["state"])
+  privileged = scaling.apply(scales or {}, "privileged", batch["privileged"])
+  last = batch["last"]
   size, time = state.shape[:2]
   images = None
   if "image" in batch:
@@ -178,7 +199,7 @@ def total_loss(
   # One set of sampled actions serves the E-step and the bootstrap.
   noise = jax.random.normal(sample_key, (config.num_samples, *target.action.mean.shape))
   actions = target.action.mean + target.action.stddev * noise  # [N, B, T, A]
-  critic_inputs = jnp.concatenate([state, batch["privileged"]], axis=-1)
+  critic_inputs = jnp.concatenate([state, privileged], axis=-1)
   atoms = networks.atoms(config.network)
   probabilities = jax.nn.softmax(
     networks.critic_logits(target_critic, critic_inputs, actions), axis=-1
@@ -201,7 +222,7 @@ def total_loss(
     target=_flatten_gaussian(target.action, flat),
     actions=actions.reshape(config.num_samples, flat, -1),
     values=values.reshape(config.num_samples, flat),
-    weights=present.reshape(flat),
+    weights=policy_weights(batch["discount"], last).reshape(flat),
     epsilons=losses.MpoEpsilons(
       config.epsilon, config.epsilon_mean, config.epsilon_stddev, config.epsilon_action_penalty
     ),
@@ -223,6 +244,22 @@ def total_loss(
     )
   metrics["loss"] = loss
   return loss, metrics
+
+
+def policy_weights(discount: jax.Array, last: jax.Array) -> jax.Array:
+  """How much each state counts in the policy's loss [B, T]: 1, or 0 for padding and terminal ones.
+
+  Nothing follows a terminal state: the critic is never trained there, so that its values say
+  nothing about actions. A state at which a trajectory was cut counts; another one goes on from it.
+
+  Args:
+    discount: the environment's after the action of each step [B, T], 0 where it terminates.
+    last: index of each trajectory's last observation [B].
+  """
+  steps = jnp.arange(discount.shape[1])
+  into_last = jnp.take_along_axis(discount, jnp.maximum(last - 1, 0)[:, None], axis=1)
+  counts = (steps < last[:, None]) | ((steps == last[:, None]) & (into_last != 0))
+  return counts.astype(jnp.float32)
 
 
 def critic_loss(
@@ -268,8 +305,76 @@ def critic_loss(
 
 
 def served_parameters(state: TrainingState) -> dict[str, np.ndarray]:
-  """What the actors need: the target policy and the belief, as flat named arrays."""
-  return flatten_params({"policy": state.target_policy, "belief": state.belief})
+  """What the actors need: the target policy and the belief, as flat named arrays.
+
+  The policy takes observations as they are; the scaling folded into it goes along (`scaling/...`),
+  so that training can begin with an exported policy.
+  """
+  policy = scaling.fold(state.target_policy, state.scaling)
+  return flatten_params({"policy": policy, "belief": state.belief, "scaling": state.scaling})
+
+
+def with_policy(state: TrainingState, parameters: Mapping[str, np.ndarray]) -> TrainingState:
+  """Returns a fresh state whose policy and belief are those of an exported policy.
+
+  The head of the standard deviation and all optimisers stay fresh. Where observations are scaled
+  and the policy was exported without a scaling, its first layer is to be rewritten when one is
+  measured (`with_scaling`).
+
+  Args:
+    state: a state that has seen no update.
+    parameters: flat named arrays, `served_parameters`.
+
+  Raises:
+    ValueError: the arrays are not those of this network.
+  """
+  tree = nest(parameters)
+  policy, beliefs, scales = tree["policy"], tree.get("belief", {}), state.scaling
+  if scales and "scaling" in tree:
+    scales = tree["scaling"]
+    policy = scaling.unfold(policy, scales)
+  policy = policy | {"stddev": state.policy["stddev"]}
+  for name, given, wanted in (
+    ("policy", policy, state.policy),
+    ("belief", beliefs or state.belief, state.belief),
+  ):
+    found, expected = _shapes(given), _shapes(wanted)
+    if found != expected:
+      wrong = sorted(k for k in found | expected if found.get(k) != expected.get(k))
+      raise ValueError(
+        f"The {name} to begin with has other networks than the settings give: {wrong[0]} has the "
+        f"shape {found.get(wrong[0])}, expected {expected.get(wrong[0])}. Take the preset and the "
+        "--set of the run that made it."
+      )
+  arrays = jax.tree.map(jnp.array, {"policy": policy, "belief": beliefs or state.belief})
+  return state._replace(
+    policy=arrays["policy"],
+    target_policy=jax.tree.map(jnp.copy, arrays["policy"]),
+    belief=arrays["belief"],
+    scaling=jax.tree.map(jnp.array, scales),
+  )
+
+
+def with_scaling(state: TrainingState, scales: Params, *, keep_policy: bool) -> TrainingState:
+  """Returns a state that has seen no update with another scaling.
+
+  Args:
+    state: the state.
+    scales: from `scaling.measure`.
+    keep_policy: rewrites the policies' first layers so that they act as before; a policy with
+      random weights is better left with them, for inputs of one size.
+  """
+  state = state._replace(scaling=jax.tree.map(jnp.array, scales))
+  if not keep_policy:
+    return state
+  policy, target = (
+    jax.tree.map(jnp.array, scaling.unfold(p, scales)) for p in (state.policy, state.target_policy)
+  )
+  return state._replace(policy=policy, target_policy=target)
+
+
+def _shapes(params: Params) -> dict[str, tuple[int, ...]]:
+  return {name: array.shape for name, array in flatten_params(params).items()}
 
 
 def flatten_params(params: Params, prefix: str = "") -> dict[str, np.ndarray]:

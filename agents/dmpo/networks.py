@@ -123,7 +123,10 @@ def _linear(params: Params, x: jax.Array) -> jax.Array:
 
 def mlp(params: Params, x: jax.Array) -> jax.Array:
   """Linear, layer norm, tanh, then linear and ELU for every further layer."""
-  x = _linear(params["layer0"], x)
+  return _after_first_layer(params, _linear(params["layer0"], x))
+
+
+def _after_first_layer(params: Params, x: jax.Array) -> jax.Array:
   x = x - x.mean(-1, keepdims=True)
   x = x * jax.lax.rsqrt(jnp.mean(x**2, -1, keepdims=True) + _LAYER_NORM_EPSILON)
   x = jnp.tanh(x * params["norm_scale"] + params["norm_bias"])
@@ -234,14 +237,13 @@ def unroll_policy(
 def critic_logits(params: Params, inputs: jax.Array, actions: jax.Array) -> jax.Array:
   """The critic's logits [..., K] for inputs [..., S + P] and actions [..., A], clipped to [-1, 1].
 
-  Leading axes are broadcast against each other.
+  Leading axes are broadcast against each other. The first layer's product with the inputs is taken
+  once and not for every sampled action, W [x, a] = W_x x + W_a a.
   """
-  actions = jnp.clip(actions, -1.0, 1.0)
-  shape = jnp.broadcast_shapes(inputs.shape[:-1], actions.shape[:-1])
-  inputs = jnp.broadcast_to(inputs, (*shape, inputs.shape[-1]))
-  actions = jnp.broadcast_to(actions, (*shape, actions.shape[-1]))
-  hidden = mlp(params["mlp"], jnp.concatenate([inputs, actions], axis=-1))
-  return _linear(params["head"], hidden)
+  first, count = params["mlp"]["layer0"], inputs.shape[-1]
+  of_inputs = inputs @ first["w"][:count] + first["b"]
+  of_actions = jnp.clip(actions, -1.0, 1.0) @ first["w"][count:]
+  return _linear(params["head"], _after_first_layer(params["mlp"], of_inputs + of_actions))
 
 
 def atoms(config: NetworkConfig) -> jax.Array:

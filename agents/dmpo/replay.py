@@ -3,12 +3,15 @@
 Trajectories shorter than T are padded with zeros; `last` is the index of a trajectory's last
 observation, so that it holds `last` transitions (environment steps). Stored on disk, the arrays are
 memory maps: what was inserted survives the death of the process, and every entry knows the actor
-and the number that it came with, so that nothing is inserted twice after a restart.
+and the number that it came with, so that nothing is inserted twice after a restart. The files are
+sparse and grow with what is inserted; an entry's space is reserved before it is written, so that a
+full disk is an OSError and not the signal SIGBUS.
 """
 
 import json
+import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -140,9 +143,13 @@ class Replay:
       trajectory: arrays as `check_trajectory` accepts them.
       actor: key of the actor that made it.
       number: its number among that actor's.
+
+    Raises:
+      OSError: the disk is full; what the replay held is untouched.
     """
     with self._lock:
       slot = self.inserted % self.capacity
+      self._reserve(slot)
       origin = self._arrays[_ORIGIN]
       if origin[slot, 2]:
         self._steps -= int(self._arrays["last"][slot])
@@ -162,15 +169,35 @@ class Replay:
       self._size += 1
       self._steps += steps - 1
 
-  def sample(self, rng: np.random.Generator, batch_size: int) -> dict[str, np.ndarray]:
-    """Draws trajectories uniformly with replacement: arrays [B, T, ...], and `last` [B]."""
+  def _reserve(self, slot: int) -> None:
+    if not hasattr(os, "posix_fallocate"):  # not on macOS
+      return
+    for array in self._arrays.values():
+      if isinstance(array, np.memmap):
+        size = array.nbytes // self.capacity
+        descriptor = os.open(str(array.filename), os.O_RDWR)
+        try:
+          os.posix_fallocate(descriptor, slot * size, size)
+        finally:
+          os.close(descriptor)
+
+  def sample(
+    self, rng: np.random.Generator, batch_size: int, *, names: Sequence[str] | None = None
+  ) -> dict[str, np.ndarray]:
+    """Draws trajectories uniformly with replacement: arrays [B, T, ...], and `last` [B].
+
+    Args:
+      rng: source of the draws.
+      batch_size: trajectories, B.
+      names: of the arrays to give; None for all.
+    """
     with self._lock:
       if not self._size:
         raise ValueError("The replay is empty: insert trajectories before sampling.")
       # The whole entries are the `size` most recent ones.
       newest = self.inserted - 1 - rng.integers(self._size, size=batch_size)
       slots = newest % self.capacity
-      names = [name for name in self._arrays if name != _ORIGIN]
+      names = names or [name for name in self._arrays if name != _ORIGIN]
       return {name: np.array(self._arrays[name][slots]) for name in names}
 
   def steps_after(self, inserted: int) -> int:

@@ -149,8 +149,12 @@ class ActorLink:
     return self.version, message.arrays
 
   def status(self) -> dict[str, Any] | None:
-    """Asks for the learner's status and description; None if it is away."""
-    message = self.ask("status", schema.encode("ask", {}), kind="status")
+    """Asks for the learner's status, its description and this actor's predecessors.
+
+    Returns None if the learner is away.
+    """
+    question = schema.encode("ask", {"actor": self.actor})
+    message = self.ask("status", question, kind="status")
     return None if message is None else message.values
 
   def report(self, values: Mapping[str, Any]) -> None:

@@ -1,11 +1,12 @@
 """The rate limiter: how many environment steps may be taken, and when an update is due.
 
 Credits are environment steps. An actor asks for some before it takes them; what it was granted and
-has not delivered yet is outstanding, and returns to the pool when the actor is gone. Updates follow
-steps as updates = floor(steps / steps_per_update), so that over a run the ratio is exact; actors
-may run ahead of the updates by two trajectories each. Credits are granted for what a whole
-trajectory still needs or not at all, so that no actor is left waiting in the middle of one. Pure
-accounting: no threads, no clock.
+has not delivered yet is outstanding, and returns to the pool when the actor is gone. Steps that
+fill the replay pay for no update, as in Reverb's SampleToInsertRatio with Acme's offset:
+updates = floor((steps - unpaid) / steps_per_update), so that training begins at the ratio and not
+with a burst on the first data. Actors may run ahead of the updates by two trajectories each.
+Credits are granted for what a whole trajectory still needs or not at all, so that no actor is left
+waiting in the middle of one. Pure accounting: no threads, no clock.
 """
 
 import dataclasses
@@ -28,14 +29,30 @@ class LimiterSettings:
 class RateLimiter:
   """Counts steps, updates and credits."""
 
-  def __init__(self, settings: LimiterSettings, *, steps: int = 0, updates: int = 0):
-    """Continues from `steps` and `updates` done."""
+  def __init__(
+    self,
+    settings: LimiterSettings,
+    *,
+    steps: int = 0,
+    updates: int = 0,
+    refill_until: int | None = None,
+    unpaid: int | None = None,
+  ):
+    """Starts a run, or continues one.
+
+    Args:
+      settings: the limiter's settings.
+      steps: environment steps that reached the replay.
+      updates: updates done.
+      refill_until: number of steps at which the replay was, or will be, filled; None for a new run.
+      unpaid: steps that pay for no update; None for a new run.
+    """
     self.settings = settings
-    self.steps = steps  # environment steps that reached the replay
+    self.steps = steps
     self.updates = updates
+    self.refill_until = settings.min_replay_steps if refill_until is None else refill_until
+    self.unpaid = settings.min_replay_steps if unpaid is None else unpaid
     self._outstanding: dict[str, int] = {}
-    # A replay that was not saved must fill again before updates go on.
-    self.refill_until = steps + settings.min_replay_steps if steps else settings.min_replay_steps
 
   @property
   def outstanding(self) -> int:
@@ -58,7 +75,7 @@ class RateLimiter:
   @property
   def limit(self) -> int:
     """Steps that may be taken until further updates are done."""
-    paid = self.updates * self.settings.steps_per_update
+    paid = self.unpaid + self.updates * self.settings.steps_per_update
     limit = max(self.refill_until, int(paid)) + self.lead
     return limit if self.settings.max_steps is None else min(limit, self.settings.max_steps)
 
@@ -71,7 +88,8 @@ class RateLimiter:
   @property
   def update_due(self) -> bool:
     """Whether an update may be done now."""
-    return self.filled and (self.updates + 1) * self.settings.steps_per_update <= self.steps
+    paid = self.unpaid + (self.updates + 1) * self.settings.steps_per_update
+    return self.filled and paid <= self.steps
 
   @property
   def finished(self) -> bool:
@@ -79,9 +97,11 @@ class RateLimiter:
     end = self.settings.max_steps
     return end is not None and self.steps >= end and not self.update_due
 
-  def already_filled(self) -> None:
-    """Says that the replay was restored with enough in it."""
-    self.refill_until = min(self.refill_until, self.steps)
+  def refill(self, held: int) -> None:
+    """Waits for a replay to fill again that holds only `held` steps when a run is continued."""
+    until = self.steps + max(0, self.settings.min_replay_steps - held)
+    self.unpaid += max(0, until - max(self.steps, self.refill_until))
+    self.refill_until = max(self.refill_until, until)
 
   def request(self, actor: str, wanted: int, *, held: int) -> int:
     """Grants up to `wanted` steps to an actor that says it holds `held` unspent or undelivered."""
@@ -96,6 +116,10 @@ class RateLimiter:
   def delivered(self, actor: str, steps: int) -> None:
     """Counts steps that reached the replay."""
     self.steps += steps
+    self.returned(actor, steps)
+
+  def returned(self, actor: str, steps: int) -> None:
+    """Returns credits to the pool that an actor spent: on delivered steps, or on refused ones."""
     if actor in self._outstanding:
       self._outstanding[actor] = max(0, self._outstanding[actor] - steps)
 

@@ -10,6 +10,7 @@ Keys below the prefix: `trajectory/<actor>`, `metrics/<who>`, `ask/credit`, `ask
 
 import dataclasses
 import hashlib
+import logging
 import queue
 import threading
 import time
@@ -26,6 +27,7 @@ from nerf2real.agents.link.limiter import RateLimiter
 from nerf2real.agents.link.schema import MessageError
 from nerf2real.agents.link.sessions import LinkSettings
 
+_log = logging.getLogger(__name__)
 # Versions kept for the evaluator: when it reports a best return, they are still here to be saved.
 _HELD_VERSIONS = 4
 
@@ -39,6 +41,7 @@ class ActorRecord:
   heard: float  # monotonic time of its last message [s]
   alive: bool = True
   parameters_version: int = 0
+  refused: int = 0  # trajectories that did not fit the replay
 
 
 @dataclasses.dataclass
@@ -84,6 +87,7 @@ class LearnerLink:
     self.lock = threading.Lock()
     self.limiter = limiter
     self.counters = Counters()
+    self.failure = ""  # why nothing is taken in any more; empty while all is well
     self.incarnation = uuid.uuid4().hex
     self._insert = insert
     self._session = session  # a session without a reference closes itself
@@ -234,9 +238,11 @@ class LearnerLink:
     with self.lock:
       self._ledger.confirm(actor_key(actor), oldest=oldest)
       granted = 0
-      if wanted + held > 0:  # the evaluator asks for nothing: only what has been reached
+      # The evaluator never asks for anything: only what has been reached.
+      acts = wanted + held > 0 or actor in self._actors
+      if acts:
         self._record(actor).parameters_version = version
-      if wanted + held > 0 and not self._stopping:
+      if acts and not self._stopping:
         granted = self.limiter.request(actor, wanted, held=held)
       values = {
         "granted": granted,
@@ -260,10 +266,20 @@ class LearnerLink:
       return self._parameters
 
   def _answer_status(self, message: schema.Message) -> bytes:
+    actor = message.values.get("actor")
     with self.lock:
-      return schema.encode(
-        "status", {"status": self._status | self._figures(), "description": self._description}
-      )
+      refused = {name: r.refused for name, r in self._actors.items() if r.refused}
+      values = {
+        "status": self._status | self._figures() | {"refused_by": refused},
+        "description": self._description,
+        "predecessors": self._predecessors(actor) if isinstance(actor, str) else 0,
+      }
+    return schema.encode("status", values)
+
+  def _predecessors(self, actor: str) -> int:
+    """How many actors of the same number (role-number-...) were here before this one."""
+    place = actor.rpartition("-")[0]
+    return sum(name != actor and name.rpartition("-")[0] == place for name in self._actors)
 
   # ------------------------------------------------------------ the ingest thread
 
@@ -271,18 +287,25 @@ class LearnerLink:
     with self.lock:
       self.counters.refused += 1
       self.counters.last_refusal = reason[:500]
+      count = self.counters.refused
+    if count & (count - 1) == 0:  # the first, second, fourth, ...: a flood does not fill the log
+      _log.warning("Refused a message (number %d): %s", count, reason)
 
   def _ingest(self) -> None:
-    while (item := self._inbox.get()) is not None:
-      kind, data = item
-      try:
-        if kind == "trajectory":
-          self._take_trajectory(data)
-        else:
-          message = schema.decode(data, kind="metrics")
-          self.metrics.put((schema.text(message, "who"), message.values))
-      except (MessageError, ValueError) as error:
-        self._refuse(str(error))
+    try:
+      while (item := self._inbox.get()) is not None:
+        kind, data = item
+        try:
+          if kind == "trajectory":
+            self._take_trajectory(data)
+          else:
+            message = schema.decode(data, kind="metrics")
+            self.metrics.put((schema.text(message, "who"), message.values))
+        except MessageError as error:
+          self._refuse(str(error))
+    except Exception as error:  # such as a full disk: the learner must end, not stand still
+      _log.exception("Trajectories can no longer be taken in.")
+      self.failure = f"{type(error).__name__}: {error}"
 
   def _take_trajectory(self, data: bytes) -> None:
     message = schema.decode(data, kind="trajectory")
@@ -293,9 +316,24 @@ class LearnerLink:
       if self._ledger.seen(key, number):
         self.counters.duplicates += 1
         return
-    steps = self._insert(message.arrays, key, number)
+    try:
+      steps = self._insert(message.arrays, key, number)
+    except ValueError as error:
+      self._drop(actor, number, message.arrays)
+      self._refuse(f"trajectory {number} of {actor}: {error}")
+      return
     with self.lock:
       self._ledger.record(key, number)
       self.limiter.delivered(actor, steps)
       self.counters.trajectories += 1
       self.counters.bytes += len(data)
+
+  def _drop(self, actor: str, number: int, arrays: Mapping[str, np.ndarray]) -> None:
+    """Acknowledges a trajectory that does not fit, so that its actor does not send it for ever."""
+    rewards = arrays.get("reward")
+    steps = 0 if rewards is None or rewards.ndim != 1 else max(0, rewards.shape[0] - 1)
+    with self.lock:
+      self._ledger.record(actor_key(actor), number)
+      self.limiter.returned(actor, steps)
+      unknown = ActorRecord(time.monotonic(), alive=False)
+      self._actors.setdefault(actor, unknown).refused += 1

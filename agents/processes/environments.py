@@ -1,11 +1,21 @@
 """Environments by name, with actions in [-1, 1]: anything that follows dm_env can be learned.
 
 Names: `dm_control:cartpole:swingup`, `suite:nerf_nav`, `agents:cue`; options follow a question
-mark: `suite:nerf_nav?image_size=60x80&scene=out/demo&effects=effects.json`.
+mark: `suite:nerf_nav?image_size=60x80&scene=out/demo&pushes=false&camera_rate=15`. Options of
+`suite:` environments:
+
+- `scene`, `effects`: folder of a bundle, an effects.json;
+- `image_size`: such as 30x40, height x width; `lens`: a camera_info YAML (a calibrated camera);
+- `time_limit`, `physics_timestep` [s];
+- every field of `RandomisationSettings`, such as `pushes=false` or `push_force=2,6`;
+- every plain field of `CameraSettings` after `camera_`, such as `camera_rate=15` [Hz];
+- `protocol`: navigation, gain or ball: episodes are the trials of that evaluation.
 """
 
+import dataclasses
 import urllib.parse
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import dm_env
@@ -13,6 +23,7 @@ import numpy as np
 from dm_env import specs
 
 from nerf2real.agents.dmpo.specs import PRIVILEGED
+from nerf2real.agents.processes.trials import Trials
 
 
 def make_environment(name: str, *, seed: int, history: int = 1) -> dm_env.Environment:
@@ -51,20 +62,99 @@ def _dm_control(rest: str, options: dict[str, str], seed: int) -> dm_env.Environ
 
 def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
   from nerf2real import suite
+  from nerf2real.core.camera_info import read_camera_info
+  from nerf2real.suite.randomisation.draws import RandomisationSettings
+  from nerf2real.suite.sensors.camera import CameraSettings
 
+  protocol = options.pop("protocol", None)
+  known = _protocols(rest)
+  if protocol is not None and protocol not in known:
+    raise ValueError(
+      f"suite:{rest} has no protocol {protocol!r}: expected one of {', '.join(known) or 'none'}."
+    )
   arguments: dict[str, Any] = {}
   for key in ("scene", "effects"):
     if key in options:
       arguments[key] = options.pop(key)
-  if "time_limit" in options:
-    arguments["time_limit"] = float(options.pop("time_limit"))
+  for key in ("time_limit", "physics_timestep"):
+    if key in options:
+      arguments[key] = _parse(key, options.pop(key), 0.0)
   if "image_size" in options:
     text = options.pop("image_size")
     height, _, width = text.partition("x")
     if not (height.isdigit() and width.isdigit()):
       raise ValueError(f"image_size must be such as 30x40 (height x width), found {text!r}.")
     arguments["image_size"] = (int(height), int(width))
-  return suite.load(rest, random=seed, **arguments)
+  lens = options.pop("lens", None)
+  camera = _take(options, CameraSettings(), prefix="camera_")
+  if lens is not None:
+    camera = dataclasses.replace(camera, lens=read_camera_info(Path(lens)))
+  randomisation = _take(options, RandomisationSettings())
+  environment = suite.load(
+    rest, random=seed, camera=camera, randomisation=randomisation, **arguments
+  )
+  return environment if protocol is None else Trials(environment, known[protocol], seed=seed)
+
+
+def _protocols(task: str) -> dict[str, tuple[Any, ...]]:
+  """The evaluation protocols of a task of the suite; the first is that of the paper's table I."""
+  from nerf2real.suite import protocols
+
+  known: dict[str, dict[str, tuple[Any, ...]]] = {
+    "nerf_nav": {"navigation": protocols.navigation(), "gain": protocols.camera_gain()},
+    "ball_push": {"ball": (*protocols.ball_center(), *protocols.ball_wall())},
+  }
+  return known.get(task, {})
+
+
+def _take(options: dict[str, str], settings: Any, *, prefix: str = "") -> Any:
+  """Takes the options that name a field of settings; returns the settings with them."""
+  changes = {}
+  for field in dataclasses.fields(settings):
+    default, name = getattr(settings, field.name), prefix + field.name
+    if name in options and default is not None:
+      changes[field.name] = _parse(name, options.pop(name), default)
+  return dataclasses.replace(settings, **changes)
+
+
+def _parse(name: str, text: str, like: Any) -> Any:
+  """Reads an option's value of the type that its default has."""
+  try:
+    if isinstance(like, bool):
+      return {"true": True, "false": False}[text]
+    if isinstance(like, tuple):
+      values = tuple(float(part) for part in text.split(","))
+      if len(values) != len(like):
+        raise ValueError
+      return values
+    return type(like)(text)
+  except (KeyError, ValueError):
+    kinds = {bool: "true or false", float: "a number", tuple: f"numbers such as {like}"}
+    kind = kinds.get(type(like), "text")
+    raise ValueError(f"{name} must be {kind}, found {text!r}.") from None
+
+
+def evaluation_name(name: str) -> str:
+  """The environment that a policy for `name` is evaluated on while it learns.
+
+  For the suite's tasks: the protocol of the paper's table I, without pushes, as
+  `launch/evaluate.py` runs it in simulation; scene, lens, effects and all else as in training. For
+  other environments: the same.
+  """
+  path, _, query = name.partition("?")
+  family, _, task = path.partition(":")
+  if family != "suite" or not _protocols(task):
+    return name
+  options = dict(urllib.parse.parse_qsl(query))
+  options = {"protocol": next(iter(_protocols(task)))} | options | {"pushes": "false"}
+  return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
+
+
+def trials_of(environment: Any) -> Trials | None:
+  """The protocol below the wrappers of an environment; None if its episodes are no trials."""
+  while not isinstance(environment, Trials) and hasattr(environment, "_environment"):
+    environment = environment._environment
+  return environment if isinstance(environment, Trials) else None
 
 
 def _agents(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:

@@ -9,6 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.summary import scalar
+
 _log = logging.getLogger(__name__)
 
 
@@ -19,12 +23,8 @@ class MetricsLog:
     """Opens `metrics.jsonl` in folder for appending, and a TensorBoard event file beside it."""
     folder.mkdir(parents=True, exist_ok=True)
     self._file = (folder / "metrics.jsonl").open("a", buffering=1)
-    self._writer = None
+    self._events = _EventFile(folder / "tensorboard") if tensorboard else None
     self.failures = 0
-    if tensorboard:
-      from tensorboardX import SummaryWriter
-
-      self._writer = SummaryWriter(str(folder / "tensorboard"), write_to_disk=True)
 
   def write(self, source: str, values: Mapping[str, Any], *, steps: int, updates: int) -> None:
     """Writes figures; a full disk is counted and reported, and stops nothing.
@@ -39,11 +39,14 @@ class MetricsLog:
     row = {"time": round(time.time(), 3), "source": source, "steps": steps, "updates": updates}
     try:
       self._file.write(json.dumps(row | plain) + "\n")
-      if self._writer is not None:
+      if self._events is not None:
         group = "actor" if source.startswith("actor") else source
-        for name, value in plain.items():
-          if isinstance(value, numbers.Number):
-            self._writer.add_scalar(f"{group}/{name}", value, steps)
+        numeric = {
+          f"{group}/{name}": float(value)
+          for name, value in plain.items()
+          if isinstance(value, numbers.Real)
+        }
+        self._events.write(numeric, step=steps)
     except OSError as error:
       self.failures += 1
       if self.failures == 1:
@@ -53,10 +56,41 @@ class MetricsLog:
     """Writes what is left."""
     try:
       self._file.close()
-      if self._writer is not None:
-        self._writer.close()
+      if self._events is not None:
+        self._events.close()
     except OSError as error:
       _log.error("Metrics cannot be written (%s).", error)
+
+
+class _EventFile:
+  """TensorBoard's event files, written in the caller's thread.
+
+  The thread of tensorboardX's SummaryWriter dies when the disk is full; then its queue fills, and
+  whoever writes waits for ever.
+  """
+
+  def __init__(self, folder: Path):
+    folder.mkdir(parents=True, exist_ok=True)
+    self._folder = folder
+    self._writer: EventsWriter | None = None
+
+  def write(self, values: Mapping[str, float], *, step: int) -> None:
+    """Appends scalars; after an OSError, which is raised, the next call begins another file."""
+    try:
+      if self._writer is None:
+        self._writer = EventsWriter(str(self._folder / "events"))
+      for name, value in values.items():
+        event = Event(wall_time=time.time(), step=step, summary=scalar(name, value))
+        self._writer.write_event(event)
+      self._writer.flush()
+    except OSError:  # a record that was cut off would hide all that follow it in its file
+      self._writer = None
+      raise
+
+  def close(self) -> None:
+    """Closes the file."""
+    if self._writer is not None:
+      self._writer.close()
 
 
 def _plain(value: Any) -> Any:

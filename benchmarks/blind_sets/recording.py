@@ -5,7 +5,8 @@ import pathlib
 
 import numpy as np
 
-from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.core.robot_logs import messages
+from nerf2real.core.robot_logs.writer import open_log
 
 from .apparatus import Apparatus
 from .machine import Machine, Reading
@@ -134,27 +135,31 @@ def write(path: pathlib.Path, joints: list[str], recording: Recording, reading: 
   rows += [(time, 0, index) for index, time in enumerate(recording.command_time)]
   rows += [(time, 1, index) for index, time in enumerate(recording.log_time)]
   rows += [(time, 2, index) for index, time in enumerate(recording.slow_time)]
-  with log_writer.open_log(path, joints) as log:
+  with open_log(path) as log:
     for time, kind, index in sorted(rows):
       moment = _ns(time)
       if kind == 0:
-        log.command(moment, position=recording.command[index].tolist())
+        commands = recording.command[index]
+        log.write(messages.joint_state(moment, messages.COMMANDS, joints, position=commands))
       elif kind == 1:
         stamp = _ns(recording.stamp[index])
-        log.state(
+        states = messages.joint_state(
           stamp,
-          position=recording.position[index].tolist(),
-          velocity=recording.velocity[index].tolist(),
-          effort=recording.effort[index].tolist(),
-          log_ns=moment,
+          messages.STATES,
+          joints,
+          position=recording.position[index],
+          velocity=recording.velocity[index],
+          effort=recording.effort[index],
         )
+        log.write(states, log_ns=moment)
         if reading.with_duty:
-          log.pwm(stamp, recording.duty[index].tolist(), log_ns=moment)
+          duty = messages.joint_state(stamp, messages.PWM, joints, effort=recording.duty[index])
+          log.write(duty, log_ns=moment)
       else:
-        log.battery(moment, recording.volts[index])
+        log.write(messages.battery(moment, recording.volts[index]))
         if reading.with_temperature and index % 5 == 0:
           for joint, celsius in zip(joints, recording.celsius[index], strict=True):
-            log.temperature(moment, joint, celsius)
+            log.write(messages.temperature(moment, joint, celsius))
 
 
 def _ns(seconds: float) -> int:

@@ -1,34 +1,35 @@
 """Measured logs: MCAP files with ROS 2 messages, read into arrays and checked.
 
-`topics` reads the file, `series` makes the arrays; what a log must be to be usable is here.
+`streaming` reads the file, `series` makes the arrays; what a log must be to be usable is here.
 """
 
 import dataclasses
 import pathlib
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 
+from nerf2real.core.robot_logs.messages import (
+  BATTERY,
+  COMMANDS,
+  IMAGE,
+  IMU,
+  PWM,
+  STATES,
+  TEMPERATURE_TYPE,
+)
 from nerf2real.core.robot_logs.series import (
   ImuSeries,
   JointSeries,
   ScalarSeries,
+  Topic,
   battery,
+  check_time,
   imu,
   joint_series,
   temperatures,
 )
-from nerf2real.core.robot_logs.topics import (
-  BATTERY,
-  COMMANDS,
-  IMU,
-  PWM,
-  STATES,
-  LogError,
-  check_time,
-  read_topics,
-)
+from nerf2real.core.robot_logs.streaming import DamagedLogError, LogError, read_messages
 
 __all__ = [
   "BATTERY",
@@ -41,19 +42,19 @@ __all__ = [
   "Log",
   "LogError",
   "ScalarSeries",
-  "check_against_model",
   "read_log",
 ]
 
+_TOPICS = (COMMANDS, STATES, PWM, IMU, BATTERY, IMAGE)
 MINIMUM_DURATION = 1.0
-"""s; ours: a shorter log holds not one period of the slowest excitation of a servo joint."""
+"""s; chosen: a shorter log holds not one period of the slowest excitation of a servo joint."""
 
 
 MINIMUM_RATE = 20.0
-"""Hz; ours: servo joints answer within a tenth of a second, which two readings must show."""
+"""Hz; chosen: servo joints answer within a tenth of a second, which two readings must show."""
 
 MINIMUM_MOTION = 1e-4
-"""rad or m; ours: less is rounding."""
+"""rad or m; chosen: less is rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +75,8 @@ class Log:
   """The file was damaged and this is what could be read of it."""
   path: pathlib.Path | None = None
   """The file, which holds the pictures too; None of a log that was never written."""
+  pictures: int = 0
+  """How many pictures the file holds."""
 
   @property
   def joints(self) -> tuple[str, ...]:
@@ -102,7 +105,21 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
   path = pathlib.Path(path)
   if not path.is_file():
     raise FileNotFoundError(f"Found no file {path}, expected a measured log (.mcap).")
-  topics, damaged = read_topics(path, recover)
+  topics: dict[str, Topic] = {}
+  pictures, damaged = 0, False
+  try:
+    # Temperatures are found by type: the topic's name is free, frame_id names the joint.
+    for reading in read_messages(path, topics=_TOPICS, schemas=[TEMPERATURE_TYPE]):
+      if reading.topic == IMAGE:  # read again when they are looked at: too many to keep
+        pictures += 1
+        continue
+      if reading.topic not in topics:
+        topics[reading.topic] = Topic(reading.topic, reading.schema)
+      topics[reading.topic].append(reading)
+  except DamagedLogError:
+    if not recover:
+      raise
+    damaged = True
   for topic in topics.values():
     check_time(path.name, topic)
   for name, holds in ((COMMANDS, "commands"), (STATES, "states")):
@@ -132,6 +149,7 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
     temperatures=temperatures(topics.values(), start),
     recovered=damaged,
     path=path,
+    pictures=pictures,
   )
   if log.duration < MINIMUM_DURATION:
     raise LogError(
@@ -159,40 +177,3 @@ def check_motion(logs: Sequence[Log]) -> None:
     f"Found no commanded joint that moves in {names}, expected some motion: record a sweep, a slow "
     "motion and steps."
   )
-
-
-def check_against_model(log: Log, model: mujoco.MjModel) -> None:
-  """Raises a LogError where a model has not the joints and actuators that a log speaks of."""
-  names = [model.joint(index).name for index in range(model.njnt)]
-  missing = [name for name in dict.fromkeys(log.commands.joints + log.joints) if name not in names]
-  if missing:
-    raise LogError(
-      f"{log.name} has the joints {missing} that the model lacks: it has {names}; give the model "
-      "of this apparatus, or the log's joints the model's names."
-    )
-  unmeasured = [name for name in log.commands.joints if name not in log.joints]
-  if unmeasured:
-    raise LogError(
-      f"{log.name} commands {unmeasured} but {STATES} has no such joints: record their positions."
-    )
-  joint_transmission = int(mujoco.mjtTrn.mjTRN_JOINT)
-  driven = {
-    names[model.actuator_trnid[index, 0]]: index
-    for index in range(model.nu)
-    if model.actuator_trntype[index] == joint_transmission
-  }
-  for name in log.commands.joints:
-    kind = int(model.joint(name).type[0])
-    if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-      raise LogError(f"{log.name} commands {name!r}, in the model neither a hinge nor a slide.")
-    if name not in driven:
-      raise LogError(
-        f"{log.name} commands {name!r}, but no actuator of the model drives that joint: it drives "
-        f"{sorted(driven)}."
-      )
-    takes = "position" if model.actuator_biasprm[driven[name], 1] != 0.0 else "effort"
-    if getattr(log.commands, takes) is None:
-      raise LogError(
-        f"{log.name} has no {takes}s in {COMMANDS}, which the model's actuator on {name!r} takes: "
-        f"record {takes}s, or give a model with the actuator that was driven."
-      )

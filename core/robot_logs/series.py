@@ -6,10 +6,42 @@ message's header stamp, `log_time` the moment it was written down, on the same z
 
 import dataclasses
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
-from nerf2real.core.robot_logs.topics import NANO, TEMPERATURE_TYPE, LogError, Topic
+from nerf2real.core.robot_logs.messages import TEMPERATURE_TYPE
+from nerf2real.core.robot_logs.streaming import NANO, LogError, Reading
+
+
+@dataclasses.dataclass
+class Topic:
+  """The messages of one topic in the order of the file."""
+
+  name: str
+  schema: str
+  stamp_ns: list[int] = dataclasses.field(default_factory=list)
+  log_ns: list[int] = dataclasses.field(default_factory=list)
+  messages: list[Any] = dataclasses.field(default_factory=list)
+
+  def append(self, reading: Reading) -> None:
+    """Adds a message."""
+    self.stamp_ns.append(reading.stamp_ns)
+    self.log_ns.append(reading.log_ns)
+    self.messages.append(reading.message)
+
+
+def check_time(name: str, topic: Topic) -> None:
+  """Raises a LogError where the stamps or log times of a topic of file `name` decrease."""
+  for which, times in (("header stamps", topic.stamp_ns), ("log times", topic.log_ns)):
+    steps = np.diff(np.array(times, dtype=np.int64))
+    if np.any(steps < 0):
+      at = int(np.argmax(steps < 0))
+      raise LogError(
+        f"{name}: time runs backwards on {topic.name} by {-steps[at] * NANO:.6g} s at message "
+        f"{at + 1} ({which}), {np.count_nonzero(steps < 0)} times in all; expected increasing "
+        "stamps: record with one monotonic clock."
+      )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,133 +1,79 @@
-"""Writes measured logs: MCAP files with ROS 2 messages, without ROS."""
+"""Writes robot logs: MCAP files with ROS 2 messages, without ROS."""
 
 import contextlib
-import pathlib
-from collections.abc import Iterator, Sequence
-from typing import Any
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
 
-from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 
-from nerf2real.core.cameras import Camera
 from nerf2real.core.robot_logs import messages
 
 CHUNK_SIZE = 64 * 1024
-"""Bytes before compression; ours: what a power cut may lose, a second of 20 joints."""
+"""Bytes before compression; chosen: what a power cut may lose, a second of 20 joints."""
 
 
 class LogWriter:
-  """One log being written. Times are integers, ns; `log_ns` defaults to the header stamp.
+  """A log being written. Messages must come in the order of time within a topic."""
 
-  Messages must come in the order of time within a topic.
-  """
+  def __init__(
+    self, stream: BinaryIO, *, chunk_size: int = CHUNK_SIZE, flush_period: float | None = None
+  ):
+    """Writes the head of the file.
 
-  def __init__(self, writer: Writer, joints: Sequence[str]):
-    self._writer = writer
-    self._joints = list(joints)
+    Args:
+      stream: The file.
+      chunk_size: Bytes of messages that are compressed together.
+      flush_period: s after which a chunk ends though it is not full, so that what was written can
+        be read; None: chunks end when they are full.
+    """
+    self._stream, self._flush_period = stream, flush_period
+    self._writer = Writer(stream, chunk_size=chunk_size)
     self._schemas: dict[str, Any] = {}
-    self._sequence: dict[str, int] = {}
+    self._sequences: dict[str, int] = {}
+    self._flushed = time.monotonic()
 
-  def command(
-    self,
-    stamp_ns: int,
-    *,
-    position: Sequence[float] = (),
-    effort: Sequence[float] = (),
-    log_ns: int | None = None,
-  ) -> None:
-    """Writes what the actuators are told: positions or efforts, one a joint."""
-    self._write(
-      messages.joint_state(
-        messages.COMMANDS, stamp_ns, self._joints, position=position, effort=effort
-      ),
-      stamp_ns,
-      log_ns,
-    )
+  def write(self, message: messages.Message, *, log_ns: int | None = None) -> None:
+    """Adds one message.
 
-  def state(
-    self,
-    stamp_ns: int,
-    *,
-    position: Sequence[float],
-    velocity: Sequence[float] = (),
-    effort: Sequence[float] = (),
-    log_ns: int | None = None,
-  ) -> None:
-    """Writes what the encoders read; efforts are measured torques, N m or N."""
-    self._write(
-      messages.joint_state(
-        messages.STATES, stamp_ns, self._joints, position=position, velocity=velocity, effort=effort
-      ),
-      stamp_ns,
-      log_ns,
-    )
-
-  def pwm(self, stamp_ns: int, duty: Sequence[float], *, log_ns: int | None = None) -> None:
-    """Writes the motors' measured duty, -1 to 1."""
-    message = messages.joint_state(messages.PWM, stamp_ns, self._joints, effort=duty)
-    self._write(message, stamp_ns, log_ns)
-
-  def battery(self, stamp_ns: int, voltage: float, *, log_ns: int | None = None) -> None:
-    """Writes the supply's voltage, V; what is not measured is NaN, as ROS defines it."""
-    self._write(messages.battery(stamp_ns, voltage), stamp_ns, log_ns)
-
-  def temperature(
-    self, stamp_ns: int, joint: str, celsius: float, *, log_ns: int | None = None
-  ) -> None:
-    """Writes a servo's temperature, degrees Celsius."""
-    self._write(messages.temperature(stamp_ns, joint, celsius), stamp_ns, log_ns)
-
-  def imu(
-    self,
-    stamp_ns: int,
-    *,
-    angular_velocity: Sequence[float],
-    linear_acceleration: Sequence[float],
-    frame: str = messages.IMU_FRAME,
-    log_ns: int | None = None,
-  ) -> None:
-    """Writes turning rates [rad/s] and accelerations [m/s2] in the sensor's frame."""
-    message = messages.imu(stamp_ns, angular_velocity, linear_acceleration, frame=frame)
-    self._write(message, stamp_ns, log_ns)
-
-  def picture(self, stamp_ns: int, jpeg: bytes, *, log_ns: int | None = None) -> None:
-    """Writes a JPEG picture; the stamp is when it was taken, as far as the machine knows."""
-    self._write(messages.image(stamp_ns, jpeg), stamp_ns, log_ns)
-
-  def lens(self, stamp_ns: int, camera: Camera, *, log_ns: int | None = None) -> None:
-    """Writes the camera's calibrated lens."""
-    self._write(messages.camera_info(stamp_ns, camera), stamp_ns, log_ns)
-
-  def _write(self, message: messages.Message, stamp_ns: int, log_ns: int | None) -> None:
-    topic, schema, fields = message
-    if schema not in self._schemas:
-      self._schemas[schema] = self._writer.register_msgdef(schema, messages.DEFINITIONS[schema])
-    sequence = self._sequence.get(topic, 0)
-    self._sequence[topic] = sequence + 1
-    moment = int(stamp_ns if log_ns is None else log_ns)
+    Args:
+      message: From `core.robot_logs.messages`.
+      log_ns: When it was written down, ns since 1970; the header's stamp if None.
+    """
+    topic, kind, fields = message
+    if kind not in self._schemas:
+      self._schemas[kind] = self._writer.register_msgdef(kind, messages.definition(kind))
+    if log_ns is None:
+      stamp = fields["header"]["stamp"]
+      log_ns = stamp["sec"] * messages.SECOND + stamp["nanosec"]
+    sequence = self._sequences.get(topic, 0)
+    self._sequences[topic] = sequence + 1
     self._writer.write_message(
-      topic=topic,
-      schema=self._schemas[schema],
-      message=fields,
-      log_time=moment,
-      publish_time=moment,
-      sequence=sequence,
+      topic, self._schemas[kind], fields, log_time=log_ns, publish_time=log_ns, sequence=sequence
     )
+    if self._flush_period is not None and time.monotonic() - self._flushed > self._flush_period:
+      self.flush()
+
+  def flush(self) -> None:
+    """Ends the chunk, so that what was written is readable."""
+    self._writer._writer.flush()  # the ROS 2 writer does not pass it on
+    self._stream.flush()
+    self._flushed = time.monotonic()
+
+  def finish(self) -> None:
+    """Writes index and footer."""
+    self._writer.finish()
 
 
 @contextlib.contextmanager
-def open_log(path: str | pathlib.Path, joints: Sequence[str]) -> Iterator[LogWriter]:
-  """Opens a log for writing; the file is complete when the context ends.
-
-  Args:
-    path: the file to make; its folder is made too.
-    joints: names of the joints, in the order of all values.
-  """
-  path = pathlib.Path(path)
+def open_log(path: str | Path) -> Iterator[LogWriter]:
+  """Opens a log for writing, its folder is made; the file is complete when the context ends."""
+  path = Path(path)
   path.parent.mkdir(parents=True, exist_ok=True)
   with path.open("wb") as stream:
-    writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
+    writer = LogWriter(stream)
     try:
-      yield LogWriter(writer, joints)
+      yield writer
     finally:
       writer.finish()

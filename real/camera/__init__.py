@@ -1,1 +1,1 @@
-"""The robot's camera: newest picture, the policy's picture, lens calibration."""
+"""The robot's camera: newest picture of a device, file or stream, and lens calibration."""

@@ -1,7 +1,7 @@
 """Calibrates a camera from pictures of a checkerboard: an OPENCV model with its uncertainty.
 
 Pixels follow OpenCV and ROS here: the centre of the upper left pixel is (0, 0). `core.cameras`
-has it at (0.5, 0.5); `Calibration.camera` and `read_camera_info` convert. N views.
+has it at (0.5, 0.5); `Calibration.camera` and `core.camera_info` convert. N views.
 """
 
 import dataclasses
@@ -17,8 +17,8 @@ from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-MIN_VIEWS = 8  # ours: eight numbers of the lens need well more than two views
-_OUTLIER = 2.5  # views with more than this times the median error are left out: ours
+MIN_VIEWS = 8  # chosen: eight numbers of the lens need well more than two views
+_OUTLIER = 2.5  # views with more than this times the median error are left out: chosen
 _BLOCKS = 10  # of the jackknife: neighbouring frames of a video err alike
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _FLAGS = cv2.CALIB_FIX_K3  # the OPENCV model has two radial terms
@@ -30,8 +30,11 @@ class View:
   """One picture in which the board was found."""
 
   name: str
-  corners: np.ndarray  # float32 [rows * columns, 2] pixel
-  size: tuple[int, int]  # width, height of the picture
+  """Of the file or frame."""
+  corners: np.ndarray
+  """float32 [rows * columns, 2] pixel."""
+  size: tuple[int, int]
+  """Width, height of the picture."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,13 +42,21 @@ class Calibration:
   """A calibrated camera."""
 
   width: int
+  """Of the pictures [pixel]."""
   height: int
-  values: np.ndarray  # [8] as NAMES; focal lengths and centre in pixels, OpenCV's convention
-  stddevs: np.ndarray  # [8] standard deviations, block jackknife over the views
-  rms: float  # of the reprojection error over the views kept [pixel]
-  views: tuple[str, ...]  # kept
-  rejected: tuple[str, ...]  # views that fitted badly
-  coverage: float  # share of the picture's 8 x 6 cells in which a corner was seen
+  """Of the pictures [pixel]."""
+  values: np.ndarray
+  """[8] as NAMES; focal lengths and centre in pixels, OpenCV's convention."""
+  stddevs: np.ndarray
+  """[8] standard deviations, block jackknife over the views."""
+  rms: float
+  """Of the reprojection error over the views kept [pixel]."""
+  views: tuple[str, ...]
+  """Kept."""
+  rejected: tuple[str, ...]
+  """Views that fitted badly."""
+  coverage: float
+  """Share of the picture's 8 x 6 cells in which a corner was seen."""
 
   @property
   def camera(self) -> Camera:
@@ -224,28 +235,3 @@ def write_camera_info(path: Path, calibration: Calibration, *, name: str = "came
   info = camera_info(calibration, name=name)
   text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
   files.write_atomically(path, "\n".join(lines) + "\n" + text)
-
-
-def read_camera_info(path: Path) -> Camera:
-  """Reads a camera_info YAML as ROS and `write_camera_info` write it.
-
-  Raises:
-    ValueError: The file is none, or of another distortion model.
-  """
-  try:
-    info = yaml.safe_load(Path(path).read_text())
-    matrix, coefficients = info["camera_matrix"]["data"], info["distortion_coefficients"]["data"]
-    size = int(info["image_width"]), int(info["image_height"])
-    model = info["distortion_model"]
-  except (yaml.YAMLError, KeyError, TypeError) as error:
-    raise ValueError(
-      f"{path} is no camera_info YAML ({error}): write one with launch/calibrate_camera.py or "
-      "ROS's camera_calibration."
-    ) from error
-  k1, k2, p1, p2, *rest = (float(c) for c in [*coefficients, 0, 0, 0, 0][:5])
-  if model != "plumb_bob" or any(rest):
-    raise ValueError(
-      f"{path} has the distortion {model!r} with k3 = {rest}, expected plumb_bob with k3 = 0: "
-      "calibrate again with two radial terms."
-    )
-  return Camera.from_opencv(*size, matrix, (k1, k2, p1, p2))

@@ -54,7 +54,8 @@ class Readback:
   """What a control was set to and what the driver says that it is."""
 
   asked: float
-  found: float | None  # None: the source has no such control
+  found: float | None
+  """None: the source has no such control."""
 
   @property
   def holds(self) -> bool:
@@ -62,6 +63,20 @@ class Readback:
     return self.found is not None and abs(self.found - self.asked) <= _TOLERANCE * max(
       1.0, abs(self.asked)
     )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CaptureSettings:
+  """How a source is opened and what is held fixed."""
+
+  capture_size: tuple[int, int] | None = None
+  """Height and width that a device is asked for; None: its own."""
+  controls: Controls = Controls()
+  """What the camera shall hold fixed."""
+  latency: float = 0.0
+  """s from the light to the arrival of a frame, as measured; added to the age."""
+  timeout: float = OPEN_TIMEOUT
+  """s to wait for the first picture."""
 
 
 class CameraLostError(RuntimeError):
@@ -76,15 +91,13 @@ class Camera:
     source: Source,
     *,
     size: tuple[int, int],
-    capture_size: tuple[int, int] | None,
-    controls: Controls,
-    latency: float,
+    settings: CaptureSettings,
     capture: Callable[[Source], Any],
   ):
     """See `open`."""
     self.source = source
     self._height, self._width = size
-    self._capture_size, self._asked, self._latency = capture_size, controls, latency
+    self._settings, self._asked = settings, settings.controls
     self._make_capture = capture
     self._lock = threading.Condition()
     self._picture: np.ndarray | None = None  # full size, BGR
@@ -102,26 +115,16 @@ class Camera:
     source: Source,
     *,
     size: tuple[int, int],
-    capture_size: tuple[int, int] | None = None,
-    gain: float | None = None,
-    exposure: float | None = None,
-    white_balance: float | None = None,
-    latency: float = 0.0,
-    timeout: float = OPEN_TIMEOUT,
+    settings: CaptureSettings | None = None,
     capture: Callable[[Source], Any] | None = None,
   ) -> "Camera":
     """Opens a camera and waits for its first picture.
 
     Args:
       source: Number of a device, a video file (played at its own rate), or the URL of a stream.
-      size: Height and width of the pictures given; each pixel is the mean over its area. The
-        source's pictures must have the same shape, as a calibrated lens is for one shape.
-      capture_size: Height and width that a device is asked for.
-      gain: See `Controls`; likewise exposure and white_balance.
-      exposure: See `Controls`.
-      white_balance: See `Controls`.
-      latency: s from the light to the arrival of a frame, as measured; added to the age.
-      timeout: s to wait for the first picture.
+      size: Height and width of the policy's picture. The source's pictures must have the same
+        shape, as a calibrated lens is for one shape.
+      settings: Settings of the camera.
       capture: Opens a source as cv2.VideoCapture does; for tests.
 
     Raises:
@@ -136,14 +139,9 @@ class Camera:
         source = int(source)
       elif not Path(source).exists():
         raise ValueError(f"Found no {source}: expected a device's number, a video file or a URL.")
-    camera = cls(
-      source,
-      size=size,
-      capture_size=capture_size,
-      latency=latency,
-      controls=Controls(gain=gain, exposure=exposure, white_balance=white_balance),
-      capture=capture or open_capture,
-    )
+    settings = settings or CaptureSettings()
+    timeout = settings.timeout
+    camera = cls(source, size=size, settings=settings, capture=capture or open_capture)
     camera._thread.start()
     with camera._lock:
       camera._lock.wait_for(lambda: camera._picture is not None or camera._shape_error, timeout)
@@ -159,25 +157,15 @@ class Camera:
     return camera
 
   def read(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture, RGB uint8 [H, W, 3], and its age [s].
+    """Returns the newest picture as it came, RGB uint8 [H, W, 3], and its age [s].
 
     The age grows while no picture comes: the reader decides how old is too old.
     """
     with self._lock:
       picture, taken = self._picture, self._taken
     assert picture is not None  # `open` has waited for the first one
-    small = cv2.resize(picture, (self._width, self._height), interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(small[..., ::-1]), self._age(taken)
-
-  def read_full(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture as it came, RGB uint8, and its age [s]; for calibration."""
-    with self._lock:
-      picture, taken = self._picture, self._taken
-    assert picture is not None
-    return np.ascontiguousarray(picture[..., ::-1]), self._age(taken)
-
-  def _age(self, taken: float) -> float:
-    return time.monotonic() - taken + self._latency
+    age = time.monotonic() - taken + self._settings.latency
+    return np.ascontiguousarray(picture[..., ::-1]), age
 
   def set_controls(self, controls: Controls) -> dict[str, Readback]:
     """Changes what is held fixed from now on; returns what the driver made of it.
@@ -234,9 +222,9 @@ class Camera:
   def _set_up(self, capture: Any) -> None:
     if isinstance(self.source, int):
       capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-      if self._capture_size is not None:
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._capture_size[0])
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._capture_size[1])
+      if self._settings.capture_size is not None:
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._settings.capture_size[0])
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._settings.capture_size[1])
     asked = self._asked.asked()
     if _is_http(self.source):
       self.readback = _set_http(str(self.source), asked)

@@ -1,1 +1,1 @@
-"""The control loop: the environment, the bus cycle, slow moves, clocks and timing."""
+"""The control loop: the environment, the bus cycle, sensing, pictures, slow moves, timing."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.real.loop.sensing import Sensing
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.loop.timing import Timing
 from nerf2real.real.safety.monitor import Monitor, Reason, Stop
 from nerf2real.real.safety.operator import Operator
@@ -32,30 +33,28 @@ class Cycle:
     self,
     bus: Bus,
     servos: Servos,
-    sensing: Sensing,
     monitor: Monitor,
     *,
     operator: Operator,
     timing: Timing,
+    settings: RobotSettings,
     recorder: Any = None,
-    dry_run: bool = False,
   ):
     """Starts reading.
 
     Args:
       bus: The bus.
       servos: The servos on it, set up.
-      sensing: Takes the readings.
-      monitor: Judges them.
+      monitor: Judges the readings.
       operator: Whose key stops the robot.
       timing: Takes how long things took.
+      settings: Settings of the robot.
       recorder: Takes everything that was read (`real.recorder.recorder.Recorder`), or None.
-      dry_run: Nothing is ever written to the servos.
     """
     self.stop: Stop | None = None
-    self.sensing = sensing
+    self.sensing = Sensing(low_pass=not settings.chip_low_pass)
     self._bus, self._servos, self._monitor, self._operator = bus, servos, monitor, operator
-    self._timing, self._recorder, self._dry_run = timing, recorder, dry_run
+    self._timing, self._recorder, self._dry_run = timing, recorder, settings.dry_run
     self._commands = threading.Lock()  # a goal must not follow a stop
     self._torque_off = True
     self._count = 0

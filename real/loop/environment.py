@@ -14,10 +14,11 @@ import numpy as np
 from dm_env import specs
 
 from nerf2real.core import errors
-from nerf2real.real.camera.pictures import CameraSource, Pictures
+from nerf2real.real.camera.source import CameraSource
 from nerf2real.real.loop.cycle import Cycle
-from nerf2real.real.loop.motion import SUPPORTED_POSE, Motion, RobotSettings
-from nerf2real.real.loop.sensing import Sensing
+from nerf2real.real.loop.motion import SUPPORTED_POSE, Motion
+from nerf2real.real.loop.pictures import Pictures
+from nerf2real.real.loop.settings import RobotSettings, TaskSpec
 from nerf2real.real.loop.timing import Timing
 from nerf2real.real.safety.monitor import Limiter, Monitor, Stop
 from nerf2real.real.safety.operator import Operator
@@ -36,54 +37,42 @@ class RobotEnvironment(dm_env.Environment):
   def __init__(
     self,
     bus: Bus,
+    task: TaskSpec,
     *,
-    camera: CameraSource | None,
     operator: Operator,
-    goal_bounds: tuple[np.ndarray, np.ndarray],
-    goals: np.ndarray,
-    image_size: tuple[int, int] | None,
-    time_limit: float,
-    head_pan_limit: float | None = None,
+    camera: CameraSource | None = None,
     settings: RobotSettings | None = None,
     recorder: Any = None,
-    dry_run: bool = False,
   ):
     """Switches the supply on, sets the servos up and begins to read; nothing moves.
 
     Args:
       bus: The open bus.
-      camera: Source of pictures; None for a robot without.
+      task: What is observed, and for how long.
       operator: Who holds the robot and may stop it.
-      goal_bounds: Lower and upper corner of the floor [2] each [m].
-      goals: The scene's goals [G, 2] [m]; the first is set.
-      image_size: (height, width) of the picture; None without a camera.
-      time_limit: Length of an episode [s].
-      head_pan_limit: Limit of the head pan, +- rad; None: the paper's table.
+      camera: Source of pictures; None for a robot without.
       settings: Settings of the robot.
       recorder: A `real.recorder.recorder.Recorder`, or None.
-      dry_run: Whether to write nothing to the servos: nothing moves.
 
     Raises:
       BusError: A device is missing or cannot be set up.
       ValueError: A camera without image_size, or the other way round.
     """
+    image_size = task.image_size
     if (camera is None) != (image_size is None):
       raise ValueError(
         "A camera and an image_size belong together: give both, or image_size=None and no camera."
       )
     self.settings = settings or RobotSettings()
-    self.goals = np.asarray(goals, np.float64).reshape(-1, 2)
+    self.goals = np.asarray(task.goals, np.float64).reshape(-1, 2)
     self.timing = Timing()
-    self.dry_run = dry_run
+    self.dry_run = self.settings.dry_run
     self._bus, self._clock = bus, bus.clock
     self._operator = operator
-    self._time_limit = time_limit
-    self._goal_bounds = goal_bounds
-    self._lower, self._upper = constants.joint_limits(head_pan=head_pan_limit)
-    self._middle, self._half_range = (
-      (self._lower + self._upper) / 2,
-      (self._upper - self._lower) / 2,
-    )
+    self._time_limit = task.time_limit
+    self._lower, self._upper = constants.joint_limits(head_pan=task.head_pan_limit)
+    self._middle = (self._lower + self._upper) / 2
+    self._half_range = (self._upper - self._lower) / 2
     safety = self.settings.safety
     self._limiter = Limiter(self._lower, self._upper, max_speed=safety.max_speed)
     self._action_filter = filters.ExponentialFilter(constants.ACTION_FILTER)
@@ -100,8 +89,8 @@ class RobotEnvironment(dm_env.Environment):
       )
     self._action_spec = policy_specs.action_spec()
     self._observation_spec = policy_specs.policy_observation_spec(
-      goal_lower=goal_bounds[0],
-      goal_upper=goal_bounds[1],
+      goal_lower=task.goal_lower,
+      goal_upper=task.goal_upper,
       image_shape=None if image_size is None else (*image_size, 3),
     )
     self.set_goal(self.goals[0])
@@ -110,18 +99,17 @@ class RobotEnvironment(dm_env.Environment):
     self._closed = False
     self.servos = Servos(bus)
     self.servos.power_on()
-    if not dry_run:
+    if not self.dry_run:
       self.servos.set_up()
     self._monitor.arm(self._clock.now())
     self._cycle = Cycle(
       bus,
       self.servos,
-      Sensing(low_pass=not self.settings.chip_low_pass),
       self._monitor,
       operator=operator,
       timing=self.timing,
+      settings=self.settings,
       recorder=recorder,
-      dry_run=dry_run,
     )
     self._motion = Motion(
       self._cycle,
@@ -131,7 +119,6 @@ class RobotEnvironment(dm_env.Environment):
       operator=operator,
       clock=self._clock,
       settings=self.settings,
-      dry_run=dry_run,
     )
 
   # ---- dm_env ----

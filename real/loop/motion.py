@@ -1,22 +1,15 @@
 """Slow moves with the robot held: up to its pose before an episode, and to rest at the end."""
 
-import dataclasses
 import logging
 
 import numpy as np
 
-from nerf2real.real.loop.clock import Clock
+from nerf2real.real.clock import Clock
 from nerf2real.real.loop.cycle import Cycle
-from nerf2real.real.safety.monitor import (
-  Limiter,
-  Monitor,
-  Reason,
-  SafetyError,
-  SafetySettings,
-  Stop,
-)
+from nerf2real.real.loop.settings import RobotSettings
+from nerf2real.real.safety.monitor import Limiter, Monitor, Reason, SafetyError, Stop
 from nerf2real.real.safety.operator import Operator
-from nerf2real.real.wire.bus import BusError, BusSettings
+from nerf2real.real.wire.bus import BusError
 from nerf2real.real.wire.servos import Servos
 from nerf2real.suite.op3 import constants
 
@@ -24,18 +17,6 @@ SUPPORTED_POSE = constants.standing_targets()  # [J] rad, where the robot starts
 _LEVEL_TIME = 0.1  # s in which at least one of a dozen IMU readings arrives
 _FIRST_READING = 2.0  # s to wait for the first reading of everything
 _log = logging.getLogger(__name__)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RobotSettings:
-  """Settings of the robot."""
-
-  bus: BusSettings = dataclasses.field(default_factory=BusSettings)
-  safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
-  chip_low_pass: bool = True  # the IMU chip filters by itself; False: filtered here
-  settle_time: float = 2.5  # s between being let go and the start of an episode
-  rest_time: float = 1.0  # s at the end of it in which the gyroscope's zero is measured; ours
-  grip_time: float = 1.0  # s between being taken hold of and the first move
 
 
 class Motion:
@@ -51,12 +32,11 @@ class Motion:
     operator: Operator,
     clock: Clock,
     settings: RobotSettings,
-    dry_run: bool,
   ):
     """Takes what moves and watches the robot; nothing moves."""
     self._cycle, self._servos, self._monitor, self._limiter = cycle, servos, monitor, limiter
     self._operator, self._clock = operator, clock
-    self._settings, self._dry_run = settings, dry_run
+    self._settings = settings
     self.standing = False  # under torque, in the supported pose or beyond
 
   def stand(self) -> None:
@@ -72,7 +52,7 @@ class Motion:
       self._energize()
     self._move_slowly(SUPPORTED_POSE)
     self._level()
-    if not self._dry_run:  # without torque it could not stand
+    if not self._settings.dry_run:  # without torque it could not stand
       self._monitor.held = False
       self._operator.support(False)
       self._stand_still()
@@ -89,7 +69,7 @@ class Motion:
       self._move_slowly(SUPPORTED_POSE)
       self.standing = False
       return self._cycle.relax()
-    return self._dry_run or self._cycle.torque_off or self._servos.torque(False)
+    return self._settings.dry_run or self._cycle.torque_off or self._servos.torque(False)
 
   def _stand_still(self) -> None:
     """Lets the robot settle on its feet, and measures the gyroscope's zero when it has."""
@@ -157,13 +137,13 @@ class Motion:
     end = self._clock.now() + _FIRST_READING
     while not self._cycle.torque_off and self._clock.now() < end:
       self._clock.sleep_until(self._clock.now() + constants.BUS_PERIOD)
-    errors_found = {} if self._dry_run else self._servos.hardware_errors()
+    errors_found = {} if self._settings.dry_run else self._servos.hardware_errors()
     if errors_found:
       raise SafetyError(
         f"These servos report errors: {errors_found}. Find the cause, then clear them with "
         "environment.servos.reboot(joint)."
       )
-    if not self._dry_run and not self._cycle.torque_off:
+    if not self._settings.dry_run and not self._cycle.torque_off:
       silent = ", ".join(self._servos.silent()) or "none at the moment"
       raise SafetyError(
         f"Not every servo confirmed that its torque is off. Devices that do not answer: {silent}."

@@ -20,9 +20,9 @@ from nerf2real.suite.sensors import filters
 from nerf2real.suite.sensors.madgwick import Madgwick
 
 _LONG_GAP = 1.5  # periods after which a sample was missed
-_STILL = 0.03  # rad/s, standard deviation of the turning rate of a robot that stands still: ours
-_MAX_ZERO = 0.1  # rad/s: a mean above it is a turn and no zero, whatever the deviation says: ours
-_MIN_READINGS = 20  # of which a zero is the mean: ours
+_STILL = 0.03  # rad/s, standard deviation of the turning rate of a robot that stands still: chosen
+_MAX_ZERO = 0.1  # rad/s: a mean above it is a turn and no zero, whatever the deviation says: chosen
+_MIN_READINGS = 20  # of which a zero is the mean: chosen
 
 
 class Sensing:

@@ -1,12 +1,13 @@
 """Records what the robot did and saw as MCAP, in a process of its own.
 
-The control loop only puts messages into a queue; a thread passes them through a pipe to
-`real.recorder.process`, which encodes pictures, packs and writes. The loop never waits for a disk:
-if the recorder falls behind by more than the queue holds, messages are dropped and counted.
+The control loop only puts readings into a queue; a thread passes them through a pipe to
+`real.recorder.process`, which builds the messages, encodes pictures, packs and writes. The loop
+never waits for a disk: if the recorder falls behind by more than the queue holds, readings are
+dropped and counted.
 
 If the control process dies, the recorder sees the pipe end and closes the file properly. If the
 recorder is killed, the file lacks its footer but holds every chunk until then, a quarter of a
-second at most before the end; `core.robot_logs.playback` and other streaming readers read it.
+second at most before the end; `core.robot_logs.streaming` and other streaming readers read it.
 """
 
 import contextlib
@@ -24,12 +25,16 @@ from typing import Any
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.robot_logs import messages
 
 LENGTH = struct.Struct("<I")  # before every pickled message in the pipe
-_QUEUE = 2000  # messages: about four seconds at full rates
+_QUEUE = 2000  # readings: about four seconds at full rates
 _START_TIMEOUT = 20.0  # s for the other process to import and open the file
 _CLOSE_TIMEOUT = 20.0  # s for it to write what is left
 _log = logging.getLogger(__name__)
+
+Call = tuple[str, float, tuple[Any, ...], dict[str, Any]]
+"""A message to build: name in `real.recorder.process.BUILDERS`, time [s], arguments."""
 
 
 class Recorder:
@@ -54,8 +59,8 @@ class Recorder:
       start_new_session=True,
     )
     self._wait_until_open()
-    self._queue: queue.Queue[tuple[str, tuple] | None] = queue.Queue(_QUEUE)
-    self.dropped = 0  # messages that found the queue full or the process gone
+    self._queue: queue.Queue[tuple[Call, ...] | None] = queue.Queue(_QUEUE)
+    self.dropped = 0  # readings that found the queue full or the process gone
     self._closed = False
     self._sender = threading.Thread(target=self._send, daemon=True, name="recorder")
     self._sender.start()
@@ -85,18 +90,18 @@ class Recorder:
     """Whether the recorder's process runs."""
     return self._process.poll() is None
 
-  def _put(self, kind: str, *arguments: Any) -> None:
+  def _put(self, *calls: Call) -> None:
     if self._closed or not self.alive:
       self.dropped += 1
       return
     try:
-      self._queue.put_nowait((kind, arguments))
+      self._queue.put_nowait(calls)
     except queue.Full:
       self.dropped += 1
 
   def command(self, t: float, names: Sequence[str], positions: Sequence[float]) -> None:
     """Notes position targets [J] [rad]."""
-    self._put("command", t, tuple(names), _copy(positions))
+    self._put(_joint_state(messages.COMMANDS, t, names, position=positions))
 
   def joints(
     self,
@@ -121,9 +126,21 @@ class Recorder:
       pwm: Measured duty, -1 to 1.
       stamps: When each joint was read, s since 1970.
     """
-    values = [_copy(v) for v in (positions, velocities, currents, voltages, pwm)]
-    offsets = None if stamps is None else _copy(stamps) - t
-    self._put("joints", t, tuple(names), *values, offsets)
+    # Not efforts: amperes, volts, shares and seconds travel in a JointState's effort, by topic.
+    others = {
+      messages.CURRENTS: currents,
+      messages.VOLTAGES: voltages,
+      messages.PWM: pwm,
+      messages.STAMPS: None if stamps is None else np.asarray(stamps) - t,
+    }
+    self._put(
+      _joint_state(messages.STATES, t, names, position=positions, velocity=velocities),
+      *(
+        _joint_state(topic, t, names, effort=values)
+        for topic, values in others.items()
+        if values is not None
+      ),
+    )
 
   def imu(
     self,
@@ -133,24 +150,27 @@ class Recorder:
     gravity: Sequence[float] | None = None,
   ) -> None:
     """Notes turning rates [rad/s], specific force [m/s^2] and the estimate of gravity, [3] each."""
-    self._put("imu", t, _copy(gyro), _copy(accel), _copy(gravity))
+    calls: list[Call] = [("imu", t, (_copy(gyro), _copy(accel)), {})]
+    if gravity is not None:
+      calls.append(("gravity", t, (_copy(gravity),), {}))
+    self._put(*calls)
 
   def image(self, t: float, jpeg_or_array: bytes | np.ndarray) -> None:
     """Notes a picture, JPEG or RGB uint8 [H, W, 3]."""
     data = jpeg_or_array if isinstance(jpeg_or_array, bytes) else np.array(jpeg_or_array, np.uint8)
-    self._put("image", t, data)
+    self._put(("image", t, (data,), {}))
 
   def camera_info(self, t: float, camera: Camera) -> None:
     """Notes the lens."""
-    self._put("camera_info", t, camera)
+    self._put(("camera_info", t, (camera,), {}))
 
   def battery(self, t: float, voltage: float) -> None:
     """Notes the supply's voltage [V]."""
-    self._put("battery", t, float(voltage))
+    self._put(("battery", t, (float(voltage),), {}))
 
   def temperature(self, t: float, name: str, celsius: float) -> None:
     """Notes a servo's temperature [degrees Celsius]."""
-    self._put("temperature", t, name, float(celsius))
+    self._put(("temperature", t, (name, float(celsius)), {}))
 
   def _send(self) -> None:
     pipe = self._process.stdin
@@ -189,7 +209,7 @@ class Recorder:
     if self._process.stdout is not None:
       self._process.stdout.close()
     if self.dropped:
-      _log.warning("The recorder of %s dropped %d messages.", self.path, self.dropped)
+      _log.warning("The recorder of %s dropped %d readings.", self.path, self.dropped)
 
   def __enter__(self) -> "Recorder":
     return self
@@ -198,5 +218,11 @@ class Recorder:
     self.close()
 
 
-def _copy(values: Sequence[float] | None) -> Any:
+def _joint_state(
+  topic: str, t: float, names: Sequence[str], **fields: Sequence[float] | np.ndarray | None
+) -> Call:
+  return "joint_state", t, (topic, tuple(names)), {k: _copy(v) for k, v in fields.items()}
+
+
+def _copy(values: Sequence[float] | np.ndarray | None) -> Any:
   return None if values is None else np.array(values, np.float64)

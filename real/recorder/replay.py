@@ -6,17 +6,18 @@ Shapes: N messages of a topic, J joints.
 import base64
 import dataclasses
 import itertools
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.offline
 
+from nerf2real.core import palette
+from nerf2real.core.pages import page as pages
 from nerf2real.core.robot_logs import messages
-from nerf2real.core.robot_logs import playback as recording
+from nerf2real.core.robot_logs import streaming as recording
 
 _MAX_POINTS = 4000  # of a plotted line: more than a screen has pixels
+_TEMPERATURE = "temperature "  # before a joint, in names of series
 _JOINT_TOPICS = {
   messages.COMMANDS: ("position", "command", "rad"),
   messages.STATES: ("position", "position", "rad"),
@@ -65,7 +66,8 @@ def load(path: Path | str) -> Replay:
       times.append(time)
       rows.append(values)
 
-  for topic, time, message in recording.read_messages(path):
+  for reading in recording.read_messages(path, recover=True):
+    topic, time, message = reading.topic, reading.time, reading.message
     if topic in _JOINT_TOPICS:
       field, name, unit = _JOINT_TOPICS[topic]
       names = tuple(message.name)
@@ -88,7 +90,7 @@ def load(path: Path | str) -> Replay:
       frames.append((time, bytes(message.data)))
     elif topic == messages.TEMPERATURE:
       joint = message.header.frame_id
-      add(f"temperature {joint}", "degrees C", (joint,), time, (message.temperature,))
+      add(_TEMPERATURE + joint, "degrees C", (joint,), time, (message.temperature,))
   if not collected and not frames:
     raise ValueError(f"{path} holds no message that can be shown: record joints, IMU or pictures.")
   begins = [times[0] for _, _, times, _ in collected.values()] + [t for t, _ in frames[:1]]
@@ -126,36 +128,58 @@ def thin(series: Series) -> tuple[np.ndarray, np.ndarray]:
   return series.times[index], series.values[index]
 
 
-def _plots(replay: Replay) -> dict[str, Any]:
-  """Returns the data of all plots for the page's script."""
-  joints = dict.fromkeys(
-    name
-    for key in ("position", "command")
-    if key in replay.series
-    for name in replay.series[key].names
-  )
-  data: dict[str, Any] = {"joints": list(joints), "duration": replay.duration, "series": {}}
-  hottest = {name: found for name, found in replay.series.items() if name.startswith("temperature")}
+@dataclasses.dataclass
+class Plot:
+  """Numbers over time, as the page's script takes them."""
+
+  unit: str
+  names: tuple[str, ...]  # of the lines
+  t: list[float]  # s
+  y: list[list[float]]  # of each line
+
+
+@dataclasses.dataclass
+class Line:
+  """A number over time."""
+
+  t: list[float]  # s
+  y: list[float]
+
+
+@dataclasses.dataclass
+class PageData:
+  """What the page's script shows."""
+
+  joints: list[str]
+  moving: str  # the joint that is shown first
+  duration: float  # s
+  series: dict[str, Plot]
+  temperatures: dict[str, Line]  # by joint [degrees C]
+  frames: list[float]  # times of the pictures [s]
+  pictures: list[str] | None  # JPEG in base64; None where a server gives them
+
+
+def _page_data(replay: Replay, *, embed: bool) -> PageData:
+  moved = [replay.series[key] for key in ("position", "command") if key in replay.series]
+  joints = list(dict.fromkeys(name for found in moved for name in found.names))
+  series, temperatures = {}, {}
   for name, found in replay.series.items():
-    if name in hottest:
+    if name.startswith(_TEMPERATURE):
+      line = Line(np.round(found.times, 2).tolist(), found.values[:, 0].tolist())
+      temperatures[name.removeprefix(_TEMPERATURE)] = line
       continue
     times, values = thin(found)
-    data["series"][name] = {
-      "unit": found.unit,
-      "names": list(found.names),
-      "t": np.round(times, 4).tolist(),
-      "y": [np.round(column, 5).tolist() for column in values.T],
-    }
-  data["temperatures"] = {
-    name.removeprefix("temperature "): {
-      "t": np.round(found.times, 2).tolist(),
-      "y": found.values[:, 0].tolist(),
-    }
-    for name, found in hottest.items()
-  }
-  data["moving"] = _most_moving(replay) or next(iter(joints), "")
-  data["frames"] = [round(time, 4) for time, _ in replay.frames]
-  return data
+    t, y = np.round(times, 4).tolist(), np.round(values.T, 5).tolist()
+    series[name] = Plot(found.unit, found.names, t, y)
+  return PageData(
+    joints=joints,
+    moving=_most_moving(replay) or next(iter(joints), ""),
+    duration=replay.duration,
+    series=series,
+    temperatures=temperatures,
+    frames=[round(time, 4) for time, _ in replay.frames],
+    pictures=[base64.b64encode(jpeg).decode() for _, jpeg in replay.frames] if embed else None,
+  )
 
 
 def _most_moving(replay: Replay) -> str:
@@ -172,18 +196,15 @@ def page(replay: Replay, *, embed: bool) -> str:
     embed: Puts the pictures into the page, so that it works without a server; otherwise they are
       asked for at `frame/<number>`.
   """
-  data = _plots(replay)
-  if embed:
-    data["pictures"] = [base64.b64encode(jpeg).decode() for _, jpeg in replay.frames]
-  lead = f"{replay.duration:.1f} s, {len(data['joints'])} joints, {len(replay.frames)} pictures"
+  data = _page_data(replay, embed=embed)
+  lead = f"{replay.duration:.1f} s, {len(data.joints)} joints, {len(replay.frames)} pictures"
   if not replay.complete:
     lead += "; cut off: this is what was written until then"
-  template = Path(__file__).with_name("replay.html").read_text()
-  for key, value in {
-    "__NAME__": replay.name,
-    "__LEAD__": lead,
-    "__PLOTLY__": plotly.offline.get_plotlyjs(),
-    "__DATA__": json.dumps(data).replace("</", "<\\/"),
-  }.items():
-    template = template.replace(key, value)
-  return template
+  return pages.render(
+    Path(__file__).with_name("replay.html"),
+    plots=True,
+    name=replay.name,
+    lead=lead,
+    data=data,
+    colors=[palette.BLUE, palette.VERMILION, palette.GREEN, palette.PURPLE],
+  )

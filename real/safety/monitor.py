@@ -13,7 +13,6 @@ import numpy as np
 
 from nerf2real.real.wire.bus import JointReading
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.tasks.base import MIN_UPRIGHT
 
 
 class Reason(enum.StrEnum):
@@ -45,18 +44,28 @@ class SafetyError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SafetySettings:
-  """Limits. Where nothing else is said they are ours."""
+  """Limits. Where no source is said they are chosen with room to ordinary walking."""
 
-  min_upright: float = MIN_UPRIGHT  # cosine of the tilt below which the robot falls, as in `suite`
-  max_temperature: float = 70.0  # degrees C; the servos themselves give up at 80
-  min_voltage: float = 10.0  # V; a 3-cell battery below it is empty, servos give up at 9.5
-  voltage_time: float = 0.2  # s that the voltage may be lower: a heavy step is a short dip
-  bus_timeout: float = 0.1  # s without a reading of all joints, or of the IMU
-  camera_timeout: float = 0.5  # s that the newest picture may be old
-  max_speed: float = 10.0  # rad/s of a goal: twice what a servo can do
-  slow_speed: float = 0.5  # rad/s of the moves to and from the supported pose
-  max_following_error: float = 0.7  # rad between goal and joint: more than a standing load bends
-  following_time: float = 0.75  # s that it may be larger
+  min_upright: float = constants.MIN_UPRIGHT
+  """Cosine of the tilt below which the robot falls, as in `suite`."""
+  max_temperature: float = 70.0
+  """degrees C; the servos themselves give up at 80."""
+  min_voltage: float = 10.0
+  """V; a 3-cell battery below it is empty, servos give up at 9.5."""
+  voltage_time: float = 0.2
+  """s that the voltage may be lower: a heavy step is a short dip."""
+  bus_timeout: float = 0.1
+  """s without a reading of all joints, or of the IMU."""
+  camera_timeout: float = 0.5
+  """s that the newest picture may be old."""
+  max_speed: float = 10.0
+  """rad/s of a goal: twice what a servo can do."""
+  slow_speed: float = 0.5
+  """rad/s of the moves to and from the supported pose."""
+  max_following_error: float = 0.7
+  """rad between goal and joint: more than a standing load bends."""
+  following_time: float = 0.75
+  """s that it may be larger."""
 
 
 class Limiter:

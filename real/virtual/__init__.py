@@ -1,1 +1,1 @@
-"""A virtual robot and the room it stands in, whose truth is known."""
+"""A virtual robot behind the wires of the real one: devices on a bus, a camera, a body."""

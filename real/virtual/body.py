@@ -19,11 +19,12 @@ from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.motors import Motors
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.delays import History
 
 STEP = 0.001  # s
 WORLDS = ("floor", "room")
 PREFIX = "op3/"
-_STOP_MARGIN = 0.5  # rad from the control limits to a joint's mechanical stop: ours
+_STOP_MARGIN = 0.5  # rad from the control limits to a joint's mechanical stop: chosen
 _HELD_HEIGHT = 0.30  # m of the torso: legs hang free
 _HAND_SPEED = 0.1  # m/s
 _LET_GO_LAG = 0.002  # m that the torso stays above the sinking hand when the feet carry it
@@ -63,7 +64,7 @@ class Body:
     world: str = "floor",
     hidden: Hidden | None = None,
     ball: bool = False,
-    furnish=None,
+    furnish: Callable[[mujoco.MjSpec], None] | None = None,
     looks: bool = True,
   ):
     """Builds the world and hangs the robot at its origin.
@@ -103,9 +104,7 @@ class Body:
     self._bias = np.array([*self.hidden.gyroscope_bias, *self.hidden.accelerometer_bias])
     self._parts = self._other_parts()
     self._ball = int(model.joint("ball").qposadr[0]) if ball else None
-    self._trace_times = np.full(_TRACE_LENGTH, -np.inf)
-    self._trace = np.zeros((_TRACE_LENGTH, model.nq))
-    self._traced = 0
+    self._trace = History(_TRACE_LENGTH)  # poses
     self._lowering = False
     self.time = 0.0  # s; follows the clock of whoever calls `advance`
     self.place(0.0, 0.0, 0.0)
@@ -171,10 +170,8 @@ class Body:
     self._sense()
     if self.after_step is not None:
       self.after_step(self.time)
-    if self.time >= self._trace_times[(self._traced - 1) % _TRACE_LENGTH] + _TRACE_PERIOD:
-      row = self._traced % _TRACE_LENGTH
-      self._trace_times[row], self._trace[row] = self.time, data.qpos
-      self._traced += 1
+    if self.time >= self._trace.last_time + _TRACE_PERIOD:
+      self._trace.push(self.time, data.qpos)
       if data.ncon:
         self._note_touches()
 
@@ -231,9 +228,7 @@ class Body:
   def pose_at(self, time: float) -> np.ndarray:
     """Returns qpos at the newest kept moment not after a time [s] (up to 0.6 s ago)."""
     with self.lock:
-      past = np.where(self._trace_times <= time + 1e-9, self._trace_times, -np.inf)
-      row = int(np.argmax(past))
-      return self._trace[row].copy() if np.isfinite(past[row]) else self.data.qpos.copy()
+      return self._trace.newest(time) if self._trace.count else self.data.qpos.copy()
 
 
 def _build(world: str, hidden: Hidden, ball: bool, furnish, looks: bool) -> mujoco.MjModel:

@@ -12,17 +12,29 @@ class Hidden:
   """The virtual robot's own physics, where it may differ from the simulation of `suite`."""
 
   motors: MotorParameters
-  armature: float = 0.045  # kg m^2
-  bearing_damping: float = 0.02  # N m s/rad, besides back-EMF
-  payload: float = 0.0  # kg fixed to the torso
-  payload_position: tuple[float, float, float] = (0.0, 0.0, 0.06)  # m in the torso
-  foot_friction: float = 0.8  # sliding coefficient
-  contact_time: float = 0.012  # s, time constant of contacts; the simulation has 0.02
-  imu_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rotation vector [rad]
-  gyroscope_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad/s
-  accelerometer_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s^2
-  gyroscope_noise: float = 0.002  # rad/s, standard deviation of a reading
-  accelerometer_noise: float = 0.03  # m/s^2
+  """The servos' motors and the battery."""
+  armature: float = 0.045
+  """kg m^2."""
+  bearing_damping: float = 0.02
+  """N m s/rad, besides back-EMF."""
+  payload: float = 0.0
+  """kg fixed to the torso."""
+  payload_position: tuple[float, float, float] = (0.0, 0.0, 0.06)
+  """m in the torso."""
+  foot_friction: float = 0.8
+  """Sliding coefficient."""
+  contact_time: float = 0.012
+  """s, time constant of contacts; the simulation has 0.02."""
+  imu_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
+  """Rotation vector [rad]."""
+  gyroscope_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+  """rad/s."""
+  accelerometer_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+  """m/s^2."""
+  gyroscope_noise: float = 0.002
+  """rad/s, standard deviation of a reading."""
+  accelerometer_noise: float = 0.03
+  """m/s^2."""
 
   @classmethod
   def none(cls, count: int = 20) -> "Hidden":
@@ -31,7 +43,7 @@ class Hidden:
 
   @classmethod
   def draw(cls, seed: int, count: int = 20) -> "Hidden":
-    """Draws a robot: the ranges are ours, of the size that robots of one kind differ by."""
+    """Draws a robot: the ranges are chosen, of the size that robots of one kind differ by."""
     rng = np.random.default_rng([seed, 5])
     motors = MotorParameters(
       strength=rng.uniform(0.92, 1.05, count),

@@ -26,24 +26,31 @@ RESISTANCE = 12.0 / 2.3  # Ohm: stall current at 12 V, data sheet
 STALL_TORQUE = 4.1  # N m at 12 V, data sheet
 GEAR_SHARE = 1 - STALL_TORQUE / (SPEED_CONSTANT * 12.0 / RESISTANCE)  # 0.28
 _P_DIVISOR = 128.0
-# Ours: a small metal gear motor warms by 8 K for each watt, with a time constant of ten minutes.
+# Chosen: a small metal gear motor warms by 8 K for each watt, with a time constant of ten minutes.
 _HEATING, _WARMING_TIME, _AMBIENT = 8.0, 600.0, 25.0  # K/W, s, degrees C
-_COMPUTER_CURRENT = 1.5  # A that everything but the servos draws: ours
-_DIP_TIME = 0.1  # s, time constant with which servos judge the supply: ours
-_BROWN_OUT = 6.0  # V below which a servo's controller resets: ours
+_COMPUTER_CURRENT = 1.5  # A that everything but the servos draws: chosen
+_DIP_TIME = 0.1  # s, time constant with which servos judge the supply: chosen
+_BROWN_OUT = 6.0  # V below which a servo's controller resets: chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MotorParameters:
   """What differs from servo to servo and from battery to battery."""
 
-  strength: np.ndarray  # [N] factor on the torque
-  gear_share: np.ndarray  # [N] friction as a share of the torque
-  dry_friction: np.ndarray  # [N] N m
-  encoder_offset: np.ndarray  # [N] counts that the encoder reads too much
-  goal_delay: float = 0.0  # s from the arrival of a goal to its effect
-  battery_voltage: float = 12.0  # V without load
-  battery_resistance: float = 0.08  # Ohm
+  strength: np.ndarray
+  """[N] factor on the torque."""
+  gear_share: np.ndarray
+  """[N] friction as a share of the torque."""
+  dry_friction: np.ndarray
+  """[N] N m."""
+  encoder_offset: np.ndarray
+  """[N] counts that the encoder reads too much."""
+  goal_delay: float = 0.0
+  """s from the arrival of a goal to its effect."""
+  battery_voltage: float = 12.0
+  """V without load."""
+  battery_resistance: float = 0.08
+  """Ohm."""
 
   @classmethod
   def nominal(cls, count: int) -> "MotorParameters":

@@ -9,95 +9,23 @@ Everything else here (`place`, `truth`, `faults`, ...) is what a person in the r
 the host has only the port and the camera.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import pose_of_mujoco_camera
+from nerf2real.real.clock import RealClock, SteppedClock
 from nerf2real.real.loading import Connection
-from nerf2real.real.loop.clock import Clock, RealClock, SteppedClock
 from nerf2real.real.safety.operator import Hand
 from nerf2real.real.virtual.body import Body, Truth
 from nerf2real.real.virtual.bus.devices import Devices
 from nerf2real.real.virtual.bus.faults import Faults
 from nerf2real.real.virtual.bus.protocol_rehearsal import Cable
 from nerf2real.real.virtual.bus.wire import Wire
+from nerf2real.real.virtual.camera import Eyes, SteppedCamera, VirtualCamera
 from nerf2real.real.virtual.hidden import Hidden
-from nerf2real.real.virtual.stream import CameraStream, Sensor
-from nerf2real.scenes.builtin.eye import Eye
+from nerf2real.real.virtual.stream import CameraStream
 from nerf2real.suite.op3 import constants
-
-# The lens of the virtual robot's camera: as wide as the C920 of the facts, not quite without
-# distortion, its axis not quite in the middle. Ours.
-LENS = Camera(
-  width=320,
-  height=240,
-  fx=303.5,
-  fy=303.1,
-  cx=161.6,
-  cy=118.9,
-  k1=0.045,
-  k2=-0.07,
-  p1=0.0004,
-  p2=-0.0003,
-)
-FRAME_RATE = 30.0  # Hz
-_SUPERSAMPLE = 1  # 45 dB from 4 x 4 samples at 30x40, and half the time of 2 x 2
-_HEAD_CAMERA = "op3/head_camera"
-
-
-class Eyes:
-  """True pictures from the robot's head. One thread uses it: an OpenGL context belongs to one."""
-
-  def __init__(self, body: Body, lens: Camera):
-    self._body, self._lens = body, lens
-    self._eye: Any = None
-    self._data: Any = None
-
-  def picture(self, time: float | None = None) -> np.ndarray:
-    """Returns the picture uint8 [H, W, 3] of now, or of a moment [s] up to 0.6 s ago."""
-    model = self._body.model
-    if self._eye is None or self._data is None:
-      self._eye = Eye(model, groups=(0, 2))  # not the head, inside which the camera is
-      self._data = mujoco.MjData(model)
-    data = self._data
-    data.qpos[:] = self._body.pose_at(self._body.time if time is None else time)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_camlight(model, data)
-    self._eye.update(data)
-    camera = model.camera(_HEAD_CAMERA).id
-    pose = pose_of_mujoco_camera(data.cam_xpos[camera], data.cam_xmat[camera])
-    return self._eye.render(self._lens, pose, supersample=_SUPERSAMPLE)[0]
-
-  def close(self) -> None:
-    """Frees the OpenGL context."""
-    if self._eye is not None:
-      self._eye.close()
-      self._eye = None
-
-
-class SteppedCamera:
-  """The camera of a robot on a `SteppedClock`: the stream's sensor, without a network."""
-
-  def __init__(self, eyes: Eyes, clock: Clock, *, latency: float, sensor: Sensor):
-    """Makes the camera; pictures are taken at multiples of the frame's duration."""
-    self._eyes, self._clock, self._latency, self.sensor = eyes, clock, latency, sensor
-    self._frame, self._picture = -1, np.zeros((1, 1, 3), np.uint8)
-    self.frozen = False  # no new pictures come
-
-  def read(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture that has arrived, uint8 [H, W, 3], and its age [s]."""
-    now = self._clock.now()
-    frame = int(np.floor((now - self._latency) * FRAME_RATE + 1e-6))
-    if frame != self._frame and not (self.frozen and self._frame >= 0):
-      self._frame = frame
-      self._picture = self.sensor.develop(self._eyes.picture(frame / FRAME_RATE))
-    return self._picture, now - self._frame / FRAME_RATE
-
-  def close(self) -> None:
-    """Has nothing to free: the picture belongs to the robot."""
 
 
 class VirtualRobot:
@@ -110,13 +38,9 @@ class VirtualRobot:
     seed: int | None = None,
     hidden: Hidden | None = None,
     stepped: bool = False,
-    camera: bool = False,
+    camera: VirtualCamera | None = None,
     ball: bool = False,
-    lens: Camera = LENS,
-    latency: float = 0.04,
-    gain: float = 1.0,
-    noise: float = 2.0,
-    furnish=None,
+    furnish: Callable[[mujoco.MjSpec], None] | None = None,
   ):
     """Builds the robot, hanging in the hand of a person, supply off.
 
@@ -125,12 +49,8 @@ class VirtualRobot:
       seed: Seed of what is hidden, of noise and of chances; None: as in the data sheets.
       hidden: What is hidden, instead of a draw.
       stepped: Whether time jumps (`SteppedClock`), for rehearsals faster than real time.
-      camera: Whether there is a camera (needs EGL).
+      camera: The camera (needs EGL); None: a robot without.
       ball: Whether there is a ball.
-      lens: The camera's lens.
-      latency: s from the light to the arrival of a picture.
-      gain: Of the camera; 1 is neutral.
-      noise: Of the camera [8-bit levels].
       furnish: Called with the world's `mujoco.MjSpec` before the robot is put in, to change it.
     """
     if hidden is None:
@@ -138,7 +58,8 @@ class VirtualRobot:
       hidden = Hidden.none(count) if seed is None else Hidden.draw(seed, count)
     self.clock: RealClock | SteppedClock = SteppedClock() if stepped else RealClock()
     self.faults = Faults()
-    self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish, looks=camera)
+    looks = camera is not None
+    self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish, looks=looks)
     self.body.time = self.clock.now()
     devices = Devices(self.body, faults=self.faults, seed=seed or 0)
     self._wire: Wire | Cable
@@ -148,17 +69,15 @@ class VirtualRobot:
       self._wire = Wire(devices, self.clock)
     self.devices = devices
     self.operator = Hand(self.hold)
-    self.eyes = Eyes(self.body, lens) if camera else None
+    self.eyes = None if camera is None else Eyes(self.body, camera.lens)
     self.camera: SteppedCamera | None = None
     self.stream: CameraStream | None = None
-    if self.eyes is not None and stepped:
-      sensor = Sensor(gain=gain, exposure=1.0, noise=noise, seed=seed or 0)
-      self.camera = SteppedCamera(self.eyes, self.clock, latency=latency, sensor=sensor)
-    elif self.eyes is not None:
-      self.stream = CameraStream(
-        self.eyes.picture, rate_hz=FRAME_RATE, latency_s=latency, gain=gain, noise=noise
-      )
-      self.stream.start()
+    if self.eyes is not None and camera is not None:
+      if stepped:
+        self.camera = SteppedCamera(self.eyes, self.clock, camera, seed=seed or 0)
+      else:
+        self.stream = CameraStream(self.eyes.picture, camera)
+        self.stream.start()
 
   @property
   def port(self) -> str:

@@ -1,10 +1,9 @@
 """The virtual robot's camera: an MJPEG stream over HTTP, as network cameras give it.
 
-The pictures are those of the true room, never of the radiance field. The sensor has a response of
-its own: white balance, gain and exposure act on the light, photons and the amplifier add noise, a
-JPEG encoder follows, and every frame leaves a fixed time after it was taken. Like a webcam's driver
-it has controls that are read back: `GET /controls` gives them, `GET /controls?gain=90` sets them
-(the gain in the units of the Logitech C920, in which 50 is neutral).
+A JPEG encoder follows the sensor, and every frame leaves a fixed time after it was taken. Like a
+webcam's driver it has controls that are read back: `GET /controls` gives them,
+`GET /controls?gain=90` sets them (the gain in the units of the Logitech C920, in which 50 is
+neutral).
 """
 
 import json
@@ -18,47 +17,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 
+from nerf2real.real.virtual.camera import Sensor, VirtualCamera
+
 NEUTRAL_GAIN = 50.0  # of the C920 (paper: the default of the navigation experiments)
 MAX_GAIN, MAX_EXPOSURE = 255.0, 16.0  # the driver's ranges; of exposure in shares of the neutral
-_GAMMA = 2.2
-_WHITE_BALANCE = (1.02, 1.0, 0.97)  # of this sensor, on red, green and blue light: ours
-_SHOT_NOISE = 0.5  # share of the noise at mid grey that goes with the root of the light: ours
 _JPEG_QUALITY = 85
 _BOUNDARY = "frame"
 _WAIT = 0.5  # s a client's thread waits for a frame before it looks whether the stream has ended
-
-
-class Sensor:
-  """What the camera makes of a true picture."""
-
-  def __init__(self, *, gain: float, exposure: float, noise: float, seed: int = 0):
-    """Sets the sensor.
-
-    Args:
-      gain: Factor on the signal; 1 is neutral.
-      exposure: Factor on the light; 1 is neutral.
-      noise: Standard deviation at mid grey and gain 1 [8-bit levels].
-      seed: Of the noise.
-    """
-    self.gain, self.exposure, self.noise = gain, exposure, noise
-    self._rng = np.random.default_rng(seed)
-
-  def develop(self, picture: np.ndarray) -> np.ndarray:
-    """Returns the picture uint8 [H, W, 3] that leaves the sensor.
-
-    light = (v / 255)^2.2 * exposure * balance; noise of variance a + b light, times the gain;
-    value = 255 * clip(gain * light + noise)^(1 / 2.2)
-    """
-    table = (np.arange(256) / 255.0) ** _GAMMA
-    light = table[picture] * (self.exposure * np.asarray(_WHITE_BALANCE))
-    if self.noise > 0:
-      middle = 0.5**_GAMMA
-      # Levels to light at mid grey: d light / d value.
-      deviation = self.noise / 255.0 * _GAMMA * 0.5 ** (_GAMMA - 1)
-      share = _SHOT_NOISE * light / middle + (1 - _SHOT_NOISE)
-      light = light + self._rng.normal(size=light.shape) * deviation * np.sqrt(share)
-    signal = np.clip(self.gain * light, 0.0, 1.0) ** (1 / _GAMMA)
-    return np.rint(255 * signal).astype(np.uint8)
 
 
 class CameraStream:
@@ -67,12 +32,8 @@ class CameraStream:
   def __init__(
     self,
     render: Callable[[], np.ndarray],
+    settings: VirtualCamera | None = None,
     *,
-    rate_hz: float = 30.0,
-    latency_s: float = 0.03,
-    gain: float = 1.0,
-    exposure: float = 1.0,
-    noise: float = 2.0,
     port: int = 0,
     seed: int = 0,
   ):
@@ -81,20 +42,13 @@ class CameraStream:
     Args:
       render: Returns the true picture now, RGB uint8 [H, W, 3]; always called from the stream's own
         thread, which may therefore own an OpenGL context that the first call makes.
-      rate_hz: Pictures a second.
-      latency_s: From taking a picture to sending it [s].
-      gain: Factor on the signal; 1 is neutral.
-      exposure: Factor on the light; 1 is neutral.
-      noise: Standard deviation at mid grey and gain 1 [8-bit levels].
+      settings: Rate, latency and the sensor's response; the lens is the renderer's.
       port: 0 takes a free one.
       seed: Of the noise.
     """
-    if not rate_hz > 0:
-      raise ValueError(f"The stream's rate must be positive [Hz], found {rate_hz}.")
-    if not latency_s >= 0:
-      raise ValueError(f"The stream's latency must be 0 s or more, found {latency_s}.")
-    self._render, self._period, self._latency = render, 1.0 / rate_hz, latency_s
-    self.sensor = Sensor(gain=gain, exposure=exposure, noise=noise, seed=seed)
+    settings = settings or VirtualCamera()
+    self._render, self._period, self._latency = render, 1.0 / settings.rate, settings.latency
+    self.sensor = Sensor(settings, seed=seed)
     self._blocked = False
     self._frozen = False
     self._due: deque[tuple[float, bytes]] = deque()

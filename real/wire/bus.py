@@ -13,8 +13,9 @@ import dynamixel_sdk as sdk
 import numpy as np
 import serial
 
-from nerf2real.real.loop.clock import Clock, RealClock
+from nerf2real.real.clock import Clock, RealClock
 from nerf2real.real.wire import op3, opencr
+from nerf2real.real.wire.packets import PacketHandler
 from nerf2real.real.wire.port import Port
 
 TORQUE_ENABLE, GOAL_POSITION = 64, 116
@@ -48,12 +49,18 @@ class BusError(OSError):
 class BusSettings:
   """Settings of the bus and of the servos' registers."""
 
-  baud: int = 2_000_000  # bit/s (OP3)
-  position_gain: int = 800  # P gain register; with D and I 0 (paper) 18.9 to 26.4 N m/rad at 12 V
-  pwm_limit: int = 885  # 885 is the whole supply voltage
-  return_delay: int = 0  # 2 us; the factory's 250 would cost half a millisecond a reading
-  watchdog: float = 0.1  # s without traffic after which servos stop by themselves; 0: never
-  margin: float = 0.002  # s that an answer may be late
+  baud: int = 2_000_000
+  """bit/s (OP3)."""
+  position_gain: int = 800
+  """P gain register; with D and I 0 (paper) 18.9 to 26.4 N m/rad at 12 V."""
+  pwm_limit: int = 885
+  """885 is the whole supply voltage."""
+  return_delay: int = 0
+  """2 us; the factory's 250 would cost half a millisecond a reading."""
+  watchdog: float = 0.1
+  """s without traffic after which servos stop by themselves; 0: never."""
+  margin: float = 0.002
+  """s that an answer may be late."""
 
 
 class JointReading(NamedTuple):
@@ -74,9 +81,13 @@ class BusCounts:
   """What became of the readings so far."""
 
   joint_readings: int = 0
+  """Readings of all joints that arrived."""
   joint_losses: int = 0
+  """Readings of all joints that were lost or damaged."""
   imu_readings: int = 0
+  """Readings of the board that arrived."""
   imu_losses: int = 0
+  """Readings of the board that were lost or damaged."""
 
 
 class Bus:
@@ -110,7 +121,7 @@ class Bus:
     self._directions, self._id_row = self.wiring.directions, np.array(self._ids)
     self._lock = threading.Lock()
     self._port = Port(path, baud=self.settings.baud, clock=self.clock)
-    self._handler = sdk.Protocol2PacketHandler()
+    self._handler = PacketHandler()
     self._return_delay = 2e-6 * self.settings.return_delay
 
   def close(self) -> None:

@@ -64,6 +64,7 @@ class Wiring:
   """The table as arrays, in the order of `constants.JOINT_NAMES`. J joints."""
 
   joints: tuple[Joint, ...] = JOINTS
+  """One of each joint."""
 
   def __post_init__(self):
     names = tuple(joint.name for joint in self.joints)

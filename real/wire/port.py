@@ -11,14 +11,11 @@ from pathlib import Path
 import dynamixel_sdk
 import serial
 
-from nerf2real.real.loop.clock import Clock
+from nerf2real.real.clock import Clock
 
 _PATIENCE = 0.1  # s that an answer may be late outside the cycle
 _GRACE = 0.005  # s after a time-out in which bytes that lie here are still taken
 _TICK = 1e-6  # s beyond a time-out: the SDK ends a wait only when it has passed
-serial.protocol_handler_packages.append(
-  "nerf2real.real.virtual.bus"
-)  # for rehearsals, which have a URL
 _LATENCY_LIMIT = 1  # ms; the adapter's own default of 16 ms is a hidden delay
 
 

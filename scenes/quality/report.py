@@ -4,45 +4,101 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import trimesh
 
-from nerf2real.core import files
-from nerf2real.core.pages import parts
+from nerf2real.core import palette
+from nerf2real.core.floor_map import FloorMap
+from nerf2real.core.pages import charts, page, pictures
+from nerf2real.core.pages.blocks import (
+  Block,
+  Details,
+  Figure,
+  Figures,
+  Grid,
+  Picture,
+  Preformatted,
+  Times,
+)
+from nerf2real.core.pages.page import Section
 from nerf2real.scenes.quality.held_out import ViewScore
 
 _THUMBNAILS = 18
 _THUMBNAIL_WIDTH = 240
 _SHOWN_VIEWS = 5
+_SHOWN_ROBOT_VIEWS = 8
 _VIEW_WIDTH = 480
 
-# name in scene.json -> (unit, what it means); names that are not here are shown without a text
-FIGURES: Mapping[str, tuple[str, str]] = {
-  "keyframes": ("", "pictures taken from the capture"),
-  "registered_fraction": ("", "share of the keyframes whose pose was found"),
-  "reprojection_error_px": ("px", "mean distance between seen and predicted feature positions"),
-  "focal_length_px": ("px", "mean focal length of the capture's camera"),
-  "held_out_views": ("", "pictures kept from training, used for the figures below"),
-  "held_out_psnr_db": ("dB", "peak signal-to-noise ratio on held-out views, full size, mean"),
-  "held_out_ssim": ("", "structural similarity on held-out views, full size, mean"),
-  "held_out_psnr_30x40_db": ("dB", "the same views at 30x40"),
-  "exposure_ratio": ("", "brightest to darkest exposure of the capture; it was evened out"),
-  "held_out_psnr_60x80_db": ("dB", "the same views at 60x80"),
-  "held_out_ssim_30x40": ("", "the same views at 30x40"),
-  "held_out_ssim_60x80": ("", "the same views at 60x80"),
-  "robot_psnr_db": ("dB", "PSNR at 30x40; from the robot's own camera where the truth is known"),
-  "robot_psnr_60x80_db": ("dB", "PSNR at 60x80 from the robot's own camera"),
-  "collision_error_m": ("m", "95th percentile of parts to seen surface and back, the worse"),
-  "collision_parts": ("", "convex parts that MuJoCo collides"),
-  "floor_tilt_deg": ("deg", "angle between the floor found and the true vertical's floor"),
-  "scale_source": ("", "where the metric scale comes from"),
-  "scale_error": ("", "relative error of the scale against the truth"),
-  "camera_rmse_m": ("m", "RMSE of the camera positions against the truth after alignment"),
-  "free_area_m2": ("m^2", "floor area that the robot can stand on"),
-  "baseline_psnr_db": ("dB", "PSNR of the COLMAP Poisson mesh on the same held-out views"),
+
+class Meaning(NamedTuple):
+  """What a figure of scene.json says."""
+
+  unit: str
+  text: str
+  good: str = ""
+
+
+# Name in scene.json -> its meaning; names that are not here are shown without a text.
+FIGURES: Mapping[str, Meaning] = {
+  "keyframes": Meaning("", "pictures taken from the capture"),
+  "registered_fraction": Meaning("", "share of the keyframes whose pose was found", "1"),
+  "reprojection_error_px": Meaning(
+    "px", "mean distance between seen and predicted feature positions", "lower"
+  ),
+  "focal_length_px": Meaning("px", "mean focal length of the capture's camera"),
+  "held_out_views": Meaning("", "pictures kept from training, used for the figures below"),
+  "held_out_psnr_db": Meaning(
+    "dB", "peak signal-to-noise ratio on held-out views, full size, mean", "higher"
+  ),
+  "held_out_ssim": Meaning(
+    "", "structural similarity on held-out views, full size, mean", "near 1"
+  ),
+  "held_out_psnr_30x40_db": Meaning("dB", "the same views at 30x40", "higher"),
+  "exposure_ratio": Meaning(
+    "", "brightest to darkest exposure of the capture; it was evened out", "near 1"
+  ),
+  "held_out_psnr_60x80_db": Meaning("dB", "the same views at 60x80", "higher"),
+  "held_out_ssim_30x40": Meaning("", "the same views at 30x40", "near 1"),
+  "held_out_ssim_60x80": Meaning("", "the same views at 60x80", "near 1"),
+  "robot_psnr_db": Meaning(
+    "dB", "PSNR at 30x40; from the robot's own camera where the truth is known", "higher"
+  ),
+  "robot_psnr_60x80_db": Meaning("dB", "PSNR at 60x80 from the robot's own camera", "higher"),
+  "collision_error_m": Meaning(
+    "m", "95th percentile of parts to seen surface and back, the worse", "lower"
+  ),
+  "collision_parts": Meaning("", "convex parts that MuJoCo collides"),
+  "floor_tilt_deg": Meaning(
+    "deg", "angle between the floor found and the true vertical's floor", "near 0"
+  ),
+  "floor_tilt_from_cameras_deg": Meaning(
+    "deg", "angle between the floor's normal and the cameras' mean up direction"
+  ),
+  "floor_height_error_m": Meaning("m", "height of the floor found against the truth", "near 0"),
+  "scale_source": Meaning("", "where the metric scale comes from"),
+  "scale_spread": Meaning("", "relative standard deviation of the scale", "lower"),
+  "scale_error": Meaning("", "relative error of the scale against the truth", "near 0"),
+  "camera_rmse_m": Meaning(
+    "m", "RMSE of the camera positions against the truth after alignment", "lower"
+  ),
+  "camera_rotation_deg": Meaning("deg", "RMSE of the camera rotations against the truth", "lower"),
+  "collision_true_p95_m": Meaning(
+    "m", "95th percentile of the parts' distance from the true surface", "lower"
+  ),
+  "collision_true_within_5cm": Meaning(
+    "", "share of the touchable collision surface within 5 cm of the true surface", "near 1"
+  ),
+  "surface_true_p95_m": Meaning(
+    "m", "95th percentile of the true surface's distance from the parts", "lower"
+  ),
+  "surface_true_within_5cm": Meaning(
+    "", "share of the true surface within 5 cm of the parts", "near 1"
+  ),
+  "free_area_m2": Meaning("m^2", "floor area that the robot can stand on"),
+  "baseline_psnr_db": Meaning("dB", "PSNR of the COLMAP Poisson mesh on the same held-out views"),
 }
 
 
@@ -64,119 +120,115 @@ class ReportData:
   baseline: Mapping[str, np.ndarray]  # name of a held-out view -> baseline's picture; may be empty
   visual: trimesh.Trimesh
   collision: Sequence[trimesh.Trimesh]
-  free_space_picture: np.ndarray  # uint8 [H, W, 3], top-down with goals and camera path
+  floor: FloorMap  # without goals and camera path
+  goals: np.ndarray  # [G, 2]
 
 
 def write(path: Path, data: ReportData) -> None:
   """Writes the page as one file that opens offline."""
   sections = [
-    _summary(data),
+    Section("Figures", "", [_figures(data.figures)]),
     _keyframes(data),
     _views(data),
-    _robot_views(data),
-    _geometry(data),
-    parts.section(
-      "Free space",
-      "Seen from above: white is floor that the robot's centre may stand on, grey is too near to "
-      "something, black is occupied or never seen. Crosses are the goals, the line is the camera.",
-      parts.grid([parts.picture(data.free_space_picture)], 2),
-    ),
-    parts.section("Time", "Wall-clock time of each stage.", parts.times(data.seconds)),
-    parts.section(
-      "Settings", "", parts.details("all settings", json.dumps(data.settings, indent=1))
+    *([_robot_views(data.robot_views)] if data.robot_views else []),
+    *_geometry(data),
+    _free_space(data),
+    Section("Time", "Wall-clock time of each stage.", [Times(data.seconds)]),
+    Section(
+      "Settings",
+      "",
+      [Details("all settings", [Preformatted(json.dumps(data.settings, indent=1))])],
     ),
   ]
-  files.write_atomically(path, parts.page(data.title, data.lead, sections, with_plots=True))
+  page.write(path, page.Page(data.title, data.lead, sections, warnings=data.warnings))
 
 
-def _summary(data: ReportData) -> str:
-  rows = []
-  for name, value in data.figures.items():
-    if value is None or isinstance(value, Mapping):
-      continue
-    unit, text = FIGURES.get(name, ("", ""))
-    rows.append((name, value, unit, text))
-  return parts.section(
-    "Figures",
-    "",
-    parts.warnings(data.warnings),
-    parts.table(("figure", "value", "unit", "meaning"), rows),
+def _figures(values: Mapping[str, Any]) -> Figures:
+  return Figures(
+    [
+      Figure(name, value, *FIGURES.get(name, ()))
+      for name, value in values.items()
+      if value is not None and not isinstance(value, Mapping)
+    ]
   )
 
 
-def _keyframes(data: ReportData) -> str:
+def _keyframes(data: ReportData) -> Section:
   chosen = np.unique(np.linspace(0, len(data.keyframes) - 1, _THUMBNAILS).astype(int))
-  pictures = []
-  for index in chosen:
-    image: Any = cv2.imread(str(data.keyframes[index]))
-    height = round(image.shape[0] * _THUMBNAIL_WIDTH / image.shape[1])
-    image = cv2.resize(image, (_THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
-    pictures.append(parts.picture(image[..., ::-1], data.keyframes[index].stem))
-  text = f"{len(data.keyframes)} keyframes; {data.strategy}."
-  return parts.section("Keyframes", text, parts.grid(pictures, 6))
-
-
-def _shrink(image: np.ndarray) -> np.ndarray:
-  height = round(image.shape[0] * _VIEW_WIDTH / image.shape[1])
-  if image.shape[1] <= _VIEW_WIDTH:
-    return image
-  return cv2.resize(image, (_VIEW_WIDTH, height), interpolation=cv2.INTER_AREA)
-
-
-def _views(data: ReportData) -> str:
-  """Shows the best, the worst and some views between, so that failures are seen."""
-  order = sorted(range(len(data.views)), key=lambda k: data.views[k].psnr_db)
-  chosen = [order[k] for k in np.unique(np.linspace(0, len(order) - 1, _SHOWN_VIEWS).astype(int))]
   cells = []
-  columns = 5 if data.baseline else 4
-  for index in chosen:
-    view = data.views[index]
-    cells += [
-      parts.picture(_shrink(view.truth), f"{view.name}: picture"),
-      parts.picture(_shrink(view.image), f"field: {view.psnr_db:.1f} dB, SSIM {view.ssim:.3f}"),
-      parts.picture(_shrink(parts.error_map(view.truth, view.image)), "error (white: 64 of 255)"),
-      parts.picture(_shrink(parts.depth_map(view.depth)), "depth (near is red)"),
+  for file in (data.keyframes[index] for index in chosen):
+    image: Any = cv2.imread(str(file))
+    cells.append(Picture(pictures.shrink(image[..., ::-1], _THUMBNAIL_WIDTH), file.stem))
+  return Section(
+    "Keyframes", f"{len(data.keyframes)} keyframes; {data.strategy}.", [Grid(cells, 6)]
+  )
+
+
+def _views(data: ReportData) -> Section:
+  """Shows the best, the worst and some views between, so that failures are seen."""
+  order = sorted(data.views, key=lambda view: view.psnr_db)
+  chosen = np.unique(np.linspace(0, len(order) - 1, _SHOWN_VIEWS).astype(int))
+  cells: list[Block] = []
+  for view in (order[index] for index in chosen):
+    shown = [
+      (view.truth, f"{view.name}: picture"),
+      (view.image, f"field: {view.psnr_db:.1f} dB, SSIM {view.ssim:.3f}"),
+      (pictures.error_map(view.truth, view.image), "error (white: 64 of 255)"),
+      (pictures.depth_map(view.depth), "depth (near is red)"),
     ]
     if data.baseline:
-      cells.append(parts.picture(_shrink(data.baseline[view.name]), "COLMAP Poisson mesh"))
-  return parts.section(
+      shown.append((data.baseline[view.name], "COLMAP Poisson mesh"))
+    cells += [Picture(pictures.shrink(image, _VIEW_WIDTH), text) for image, text in shown]
+  return Section(
     "Held-out views",
     "Pictures that training never saw, from the worst to the best.",
-    parts.grid(cells, columns),
+    [Grid(cells, 5 if data.baseline else 4)],
   )
 
 
-def _robot_views(data: ReportData) -> str:
-  if not data.robot_views:
-    return ""
-  cells = []
-  for view in data.robot_views[:8]:
+def _robot_views(views: Sequence[ViewScore]) -> Section:
+  cells: list[Block] = []
+  for view in views[:_SHOWN_ROBOT_VIEWS]:
     cells += [
-      parts.picture(view.truth, f"{view.name}: truth", pixelated=True),
-      parts.picture(view.image, f"field: {view.psnr_db:.1f} dB", pixelated=True),
+      Picture(view.truth, f"{view.name}: truth", pixelated=True),
+      Picture(view.image, f"field: {view.psnr_db:.1f} dB", pixelated=True),
     ]
-  height, width = data.robot_views[0].truth.shape[:2]
-  return parts.section(
+  height, width = views[0].truth.shape[:2]
+  return Section(
     f"At the robot's resolution ({height}x{width})",
     "What the policy would see beside the same picture averaged over its pixels.",
-    parts.grid(cells, 4),
+    [Grid(cells, 4)],
   )
 
 
-def _geometry(data: ReportData) -> str:
-  surface = parts.figure_3d(
-    [parts.mesh_trace(data.visual, name="surface"), parts.path_trace(data.camera_path)]
-  )
-  convex = parts.figure_3d(
-    [
-      parts.mesh_trace(part, color=parts.part_color(index), name=f"part {index}")
-      for index, part in enumerate(data.collision)
-    ]
-  )
-  return parts.section(
-    "Surface and camera path", "Drag to turn, scroll to zoom.", surface
-  ) + parts.section(
-    "Contact geometry",
-    f"{len(data.collision)} convex parts as MuJoCo collides them; the floor is a plane at z = 0.",
-    convex,
+def _geometry(data: ReportData) -> list[Section]:
+  surface = [charts.mesh_trace(data.visual, name="surface"), charts.path_trace(data.camera_path)]
+  convex = [
+    charts.mesh_trace(part, color=palette.cycle(index), name=f"part {index}")
+    for index, part in enumerate(data.collision)
+  ]
+  return [
+    Section(
+      "Surface and camera path",
+      "Drag to turn, scroll to zoom.",
+      [charts.figure_3d(surface)],
+    ),
+    Section(
+      "Contact geometry",
+      f"{len(data.collision)} convex parts as MuJoCo collides them; the floor is a plane at z = 0.",
+      [charts.figure_3d(convex)],
+    ),
+  ]
+
+
+def _free_space(data: ReportData) -> Section:
+  floor = data.floor.copy().path(data.camera_path, palette.rgb(palette.VERMILION))
+  for goal in data.goals:
+    floor.cross(goal, palette.rgb(palette.BLUE))
+  return Section(
+    "Free space",
+    "Seen from above: white is floor that the robot's centre may stand on, light grey is too near "
+    "to something, grey was never seen, dark grey is occupied. Crosses are the goals, the line is "
+    "the camera.",
+    [Grid([Picture(floor.scale_bar().picture)], 2)],
   )

@@ -10,6 +10,7 @@ import numpy as np
 
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.sensors.delays import StepRing
 
 _LEAST_STRENGTH = 0.1  # ours: a servo that hot or starved has shut down; keeps the model regular
 
@@ -28,31 +29,28 @@ class CommandDelay(Operator):
     self._fraction = np.maximum(delay - whole, 0.0)
     self._fraction[self._fraction < 1e-9] = 0.0
     self._whole = whole.astype(int)
-    self._length = int(self._whole.max(initial=0)) + 2
-    self._ring = np.zeros((self._length, binding.model.nu))
-    self._columns = np.arange(binding.model.nu)
+    self._ring = StepRing(int(self._whole.max(initial=0)) + 2, binding.model.nu)
     self._uniform = len(set(delay.tolist())) == 1
     self.reset()
 
   def reset(self) -> None:
-    self._count = 0
+    self._empty = True
 
   def command(self, time: float, ctrl: Array) -> None:
-    ring, length = self._ring, self._length
-    if self._count == 0:
-      ring[:] = ctrl
-    now = self._count % length
-    ring[now] = ctrl
-    self._count += 1
+    ring = self._ring
+    if self._empty:
+      ring.fill(ctrl)
+      self._empty = False
+    else:
+      ring.push(ctrl)
     if self._uniform:
       whole, fraction = int(self._whole[0]), float(self._fraction[0])
-      ctrl[:] = ring[(now - whole) % length]
+      ctrl[:] = ring.back(whole)
       if fraction:
         ctrl *= 1 - fraction
-        ctrl += fraction * ring[(now - whole - 1) % length]
+        ctrl += fraction * ring.back(whole + 1)
       return
-    newer = ring[(now - self._whole) % length, self._columns]
-    older = ring[(now - self._whole - 1) % length, self._columns]
+    newer, older = ring.back_each(self._whole), ring.back_each(self._whole + 1)
     ctrl[:] = np.where(self._fraction > 0, newer + self._fraction * (older - newer), newer)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
-from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.delays import DelayLine
 
 
 class CameraGain(Operator):
@@ -27,7 +27,7 @@ class CameraLatency(Operator):
 
   def bind(self, binding: Binding) -> None:
     self._delay = sum(self.value(effect, "delay") for effect in self.effects)
-    self._line = filters.DelayLine(self._delay, capacity=256)
+    self._line = DelayLine(self._delay, capacity=256)
 
   def reset(self) -> None:
     self._line.reset(self._delay)

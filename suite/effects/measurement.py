@@ -11,51 +11,11 @@ import numpy as np
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.sensors.delays import History
 
 _JOINT_CHANNELS = ("joint_positions", "joint_velocities")
 _IMU_CHANNELS = ("gyroscope", "accelerometer")
-
-
-class History:
-  """Samples of one channel with their times, read back at an earlier time by interpolation."""
-
-  def __init__(self, capacity: int = 512):
-    self._times = np.zeros(capacity)
-    self._values: Array | None = None
-    self._count = 0
-
-  def clear(self) -> None:
-    """Forgets everything."""
-    self._count = 0
-
-  def push(self, time: float, value: Array) -> None:
-    """Adds a sample; the oldest half is dropped when full."""
-    if self._values is None or self._values.shape[1:] != value.shape:
-      self._values = np.zeros((len(self._times), *value.shape))
-      self._count = 0
-    if self._count and time <= self._times[self._count - 1]:
-      self._values[self._count - 1] = value
-      return
-    if self._count == len(self._times):
-      half = self._count // 2
-      self._times[:half] = self._times[self._count - half :].copy()
-      self._values[:half] = self._values[self._count - half :].copy()
-      self._count = half
-    self._times[self._count] = time
-    self._values[self._count] = value
-    self._count += 1
-
-  def read(self, time: float) -> Array:
-    """Returns the value at `time`, linear between samples, the nearest outside them."""
-    assert self._values is not None
-    times = self._times[: self._count]
-    right = int(np.searchsorted(times, time))
-    if right == 0:
-      return self._values[0].copy()
-    if right == self._count:
-      return self._values[right - 1].copy()
-    weight = (time - times[right - 1]) / (times[right] - times[right - 1])
-    return self._values[right - 1] + weight * (self._values[right] - self._values[right - 1])
+_CAPACITY = 512  # samples kept for delays
 
 
 class MeasurementDelay(Operator):
@@ -76,11 +36,11 @@ class MeasurementDelay(Operator):
   def observe(self, channel: str, value: Array, time: float) -> Array:
     if channel not in _JOINT_CHANNELS or not self._groups:
       return value
-    history = self._histories.setdefault(channel, History())
+    history = self._histories.setdefault(channel, History(_CAPACITY))
     history.push(time, np.asarray(value, np.float64))
     late = np.array(value, np.float64)
     for delay, joints in self._groups:
-      late[joints] = history.read(time - delay)[joints]
+      late[joints] = history.interpolate(time - delay)[joints]
     return late
 
 
@@ -142,7 +102,7 @@ class ImuLag(Operator):
   def bind(self, binding: Binding) -> None:
     self._delay = sum(self.value(effect, "delay") for effect in self.effects)
     self._lag = sum(self.value(effect, "time_constant") for effect in self.effects)
-    self._histories = {channel: History() for channel in _IMU_CHANNELS}
+    self._histories = {channel: History(_CAPACITY) for channel in _IMU_CHANNELS}
     self.reset()
 
   def reset(self) -> None:
@@ -155,7 +115,7 @@ class ImuLag(Operator):
       return value
     if self._delay > 0:
       self._histories[channel].push(time, np.asarray(value, np.float64))
-      value = self._histories[channel].read(time - self._delay)
+      value = self._histories[channel].interpolate(time - self._delay)
     if self._lag > 0:
       if channel in self._state:
         before, state = self._state[channel]

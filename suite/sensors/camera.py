@@ -43,6 +43,7 @@ class CameraSettings:
   white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors on red, green, blue light
   noise: float = 0.0  # standard deviation of the noise at gain 1 [8-bit levels]
   latency: float = 0.0  # s, in addition to the delay that an episode draws
+  rate: float = 1 / constants.CONTROL_TIMESTEP  # pictures a second [Hz]; between two the last stays
 
   def __post_init__(self):
     if self.compositing not in (DEPTH, OVERLAY):
@@ -55,6 +56,12 @@ class CameraSettings:
     for name in ("noise", "latency"):
       if not 0 <= getattr(self, name) < np.inf:
         raise ValueError(f"The camera's {name} must be 0 or more, found {getattr(self, name)}.")
+    fastest = 1 / constants.CONTROL_TIMESTEP
+    if not 0 < self.rate <= fastest:
+      raise ValueError(
+        f"The camera's rate must be above 0 and at most that of the control, {fastest:g} Hz, found "
+        f"{self.rate:g} Hz."
+      )
 
   def camera(self, image_size: tuple[int, int]) -> Camera:
     """Returns the camera model for a picture of (height, width)."""

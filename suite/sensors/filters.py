@@ -1,4 +1,4 @@
-"""Filters of the sensor and action path: low-pass, action smoothing, delay with jitter.
+"""Filters of the sensor and action path: low-pass, range of the IMU chip, action smoothing.
 
 They hold state, work on float arrays of a fixed shape and know nothing of the simulator: the same
 objects run on the robot. Each has `reset()` and one call a sample.
@@ -128,72 +128,3 @@ class ExponentialFilter:
     else:
       self.value = self.strength * self.value + (1 - self.strength) * action
     return self.value.copy()
-
-
-class DelayLine:
-  """Delivers samples late: a constant delay and a jitter drawn for each sample.
-
-  A sample taken at time t arrives at t + delay + uniform(-jitter, jitter), never before t. `read`
-  returns the sample with the newest time stamp of those that have arrived, so a late sample never
-  replaces a newer one. Until the first has arrived, the first one is returned (the robot was
-  standing there before the episode).
-  """
-
-  def __init__(self, delay: float = 0.0, *, jitter: float = 0.0, capacity: int = 64):
-    """Creates a delay line.
-
-    Args:
-      delay: s.
-      jitter: half width of the uniform jitter, s.
-      capacity: samples kept; at least (delay + jitter) * sampling rate + 2.
-    """
-    self._capacity = capacity
-    self._values: Array | None = None
-    self._arrivals = [0.0] * capacity
-    self._times = [0.0] * capacity
-    self._rng = np.random.default_rng(0)
-    self.reset(delay, jitter=jitter)
-
-  def reset(
-    self, delay: float, *, jitter: float = 0.0, rng: np.random.Generator | None = None
-  ) -> None:
-    """Empties the line for a new episode with its own delay [s], jitter [s] and random stream."""
-    if delay < 0 or jitter < 0:
-      raise ValueError(f"Found delay {delay} s and jitter {jitter} s, expected both at least 0.")
-    self.delay, self.jitter = delay, jitter
-    if rng is not None:
-      self._rng = rng
-    self._count = 0
-
-  def push(self, time: float, value: Array) -> None:
-    """Adds the sample taken at `time` [s]; times must not decrease."""
-    if self._values is None or self._values.shape[1:] != np.shape(value):
-      value = np.asarray(value)
-      self._values = np.empty((self._capacity, *value.shape), value.dtype)
-    slot = self._count % self._capacity
-    lateness = self.delay
-    if self.jitter:
-      lateness = max(0.0, lateness + self.jitter * (2 * self._rng.random() - 1))
-    self._values[slot] = value
-    self._times[slot] = time
-    self._arrivals[slot] = time + lateness
-    self._count += 1
-
-  def _newest_arrived(self, time: float) -> int:
-    if self._values is None or not self._count:
-      raise ValueError("Found an empty delay line, expected a push before the first read.")
-    oldest = max(0, self._count - self._capacity)
-    for index in range(self._count - 1, oldest - 1, -1):
-      if self._arrivals[index % self._capacity] <= time + 1e-9:
-        return index % self._capacity
-    return oldest % self._capacity
-
-  def read(self, time: float) -> Array:
-    """Returns a copy of the newest sample that has arrived by `time` [s]."""
-    slot = self._newest_arrived(time)
-    assert self._values is not None
-    return self._values[slot].copy()
-
-  def age(self, time: float) -> float:
-    """Returns how old [s] the sample is that `read(time)` returns."""
-    return time - self._times[self._newest_arrived(time)]

@@ -13,6 +13,7 @@ import numpy as np
 from nerf2real.suite import specs
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.delays import DelayLine
 from nerf2real.suite.sensors.madgwick import Madgwick
 
 _EPSILON = 1e-9  # s, against rounding in sums of time steps
@@ -31,7 +32,7 @@ class Proprioception:
     self._timestep, self._substeps = physics_timestep, substeps
     self._low_pass = filters.LowPass(filters.CHIP_BANDWIDTH_HZ, 1 / physics_timestep)
     self._madgwick = Madgwick()
-    self._imu_line, self._joint_line = filters.DelayLine(), filters.DelayLine()
+    self._imu_line, self._joint_line = DelayLine(), DelayLine()
     # Row 0 holds the last values of the previous control step: ticks fall between physics steps.
     self._imu = np.zeros((substeps + 1, 6))
     self._joints = np.zeros((substeps + 1, len(constants.JOINT_NAMES)))

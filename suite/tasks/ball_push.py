@@ -3,15 +3,17 @@
 Byravan et al. 2022, NeRF2Real, section "Tasks" and appendix "Rewards".
 """
 
+import functools
 from typing import Any
 
 import numpy as np
+from dm_control import composer
 
 from nerf2real.core import rotations
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.camera import RobotCamera
-from nerf2real.suite.tasks import rewards, touch
+from nerf2real.suite.tasks import catalogue, rewards, touch
 from nerf2real.suite.tasks.ball import Ball
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.privileged import Quantity
@@ -19,8 +21,8 @@ from nerf2real.suite.tasks.settings import TaskSettings
 from nerf2real.suite.tasks.state import Start
 from nerf2real.suite.tasks.workspace import Workspace, find_workspace
 
-NAME = "ball_push"
-TIME_LIMIT = protocols.BALL_TIME_LIMIT  # s (paper)
+NAME = catalogue.BALL_PUSH
+TIME_LIMIT = catalogue.TIME_LIMITS[NAME]  # s
 FALL = "fall"
 BALL_IN_FRONT = 0.5  # share of episodes with the ball just in front of the robot (paper)
 # m ahead of and beside the robot's torso, when it starts in front: ours.
@@ -97,7 +99,9 @@ class BallPush(RobotTask):
 
   def _place(self, random_state: np.random.RandomState) -> None:
     in_front = random_state.uniform() < BALL_IN_FRONT
-    for _ in range(_MAX_ATTEMPTS):
+    for attempt in range(2 * _MAX_ATTEMPTS):
+      if attempt == _MAX_ATTEMPTS:  # there is no room in front of the robot: beside it there may be
+        in_front = False
       self._put_ball((0.0, 0.0), height=10.0)  # out of the way while the robot is placed
       self._stand_somewhere(
         lambda: Start(tuple(self._free_place(random_state)), random_state.uniform(-np.pi, np.pi))
@@ -108,9 +112,9 @@ class BallPush(RobotTask):
       self._put_ball(self._in_front(random_state) if in_front else self._free_place(random_state))
       if not self._ball_touches_anything():
         return
-    raise ValueError(
-      f"Found no place for robot and ball in {_MAX_ATTEMPTS} attempts: the workspace of the scene "
-      f"{getattr(self.scene, 'name', '')!r} is too full."
+    raise composer.EpisodeInitializationError(
+      f"Found no place for robot and ball in {2 * _MAX_ATTEMPTS} attempts: the workspace of the "
+      f"scene {getattr(self.scene, 'name', '')!r} is too full."
     )
 
   def _free_place(self, random_state: np.random.RandomState) -> np.ndarray:
@@ -119,10 +123,14 @@ class BallPush(RobotTask):
       xy = random_state.uniform(self.workspace.lower, self.workspace.upper)
       if self.scene.free_space.is_reachable(xy):
         return xy
-    raise ValueError(
-      f"Found no free place in the workspace of {getattr(self.scene, 'name', '')!r} in "
-      f"{_MAX_ATTEMPTS} attempts."
-    )
+    places = self._free_places
+    return places[random_state.randint(len(places))]
+
+  @functools.cached_property
+  def _free_places(self) -> np.ndarray:
+    """The places [N, 2] of a grid over the workspace at which a robot can stand."""
+    places = self.workspace.places()
+    return places[np.asarray(self.scene.free_space.is_reachable(places), bool)]
 
   def _in_front(self, random_state: np.random.RandomState) -> np.ndarray:
     root = self._indices.root_qpos

@@ -26,8 +26,6 @@ from nerf2real.suite.tasks.delayed_picture import DelayedPicture
 from nerf2real.suite.tasks.settings import TaskSettings
 from nerf2real.suite.tasks.state import RobotIndices, RobotState, Start
 
-MIN_UPRIGHT = 0.5  # cosine of the torso's tilt below which it has fallen (60 degrees): ours
-MIN_HEIGHT = 0.14  # m of the torso's origin above the floor (standing: 0.246): ours
 _MAX_START_ATTEMPTS = 100
 
 
@@ -106,6 +104,11 @@ class RobotTask(composer.Task):
   def state(self) -> RobotState:
     """The robot's true state."""
     return self._state
+
+  @property
+  def render_time(self) -> float:
+    """Time spent on pictures since the environment was built [s]."""
+    return 0.0 if self._picture is None else self._picture.render_time
 
   @property
   def standing_action(self) -> np.ndarray:
@@ -218,7 +221,7 @@ class RobotTask(composer.Task):
       rng=np.random.default_rng(random_state.randint(2**31)),
     )
     if self._picture is not None:
-      self._picture.reset(self._data.qpos)
+      self._picture.reset(self._data.qpos, random_state)
     self._state = self._indices.read()
 
   def before_step(
@@ -232,8 +235,6 @@ class RobotTask(composer.Task):
       self.draws.pushes.at(self._data.time) + self.hand_force
     )
     self._substep = 0
-    if self._picture is not None:
-      self._picture.start_step()
 
   def before_substep(
     self, physics: Any, action: np.ndarray, random_state: np.random.RandomState
@@ -248,7 +249,7 @@ class RobotTask(composer.Task):
       self._substep, data.sensordata[self._indices.imu], qpos[self._indices.joint_qpos]
     )
     if self._picture is not None:
-      self._picture.record(self._substep, qpos)
+      self._picture.record(qpos)
     self._touch.note(data)
     self._substep += 1
 
@@ -288,8 +289,8 @@ class RobotTask(composer.Task):
   def fallen(self) -> bool:
     """Whether the robot has fallen: tilted, low, or on the floor with anything but its feet."""
     return (
-      self._state.rotation[2, 2] < MIN_UPRIGHT
-      or self._state.position[2] < MIN_HEIGHT
+      self._state.rotation[2, 2] < constants.MIN_UPRIGHT
+      or self._state.position[2] < constants.MIN_HEIGHT
       or self._touch.floor
     )
 

@@ -12,14 +12,13 @@ import numpy as np
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.camera import RobotCamera
-from nerf2real.suite.tasks import rewards
+from nerf2real.suite.tasks import catalogue, rewards
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.settings import TaskSettings
 from nerf2real.suite.tasks.state import Start
 
-NAME = "nerf_nav"
-# s: ours, the paper names no limit for navigation; three times its median time to a goal (10.3 s).
-TIME_LIMIT = 30.0
+NAME = catalogue.NERF_NAV
+TIME_LIMIT = catalogue.TIME_LIMITS[NAME]  # s
 FALL, COLLISION = "fall", "collision"
 
 

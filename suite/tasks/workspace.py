@@ -42,6 +42,11 @@ class Workspace:
     """Returns whether a point [2] lies in the target cell."""
     return bool((np.abs(xy - self.target) <= protocols.CELL_SIZE / 2).all())
 
+  def places(self) -> np.ndarray:
+    """Returns a grid of places over the workspace [N, 2] [m]."""
+    side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2
+    return self.lower + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+
   def starts(
     self, trial: protocols.BallTrial, free_space: FreeSpace
   ) -> tuple[np.ndarray, np.ndarray]:
@@ -49,8 +54,7 @@ class Workspace:
 
     Where furniture stands in the way, that is the nearest free place.
     """
-    side = np.arange(0, protocols.WORKSPACE_SIZE, _PLACE_GRID) + _PLACE_GRID / 2
-    places = self.lower + np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    places = self.places()
     robot = free_space.nearest_reachable(self.center + trial.robot_xy, places)
     ball = free_space.nearest_reachable(self.center + trial.ball_xy, places)
     return robot, ball

@@ -1,16 +1,19 @@
 """report.html: what was found, how sure, and the pictures to judge it by."""
 
-import html
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from nerf2real.core.pages import parts
+from nerf2real.core.pages import charts
+from nerf2real.core.pages.blocks import Block, Heading, Table, Text, Warnings
+from nerf2real.core.pages.charts import Bars, Interval
+from nerf2real.core.pages.page import Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.report import charts, residual_plots
+from nerf2real.sysid.report import residual_plots
+from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
 from nerf2real.sysid.selection import decision, race
 from nerf2real.sysid.selection.identification import Identified
 
@@ -35,7 +38,7 @@ def page(
   held: Sequence[Log],
   effects: Sequence[Effect],
   window_s: float,
-) -> str:
+) -> Page:
   """Returns the page.
 
   Args:
@@ -58,12 +61,11 @@ def page(
     sections.append(residual_plots.held_out(found, held, effects, items[:_SHOWN], window_s))
   sections += [_joints(found), _next(content), _audit(details)]
   names = _summary(content["effects"])
-  return parts.page(
+  return Page(
     "What the model lacks",
     f"Verdict: {content['verdict']}{': ' + names if names else ''}. Model:"
     f" {details['model'].rsplit('/', 1)[-1]}. Residuals are measured minus simulated.",
     sections,
-    with_plots=True,
   )
 
 
@@ -83,7 +85,7 @@ def _place(effect: dict[str, Any]) -> str:
   return next((place for place in places if place), "all")
 
 
-def _verdict(content: dict[str, Any]) -> str:
+def _verdict(content: dict[str, Any]) -> Section:
   rows, bounds = _parameters(content["effects"])
   notes = [
     f"As good an explanation of {a['joint']}: {a['kind']}."
@@ -94,14 +96,16 @@ def _verdict(content: dict[str, Any]) -> str:
   listed = [a for a in content["alternatives"] if "kinds" not in a]
   nearest, _ = _parameters([a for a in listed if "sensor" not in a])
   alike, _ = _parameters([a for a in listed if "sensor" in a])
-  blocks = [parts.warnings([*notes, *content["notes"]])]
+  blocks: list[Block] = [Warnings([*notes, *content["notes"]])]
   if rows:
-    blocks += [parts.table(_HEADER, rows), charts.intervals("95 % intervals", bounds)]
+    blocks.append(Table(_HEADER, rows))
+    chart = charts.intervals("95 % intervals", bounds)
+    blocks += [chart] if chart is not None else []
   if nearest:
-    blocks += ["<h3>In the extended model, but not claimed</h3>", parts.table(_HEADER, nearest)]
+    blocks += [Heading("In the extended model, but not claimed"), Table(_HEADER, nearest)]
   if alike:
-    blocks += ["<h3>One of these, the sensors cannot tell which</h3>", parts.table(_HEADER, alike)]
-  return parts.section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], *blocks)
+    blocks += [Heading("One of these, the sensors cannot tell which"), Table(_HEADER, alike)]
+  return Section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], blocks)
 
 
 _FOLLOWED = (
@@ -111,8 +115,8 @@ _FOLLOWED = (
 _HEADER = ["effect", "where", "parameter", "value", "95 % interval", "unit", "gain [nats]"]
 
 
-def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], list[tuple]]:
-  """Returns a table's rows, and the intervals that are known as (name, value, low, high)."""
+def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], list[Interval]]:
+  """Returns a table's rows, and the intervals that are known."""
   rows: list[list[Any]] = []
   bounds = []
   for effect in effects:
@@ -129,7 +133,7 @@ def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
       rows.append([effect["kind"], where, name, number, interval, value["unit"], gain])
       if known and value["high"] > value["low"]:
         label = f"{effect['kind']} {name} ({where})"
-        bounds.append((label, value["value"], value["low"], value["high"]))
+        bounds.append(Interval(label, value["value"], value["low"], value["high"]))
     if not effect["parameters"]:
       rows.append([effect["kind"], where, "a table over position and speed", "", "", "", ""])
   return rows, bounds
@@ -139,7 +143,7 @@ def _number(value: Any) -> str:
   return "infinite" if value is None else f"{value:.4g}"
 
 
-def _errors(found: Identified, content: dict[str, Any]) -> str:
+def _errors(found: Identified, content: dict[str, Any]) -> Section:
   names = (("train", "fitted logs"), ("held", "logs that were not fitted"))
   errors = [(label, content["error"][name]) for name, label in names]
   rows = []
@@ -155,13 +159,13 @@ def _errors(found: Identified, content: dict[str, Any]) -> str:
   worse = [label for label, error in errors if error and evaluation.is_worse(error)]
   if worse:
     text += f" On {' and '.join(worse)} the extended model is worse: do not use it."
-  blocks = [parts.table(["logs", "declared", "extended", "lower by"], rows)]
+  blocks: list[Block] = [Table(["logs", "declared", "extended", "lower by"], rows)]
   if len(found.screened) > 1:
     blocks.append(_by_joint(found))
-  return parts.section("Error before and after", text, *blocks)
+  return Section("Error before and after", text, blocks)
 
 
-def _by_joint(found: Identified) -> str:
+def _by_joint(found: Identified) -> Block:
   chosen = {f.screened.joint: f.finding.chosen for f in found.found}
   before, after, names = [], [], []
   for s in found.screened:
@@ -170,14 +174,15 @@ def _by_joint(found: Identified) -> str:
     before.append(noise * float(np.sqrt(np.mean(s.declared.levels[:, 0] ** 2))))
     levels = race.levels(s.problem, chosen.get(s.joint, s.null).fit)
     after.append(noise * float(np.sqrt(np.mean(levels[:, 0] ** 2))))
-  series = [("declared", charts.BEFORE, before), ("extended", charts.AFTER, after)]
+  series = [Bars("declared", BEFORE, before), Bars("extended", AFTER, after)]
   return charts.bars(
     "fitted logs by joint, the others prescribed", "RMS of position [mrad or mm]", series, names
   )
 
 
-def _ladder(found: Identified) -> str:
-  blocks, brief = [], []
+def _ladder(found: Identified) -> Section:
+  blocks: list[Block] = []
+  brief = []
   for rank, item in enumerate(found.found):
     ladder = item.ladder
     if rank >= _SHOWN:
@@ -205,26 +210,26 @@ def _ladder(found: Identified) -> str:
       mark = "chosen" if names == own else ("as good" if names in confounded else "")
       label = " + ".join(sorted(names))
       rows.append([label, entry.score, ladder.declared.score - entry.score, mark])
-    blocks.append(f"<h3>{html.escape(item.screened.joint)}</h3>")
+    blocks.append(Heading(item.screened.joint))
     if ladder.problem.plant.follows:
-      blocks.append(f"<p>{_FOLLOWED}</p>")
-    blocks.append(parts.table(["hypothesis", "score [nats]", "gain [nats]", ""], rows))
-    series = [("gain", charts.AFTER, [row[2] for row in rows])]
+      blocks.append(Text(_FOLLOWED))
+    blocks.append(Table(["hypothesis", "score [nats]", "gain [nats]", ""], rows))
+    series = [Bars("gain", AFTER, [row[2] for row in rows])]
     blocks.append(charts.bars("gain over the declared model", "nats", series, [r[0] for r in rows]))
   if brief:
-    blocks.append("<h3>The other joints that were looked at closely</h3>")
+    blocks.append(Heading("The other joints that were looked at closely"))
     header = ["joint", "chosen", "gain over the constants [nats]", "runner-up behind [nats]"]
-    blocks.append(parts.table(header, brief))
-  return parts.section(
+    blocks.append(Table(header, brief))
+  return Section(
     "Evidence ladder",
     "Score: the logarithm of the error in units of the noise, averaged over the logs; 0.69 nats"
     " halve the error. A name needs a gain over the calibrated constants and a margin over the"
     " runner-up.",
-    *blocks,
+    blocks,
   )
 
 
-def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> str:
+def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> Section:
   at = content["residual_at"]
   quantities = {
     "position": "rad" if unit == "mrad" else "m",
@@ -247,17 +252,22 @@ def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> str:
     f"The extended model leaves {1e3 * at['rms']:.3g} {unit} RMS at {at['joint']}, most in"
     f" {at['log']}. The fifth of the samples that holds most of its square:"
   )
-  return parts.section(
+  return Section(
     "Where the rest sits",
     text,
-    parts.table(["over", "range", "share of the square"], rows),
-    "<h3>Does it go with anything?</h3><p>Chance of as large a correlation of the whitened"
-    " residual, by resampling blocks of a second; small numbers say yes.</p>",
-    parts.table(["with", "declared", "extended"], checks),
+    [
+      Table(["over", "range", "share of the square"], rows),
+      Heading("Does it go with anything?"),
+      Text(
+        "Chance of as large a correlation of the whitened residual, by resampling blocks of a"
+        " second; small numbers say yes."
+      ),
+      Table(["with", "declared", "extended"], checks),
+    ],
   )
 
 
-def _joints(found: Identified) -> str:
+def _joints(found: Identified) -> Section:
   rows = [
     [
       s.joint,
@@ -275,16 +285,16 @@ def _joints(found: Identified) -> str:
     for s in found.screened
   ]
   header = ["joint", "declared", "calibrated", "left [nats]", "constants off by"]
-  return parts.section(
+  return Section(
     "Joints",
     "Scores of the declared and the calibrated model, what the latter leaves above the noise, the"
     " relative errors of the declared constants, and the latencies of readings and commands that"
     " are taken for the machine's own.",
-    parts.table([*header, "reading late [ms]", "command late [ms]"], rows),
+    [Table([*header, "reading late [ms]", "command late [ms]"], rows)],
   )
 
 
-def _next(content: dict[str, Any]) -> str:
+def _next(content: dict[str, Any]) -> Section:
   proposal = content["next_excitation"]
   rows = [
     [k.replace("_", " "), "; ".join(" + ".join(x) for x in v) if isinstance(v, list) else str(v)]
@@ -292,19 +302,21 @@ def _next(content: dict[str, Any]) -> str:
     if k != "all_designs"
   ]
   designs = proposal.get("all_designs", {})
-  return parts.section(
+  blocks: list[Block] = [Table(["", ""], rows)]
+  if designs:
+    blocks.append(Heading("All motions that were tried"))
+    blocks.append(Table(["motion", "separation"], list(designs.items())))
+  return Section(
     "What to record next",
     "The motion under which the remaining hypotheses differ most, in units of the sensor's noise.",
-    parts.table(["", ""], rows),
-    "<h3>All motions that were tried</h3>" if designs else "",
-    parts.table(["motion", "separation"], [[k, v] for k, v in designs.items()]) if designs else "",
+    blocks,
   )
 
 
-def _audit(details: dict[str, Any]) -> str:
+def _audit(details: dict[str, Any]) -> Section:
   audits = details["audit"]
   warnings = [w for a in audits for w in a["warnings"]]
   keys = [k for k in audits[0] if k not in ("log", "warnings")]
   rows = [[k.replace("_", " "), *[a[k] for a in audits]] for k in keys]
   header = ["", *[a["log"] for a in audits]]
-  return parts.section("The logs", "", parts.warnings(warnings), parts.table(header, rows))
+  return Section("The logs", "", [Warnings(warnings), Table(header, rows)])

@@ -4,15 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerf2real.core.pages import parts
+from nerf2real.core import palette
+from nerf2real.core.pages import charts
+from nerf2real.core.pages.blocks import Chart, Grid
+from nerf2real.core.pages.charts import Curve
+from nerf2real.core.pages.page import Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.fitting import Fit
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.report import balance, charts
+from nerf2real.sysid.report import balance
 from nerf2real.sysid.selection.identification import Found, Identified
 
+BEFORE, AFTER = palette.VERMILION, palette.BLUE  # declared and extended model
 _WARMER = 1.0  # K by which a joint's temperature must change to be drawn
 _NOTHING = Fit((), np.zeros(0), 0.0, 1.0, 0)
 
@@ -22,35 +27,37 @@ def unit_of(item: Found) -> str:
   return "mrad" if item.screened.problem.plant.hinge else "mm"
 
 
-def residuals(item: Found) -> str:
+def residuals(item: Found) -> Section:
   """Returns residuals, before and after, against what they may depend on."""
   problem, unit = item.screened.problem, unit_of(item)
   after = item.finding.chosen.fit
-  hypotheses = ((_NOTHING, "declared", charts.BEFORE), (after, "extended", charts.AFTER))
-  figures = []
+  hypotheses = ((_NOTHING, "declared", BEFORE), (after, "extended", AFTER))
+  figures: list[Chart | None] = []
   simulated = [problem.simulate(fit.terms, fit.x)[0] for fit, _, _ in hypotheses]
   for index, log in enumerate(problem.plant.logs):
     curves = [
-      (name, color, log.time, 1e3 * (log.position - outputs[index].position))
+      Curve(name, color, log.time, 1e3 * (log.position - outputs[index].position))
       for (_, name, color), outputs in zip(hypotheses, simulated, strict=True)
     ]
     title = f"{log.name}: residual against time"
     figures.append(charts.lines(title, "time [s]", f"position residual [{unit}]", curves))
   for name in ("position", "velocity", "load", "temperature"):
     figures.append(_against(item, hypotheses, name))
-  note = "" if any(figures[-1:]) else " These logs hold no temperatures of this joint that change."
-  return parts.section(
+  note = (
+    "" if figures[-1] is not None else " These logs hold no temperatures of this joint that change."
+  )
+  return Section(
     f"Residual of {item.screened.joint}, before and after",
     "Against time: measured minus simulated position. Against the others: the torque that the"
     " model lacks (what the measured motion demands by inverse dynamics, less what actuator and"
     " friction give), medians and quartiles; a flat line at zero is a model that lacks nothing, a"
     " step at zero velocity is dry friction, a slope over velocity is damping. Against temperature"
     f" it counts along the actuator's: below zero is an actuator that weakens.{note}",
-    parts.grid([f for f in figures if f], 2),
+    [Grid([f for f in figures if f is not None], 2)],
   )
 
 
-def _against(item: Found, hypotheses, name: str) -> str:
+def _against(item: Found, hypotheses, name: str) -> Chart | None:
   problem = item.screened.problem
   curves = []
   for fit, label, color in hypotheses:
@@ -59,15 +66,15 @@ def _against(item: Found, hypotheses, name: str) -> str:
       r, missing = balance.missing_torque(problem, fit, index)
       if name == "temperature":
         if log.temperature is None:
-          return ""
+          return None
         x.append(log.temperature[signatures.EDGES : -signatures.EDGES])
         missing = missing * np.sign(r.torque)
       else:
         x.append({"position": r.position, "velocity": r.velocity, "load": r.torque}[name])
       y.append(missing)
     if name == "temperature" and np.ptp(np.concatenate(x)) < _WARMER:
-      return ""
-    curves.append((label, color, np.concatenate(x), np.concatenate(y)))
+      return None
+    curves.append(Curve(label, color, np.concatenate(x), np.concatenate(y)))
   hinge = problem.plant.hinge
   torque = "N m" if hinge else "N"
   length = "rad" if hinge else "m"
@@ -85,7 +92,7 @@ def held_out(
   effects: Sequence[Effect],
   items: Sequence[Found],
   window_s: float,
-) -> str:
+) -> Section:
   """Returns measured and simulated positions, and their residuals, of logs that were not fitted."""
   figures = []
   for log in held:
@@ -97,20 +104,20 @@ def held_out(
       joint, unit = item.screened.joint, unit_of(item)
       column = log.states.column(joint)
       pair = (
-        ("declared", charts.BEFORE, before[:, column]),
-        ("extended", charts.AFTER, after[:, column]),
+        ("declared", BEFORE, before[:, column]),
+        ("extended", AFTER, after[:, column]),
       )
-      curves = [(n, c, time, y) for n, c, y in pair]
-      curves = [("measured", charts.MEASURED, time, measured[:, column]), *curves]
+      curves = [Curve(n, c, time, y) for n, c, y in pair]
+      curves = [Curve("measured", palette.INK, time, measured[:, column]), *curves]
       length = "rad" if unit == "mrad" else "m"
       figures.append(
         charts.lines(f"{log.name}: {joint}", "time [s]", f"position [{length}]", curves)
       )
-      errors = [(n, c, time, 1e3 * (measured[:, column] - y)) for n, c, y in pair]
+      errors = [Curve(n, c, time, 1e3 * (measured[:, column] - y)) for n, c, y in pair]
       title = f"{log.name}: {joint}, residual"
       figures.append(charts.lines(title, "time [s]", f"residual [{unit}]", errors))
-  return parts.section(
+  return Section(
     "Logs that were not fitted",
     "Measured and simulated positions; the commands alone drive the simulation.",
-    parts.grid(figures, 2),
+    [Grid(figures, 2)],
   )

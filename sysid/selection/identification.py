@@ -12,9 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import Log, check_against_model, read_log
+from nerf2real.core.robot_logs.reading import Log, read_log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
+from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import (
   chain,

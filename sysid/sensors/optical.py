@@ -105,7 +105,7 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Seen | None:
 def with_pictures(logs: Sequence[Log]) -> list[Log]:
   """Returns the logs whose files hold pictures and are whole."""
   whole = [log for log in logs if log.path is not None and not log.recovered]
-  return [log for log in whole if pictures.count(log.path)]  # type: ignore[arg-type]
+  return [log for log in whole if log.pictures]
 
 
 def look(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[list[pictures.Source], list[View]]:

@@ -13,12 +13,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.robot_logs.messages import CAMERA_INFO, IMAGE
-from nerf2real.core.robot_logs.topics import NANO
+from nerf2real.core.robot_logs.streaming import NANO, Reading, read_messages
 
 _WIDTH = 320  # pixel: pictures at least twice as wide are decoded at a half, a quarter, an eighth
 _REDUCED = {
@@ -49,17 +47,6 @@ class Source:
   """frame_id of the pictures."""
 
 
-def count(path: pathlib.Path) -> int:
-  """Returns the number of pictures in a file: from its index, or by reading where it has none."""
-  with path.open("rb") as stream:
-    reader = make_reader(stream)
-    summary = reader.get_summary()
-    if summary is None or summary.statistics is None:
-      return sum(1 for _ in reader.iter_messages(topics=[IMAGE]))
-  numbers = summary.statistics.channel_message_counts
-  return sum(numbers.get(i, 0) for i, c in summary.channels.items() if c.topic == IMAGE)
-
-
 def source(path: pathlib.Path, start_ns: int) -> Source:
   """Returns a log's pictures with their lens.
 
@@ -75,11 +62,12 @@ def source(path: pathlib.Path, start_ns: int) -> Source:
     raise LensError(
       f"{path.name} has pictures but no lens on {CAMERA_INFO}: calibrate the camera and record it."
     )
-  lens = _lens(path.name, info[1])
+  lens = _lens(path.name, info.message)
   reduction = 1
   while reduction < 8 and lens.width >= 2 * reduction * _WIDTH:
     reduction *= 2
-  for _, message in _messages(path, IMAGE):
+  for reading in _messages(path, IMAGE):
+    message = reading.message
     grey = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), _REDUCED[reduction])
     if grey is None:
       continue
@@ -97,24 +85,19 @@ def read(source: Source) -> Iterator[tuple[float, np.ndarray]]:
   """Yields stamps [s] and grey pictures uint8 [H, W]; repeated and damaged ones are left out."""
   last = b""
   shape = (source.lens.height, source.lens.width)
-  for stamp_ns, message in _messages(source.path, IMAGE):
-    data = bytes(message.data)
+  for reading in _messages(source.path, IMAGE):
+    data = bytes(reading.message.data)
     if data == last:  # a driver that was asked before the next picture came
       continue
     last = data
     grey = cv2.imdecode(np.frombuffer(data, np.uint8), _REDUCED[source.reduction])
     if grey is not None and grey.shape == shape:
-      yield (stamp_ns - source.start_ns) * NANO, grey
+      yield (reading.stamp_ns - source.start_ns) * NANO, grey
 
 
-def _messages(path: pathlib.Path, topic: str) -> Iterator[tuple[int, Any]]:
-  """Yields stamps [ns] and messages of a topic; only chunks that hold the topic are read."""
-  with path.open("rb") as stream:
-    reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-    for decoded in reader.iter_decoded_messages(topics=[topic]):
-      message: Any = decoded.decoded_message
-      stamp = message.header.stamp
-      yield stamp.sec * 1_000_000_000 + stamp.nanosec or decoded.message.log_time, message
+def _messages(path: pathlib.Path, topic: str) -> Iterator[Reading]:
+  """Yields the messages of a topic, of a damaged file those that can be read."""
+  return read_messages(path, topics=[topic], recover=True)
 
 
 def _lens(name: str, info: Any) -> Camera:

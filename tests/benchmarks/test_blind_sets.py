@@ -15,6 +15,7 @@ import pytest
 from benchmarks.blind_sets import apparatus as apparatuses
 from benchmarks.blind_sets import effects, machine, plant, recording, rigid_body, sets
 from nerf2real.core.robot_logs import reading as logs
+from nerf2real.sysid.data import compatibility
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -280,7 +281,7 @@ def test_sets_are_what_their_seed_says(tmp_path):
   model = mujoco.MjModel.from_xml_path(str(tmp_path / "a" / "model.xml"))
   for path in (tmp_path / "a").glob("*.mcap"):
     log = logs.read_log(path)
-    logs.check_against_model(log, model)
+    compatibility.check_against_model(log, model)
     assert log.duration == pytest.approx(16.0, abs=0.1)
     steps = np.unique(np.round(log.states.position * plant.COUNTS_PER_RADIAN, 6) % 1)
     np.testing.assert_array_equal(steps, [0.0])  # whole encoder counts

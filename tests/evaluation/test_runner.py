@@ -1,9 +1,5 @@
 """How episodes are classified, which are run, and what a learned policy's belief leaves behind."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import jax
 import numpy as np
 import pytest
@@ -11,7 +7,8 @@ import pytest
 from nerf2real.agents.dmpo import belief, config, export, learning, networks
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation import episodes, operated, plants, report, runner
+from nerf2real.evaluation import episodes, operated, plants, report, runner, session
+from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import Sight
 from nerf2real.evaluation.policies import Belief
 from nerf2real.suite.gaits.floor import EmptyFloor
@@ -104,15 +101,6 @@ def test_protocols_have_the_papers_numbers():
 
 
 @pytest.fixture(scope="module")
-def script():
-  spec = importlib.util.spec_from_file_location("evaluate", Path("launch/evaluate.py"))
-  module = importlib.util.module_from_spec(spec)
-  sys.modules["evaluate"] = module
-  spec.loader.exec_module(module)
-  return module
-
-
-@pytest.fixture(scope="module")
 def exported(tmp_path_factory):
   """An untrained policy with pictures and a belief, for the suite's observations."""
   preset = config.override(config.preset("vision_small"), {"network.lstm_size": 8, "history": 1})
@@ -150,10 +138,8 @@ def exported(tmp_path_factory):
   return folder
 
 
-def test_learned_policy_needs_nothing_privileged_and_its_belief_is_drawn(
-  script, exported, tmp_path
-):
-  policy = script.LearnedPolicy(exported, seed=0, stochastic=False)
+def test_learned_policy_needs_nothing_privileged_and_its_belief_is_drawn(exported, tmp_path):
+  policy = LearnedPolicy(exported, seed=0, stochastic=False)
   assert policy.image_size == (30, 40) and len(policy.policy_id) == 12
   plant = ScriptedPlant([FAR] * 50, image=(30, 40, 3))
   found = runner.run_trial(plant, policy, TRIAL, group="navigation", index=0)
@@ -161,14 +147,14 @@ def test_learned_policy_needs_nothing_privileged_and_its_belief_is_drawn(
   assert found.localisation_error > 0 and len(found.moments) == 3 and found.moments[0].picture
   again = runner.run_trial(plant, policy, TRIAL, group="navigation", index=0)
   assert again == found  # nothing of the last episode is left in the policy
-  report.write(tmp_path / "r.html", [found], scene=EmptyFloor(), draw_belief=script.draw_belief)
+  report.write(tmp_path / "r.html", [found], scene=EmptyFloor())
   page = (tmp_path / "r.html").read_text()
   assert "Where the policy believed to be" in page and "episode 1 (lost), 1.0 s" in page
   assert page.count("data:image/jpeg") == 1 + 3
 
 
-def test_trials_may_be_spread(script):
+def test_trials_may_be_spread():
   listed = plants.trials("navigation")
-  chosen = script.choose(listed, 4)
+  chosen = session.choose(listed, 4)
   assert [index for index, _ in chosen] == [0, 18, 35, 53]
-  assert len(script.choose(listed, None)) == 54 and len(script.choose(listed, 99)) == 54
+  assert len(session.choose(listed, None)) == 54 and len(session.choose(listed, 99)) == 54

@@ -1,16 +1,15 @@
 """`launch/identify.py`: bad input is one line that says what was found and what to do."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.core.robot_logs import messages
+from nerf2real.core.robot_logs.writer import open_log
+from nerf2real.launch import identify as script
 from tests.sysid.synthetic import ARM, PENDULUM
 
-_LAUNCH = Path(__file__).parents[2] / "launch"
 START = 1_700_000_000_000_000_000
 NO_ACTUATOR = PENDULUM.replace(
   '<position name="joint" joint="joint" kp="21" forcerange="-4 4"/>', ""
@@ -20,14 +19,10 @@ NO_ACTUATOR = PENDULUM.replace(
 @pytest.fixture
 def identify(monkeypatch, capsys):
   """Runs the command line; returns exit code, stdout and stderr."""
-  spec = importlib.util.spec_from_file_location("identify", _LAUNCH / "identify.py")
-  module = importlib.util.module_from_spec(spec)
-  monkeypatch.setitem(sys.modules, "identify", module)
-  spec.loader.exec_module(module)
 
   def run(*arguments):
     monkeypatch.setattr(sys, "argv", ["identify.py", *map(str, arguments)])
-    code = module.main()
+    code = script.main()
     return code, *capsys.readouterr()
 
   return run
@@ -35,13 +30,14 @@ def identify(monkeypatch, capsys):
 
 def _log(path, *, duration=2.0, commands=True, joints=("joint",), spoil=None, cut=None):
   """Writes a log of joints that move; `spoil(index, fields)` changes states."""
-  with log_writer.open_log(path, joints) as log:
+  with open_log(path) as log:
     for index in range(round(duration * 100)):
       t = START + index * 10_000_000
       if commands and index % 2 == 0:
-        log.command(t, position=[0.1] * len(joints))
-      fields = {"stamp_ns": t, "position": [np.sin(0.1 * index)] * len(joints)}
-      log.state(**(spoil(index, fields) if spoil else fields))
+        log.write(messages.joint_state(t, messages.COMMANDS, joints, position=[0.1] * len(joints)))
+      fields = {"time_ns": t, "position": [np.sin(0.1 * index)] * len(joints)}
+      fields = spoil(index, fields) if spoil else fields
+      log.write(messages.joint_state(topic=messages.STATES, names=joints, **fields))
   if cut is not None:
     path.write_bytes(path.read_bytes()[:cut])
   return path
@@ -57,9 +53,9 @@ def _at(which, **changes):
     ({"commands": False}, "has no commands"),
     ({"joints": ("elbow",)}, "['elbow'] that the model lacks"),
     ({"spoil": _at(50, position=[np.nan])}, "NaN or infinite positions"),
-    ({"spoil": _at(50, stamp_ns=START)}, "time runs backwards"),
+    ({"spoil": _at(50, time_ns=START)}, "time runs backwards"),
     ({"duration": 0.1}, "expected at least 1 s"),
-    ({"spoil": lambda index, fields: {**fields, "stamp_ns": START + index * 10**9}}, "a second"),
+    ({"spoil": lambda index, fields: {**fields, "time_ns": START + index * 10**9}}, "a second"),
     ({"cut": 2000}, "truncated or damaged"),
     ({"cut": 0}, "is empty"),
   ],

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from nerf2real import real
-from nerf2real.real.loop.motion import RobotSettings
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.robot import VirtualRobot
 
@@ -50,9 +50,8 @@ def load(robot, quick):
   opened = []
 
   def make(*, pictures=None, **arguments):
-    connection = robot.connection()
-    if pictures is not None:
-      connection = dataclasses.replace(connection, camera=pictures)
+    own = {key: arguments.pop(key) for key in ("offsets", "lens") if key in arguments}
+    connection = dataclasses.replace(robot.connection(), camera=pictures, **own)
     arguments.setdefault("image_size", None if pictures is None else (30, 40))
     arguments.setdefault("settings", quick)
     environment = real.load("nerf_nav", robot=connection, **arguments)

@@ -19,6 +19,7 @@ from nerf2real.scenes.bundle import Bundle, BundleError
 from nerf2real.scenes.field.settings import preset as train_preset
 from nerf2real.scenes.geometry import collision as contact
 from nerf2real.scenes.geometry import convex
+from nerf2real.scenes.geometry.mesh import MeshSettings
 from nerf2real.scenes.settings import preset
 
 _FRAMES = 40
@@ -112,6 +113,22 @@ def test_second_run_does_nothing_anew(scene, source, settings):
   ).stat().st_mtime_ns == stamp
 
 
+def _stamps(folder):
+  """What identifies each stage's run: its name and when it was made."""
+  records = (folder / pipeline.STAGES).glob("*/stage.json")
+  return {path.parent.name: json.loads(path.read_text())["made"] for path in records}
+
+
+def test_changed_settings_repeat_only_their_stage(scene, source, settings, tmp_path):
+  out = tmp_path / "room"
+  shutil.copytree(scene.folder, out)
+  coarser = dataclasses.replace(settings, mesh=MeshSettings(visual_faces=3000))
+  pipeline.make_scene(source, out, settings=coarser, show_progress=False)
+  before, after = _stamps(scene.folder), _stamps(out)
+  assert before.keys() == after.keys()
+  assert {name for name in before if before[name] != after[name]} == {"surface"}
+
+
 def test_changed_alignment_keeps_the_field_but_not_the_contact(scene, source, settings, tmp_path):
   out = tmp_path / "room"
   shutil.copytree(scene.folder, out)
@@ -121,6 +138,9 @@ def test_changed_alignment_keeps_the_field_but_not_the_contact(scene, source, se
   before, after = scene.scene["hashes"], changed.scene["hashes"]
   assert after["field"] == before["field"]
   assert after["world"] != before["world"] and after["contact"] != before["contact"]
+  kept = {"keyframes", "poses", "field", "depth", "figures"}
+  made, made_again = _stamps(scene.folder), _stamps(out)
+  assert {name for name in made if made[name] == made_again[name]} == kept
   assert changed.world_from_unit.scale == pytest.approx(2.0)
   assert changed.scene["scale"] == "manual"
 

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
-from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.core.robot_logs import messages
 from nerf2real.core.robot_logs.reading import Log, read_log
+from nerf2real.core.robot_logs.writer import open_log
 
 START = 1_700_000_000_000_000_000
 LENS = Camera(
@@ -131,13 +132,14 @@ def record(path, film: Film, *, seed: int = 0, lens: bool = True, pictures: bool
   joints = np.round(joints / 0.001534) * 0.001534
   wanted = angles(at + 0.04, film.motion, seed)
   taken = np.arange(0.1, film.duration - 0.1, 1 / film.rate)
-  with log_writer.open_log(path, ("pan", "tilt")) as log:
+  names = ("pan", "tilt")
+  with open_log(path) as log:
     for n, t in enumerate(at):
       stamp = START + round(t * 1e9)
-      log.command(stamp, position=wanted[n])
-      log.state(stamp, position=joints[n])
+      log.write(messages.joint_state(stamp, messages.COMMANDS, names, position=wanted[n]))
+      log.write(messages.joint_state(stamp, messages.STATES, names, position=joints[n]))
     if lens:
-      log.lens(START, LENS)
+      log.write(messages.camera_info(START, LENS))
     last = 0.0
     for t in taken if pictures else ():
       pan, tilt = angles(np.array([t]), film.motion, seed)[0]
@@ -145,5 +147,5 @@ def record(path, film: Film, *, seed: int = 0, lens: bool = True, pictures: bool
       seen = np.clip(np.rint(seen + rng.normal(0, film.noise, seen.shape)), 0, 255)
       jpeg = cv2.imencode(".jpg", seen.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
       last = max(last, t + film.late + rng.normal(0, film.jitter))
-      log.picture(START + round(last * 1e9), jpeg.tobytes())
+      log.write(messages.image(START + round(last * 1e9), jpeg.tobytes()))
   return read_log(path)

@@ -14,6 +14,7 @@ import numpy as np
 from nerf2real.real.virtual.bus import registers
 from nerf2real.real.virtual.bus.protocol import Error
 from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.delays import DelayLine
 
 DEVICE = 200
 _GYROSCOPE_SCALE = 16.4 * 180 / np.pi  # counts per rad/s
@@ -41,7 +42,7 @@ class Board:
     """
     self._noise, self._rng = noise, rng
     self.table = registers.Table(registers.OPENCR)
-    self._line = filters.DelayLine(filters.CHIP_DELAY)
+    self._line = DelayLine(filters.CHIP_DELAY)
     self._next = 0.0  # s, of the next reading of the chip
 
   @property

@@ -21,7 +21,7 @@ from nerf2real.suite.op3 import constants
 BAUD = 2_000_000  # bit/s
 BYTE_TIME = protocol.BITS_PER_BYTE / BAUD  # s
 _FAST_HEAD = 8  # bytes of a fast answer before its first part
-_PROTECT_PERIOD = 0.010  # s between a servo's checks of temperature and voltage: ours
+_PROTECT_PERIOD = 0.010  # s between a servo's checks of temperature and voltage: chosen
 
 # Ids by joint: ROBOTIS OP3, odd right, even left. The virtual robot's own copy: what the host
 # believes (real.wire.op3) is tested against it.

@@ -9,15 +9,24 @@ import numpy as np
 class Faults:
   """The faults that act now; change them while the robot runs."""
 
-  loss: float = 0.0  # probability that a packet, instruction or answer, does not arrive
-  corruption: float = 0.0  # probability that one bit of a packet arrives flipped
-  late: float = 0.0  # probability that an answer comes late
-  lateness: float = 0.010  # s, how late
-  cut: bool = False  # the cable is out: nothing arrives in either direction
-  dead: set[int] = dataclasses.field(default_factory=set)  # ids that do not answer and do not move
-  stuck: set[int] = dataclasses.field(default_factory=set)  # ids whose encoder keeps its value
-  heat: dict[int, float] = dataclasses.field(default_factory=dict)  # id: temperature [degrees C]
-  voltage: float | None = None  # V of the supply whatever the load; None: the battery's
+  loss: float = 0.0
+  """Probability that a packet, instruction or answer, does not arrive."""
+  corruption: float = 0.0
+  """Probability that one bit of a packet arrives flipped."""
+  late: float = 0.0
+  """Probability that an answer comes late."""
+  lateness: float = 0.010
+  """s, how late."""
+  cut: bool = False
+  """The cable is out: nothing arrives in either direction."""
+  dead: set[int] = dataclasses.field(default_factory=set)
+  """Ids that do not answer and do not move."""
+  stuck: set[int] = dataclasses.field(default_factory=set)
+  """Ids whose encoder keeps its value."""
+  heat: dict[int, float] = dataclasses.field(default_factory=dict)
+  """Id: temperature [degrees C]."""
+  voltage: float | None = None
+  """V of the supply whatever the load; None: the battery's."""
 
   def arrives(self, rng: np.random.Generator) -> bool:
     """Draws whether a packet arrives."""

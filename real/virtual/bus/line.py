@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from nerf2real.real.loop.clock import Clock
+from nerf2real.real.clock import Clock
 from nerf2real.real.virtual.bus.devices import BYTE_TIME, Answer, Devices
 from nerf2real.real.virtual.bus.protocol import Parser
 

@@ -2,7 +2,7 @@
 
 A pseudo-terminal hands every byte from one kernel thread to another; on a busy machine that costs a
 rehearsal ten times what it computes. Here the same bytes go from buffer to buffer. pyserial opens
-it by its name, `rehearsal://<number>` (`serial.serial_for_url` finds this module by the name).
+it by its name, `rehearsal://<number>`: `serial.serial_for_url` finds this module by its own.
 """
 
 import itertools
@@ -11,11 +11,12 @@ import weakref
 
 import serial
 
-from nerf2real.real.loop.clock import SteppedClock
+from nerf2real.real.clock import SteppedClock
 from nerf2real.real.virtual.bus.devices import Devices
 from nerf2real.real.virtual.bus.line import Line
 
 SCHEME = "rehearsal://"
+serial.protocol_handler_packages.append(__package__)
 _numbers = itertools.count(1)
 _cables: "weakref.WeakValueDictionary[str, Cable]" = weakref.WeakValueDictionary()
 

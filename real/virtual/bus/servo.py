@@ -11,7 +11,7 @@ from nerf2real.real.virtual.bus import registers
 from nerf2real.real.virtual.bus.protocol import Error
 from nerf2real.real.virtual.motors import CURRENT_UNIT, FULL_PWM, SPEED_UNIT, Motors
 
-BOOT_TIME = 0.25  # s without answers after power-up or reboot: ours
+BOOT_TIME = 0.25  # s without answers after power-up or reboot: chosen
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # realtime tick (120) to present temperature (146)
 _PRESENT_ADDRESS = 120
 _WATCHDOG_UNIT = 0.020  # s

@@ -11,7 +11,7 @@ import select
 import threading
 import tty
 
-from nerf2real.real.loop.clock import Clock, SteppedClock, prefer_this_thread
+from nerf2real.real.clock import Clock, SteppedClock, prefer_this_thread
 from nerf2real.real.virtual.bus.devices import Devices
 from nerf2real.real.virtual.bus.line import Line
 

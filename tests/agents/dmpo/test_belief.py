@@ -7,6 +7,7 @@ import scipy.stats
 
 from nerf2real.agents.dmpo import belief, belief_plot, specs
 from nerf2real.agents.dmpo.config import NetworkConfig
+from nerf2real.core.floor_map import FloorMap
 
 
 def _mixture(seed=0):
@@ -75,15 +76,16 @@ def test_pose_of_a_privileged_vector():
 
 def test_heat_map_puts_mass_and_marks_where_they_belong():
   extent = (-2.0, 2.0, -1.0, 1.0)
-  density = belief_plot.position_density(
-    np.zeros(1), np.array([[1.0, 0.5, 0.0]]), np.full((1, 3), 0.1), extent=extent, cell=0.05
-  )
+  mixture = np.zeros(1), np.array([[1.0, 0.5, 0.0]]), np.full((1, 3), 0.1)
+  density = belief_plot.position_density(*mixture, extent=extent, cell=0.05)
   np.testing.assert_allclose(density.sum() * 0.05**2, 1.0, rtol=1e-3)
   row, column = np.unravel_index(density.argmax(), density.shape)
   assert column > 0.7 * density.shape[1] and row < 0.3 * density.shape[0]
-  picture = belief_plot.draw_heat_map(
-    density, extent=extent, truth=np.array([-1.0, 0.0]), target=np.array([-1.0, -0.5])
+  floor = FloorMap(extent, np.zeros((240, 480, 3), np.uint8))
+  picture = belief_plot.draw(
+    floor, *mixture, truth=np.array([-1.0, 0.0]), target=np.array([-1.0, -0.5])
   )
+  assert not floor.picture.any() and picture[60, 360].min() > 100  # mass at (1, 0.5)
   height, width = picture.shape[:2]
   assert picture[height // 2, width // 4].min() > 200  # the white X
   red, green, blue = picture[3 * height // 4, width // 4].astype(int)

@@ -125,6 +125,55 @@ def test_padding_has_no_influence():
   assert all(not x.any() for x in jax.tree.leaves(of_targets))  # nothing reaches the targets
 
 
+def test_terminal_states_and_padding_do_not_count_for_the_policy():
+  """Cut at the end, terminated at the end, terminated early with padding, cut early."""
+  discount = jnp.array([[1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 0]], jnp.float32)
+  last = jnp.array([3, 3, 2, 2])
+  expected = [[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 0, 0], [1, 1, 1, 0]]
+  np.testing.assert_array_equal(learning.policy_weights(discount, last), expected)
+
+
+def test_a_terminal_observation_reaches_no_gradient_of_the_policy():
+  layout = Layout(None, None, ("s",), (3,), (), (), 2)
+  functions = learning.make_learning(CONFIG, layout)
+  state = jax.jit(functions.init)(jax.random.key(0))
+  batch = _batch(layout, 0, 6)
+  ends = batch["last"][:, None] == np.arange(1, 7)  # the action before the last observation
+  batch = batch | {"discount": np.where(ends, 0.0, batch["discount"]).astype(np.float32)}
+  other = batch | {"state": batch["state"].copy()}
+  for b, last in enumerate(batch["last"]):
+    other["state"][b, last] = 5.0
+
+  @jax.jit
+  def gradient(batch):
+    trained = (state.policy, state.critic, state.duals, state.belief)
+    return jax.grad(learning.total_loss, has_aux=True)(
+      trained,
+      state.target_policy,
+      state.target_critic,
+      batch=batch,
+      key=jax.random.key(1),
+      config=CONFIG,
+      layout=layout,
+    )[0]
+
+  same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8)  # noqa: E731
+  jax.tree.map(same, gradient(batch), gradient(other))
+
+
+def test_the_first_policy_stands():
+  layout = Layout(None, None, ("s",), (3,), (), (), 2)
+  settings = config.override(CONFIG, {"network.init_stddev": 0.1})
+  standing = np.array([0.4, -0.7], np.float32)
+  functions = learning.make_learning(settings, layout, first_action=standing)
+  state = jax.jit(functions.init)(jax.random.key(0))
+  observation = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+  for policy in (state.policy, state.target_policy):
+    out = networks.policy_head(policy, jnp.zeros((50, 0)), observation, settings.network)
+    np.testing.assert_allclose(out.mean, np.tile(standing, (50, 1)), atol=0.05)
+    np.testing.assert_allclose(out.stddev, 0.1, atol=0.005)
+
+
 def test_it_learns_a_one_step_problem():
   """reward = 1 - (a - 0.5)^2 and nothing follows: the mean goes to 0.5, the value to about 1."""
   layout = Layout(None, None, ("s",), (1,), (), (), 1)

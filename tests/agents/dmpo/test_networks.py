@@ -117,6 +117,33 @@ def test_critic_clips_actions_and_broadcasts_samples():
   np.testing.assert_allclose(logits[3, 1, 2], one, rtol=1e-4, atol=1e-5)
 
 
+def test_the_critic_s_split_first_layer_is_the_whole_one():
+  """W [x, a] = W_x x + W_a a, for every sampled action and for its gradients."""
+  params = _noisy(_init(make=networks.init_critic))
+  rng = np.random.default_rng(0)
+  inputs = rng.normal(size=(2, 5, 11)).astype(np.float32)
+  actions = rng.uniform(-1, 1, size=(4, 2, 5, 3)).astype(np.float32)
+
+  def whole(params, inputs, actions):
+    inputs = jnp.broadcast_to(inputs, (*actions.shape[:-1], 11))
+    hidden = networks.mlp(params["mlp"], jnp.concatenate([inputs, actions], -1))
+    return hidden @ params["head"]["w"] + params["head"]["b"]
+
+  def loss(function, *arguments):
+    return jnp.sum(jnp.tanh(function(*arguments)))
+
+  for index, function in enumerate((whole, networks.critic_logits)):
+    value = jax.jit(function)(params, inputs, actions)
+    slopes = jax.jit(jax.grad(lambda *a, f=function: loss(f, *a), (0, 1, 2)))(
+      params, inputs, actions
+    )
+    if index == 0:
+      expected = value, slopes
+  jax.tree.map(
+    lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), (value, slopes), expected
+  )
+
+
 def test_recurrent_policy_without_state_is_refused():
   params = _init()
   images, state, _ = _inputs()

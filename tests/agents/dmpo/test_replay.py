@@ -1,5 +1,7 @@
 """The replay: padding, eviction, what survives on disk, refusals."""
 
+import subprocess
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,26 @@ def test_folder_of_another_shape_is_refused(tmp_path):
   _replay(tmp_path)
   with pytest.raises(ValueError, match="other shapes"):
     _replay(tmp_path, capacity_steps=40)
+
+
+def test_a_full_disk_is_an_error_and_leaves_what_was_there(tmp_path):
+  small = tmp_path / "small"
+  small.mkdir()
+  mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(small)]
+  try:
+    subprocess.run(mount, check=True, capture_output=True)
+  except (OSError, subprocess.CalledProcessError):
+    pytest.skip("needs the right to mount a small disk")
+  try:
+    replay, number = _replay(small, capacity_steps=40_000), 0
+    with pytest.raises(OSError, match="No space left"):
+      for number in range(5_000):
+        replay.insert(make_trajectory(5, mark=number), number=number)
+    assert number > 100 and (replay.size, replay.inserted) == (number, number)
+    replay.sample(np.random.default_rng(0), 4)
+    del replay
+  finally:
+    subprocess.run(["umount", str(small)], check=True)
 
 
 def test_empty_replay_says_so():

@@ -37,8 +37,9 @@ def main() -> None:
     LimiterSettings(steps_per_update=8.0, min_replay_steps=1, trajectory_steps=LENGTH - 1),
     steps=steps,
     updates=steps // 8,
+    refill_until=0,
+    unpaid=0,
   )
-  limiter.already_filled()
 
   def insert(trajectory, actor: int, number: int) -> int:
     size = check_trajectory(trajectory, FIELDS, length=LENGTH)

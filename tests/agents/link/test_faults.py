@@ -1,7 +1,7 @@
 """What happens to the link when processes die, freeze, lie or may not join.
 
 The learner is a process without networks (`mini_learner.py`), so that each case takes seconds; the
-same cases with the whole agent are in `tests/agents/test_runs.py`.
+same cases with the whole agent are in `tests/agents/processes/test_runs.py`.
 """
 
 import os
@@ -17,7 +17,8 @@ import pytest
 
 from nerf2real.agents.dmpo.replay import Replay
 from nerf2real.agents.link import client, schema, sessions
-from nerf2real.agents.link.server import actor_key
+from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
+from nerf2real.agents.link.server import LearnerLink, actor_key
 from tests.agents.link import mini_learner
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -191,15 +192,16 @@ def test_malformed_messages_are_refused_and_counted(learner):
   while not link.learner_is_there:
     time.sleep(0.01)
   good = mini_learner.make_trajectory(1)
-  values = {"actor": "actor-1", "number": 1}
+  values = {"actor": "broken", "number": 1}
   bad = [
     b"rubbish",
     schema.encode("metrics", values, good),
-    schema.encode("trajectory", {"actor": "actor-1"}, good),
+    schema.encode("trajectory", {"actor": "broken"}, good),
     schema.encode("trajectory", values | {"number": -1}, good),
     schema.encode("trajectory", values, {"reward": good["reward"]}),
-    schema.encode("trajectory", values, good | {"reward": good["reward"] * np.nan}),
-    schema.encode("trajectory", values, good | {"image": good["image"][:, :5]}),
+    schema.encode("trajectory", values | {"number": 2}, {"image": good["image"]}),
+    schema.encode("trajectory", values | {"number": 3}, good | {"reward": np.float32(1)}),
+    schema.encode("trajectory", values | {"number": 4}, good | {"image": good["image"][:, :5]}),
   ]
   for data in bad:
     link._publisher.put(data)
@@ -213,6 +215,60 @@ def test_malformed_messages_are_refused_and_counted(learner):
     time.sleep(0.02)
   assert status["refused"] == len(bad) + 1
   assert status["trajectories"] == 2
+
+
+def test_a_refused_trajectory_is_acknowledged_and_what_follows_arrives(learner, tmp_path):
+  """A NaN in one trajectory must not hold up its actor: credits return, the rest is taken."""
+  link = _join(learner, "sick", resend_after=0.5)
+  assert link.request(47)["granted"] == 47
+  bad = mini_learner.make_trajectory(1)
+  bad["reward"][3] = np.nan
+  link.send(bad)
+  assert link.drain(timeout=5)
+  assert link.request(0)["granted"] == 0  # says what is held: nothing any more
+  status = link.status()["status"]
+  assert (status["refused"], status["outstanding"]) == (1, 0)
+  assert status["refused_by"] == {"sick": 1}
+  assert "trajectory 1 of sick: reward holds numbers that are not finite" in status["last_refusal"]
+  _act(link, 10)  # many more than the credits of one trajectory
+  assert link.drain(timeout=5)
+  status = link.status()["status"]
+  assert (status["steps"], status["refused"], status["gaps"]) == (10 * 47, 1, 0)
+  assert sorted(n for _, n in _stored(learner, tmp_path)) == list(range(2, 12))
+
+
+def test_a_failing_replay_is_reported_and_ends_the_taking_in(tmp_path):
+  """Such as on a full disk: whoever runs the learner sees it, and nothing is acknowledged."""
+  with socket.socket() as probe:
+    probe.bind(("127.0.0.1", 0))
+    endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+  def insert(trajectory, actor, number):
+    raise OSError(28, "No space left on device")
+
+  settings = sessions.LinkSettings()
+  limiter = RateLimiter(
+    LimiterSettings(steps_per_update=8.0, min_replay_steps=1, trajectory_steps=47)
+  )
+  session = sessions.listen(endpoint, settings)
+  served = LearnerLink(session, settings, limiter=limiter, insert=insert, description={})
+  client_session = sessions.connect(endpoint, settings, timeout=5)
+  link = client.ActorLink(client_session, settings, actor="actor-0-a")
+  try:
+    while not link.learner_is_there:
+      time.sleep(0.01)
+    assert not served.failure
+    link.send(mini_learner.make_trajectory(1))
+    deadline = time.monotonic() + 5
+    while not served.failure:
+      assert time.monotonic() < deadline, "The failure was not noticed."
+      time.sleep(0.01)
+    assert "No space left on device" in served.failure
+    assert link.request(0)["acknowledged"] == 0 and link.outbox.size == 1
+  finally:
+    link.close()
+    served.close()
+    sessions.close(session)
 
 
 @pytest.fixture

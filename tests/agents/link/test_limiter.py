@@ -13,7 +13,8 @@ def _limiter(**changes):
     "trajectory_steps": 16,
     "max_steps": 2000,
   }
-  start = {k: changes.pop(k) for k in ("steps", "updates") if k in changes}
+  names = ("steps", "updates", "refill_until", "unpaid")
+  start = {k: changes.pop(k) for k in names if k in changes}
   return RateLimiter(LimiterSettings(**(settings | changes)), **start)
 
 
@@ -34,7 +35,8 @@ def _simulate(limiter, *, actors, seed, deaths=0.0):
       steps = min(held[actor], int(rng.integers(1, 17)))
       limiter.delivered(str(actor), steps)
       held[actor] -= steps
-      paid = max(limiter.updates * limiter.settings.steps_per_update, limiter.refill_until)
+      paid = limiter.unpaid + limiter.updates * limiter.settings.steps_per_update
+      paid = max(paid, limiter.refill_until)
       assert limiter.steps - paid <= limiter.lead + 16 * deaths * 1000
     if limiter.update_due and rng.random() < 0.7:
       limiter.updated()
@@ -46,7 +48,7 @@ def _simulate(limiter, *, actors, seed, deaths=0.0):
 def test_one_update_for_8_steps_over_a_run(actors, deaths):
   limiter = _limiter()
   _simulate(limiter, actors=actors, seed=actors, deaths=deaths)
-  assert limiter.updates == 2000 // 8
+  assert limiter.updates == (limiter.steps - 100) // 8
   assert abs(limiter.steps - 2000) <= 20  # 1 %; more only if a dead actor's data still arrives
 
 
@@ -54,31 +56,63 @@ def test_one_update_for_8_steps_over_a_run(actors, deaths):
 def test_other_rates(rate):
   limiter = _limiter(steps_per_update=rate)
   _simulate(limiter, actors=3, seed=0)
-  assert limiter.updates == int(limiter.steps / rate)
+  assert limiter.updates == int((limiter.steps - 100) / rate)
 
 
-def test_no_update_before_the_replay_is_filled_then_those_owed():
-  limiter = _limiter()
-  limiter.delivered("a", 99)
-  assert not limiter.update_due
-  limiter.delivered("a", 1)
+def _owed(limiter):
+  """Does the updates that are due; returns how many there were."""
   done = 0
   while limiter.update_due:
     limiter.updated()
     done += 1
-  assert done == 12
+  return done
 
 
-def test_a_resumed_run_refills_and_keeps_its_counts():
-  limiter = _limiter(steps=800, updates=100)
-  assert not limiter.update_due
+def test_updates_after_the_first_fill_follow_the_ratio_without_a_burst():
+  limiter = _limiter(min_replay_steps=10_000, max_steps=None)
+  limiter.delivered("a", 10_000)
+  assert _owed(limiter) == 0  # the fill pays for nothing
+  limiter.delivered("a", 7)
+  assert _owed(limiter) == 0
+  limiter.delivered("a", 1)
+  assert _owed(limiter) == 1
+  limiter.delivered("a", 47)
+  assert _owed(limiter) == 5
+
+
+def test_a_resumed_run_refills_without_a_burst_and_keeps_its_counts():
+  """After 100 steps of filling, 87 updates and 4 steps of the next; the replay is lost."""
+  limiter = _limiter(steps=800, updates=87, refill_until=100, unpaid=100)
+  limiter.refill(held=0)
+  assert (limiter.refill_until, limiter.unpaid) == (900, 200)
   limiter.delivered("a", 99)
   assert not limiter.update_due
+  limiter.delivered("a", 1)
+  assert _owed(limiter) == 0
   _simulate(limiter, actors=2, seed=1)
-  assert limiter.updates == limiter.steps // 8 == 250
-  restored = _limiter(steps=808, updates=100)
-  restored.already_filled()
-  assert restored.update_due
+  assert limiter.updates == (limiter.steps - 200) // 8
+
+
+@pytest.mark.parametrize(
+  ("steps", "held", "expected"),
+  [
+    (808, 808, (808, 100)),  # the replay is whole
+    (50, 50, (100, 100)),  # stopped in the first fill: it goes on
+    (50, 0, (150, 150)),  # and with the replay lost it begins again
+    (800, 30, (870, 170)),
+  ],
+)
+def test_what_a_resumed_replay_lacks_is_filled_and_pays_for_nothing(steps, held, expected):
+  limiter = _limiter(steps=steps, updates=0, refill_until=100, unpaid=100)
+  limiter.refill(held=held)
+  assert (limiter.refill_until, limiter.unpaid) == expected
+
+
+def test_credits_of_a_refused_trajectory_return():
+  limiter = _limiter()
+  assert limiter.request("a", 16, held=0) == 16
+  limiter.returned("a", 16)
+  assert (limiter.outstanding, limiter.steps) == (0, 0)
 
 
 def test_credits_come_whole_and_return():

@@ -16,6 +16,7 @@ from nerf2real.agents.processes import environments
 from nerf2real.agents.processes.checkpoints import read_info
 
 ROOT = Path(__file__).resolve().parents[3]
+FILL = 200  # steps that fill the replay, and pay for no update
 SMALL = [
   "--set",
   "network.policy_layers=[16,16]",
@@ -24,7 +25,7 @@ SMALL = [
   "--set",
   "batch_size=4",
   "--set",
-  "min_replay_steps=200",
+  f"min_replay_steps={FILL}",
   "--set",
   "num_samples=4",
   "--evaluation-period",
@@ -109,7 +110,7 @@ def test_a_run_ends_by_itself_and_is_resumed(tmp_path):
   output = finish(first, timeout=90, run=run)
   assert first.returncode == 0, output
   info = read_info(run)
-  assert (info["steps"], info["updates"]) == (600, 600 // 4)
+  assert (info["steps"], info["updates"]) == (600, (600 - FILL) // 4)
   last = rows(run, "learner")[-1]
   assert last["dropped"] == last["refused"] == last["gaps"] == 0
   assert last["replay_steps"] == 600
@@ -124,14 +125,15 @@ def test_a_run_ends_by_itself_and_is_resumed(tmp_path):
   assert "add --resume" in finish(refused, timeout=20, run=run) and refused.returncode == 2
 
   second = start(run, *SMALL, "--actors", "1", "--resume", "--no-evaluator")
-  wait_until(lambda: rows(run, "learner")[-1]["updates"] >= 200)
+  wait_until(lambda: rows(run, "learner")[-1]["updates"] >= 150)
   second.send_signal(signal.SIGINT)
   output = finish(second, timeout=60, run=run)
   assert second.returncode == 0 and "writes a checkpoint" in output, output
   info = read_info(run)
-  assert info["updates"] >= 200
-  # Steps and updates go on where they were: the ratio holds over both parts.
-  assert 0 <= info["steps"] - 4 * info["updates"] <= 200
+  assert info["updates"] >= 150
+  # Steps and updates go on where they were, and the replay has filled twice: the ratio holds.
+  assert info["unpaid_steps"] == 2 * FILL
+  assert 0 <= info["steps"] - 2 * FILL - 4 * info["updates"] <= 50
   assert children(second, "launch") == []
 
 
@@ -160,7 +162,7 @@ def test_killed_processes_are_replaced(tmp_path):
   assert process.returncode == 0, output
   assert "2 restarts" in output
   info = read_info(run)
-  assert before > 0 and (info["steps"], info["updates"]) == (3000, 750)
+  assert before > 0 and (info["steps"], info["updates"]) == (3000, (3000 - FILL) // 4)
   assert rows(run, "learner")[-1]["dropped"] == 0
 
 
@@ -178,7 +180,7 @@ def test_a_learner_frozen_for_20_seconds(tmp_path):
   assert process.returncode == 0, output
   assert "0 restarts" in output
   info = read_info(run)
-  assert (info["steps"], info["updates"]) == (3000, 750)
+  assert (info["steps"], info["updates"]) == (3000, (3000 - FILL) // 4)
   last = rows(run, "learner")[-1]
   assert last["dropped"] == last["gaps"] == 0
 
@@ -201,7 +203,7 @@ def test_pictures_lstm_state_and_belief_go_through(tmp_path):
   )
   output = finish(process, timeout=240, run=run)
   assert process.returncode == 0, output
-  assert read_info(run)["updates"] == 1600 / 8
+  assert read_info(run)["updates"] == (1600 - FILL) / 8
 
 
 def test_wrong_arguments_are_one_line(tmp_path):

@@ -8,8 +8,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from nerf2real.core.cameras import Camera
+from nerf2real.core.robot_logs import messages, streaming
 from nerf2real.core.robot_logs import reading as logs
-from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.core.robot_logs.writer import open_log
+from nerf2real.sysid.data.compatibility import check_against_model
 
 START = 1_700_000_000_000_000_000
 SAMPLES = pathlib.Path("../shared/data")
@@ -23,20 +26,26 @@ POSITIONS = '<position joint="elbow" kp="5"/><position joint="wrist" kp="5"/>'
 def _write(path, *, duration=2.0, commands=True, joints=("elbow", "wrist"), change=None, lag=0):
   """Writes two joints at 50 Hz commands and 100 Hz states; `change(kind, index, fields)` spoils."""
   change = change or (lambda kind, index, fields: fields)
-  with log_writer.open_log(path, joints) as log:
+
+  def write(topic, kind, index, fields):
+    fields = change(kind, index, fields)
+    log_ns = fields.pop("log_ns")
+    log.write(messages.joint_state(topic=topic, names=joints, **fields), log_ns=log_ns)
+
+  with open_log(path) as log:
     for index in range(round(duration * 100)):
       t = START + index * 10_000_000
       if commands and index % 2 == 0:
-        fields = {"stamp_ns": t, "position": [0.1 * index, -0.5], "log_ns": t + lag}
-        log.command(**change("command", index, fields))
+        fields = {"time_ns": t, "position": [0.1 * index, -0.5], "log_ns": t + lag}
+        write(messages.COMMANDS, "command", index, fields)
       fields = {
-        "stamp_ns": t + 1_000_000,
+        "time_ns": t + 1_000_000,
         "position": [np.sin(index), 2.0],
         "velocity": [np.cos(index), 0.0],
         "effort": [0.25, -0.25],
         "log_ns": t + 1_000_000 + lag,
       }
-      log.state(**change("state", index, fields))
+      write(messages.STATES, "state", index, fields)
   return path
 
 
@@ -46,15 +55,17 @@ def _spoil(kind, at, **changes):
 
 def test_what_is_written_comes_back(tmp_path):
   path = tmp_path / "log.mcap"
-  with log_writer.open_log(path, ["elbow", "wrist"]) as log:
+  names = ["elbow", "wrist"]
+  with open_log(path) as log:
     for index in range(200):
       t = START + index * 10_000_000
-      log.command(t, effort=[index, 2.0])
-      log.state(t + 2_000_000, position=[0.5, index], log_ns=t + 3_000_000)
-      log.pwm(t, [0.1, -1.0])
-      log.imu(t, angular_velocity=[1, 2, 3], linear_acceleration=[4, 5, 6], frame="chip")
-      log.battery(t, 12.5 if index else np.nan)
-      log.temperature(t, "wrist", 40.5)
+      log.write(messages.joint_state(t, messages.COMMANDS, names, effort=[index, 2.0]))
+      state = messages.joint_state(t + 2_000_000, messages.STATES, names, position=[0.5, index])
+      log.write(state, log_ns=t + 3_000_000)
+      log.write(messages.joint_state(t, messages.PWM, names, effort=[0.1, -1.0]))
+      log.write(messages.imu(t, [1, 2, 3], [4, 5, 6], frame="chip"))
+      log.write(messages.battery(t, 12.5 if index else np.nan))
+      log.write(messages.temperature(t, "wrist", 40.5))
   log = logs.read_log(path)
   assert log.joints == log.commands.joints == ("elbow", "wrist")
   assert log.start_ns == START and not log.recovered
@@ -87,12 +98,12 @@ def test_the_file_opens_with_the_ordinary_reader(tmp_path):
 def test_columns_follow_names_not_places(tmp_path):
   path = tmp_path / "log.mcap"
   _write(path)
-  with log_writer.open_log(path, ["elbow", "wrist"]) as log:
+  with open_log(path) as log:
     for index in range(200):
-      log._joints[:] = ["wrist", "elbow"] if index % 3 else ["elbow", "wrist"]
+      names = ["wrist", "elbow"] if index % 3 else ["elbow", "wrist"]
       values = [2.0, 1.0] if index % 3 else [1.0, 2.0]
-      log.command(START + index * 10_000_000, position=values)
-      log.state(START + index * 10_000_000, position=values)
+      for topic in (messages.COMMANDS, messages.STATES):
+        log.write(messages.joint_state(START + index * 10_000_000, topic, names, position=values))
   log = logs.read_log(path)
   np.testing.assert_array_equal(log.states.position, np.tile([1.0, 2.0], (200, 1)))
 
@@ -105,7 +116,7 @@ def test_columns_follow_names_not_places(tmp_path):
     ({"change": _spoil("state", 40, position=[np.nan, 0.0])}, "NaN or infinite positions"),
     ({"change": _spoil("state", 40, effort=[np.inf, 0.0])}, "NaN or infinite efforts"),
     ({"change": _spoil("command", 40, position=[np.nan, 0.0])}, "first at 0.400 s"),
-    ({"change": _spoil("state", 40, stamp_ns=START)}, "header stamps"),
+    ({"change": _spoil("state", 40, time_ns=START)}, "header stamps"),
     ({"change": _spoil("command", 40, log_ns=START)}, "log times"),
     ({"change": _spoil("state", 40, position=[1.0])}, "lengths [1, 2]"),
     ({"change": lambda k, i, f: {**f, "position": []} if k == "command" else f}, "no commands"),
@@ -143,6 +154,61 @@ def test_a_truncated_file_is_refused_and_recovered_when_asked(tmp_path):
   count = len(part.states.stamp)
   assert part.recovered and 200 < count < 2000
   np.testing.assert_array_equal(part.states.position, whole.states.position[:count])
+
+
+def test_a_cut_file_gives_its_messages_in_order(tmp_path):
+  path = _write(tmp_path / "log.mcap", duration=20.0)
+  whole = list(streaming.read_messages(path))
+  assert streaming.is_complete(path) and len(whole) == 3000
+  content = path.read_bytes()
+  path.write_bytes(content[: int(0.6 * len(content))])
+  part = list(streaming.read_messages(path, recover=True))
+  assert not streaming.is_complete(path) and 300 < len(part) < 3000
+  assert [r[:4] for r in part] == [r[:4] for r in whole[: len(part)]]
+  states = list(streaming.read_messages(path, topics=[messages.STATES], recover=True))
+  assert [r.stamp_ns for r in states] == [r.stamp_ns for r in part if r.topic == messages.STATES]
+
+
+def test_definitions_are_those_of_ros():
+  """Against rosbags' typestore; ROS's text of BatteryState has constants, too."""
+  typesys = pytest.importorskip("rosbags.typesys")
+  store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+  kinds = [value for name, value in vars(messages).items() if "/msg/" in str(value)]
+  assert len(kinds) == 7
+  for kind in kinds:
+    text, _ = store.generate_msgdef(kind, ros_version=2)
+    wanted = [line for line in text.splitlines() if "=" not in line.strip("=")]
+    assert messages.definition(kind).splitlines() == [line for line in wanted if line], kind
+
+
+def test_another_ros_library_reads_what_is_written(tmp_path):
+  typesys = pytest.importorskip("rosbags.typesys")
+  store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+  path = tmp_path / "log.mcap"
+  lens = Camera(width=64, height=48, fx=50.0, fy=51.0, cx=32.0, cy=24.0, k1=0.1, p2=-0.01)
+  with open_log(path) as log:
+    log.write(messages.joint_state(START, messages.STATES, ["a", "b"], position=[0.5, -1.25]))
+    log.write(messages.imu(START, [1, 2, 3], [4, 5, 6]))
+    log.write(messages.gravity(START, [0, 0, -1]))
+    log.write(messages.image(START, b"jpeg"))
+    log.write(messages.camera_info(START, lens))
+    log.write(messages.battery(START, 12.5))
+    log.write(messages.temperature(START, "a", 41.0))
+  with path.open("rb") as stream:
+    found = {
+      schema.name: store.deserialize_cdr(message.data, schema.name)
+      for schema, _, message in make_reader(stream).iter_messages()
+    }
+  assert len(found) == 7
+  joint, camera = found[messages.JOINT_STATE], found[messages.CAMERA_INFO_TYPE]
+  assert joint.name == ["a", "b"] and joint.position.tolist() == [0.5, -1.25]
+  assert joint.header.stamp.sec == START // 10**9 and joint.effort.size == 0
+  assert found[messages.IMU_TYPE].linear_acceleration.z == 6
+  assert found[messages.VECTOR_STAMPED].vector.z == -1
+  assert bytes(found[messages.COMPRESSED_IMAGE].data) == b"jpeg"
+  assert camera.k[2] == 31.5 and camera.d.tolist() == [0.1, 0, 0, -0.01, 0] and camera.width == 64
+  assert found[messages.BATTERY_TYPE].voltage == 12.5 and found[messages.BATTERY_TYPE].present
+  assert found[messages.TEMPERATURE_TYPE].header.frame_id == "a"
 
 
 @pytest.mark.parametrize("cut", [0, 3, 8, 20])
@@ -187,10 +253,10 @@ def test_models_that_do_not_fit_are_refused(tmp_path, second, joint_type, actuat
   xml = PENDULUM.format(second=second, type=joint_type, actuators=actuators)
   model = mujoco.MjModel.from_xml_string(xml)
   if words is None:
-    logs.check_against_model(log, model)
+    check_against_model(log, model)
     return
   with pytest.raises(logs.LogError) as caught:
-    logs.check_against_model(log, model)
+    check_against_model(log, model)
   assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -200,5 +266,5 @@ def test_the_shared_samples_are_read():
   assert len(paths) >= 31
   for path in paths[::6]:
     log = logs.read_log(path)
-    logs.check_against_model(log, mujoco.MjModel.from_xml_path(str(path.parent / "model.xml")))
+    check_against_model(log, mujoco.MjModel.from_xml_path(str(path.parent / "model.xml")))
     assert log.duration > 5 and np.ptp(log.states.position) > 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+from nerf2real.core.camera_info import read_camera_info
 from nerf2real.core.cameras import Camera
 from nerf2real.real.camera import calibration
 
@@ -104,7 +105,7 @@ def test_camera_info_is_what_ros_writes(result, tmp_path):
   assert info["camera_matrix"]["rows"] == 3 and len(info["projection_matrix"]["data"]) == 12
   assert info["camera_matrix"]["data"][2] == pytest.approx(result.values[2])
   assert "+-" in path.read_text()
-  assert calibration.read_camera_info(path) == result.camera
+  assert read_camera_info(path) == result.camera
 
 
 def test_errors_say_what_to_do(tmp_path):
@@ -118,7 +119,7 @@ def test_errors_say_what_to_do(tmp_path):
   other = tmp_path / "info.yaml"
   other.write_text("image_width: 3")
   with pytest.raises(ValueError, match="no camera_info"):
-    calibration.read_camera_info(other)
+    read_camera_info(other)
 
 
 def test_measured_film_of_a_phone():

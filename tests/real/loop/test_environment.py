@@ -1,11 +1,14 @@
 """Tests of the robot's environment on the virtual bus."""
 
+import dataclasses
+
 import dm_env
 import numpy as np
 import pytest
 
 from nerf2real import real, suite
-from nerf2real.real.loop.motion import SUPPORTED_POSE, RobotSettings
+from nerf2real.real.loop.motion import SUPPORTED_POSE
+from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
 from nerf2real.suite.tasks.state import standing_posture
@@ -34,8 +37,6 @@ class Empty:
 
 @pytest.mark.parametrize("task", suite.ALL_TASKS)
 def test_observations_and_actions_are_the_simulations(robot, quick, picture, task):
-  import dataclasses
-
   simulated = suite.load(task, privileged=False, random=0, renderer=Empty())
   connection = dataclasses.replace(robot.connection(), camera=picture)
   with real.load(task, robot=connection, settings=quick) as environment:
@@ -162,8 +163,8 @@ def test_start_and_end_are_slow_and_held(robot, load):
   assert start is None
 
 
-def test_a_dry_run_moves_nothing(robot, load):
-  environment = load(dry_run=True)
+def test_a_dry_run_moves_nothing(robot, load, quick):
+  environment = load(settings=dataclasses.replace(quick, dry_run=True))
   tables = {
     device: bytes(servo.table.memory[:120]) for device, servo in robot.devices.servos.items()
   }

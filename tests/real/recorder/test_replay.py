@@ -1,7 +1,6 @@
 """The replay of a recorded log: what the page holds, and what the server gives."""
 
 import base64
-import importlib.util
 import json
 import re
 import threading
@@ -13,8 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from nerf2real.core.robot_logs import messages
+from nerf2real.core.robot_logs.writer import open_log
 from nerf2real.real.recorder import process as recorder_process
-from nerf2real.real.recorder import replay
+from nerf2real.real.recorder import replay, replay_server
 
 NAMES = ("l_knee", "r_knee")
 START = 1_700_000_000.0
@@ -24,26 +25,24 @@ START = 1_700_000_000.0
 def log(tmp_path_factory):
   """A log of 10000 readings with one short peak, written without the recorder's process."""
   path = tmp_path_factory.mktemp("log") / "run.mcap"
-  with path.open("wb") as stream:
-    out = recorder_process.LogFile(stream)
+  with open_log(path) as out:
 
-    def tell(kind, *arguments):
-      for message in recorder_process.to_messages(kind, arguments):
-        out.write(message)
+    def tell(kind, t, *arguments, **fields):
+      build = recorder_process.BUILDERS[kind]
+      out.write(build(recorder_process.nanoseconds(t), *arguments, **fields))
 
     for k in range(10000):
       t = START + 0.008 * k
       peak = 3.0 if k == 7777 else 0.0
       position = np.array([0.1 * np.sin(t), 0.5 + peak])
-      tell("joints", t, NAMES, position, np.zeros(2), *4 * (None,))
+      tell("joint_state", t, messages.STATES, NAMES, position=position, velocity=np.zeros(2))
       if k % 4 == 0:
-        tell("command", t, NAMES, np.array([0.2, 0.5]))
+        tell("joint_state", t, messages.COMMANDS, NAMES, position=[0.2, 0.5])
     for k in range(20):
       tell("image", START + 4 * k, np.full((24, 32, 3), 10 * k, np.uint8))
     tell("temperature", START, "r_knee", 39.5)
     tell("battery", START, 11.75)
-    tell("imu", START + 1, np.array([1.0, 2, 3]), np.array([0.0, 0, 9.8]), None)
-    out.finish()
+    tell("imu", START + 1, np.array([1.0, 2, 3]), np.array([0.0, 0, 9.8]))
   return path
 
 
@@ -98,17 +97,14 @@ def test_log_that_was_cut_off_is_shown_and_said(log, tmp_path):
 
 def test_nothing_to_show_is_said(tmp_path):
   path = tmp_path / "empty.mcap"
-  with path.open("wb") as stream:
-    recorder_process.LogFile(stream).finish()
+  with open_log(path):
+    pass
   with pytest.raises(ValueError, match="holds no message that can be shown"):
     replay.load(path)
 
 
 def test_server_gives_page_and_pictures(log):
-  spec = importlib.util.spec_from_file_location("replay_log", Path("launch/replay_log.py"))
-  script = importlib.util.module_from_spec(spec)
-  spec.loader.exec_module(script)
-  server = script.make_server(replay.load(log), host="127.0.0.1", port=0)
+  server = replay_server.make_server(replay.load(log), host="127.0.0.1", port=0)
   threading.Thread(target=server.serve_forever, daemon=True).start()
   try:
     base = f"http://127.0.0.1:{server.server_port}"

@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.process import VirtualRobotProcess
-from nerf2real.real.virtual.robot import LENS, VirtualRobot
+from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.wire.bus import Bus, BusError
 from nerf2real.real.wire.servos import Servos
 from nerf2real.scenes.builtin.eye import EglMissingError
@@ -58,7 +59,7 @@ def _patiently(work):
 
 
 def test_the_camera_sees_the_world_from_the_head():
-  with VirtualRobot(stepped=True, camera=True, furnish=_furnish, noise=0.0) as robot:
+  with VirtualRobot(stepped=True, camera=VirtualCamera(noise=0.0), furnish=_furnish) as robot:
     _hold_pose(robot)
     robot.body.motors.set_goal(1, 2048, 0.0)  # the head level
     _advance(robot, 1.0)

@@ -58,48 +58,6 @@ def test_exponential_filter_keeps_the_strength_of_the_old_value():
   assert smooth(np.array([3.0]))[0] == 3.0
 
 
-def test_delay_without_jitter_is_exact():
-  line = filters.DelayLine(0.03)
-  for step in range(40):
-    line.push(step * 0.005, np.array([float(step)]))
-    assert line.read(step * 0.005)[0] == max(0, step - 6)
-
-
-def test_delay_and_jitter_statistics():
-  line = filters.DelayLine(capacity=512)
-  line.reset(0.03, jitter=0.005, rng=np.random.default_rng(1))
-  # Samples far apart compared with the jitter: the first time a sample can be read is its arrival.
-  line.push(0.0, np.array([0]))
-  arrivals = []
-  for sample in range(1, 400):
-    start = sample * 0.1
-    line.push(start, np.array([sample]))
-    clock = start + np.arange(0.02, 0.04, 1e-4)
-    seen = [t for t in clock if line.read(t)[0] == sample]
-    arrivals.append(seen[0] - start)
-  assert min(arrivals) >= 0.025 and max(arrivals) <= 0.0351
-  assert np.mean(arrivals) == pytest.approx(0.03, abs=5e-4)
-  # Uniform of half width 5 ms: standard deviation 5 / sqrt(3) = 2.89 ms.
-  assert np.std(arrivals) == pytest.approx(0.00289, abs=2.5e-4)
-
-
-def test_jitter_never_goes_back_in_time():
-  line = filters.DelayLine()
-  line.reset(0.02, jitter=0.01, rng=np.random.default_rng(2))
-  seen = []
-  for step in range(500):
-    line.push(step * 0.004, np.array([step]))
-    seen.append(int(line.read(step * 0.004)[0]))
-    if step > 10:
-      assert 0.01 - 1e-9 <= line.age(step * 0.004) <= 0.034 + 1e-9
-  assert (np.diff(seen) >= 0).all()
-
-
-def test_delay_line_before_the_first_push():
-  with pytest.raises(ValueError, match="push"):
-    filters.DelayLine(0.01).read(0.0)
-
-
 def test_madgwick_equals_ahrs():
   ahrs = pytest.importorskip("ahrs", reason="the ahrs package, an independent implementation")
   rng = np.random.default_rng(3)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from absl.testing import absltest
+from dm_control import composer
 from dm_env import StepType, test_utils
 
 from nerf2real import suite
@@ -291,6 +292,24 @@ def test_ball_starts_in_front_in_half_of_the_episodes(room):
   assert 80 <= near <= 125  # half, and a few by chance; deviation 7
 
 
+def test_a_crowded_workspace_still_gives_starts(room, monkeypatch):
+  """No room in front of the robot, and free floor so rare that no drawn place hits it."""
+  environment = load("ball_push", room, random=0, image_size=None)
+  task = environment.task
+  middle = task.workspace.center
+  spots = middle + np.array([[-1.0, -1.0], [1.0, 0.9]])
+  near = lambda xy: np.linalg.norm(np.asarray(xy)[..., None, :] - spots, axis=-1).min(-1) < 0.06  # noqa: E731
+  monkeypatch.setattr(type(room.free_space), "is_reachable", lambda self, xy: near(xy))
+  monkeypatch.setattr(task, "_in_front", lambda random_state: task.workspace.upper + 1.0)
+  for _ in range(4):
+    environment.reset()
+    assert near(task.ball_position[:2])
+    assert np.linalg.norm(task.ball_position[:2] - task.state.position[:2]) > 1.0
+  monkeypatch.setattr(task, "_ball_touches_anything", lambda: True)
+  with pytest.raises(composer.EpisodeInitializationError, match="is too full"):
+    environment.reset()
+
+
 def test_ball_pushing_succeeds_in_the_corner_cell(ball):
   task = ball.task
   target = task.workspace.target
@@ -376,6 +395,34 @@ def test_picture_is_late_by_the_camera_latency(room):
   for step in range(3, 9):  # 50 ms are two control steps
     np.testing.assert_array_equal(poses[0.05][step], poses[0.0][step - 2])
   assert not np.array_equal(poses[0.0][8], poses[0.0][6])
+
+
+@pytest.mark.parametrize("rate", [10.0, 15.0, 30.0, 40.0])
+def test_a_slower_camera_holds_its_last_picture(room, rate):
+  """In 3 s there are 3 s times `rate` pictures, evenly spread; the robot's motion is the same."""
+  rendered, joints = {}, {}
+  for each in (40.0, rate):
+    renderer = FlatRenderer()
+    environment = suite.load(
+      "nerf_nav",
+      scene=room,
+      renderer=renderer,
+      random=3,
+      randomisation=NOMINAL,
+      camera=CameraSettings(rate=each),
+    )
+    environment.task.set_start(Start((0.0, 0.0), 0.0))
+    environment.reset()
+    steps = [len(renderer.poses)]
+    for _ in range(120):
+      timestep = environment.step(environment.task.standing_action)
+      steps.append(len(renderer.poses))
+    rendered[each], joints[each] = np.array(steps), timestep.observation["joint_positions"]
+  np.testing.assert_array_equal(joints[rate], joints[40.0])
+  assert rendered[rate][0] == 1  # there is a picture from the start on
+  assert abs(rendered[rate][-1] - 1 - 3.0 * rate) <= 1
+  gaps = np.diff(np.flatnonzero(np.diff(rendered[rate])))
+  assert np.floor(40 / rate) <= gaps.min() and gaps.max() <= np.ceil(40 / rate)
 
 
 def test_effects_change_motion_and_readings(room, tmp_path):

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.robot_logs import writer as log_writer
+from nerf2real.core.robot_logs import messages
 from nerf2real.core.robot_logs.reading import read_log
+from nerf2real.core.robot_logs.writer import open_log
 from nerf2real.sysid.sensors import inertial
 from tests.sysid import imu_machines
 
@@ -45,17 +46,17 @@ def _ideal(t, still):
 def _log(path, *, seed=0, still=False, tilt=(0, 0, 0), scale=(1, 1), bias=(0,) * 6, late=0.0):
   random = np.random.default_rng(seed)
   turn = Rotation.from_rotvec(tilt).inv()
-  with log_writer.open_log(path, ("swing", "turn")) as log:
+  with open_log(path) as log:
     for n in range(1000):
       t = n * 0.01
       q = np.round(_angles(np.array([t]), still)[0][:, 0] / 0.001534) * 0.001534
       stamp = START + n * 10_000_000
-      log.command(stamp, position=q)
-      log.state(stamp, position=q)
+      for topic in (messages.COMMANDS, messages.STATES):
+        log.write(messages.joint_state(stamp, topic, ("swing", "turn"), position=q))
       ideal = _ideal(np.array([t + 0.002 - late]), still)[0]
       seen = np.concatenate([turn.apply(ideal[:3]) * scale[0], turn.apply(ideal[3:]) * scale[1]])
       seen = seen + bias + random.normal(0, 1, 6) * [*(0.003,) * 3, *(0.05,) * 3]
-      log.imu(stamp + 2_000_000, angular_velocity=seen[:3], linear_acceleration=seen[3:])
+      log.write(messages.imu(stamp + 2_000_000, seen[:3], seen[3:]))
   return read_log(path)
 
 

@@ -4,7 +4,7 @@ import dynamixel_sdk as sdk
 import numpy as np
 import pytest
 
-from nerf2real.real.loop.clock import SteppedClock
+from nerf2real.real.clock import SteppedClock
 from nerf2real.real.virtual.body import Body
 from nerf2real.real.virtual.bus import protocol
 from nerf2real.real.virtual.bus.devices import BYTE_TIME, IDS, Devices

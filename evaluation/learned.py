@@ -1,0 +1,72 @@
+"""Learned policies in an evaluation: exported networks with their belief about where they are."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nerf2real.agents.dmpo import export
+from nerf2real.evaluation.plants import Sight
+from nerf2real.evaluation.policies import Belief
+
+
+class LearnedPolicy:
+  """An exported policy in an evaluation."""
+
+  def __init__(self, folder: Path, *, seed: int, stochastic: bool):
+    """Loads the policy.
+
+    Args:
+      folder: Of the exported policy.
+      seed: Of drawn actions.
+      stochastic: Whether to draw actions.
+
+    Raises:
+      ValueError: The folder holds none, or one of other observations.
+    """
+    self._loaded = export.load_policy(folder)
+    if self._loaded.history != 1:
+      raise ValueError(
+        f"{folder} stacks {self._loaded.history} observations, expected 1: the suite's have a "
+        "history of their own; train with history 1."
+      )
+    # The robot has no privileged observations, and the policy does not look at them.
+    self._layout = dataclasses.replace(
+      self._loaded.layout, privileged_names=(), privileged_sizes=()
+    )
+    self.name = folder.resolve().name
+    if self.name in ("best", "newest", "policy"):
+      self.name = f"{folder.resolve().parents[1 if self.name != 'policy' else 0].name}-{self.name}"
+    self.policy_id = str(_digest(folder))
+    shape = self._layout.image_shape
+    self.image_size = None if shape is None else (shape[0], shape[1])
+    self._seed, self._stochastic = seed, stochastic
+    self.belief: Belief | None = None
+
+  def reset(self, sight: Sight) -> None:
+    """Begins an episode."""
+    self._state = self._loaded.policy.initial_state()
+    self._random = np.random.default_rng(self._seed)
+    self.belief = None
+
+  def act(
+    self, observation: Mapping[str, np.ndarray], *, goal: np.ndarray, sight: Sight
+  ) -> np.ndarray:
+    """Returns the action [20]."""
+    policy = self._loaded.policy
+    flat = self._layout.flatten(observation)
+    step = policy.step(flat.image, flat.state, self._state)
+    self._state = step.state
+    if policy.has_belief and step.embedding.size:
+      self.belief = Belief(*policy.belief(step.embedding))
+    action = step.mean
+    if self._stochastic:
+      noise = self._random.standard_normal(action.shape, dtype=np.float32)
+      action = action + step.stddev * noise
+    return np.clip(action, -1.0, 1.0)
+
+
+def _digest(folder: Path) -> str:
+  return str(json.loads((folder / "policy.json").read_text())["sha256"])[:12]

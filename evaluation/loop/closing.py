@@ -1,0 +1,61 @@
+"""Closes the loop once: excite a robot, record, identify, simulate with the effects, compare."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerf2real import sysid
+from nerf2real.evaluation.loop import gap, recording
+from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model
+
+
+class Closed(NamedTuple):
+  """What a loop gave."""
+
+  content: dict[str, Any]  # of report.json
+  table: str  # the gap, in Markdown
+  report: Path
+
+
+def close_loop(
+  out: Path,
+  *,
+  robot: str = recording.VIRTUAL,
+  seed: int = 1,
+  seconds: float = 12.0,
+  reuse: bool = False,
+) -> Closed:
+  """Excites, records, identifies, simulates and compares; writes logs, model, report and table.
+
+  Args:
+    out: Folder to write.
+    robot: Serial port, or "virtual".
+    seed: Of the virtual robot's hidden properties.
+    seconds: Length of a recorded motion [s].
+    reuse: Takes the logs that an earlier loop left in the folder instead of moving the robot.
+
+  Raises:
+    RuntimeError: The recorder or the robot did not keep up.
+    ValueError: The logs cannot be identified from.
+  """
+  out.mkdir(parents=True, exist_ok=True)
+  model, identified = out / "declared.xml", out / "identified"
+  model.write_text(declared_model())
+  if not reuse:
+    moved = recording.record_motions(out, robot=robot, seed=seed, seconds=seconds)
+    np.savez(out / "standing.npz", actions=moved["actions"], positions=moved["positions"])
+  standing = np.load(out / "standing.npz")
+  content = sysid.identify(
+    model,
+    [out / f"{name}.mcap" for name in TRAIN],
+    held=[out / f"{name}.mcap" for name in HELD],
+    out=identified,
+  )
+  before = gap.suite_motion(None, standing["actions"])
+  after = gap.suite_motion(identified / "effects.json", standing["actions"])
+  table = gap.gap_table(standing["positions"], before, after, content)
+  if robot == recording.VIRTUAL:
+    table += gap.hidden_table(seed, content, identified / "details.json")
+  (out / "gap.md").write_text(table)
+  return Closed(content, table, identified / "report.html")

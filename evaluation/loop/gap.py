@@ -1,0 +1,114 @@
+"""The gap between a robot and the suite, joint by joint, and what a virtual robot hides."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerf2real import suite
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.tasks.base import Start
+
+_STEP = constants.CONTROL_TIMESTEP
+_NOMINAL = RandomisationSettings(
+  pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
+)
+
+
+def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
+  """Returns the joint positions [T, 20] that the suite gives for the same actions."""
+  environment = suite.load(
+    "nerf_nav",
+    image_size=None,
+    random=0,
+    randomisation=_NOMINAL,
+    privileged=False,
+    time_limit=len(actions) * _STEP + 1.0,
+    effects=effects,
+  )
+  environment.task.set_start(Start((0.0, 0.0), 0.0))
+  environment.reset()
+  rows = []
+  for action in actions:
+    timestep = environment.step(action)
+    rows.append(timestep.observation["joint_positions"][-1].copy())
+    if timestep.last():
+      break
+  return np.array(rows)
+
+
+def gap_table(
+  robot: np.ndarray, before: np.ndarray, after: np.ndarray, content: dict[str, Any]
+) -> str:
+  """Returns the gap in Markdown: joint positions, standing on the floor and held in the air."""
+  count = min(len(robot), len(before), len(after))
+  gaps = [
+    np.rad2deg(np.sqrt(np.mean((robot[:count] - simulated[:count]) ** 2, axis=0)))
+    for simulated in (before, after)
+  ]
+  lines = [
+    f"Joint positions, RMS over {count * _STEP:.0f} s of swaying on the floor (not fitted).",
+    "",
+    "| joint | nominal suite [deg] | with effects [deg] |",
+    "| --- | --- | --- |",
+  ]
+  for index, name in enumerate(constants.JOINT_NAMES):
+    lines.append(f"| {name} | {gaps[0][index]:.3f} | {gaps[1][index]:.3f} |")
+  lines.append(f"| mean | {gaps[0].mean():.3f} | {gaps[1].mean():.3f} |")
+  held = content["error"]["held"]
+  lines += [
+    "",
+    "Held in the air, whole log, all joints (mrad RMS): declared"
+    f" {1e3 * held['before']:.2f}, extended {1e3 * held['after']:.2f}, noise of the readings"
+    f" {1e3 * content['error']['floor']:.2f}.",
+    "",
+    f"Verdict: {content['verdict']}: "
+    + (", ".join(f"{e['kind']} ({e['joint'] or 'all'})" for e in content["effects"]) or "nothing"),
+  ]
+  return "\n".join(lines) + "\n"
+
+
+def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:
+  """Returns what the virtual robot hides beside what was found, in Markdown."""
+  from nerf2real.real.virtual import motors
+  from nerf2real.real.virtual.hidden import Hidden
+
+  hidden = Hidden.draw(seed)
+  duty = 800 / 128 * motors.COUNTS / (2 * np.pi) / motors.FULL_PWM  # per rad at a P gain of 800
+  stall = motors.SPEED_CONSTANT * hidden.motors.battery_voltage / motors.RESISTANCE
+  strength = duty * stall * hidden.motors.strength / constants.POSITION_GAIN
+  constants_of = json.loads(details.read_text())["calibration"]
+  lines = [
+    "",
+    "Share of the torque that the gear takes, and strength over the declared one (voltage law and",
+    "battery included). Without a load strength cannot be told from all constants being smaller.",
+    "",
+    "| joint | gear's share | found | strength | found | also named |",
+    "| --- | --- | --- | --- | --- | --- |",
+  ]
+  for index, name in enumerate(constants.JOINT_NAMES):
+    own = {e["kind"]: e["parameters"] for e in content["effects"] if e["joint"] == name}
+    share = own.pop("load_friction", {}).get("coefficient", {}).get("value")
+    gain = own.pop("motor_gain", {}).get("gain", {}).get("value", 1.0)
+    gain *= constants_of[name].get("gain", 1.0)
+    found = "not named" if share is None else f"{share:.2f}"
+    lines.append(
+      f"| {name} | {hidden.motors.gear_share[index]:.2f} | {found} | {strength[index]:.2f} |"
+      f" {gain:.2f} | {', '.join(own) or '-'} |"
+    )
+  whole = [e for e in content["effects"] if e["joint"] is None]
+  for effect in whole:
+    values = ", ".join(
+      f"{n} {p['value']:.4g}" for n, p in effect["parameters"].items() if p["value"] is not None
+    )
+    lines += ["", f"Of the whole robot: {effect['kind']} ({values})."]
+  bias = ", ".join(f"{value:.4f}" for value in hidden.gyroscope_bias)
+  late = 1e3 * hidden.motors.goal_delay
+  lines += [
+    "",
+    f"Hidden besides: gyroscope's zero {bias} rad/s, goals {late:.1f} ms late, encoders off by up"
+    " to half a degree.",
+  ]
+  return "\n".join(lines) + "\n"

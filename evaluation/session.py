@@ -1,0 +1,166 @@
+"""An evaluation: settings in, missing trials run on a plant, one report out.
+
+Every evaluation adds its episodes to a folder, from which one report is made. One that was cut
+short goes on where it stopped.
+"""
+
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerf2real.evaluation import episodes, plants, report, runner, tables
+from nerf2real.evaluation.learned import LearnedPolicy
+from nerf2real.evaluation.plants import Plant
+from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
+from nerf2real.evaluation.settings import GAIT, EvaluationSettings
+from nerf2real.suite import loading
+
+
+def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
+  """Returns the policy that the settings name."""
+  if settings.policy == GAIT:
+    return GaitPolicy(scene, settings.protocol)
+  return LearnedPolicy(Path(settings.policy), seed=settings.seed, stochastic=settings.stochastic)
+
+
+def make_plant(
+  settings: EvaluationSettings, scene: Any, image_size: tuple[int, int] | None
+) -> Plant:
+  """Returns the plant that the settings name."""
+  record = None
+  if settings.record and settings.plant != "sim":
+    record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
+  if settings.plant == "sim":
+    from nerf2real.evaluation.simulated import SimulatedPlant
+
+    return SimulatedPlant(
+      scene,
+      settings.protocol,
+      settings.perturb,
+      image_size=image_size,
+      effects=settings.effects,
+      seed=settings.seed,
+      time_limit=settings.time_limit,
+    )
+  if settings.plant == "virtual":
+    from nerf2real.evaluation.rehearsed import RehearsedPlant
+
+    return RehearsedPlant(
+      scene,
+      settings.protocol,
+      settings.perturb,
+      image_size=image_size,
+      robot_seed=settings.robot_seed,
+      time_limit=settings.time_limit,
+      record=record,
+    )
+  from nerf2real.evaluation.operated import OperatedPlant
+
+  camera: Any = int(settings.camera) if settings.camera.isdigit() else settings.camera
+  return OperatedPlant(
+    scene,
+    settings.protocol,
+    settings.perturb,
+    robot=settings.robot,
+    camera=camera,
+    image_size=image_size,
+    time_limit=settings.time_limit,
+    record=record,
+    offsets=settings.offsets,
+    lens=settings.lens,
+    dry_run=settings.dry_run,
+  )
+
+
+def _free_name(path: Path) -> Path:
+  """Returns the path, or one with a number behind it if that is taken."""
+  number = 1
+  found = path
+  while found.exists():
+    number += 1
+    found = path.with_stem(f"{path.stem}_{number}")
+  return found
+
+
+def choose(listed: tuple[Any, ...], count: int | None) -> list[tuple[int, Any]]:
+  """Returns trials with their indices: all, or `count` spread over them."""
+  indices = range(len(listed))
+  if count is not None and count < len(listed):
+    indices = np.unique(np.linspace(0, len(listed) - 1, count).round().astype(int)).tolist()
+  return [(int(index), listed[index]) for index in indices]
+
+
+def _line(episode: episodes.Episode, number: int, count: int) -> str:
+  took = f"{episode.time:.1f} s" if episode.time is not None else f"after {episode.duration:.1f} s"
+  error = episode.localisation_error
+  lost = "" if error is None else f", localisation error {error:.2f} m"
+  detail = f" ({episode.detail})" if episode.detail else ""
+  return f"{number:3d}/{count} {episode.group}: {episode.outcome} {took}{detail}{lost}"
+
+
+def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path | None:
+  """Runs the trials that are missing and writes the report of all that were run.
+
+  Args:
+    settings: The evaluation.
+    say: Called with a line after every episode, and with the tables at the end.
+
+  Returns:
+    The report's path; None after a dry run, which keeps nothing.
+
+  Raises:
+    ValueError: A dry run of a plant that is no robot.
+  """
+  scene = loading.open_scene(settings.scene)
+  if settings.dry_run:
+    _dry_run(settings, scene, say)
+    return None
+  store = episodes.Store(settings.out)
+  path = settings.out / "report.html"
+  try:
+    _run_trials(settings, scene, store, settings.trials, say)
+  finally:
+    if store.episodes:
+      report.write(
+        path,
+        store.episodes,
+        scene=scene,
+        settings=dataclasses.asdict(settings),
+      )
+  shown = [*tables.paper_tables(store.episodes), tables.outcome_table(store.episodes)]
+  text = "\n".join(tables.as_text(table) for table in shown)
+  say(f"\n{text}")
+  if settings.markdown is not None:
+    settings.markdown.write_text(text)
+  return path
+
+
+def _dry_run(settings: EvaluationSettings, scene: Any, say: Callable[[str], None]) -> None:
+  """Goes through trials on the robot without moving it; nothing of it is counted or kept."""
+  if settings.plant != "robot":
+    raise ValueError(
+      f"--dry-run with --plant {settings.plant}: expected --plant robot; the others move nothing "
+      "that could break."
+    )
+  with tempfile.TemporaryDirectory() as folder:
+    _run_trials(settings, scene, episodes.Store(Path(folder)), settings.trials or 1, say)
+
+
+def _run_trials(
+  settings: EvaluationSettings,
+  scene: Any,
+  store: episodes.Store,
+  count: int | None,
+  say: Callable[[str], None],
+) -> None:
+  policy = load_policy(settings, scene)
+  plant = make_plant(settings, scene, policy.image_size or settings.camera_size)
+  chosen = choose(plants.trials(settings.protocol), count)
+  try:
+    runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
+  finally:
+    plant.close()

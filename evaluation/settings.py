@@ -1,0 +1,53 @@
+"""Settings of an evaluation: which policy, on which plant, by which of the paper's protocols."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+GAIT = "gait"
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationSettings:
+  """What is evaluated, where and how."""
+
+  policy: str = GAIT
+  """Folder of an exported policy, or "gait" for the scripted walker."""
+  plant: Literal["sim", "virtual", "robot"] = "sim"
+  """Where: the training simulation, a virtual robot in the true room, or a robot."""
+  protocol: Literal["navigation", "ball", "gain"] = "navigation"
+  """Which of the paper's evaluations: tables I, II and V."""
+  perturb: Literal["none", "blocked_camera", "moved_object", "person"] = "none"
+  """What is disturbed."""
+  out: Path = Path("out/evaluation")
+  """Folder of the episodes and the report."""
+  scene: Path | None = None
+  """Folder of a scene bundle; the built-in room if not given."""
+  effects: Path | None = None
+  """An effects.json for the simulation: what the nominal model lacks."""
+  trials: int | None = None
+  """Runs only the first trials of the protocol, spread over it; all if not given."""
+  seed: int = 0
+  """Seed of the simulation's episodes and of drawn actions."""
+  robot_seed: int = 1
+  """Which virtual robot: the seed of what is hidden in it."""
+  stochastic: bool = False
+  """Draws actions instead of taking the policy's mean."""
+  camera_size: tuple[int, int] | None = None
+  """Height and width of a picture that is taken even if the policy does not look at it."""
+  robot: str = "/dev/ttyUSB0"
+  """Serial port of the robot."""
+  camera: str = "0"
+  """The robot's camera: device number, file or URL."""
+  offsets: Path | None = None
+  """The robot's offset.yaml."""
+  lens: Path | None = None
+  """The camera's camera_info YAML of launch/calibrate_camera.py, for recordings on the robot."""
+  record: bool = False
+  """Records runs on the virtual robot and the robot as MCAP beside the report."""
+  time_limit: float | None = None
+  """Length of an episode [s]; the task's own if not given."""
+  markdown: Path | None = None
+  """Writes the tables of everything in the folder to a Markdown file, too."""
+  dry_run: bool = False
+  """Robot only: reads and asks everything, moves and keeps nothing; one trial without --trials."""

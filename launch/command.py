@@ -1,0 +1,120 @@
+"""What all commands share: arguments, environment variables, one-line errors, exit statuses.
+
+A script has a frozen dataclass of arguments and a function of them; libraries are imported in that
+function, so that `--help` answers at once and the environment is set before MuJoCo and BLAS load.
+"""
+
+import contextlib
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from types import FrameType
+from typing import Any
+
+import tyro
+
+FAILED = 1  # exit status: the input or the machine was at fault
+WRONG_ARGUMENTS = 2  # exit status, as of argparse and tyro: the same command cannot succeed
+_SIGNALLED = 128  # plus the signal's number: the shell's convention
+
+DRAWING = {"MUJOCO_GL": "egl"}
+"""Environment of commands that draw through MuJoCo, also without a screen."""
+NOT_DRAWING = {"MUJOCO_GL": "disabled"}
+"""Environment of commands in which nothing draws through MuJoCo."""
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Environment of commands whose matrices are small: BLAS threads would fight over the cores."""
+
+
+class CommandError(Exception):
+  """Ends a command with one line on stderr."""
+
+  def __init__(self, message: object, *, status: int = FAILED):
+    """Takes the message, without "error:", and the exit status."""
+    super().__init__(str(message))
+    self.status = status
+
+
+def main(
+  arguments: type,
+  function: Callable[..., int | None],
+  *,
+  environment: Mapping[str, str] | None = None,
+  errors: tuple[type[Exception], ...] = (ValueError, OSError),
+  interrupted: str = "interrupted",
+  forwards: bool = False,
+) -> int:
+  """Parses the command line, calls the function, and returns the exit status.
+
+  Ctrl-C and SIGTERM raise KeyboardInterrupt in the function, so that what it opened is closed; they
+  end in one line. Errors of other kinds than those listed show their trace.
+
+  Args:
+    arguments: dataclass of the arguments; its module's docstring is the help's description.
+    function: called with the parsed arguments; returns an exit status, or None for 0.
+    environment: environment variables that are set unless they are set already.
+    errors: exceptions of the user's making, which end in `error: <message>` and status 1.
+    interrupted: the line after Ctrl-C or SIGTERM.
+    forwards: calls the function with a list of unknown arguments besides.
+
+  Raises:
+    SystemExit: for --help (0) and wrong arguments (2).
+  """
+  for name, value in (environment or {}).items():
+    os.environ.setdefault(name, value)
+  description = sys.modules[arguments.__module__].__doc__
+  values: tuple[Any, ...]
+  try:
+    if forwards:
+      values = tyro.cli(arguments, description=description, return_unknown_args=True)
+    else:
+      values = (tyro.cli(arguments, description=description),)
+  except BrokenPipeError:  # who reads the help, such as `head`, has seen enough
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return _SIGNALLED + signal.SIGPIPE
+  received = [signal.SIGINT]
+  try:
+    with _terminated_as_interrupted(received):
+      return function(*values) or 0
+  except CommandError as error:
+    message, status = str(error), error.status
+  except errors as error:
+    message, status = str(error), FAILED
+  except KeyboardInterrupt:
+    _say(f"\n{interrupted}")
+    return _SIGNALLED + received[-1]
+  _say(f"error: {message}")
+  return status
+
+
+def _say(text: str) -> None:
+  """Prints to stderr; where that is a file on a full disk, the exit status still tells."""
+  with contextlib.suppress(OSError):
+    print(text, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]:
+  """Raises KeyboardInterrupt at SIGTERM, and appends the signal to `received`."""
+
+  def interrupt(number: int, _: FrameType | None) -> None:
+    received.append(signal.Signals(number))
+    raise KeyboardInterrupt
+
+  before = signal.signal(signal.SIGTERM, interrupt)
+  try:
+    yield
+  finally:
+    signal.signal(signal.SIGTERM, before)
+
+
+def device(camera: str | None) -> str | int | None:
+  """Returns the number of a camera's device, or its file or address as it is."""
+  return int(camera) if camera is not None and camera.isdigit() else camera
+
+
+def command_line() -> str:
+  """Returns the command that was given, as a shell takes it."""
+  program = ["python", sys.argv[0]] if sys.argv[0].endswith(".py") else sys.argv[0].split()
+  return shlex.join([*program, *sys.argv[1:]])

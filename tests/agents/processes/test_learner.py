@@ -1,0 +1,219 @@
+"""The learner in this process, with one actor in a thread: ends, failures, scaling, best, names."""
+
+import errno
+import json
+import socket
+import threading
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from nerf2real.agents.dmpo import (
+  config,
+  export,
+  learning,
+  networks,
+  scaling,
+  specs,
+)
+from nerf2real.agents.dmpo.replay import trajectory_fields
+from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.link import sessions
+from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.processes import actor
+from nerf2real.agents.processes.checkpoints import read_info
+from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+from tests.agents.processes.stubs import documented
+
+ENVIRONMENT = "dm_control:cartpole:swingup"
+CONFIG = config.override(
+  config.preset("state"),
+  {
+    "network.policy_layers": (16, 16),
+    "network.critic_layers": (16, 16),
+    "batch_size": 4,
+    "num_samples": 4,
+    "min_replay_steps": 200,
+    "scale_observations": True,
+  },
+)
+LINK = sessions.LinkSettings()
+
+
+def _endpoint():
+  with socket.socket() as probe:
+    probe.bind(("127.0.0.1", 0))
+    return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class Run:
+  """A learner; `go` runs it with an actor until it ends."""
+
+  def __init__(self, folder, *, settings=None, resume=False, **run):
+    self._endpoint = _endpoint()
+    settings = config.override(CONFIG, settings or {})
+    run_settings = RunSettings(environment=ENVIRONMENT, run=folder, log_period=0.0, **run)
+    self.learner = Learner(
+      run_settings, settings, endpoint=self._endpoint, link=LINK, resume=resume
+    )
+
+  def go(self):
+    session = sessions.connect(self._endpoint, LINK, timeout=5)
+    process = actor.ActorProcess(ActorLink(session, LINK, actor="actor-0-t"), seed=0)
+    thread = threading.Thread(target=process.run)
+    thread.start()
+    try:
+      self.learner.run()
+    finally:
+      process.stop()
+      thread.join(timeout=10)
+      process.link.close()
+
+  def close(self):
+    self.learner.stop()
+    self.learner.run()
+
+
+def _rows(folder, source="learner"):
+  lines = (folder / "metrics.jsonl").read_text().splitlines()
+  return [r for r in map(json.loads, lines) if r["source"].startswith(source)]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+  """A run of 400 steps with scaled observations that has ended."""
+  folder = tmp_path_factory.mktemp("run")
+  run = Run(folder, max_env_steps=400)
+  run.go()
+  return folder, run.learner
+
+
+def test_the_fill_pays_for_no_update(finished):
+  info = read_info(finished[0])
+  assert (info["steps"], info["updates"], info["unpaid_steps"]) == (400, (400 - 200) // 4, 200)
+
+
+def test_scaling_is_measured_on_the_fill_saved_and_folded(finished, tmp_path):
+  folder, learner = finished
+  scales = learner._state.scaling
+  assert scaling.is_measured(scales)
+  assert 0.01 < float(np.min(scales["state"]["stddev"])) < 5.0
+  resumed = Run(folder, resume=True)
+  np.testing.assert_array_equal(
+    resumed.learner._state.scaling["state"]["mean"], scales["state"]["mean"]
+  )
+  resumed.close()
+  observation = np.random.default_rng(0).normal(size=5).astype(np.float32)
+  exported = export.load_policy(folder / "policy" / "newest").policy
+  step = exported.step(None, observation, exported.initial_state())
+  head = networks.policy_head(
+    learner._state.target_policy,
+    np.zeros(0),
+    scaling.apply(scales, "state", observation),
+    CONFIG.network,
+  )
+  np.testing.assert_allclose(step.mean, head.mean, rtol=1e-3, atol=1e-4)
+
+
+def test_a_run_begins_with_a_policy(finished, tmp_path):
+  source = finished[0] / "policy" / "newest"
+  run = Run(tmp_path / "run", init_from=source)
+  begun = export.load_policy(tmp_path / "run" / "policy" / "newest").policy
+  policy, observation = export.load_policy(source).policy, np.full(5, 0.3, np.float32)
+  expected = policy.step(None, observation, policy.initial_state()).mean
+  found = begun.step(None, observation, begun.initial_state()).mean
+  np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+  assert int(run.learner._state.steps) == 0
+  assert read_info(tmp_path / "run")["init_from"] == str(source)
+  run.close()
+  with pytest.raises(ValueError, match="other networks"):
+    Run(tmp_path / "other", init_from=source, settings={"network.policy_layers": (8, 8)})
+
+
+def test_a_standing_action_is_needed_where_it_is_wanted(tmp_path):
+  with pytest.raises(ValueError, match="cartpole.*no standing action"):
+    Run(tmp_path, settings={"first_action": "standing"})
+
+
+def test_minutes_end_a_run_over_all_its_parts(tmp_path):
+  run = Run(tmp_path, minutes=1.5 / 60)
+  begin = time.monotonic()
+  run.go()
+  assert time.monotonic() - begin < 15
+  seconds = read_info(tmp_path)["seconds"]
+  assert seconds >= 1.5
+  again = Run(tmp_path, minutes=1.5 / 60, resume=True)
+  again.learner.run()  # its time is up
+  assert read_info(tmp_path)["updates"] == run.learner.limiter.updates
+
+
+def test_a_full_disk_ends_the_learner_with_a_reason(tmp_path, monkeypatch):
+  run = Run(tmp_path)
+  inserted = []
+
+  def insert(trajectory, **origin):
+    if len(inserted) == 3:
+      raise OSError(errno.ENOSPC, "No space left on device")
+    inserted.append(trajectory)
+
+  monkeypatch.setattr(run.learner.replay, "insert", insert)
+  begin = time.monotonic()
+  with pytest.raises(LearnerError, match="No trajectory can be taken in.*No space left"):
+    run.go()
+  assert time.monotonic() - begin < 30
+
+
+def _report(learner, **values):
+  learner.link.metrics.put(("evaluator-0-x", {"episodes": 27, **values}))
+  learner._take_metrics()
+
+
+def test_best_is_the_most_successful_on_fresh_trials(tmp_path):
+  run = Run(tmp_path)
+  learner, best = run.learner, tmp_path / "policy" / "best"
+  learner.link._held[0] = learner.link._parameters  # as if the evaluator had fetched them
+  found = lambda: (learner._best_success, learner._best)  # noqa: E731
+  _report(learner, success=0.9, confirmation=0, version=0, **{"return": 9.0})
+  assert learner._best_success is None and not best.exists()
+  assert learner._evaluated == 9.0
+  _report(learner, success=0.4, confirmation=1, version=0, **{"return": 5.0})
+  assert found() == (0.4, 5.0) and best.exists()
+  _report(learner, success=0.3, confirmation=1, version=0, **{"return": 50.0})
+  assert found() == (0.4, 5.0)  # a higher return is not more success
+  _report(learner, success=0.4, confirmation=1, version=0, **{"return": 6.0})
+  assert found() == (0.4, 6.0)  # the return breaks a tie
+  assert learner._status()["best_success"] == 0.4
+  assert export.load_policy(best).info["best_success"] == 0.4
+  run.close()
+
+
+def test_best_without_success_is_the_highest_mean_return(tmp_path):
+  run = Run(tmp_path)
+  for result, expected in ((5.0, 5.0), (4.0, 5.0), (6.0, 6.0)):
+    _report(run.learner, confirmation=0, version=0, **{"return": result})
+    assert run.learner._best == expected
+  run.close()
+
+
+def _update_metrics():
+  """Names that an update gives with pictures and a belief."""
+  layout = Layout("camera", (6, 8, 3), ("s",), (3,), (specs.POSITION, specs.ROTATION), (3, 9), 2)
+  settings = config.preset("vision_small")
+  functions = learning.make_learning(settings, layout)
+  fields = trajectory_fields(layout, lstm_size=settings.network.lstm_size)
+  batch = {
+    name: jax.ShapeDtypeStruct((2, 6, *f.shape) if f.per_step else (2, *f.shape), f.dtype)
+    for name, f in fields.items()
+  } | {"last": jax.ShapeDtypeStruct((2,), "int32")}
+  state = jax.eval_shape(functions.init, jax.ShapeDtypeStruct((2,), "uint32"))
+  return set(jax.eval_shape(functions.update, state, batch)[1])
+
+
+ROW = {"time", "source", "steps", "updates"}
+
+
+def test_the_readme_explains_what_the_learner_logs(finished):
+  logged = set().union(*_rows(finished[0])) - ROW
+  assert logged | _update_metrics() == documented("learner")

@@ -1,0 +1,94 @@
+"""The closed loop: motions, the gate before the recorder, and the whole loop (slow)."""
+
+import json
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.core.robot_logs.reading import read_log
+from nerf2real.evaluation.loop import closing, gap, motions, recording
+from nerf2real.launch import close_loop as script
+from nerf2real.suite.effects import Effect, read_effects, write_effects
+from nerf2real.suite.op3 import constants
+from nerf2real.sysid.data.compatibility import check_against_model
+
+
+@pytest.mark.parametrize("kind", ["sweep", "slow", "steps", "mixed", "sway"])
+def test_motions_begin_standing_and_stay_within_the_limits(kind):
+  lower, upper = constants.joint_limits()
+  targets = (lower + upper) / 2 + (upper - lower) / 2 * motions.motion(kind, 480)
+  assert targets.shape == (480, 20)
+  assert np.all(targets >= lower - 1e-6) and np.all(targets <= upper + 1e-6)
+  np.testing.assert_allclose(targets[0], constants.standing_targets(), atol=1e-6)
+  assert np.ptp(targets[80:], axis=0).min() > (0.009 if kind == "sway" else 0.1)  # all joints move
+
+
+def test_motions_differ_between_fitting_and_judging():
+  assert np.abs(motions.motion("mixed", 200) - motions.motion("sweep", 200)).max() > 0.1
+
+
+def test_the_declared_model_hangs_by_its_torso():
+  model = mujoco.MjModel.from_xml_string(motions.declared_model())
+  assert {model.joint(i).name for i in range(model.njnt)} == set(constants.JOINT_NAMES)
+  assert model.nu == 20 and model.nv == 20
+
+
+def test_a_gate_notes_only_what_comes_while_it_is_open():
+  class Notes:
+    def __init__(self):
+      self.seen = []
+
+    def command(self, t, names, positions):
+      self.seen.append(t)
+
+  notes = Notes()
+  gate = recording.Gate(notes)
+  for t in range(6):
+    gate.open = 2 <= t < 4
+    gate.command(t, (), ())
+  assert notes.seen == [2, 3]
+
+
+def test_effects_change_how_the_suite_moves(tmp_path):
+  effects = [
+    Effect("parameter_error", "l_knee", {"damping": 1.1, "gain": 0.95}),
+    Effect("load_friction", "l_knee", {"coefficient": 0.3, "carried": 1.0}),
+    Effect("payload", "r_knee_link", {"mass": 0.2, "x": 0.0, "y": 0.0, "z": -0.05}),
+    Effect("command_delay", None, {"delay": 0.01}),
+  ]
+  write_effects(tmp_path / "effects.json", effects)
+  actions = motions.motion("sway", 40)
+  nominal = gap.suite_motion(None, actions)
+  changed = gap.suite_motion(tmp_path / "effects.json", actions)
+  assert nominal.shape == changed.shape == (40, 20)
+  knee = constants.JOINT_NAMES.index("l_knee")
+  assert 1e-4 < np.abs(changed - nominal)[:, knee].max() < 0.2
+
+
+def test_an_unreachable_robot_is_one_line(monkeypatch, capsys, tmp_path):
+  monkeypatch.setattr(
+    sys, "argv", ["close_loop.py", "--robot", str(tmp_path / "tty"), "--out", str(tmp_path / "o")]
+  )
+  assert script.main() != 0
+  error = capsys.readouterr().err
+  assert error.startswith("error: ") and error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_the_loop_closes_on_the_virtual_robot(tmp_path):
+  content = closing.close_loop(tmp_path, seed=1, seconds=6.0).content
+  model = mujoco.MjModel.from_xml_path(str(tmp_path / "declared.xml"))
+  for name in ("sweep", "slow", "steps", "mixed"):
+    log = read_log(tmp_path / f"{name}.mcap")
+    check_against_model(log, model)
+    assert log.duration == pytest.approx(6.0, abs=0.2)
+    assert np.abs(log.states.position[5] - log.states.position[0]).max() < 0.01  # from rest
+  assert content["verdict"] in ("effects", "unexplained")  # the virtual servos are other ones
+  assert "load_friction" in {e["kind"] for e in [*content["effects"], *content["alternatives"]]}
+  assert content["error"]["train"]["after"] < content["error"]["train"]["before"]
+  assert json.loads((tmp_path / "identified/report.json").read_text()) == content
+  assert read_effects(tmp_path / "identified/effects.json")
+  table = (tmp_path / "gap.md").read_text()
+  assert all(f"| {name} |" in table for name in constants.JOINT_NAMES)

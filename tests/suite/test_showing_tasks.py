@@ -1,0 +1,69 @@
+"""What shows a task: the video of a rollout and the viewer in the browser."""
+
+import av
+import numpy as np
+import pytest
+import viser
+
+from nerf2real import suite
+from nerf2real.suite.viewer.elements import bars
+from nerf2real.suite.viewer.task_viewer import TaskViewer
+from nerf2real.suite.views.rollout import run_episodes
+from tests.suite.synthetic import FlatRenderer, make_room
+
+
+@pytest.fixture
+def room(tmp_path, monkeypatch):
+  made = make_room(tmp_path)
+  load = suite.load
+
+  def load_room(task, **options):
+    return load(task, **{**options, "scene": made, "renderer": FlatRenderer(depth=1.0)})
+
+  monkeypatch.setattr(suite, "load", load_room)
+  return made
+
+
+@pytest.mark.parametrize("task", suite.ALL_TASKS)
+def test_rollout_writes_a_video_of_the_length_asked_for(task, room, tmp_path):
+  path = tmp_path / "videos" / "out.mp4"
+  run_episodes(task, video=path, seconds=1.0, policy="random")
+  frames = [f.to_ndarray(format="rgb24") for f in av.open(str(path)).decode(video=0)]
+  assert len(frames) == 20
+  height, width = frames[0].shape[:2]
+  assert height == 404 and width > 2 * 480  # three pictures above a line of text
+  robot_view = frames[10][20:340, 500:940].reshape(-1, 3)
+  np.testing.assert_allclose(np.median(robot_view, axis=0), (40, 80, 120), atol=8)
+  assert frames[10][:360, :480].std() > 10  # the third person sees something
+
+
+def test_rollout_reports_how_episodes_ended(room):
+  lines = run_episodes(seconds=6.0, policy="random")
+  assert lines and all("ended by fall" in line and "no success" in line for line in lines)
+
+
+def test_viewer_shows_the_state_and_pushes(room):
+  environment = suite.load("ball_push", random=0)
+  server = viser.ViserServer(host="127.0.0.1", port=18_734, verbose=False)
+  try:
+    viewer = TaskViewer(environment, server)
+    viewer._start_push("left")
+    before = environment.task.state
+    for _ in range(8):
+      viewer.step()
+    after = environment.task.state
+    left = (after.velocity @ before.aligned)[1]
+    assert left > 0.05  # 8 N for 0.15 s
+    torso = environment.physics.model.ptr.geom("op3/body_link_0").id
+    np.testing.assert_allclose(
+      viewer._geoms[torso].position, environment.physics.data.ptr.geom_xpos[torso]
+    )
+    assert "ball" in viewer._bars.content and "total" in viewer._bars.content
+    assert (viewer._picture.image[::6, ::6] == (40, 80, 120)).all(-1).mean() > 0.5
+  finally:
+    server.stop()
+
+
+def test_bars_grow_to_their_side():
+  page = bars({"turn": -1.5, "speed": 0.75})
+  assert "left:0.0%;width:50.0%" in page and "left:50.0%;width:25.0%" in page
