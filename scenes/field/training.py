@@ -32,7 +32,7 @@ CHECKPOINT_SECONDS = 60.0  # chosen: a checkpoint takes about 0.2 s
 _RECORD_SECONDS = 2.0  # chosen: distance of the points of the report's curve
 _WARMUP_START = 0.01  # the warm-up starts at this fraction of the learning rate, as in multinerf
 _CHECKPOINT = "training.safetensors"
-_CHECKPOINT_FORMAT = "2"  # arrays of `engine.trainer`; 1 were those of numba kernels
+_CHECKPOINT_FORMAT = "2"  # of the arrays; files that name none have format 1
 
 
 class TrainError(ValueError):

@@ -11,17 +11,18 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from nerf2real.scenes.field.engine.device import OPTIONS
+from nerf2real.scenes.field.engine.device import WIDE_OPTIONS
 from nerf2real.scenes.field.engine.functions import Functions
 from nerf2real.scenes.field.engine.layout import (
   CHUNK_SAMPLES,
   AdamW,
+  Floats,
   Model,
   Occupancy,
   Optimised,
   Pictures,
   Settings,
-  Worker,
+  Workers,
 )
 from nerf2real.scenes.field.engine.losses import squareplus
 from nerf2real.scenes.field.engine.native import PADDING
@@ -45,19 +46,18 @@ def build(f: Functions) -> Chunks:
   at_place, at_out = stride * rows.PLACE_U, stride * rows.OUT
   at_extent = stride * (rows.INPUT + 2 * f.shape.levels)
   ray_losses, draw_empty, empty_loss, clear = f.losses
-  floats = wp.array(dtype=wp.float32)
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
   def train(
     p: Pictures,
     s: Settings,
     grids: Occupancy,
     m: Model,
-    workers: wp.array(dtype=Worker),
+    workers: Workers,
     seed: wp.uint64,
-    first_worker: wp.int32,
-    budget: wp.int32,
-    threshold: wp.float32,
+    first_worker: int,
+    budget: int,
+    threshold: float,
   ):
     """Adds the gradient of as many random rays as fit into a budget of samples.
 
@@ -122,19 +122,19 @@ def build(f: Functions) -> Chunks:
     for i in range(3):
       w.figures[3 + i] = sums[i]
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
   def densities(
     s: Settings,
     m: Model,
-    workers: wp.array(dtype=Worker),
-    number: wp.int32,
-    size: wp.int32,
-    threads: wp.int32,
+    workers: Workers,
+    number: int,
+    size: int,
+    threads: int,
     positions: wp.array(dtype=wp.vec3),
-    extent: wp.float32,
-    first: wp.int32,
-    stop: wp.int32,
-    result: floats,
+    extent: float,
+    first: int,
+    stop: int,
+    result: Floats,
   ):
     """Writes the densities [1/unit] at points [first, stop) of the unit frame.
 
@@ -157,21 +157,16 @@ def build(f: Functions) -> Chunks:
         result[at + n] = s.density_scale * squareplus(z)
       at += size * threads
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def scatter(
-    gradient: floats,
-    workers: wp.array(dtype=Worker),
-    m: Model,
-    level: wp.int32,
-  ):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def scatter(gradient: Floats, workers: Workers, m: Model, level: int):
     """Adds the table's gradient of one level, all workers' samples in one order."""
     for number in range(workers.shape[0]):
       w = workers[number]
       count = wp.int32(w.figures[1])
       f.scatter_points(gradient, w, m, 0, count, level)
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def adam(v: Optimised, how: AdamW, start: wp.int32, stop: wp.int32, size: wp.int32):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def adam(v: Optimised, how: AdamW, start: int, stop: int, size: int):
     """Updates [start, stop) by AdamW where the gradient is not zero, then clears the gradient.
 
     A thread does `size` parameters. Those that no sample touched keep their value and their

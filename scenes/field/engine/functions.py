@@ -15,6 +15,7 @@ from nerf2real.scenes.field.engine import losses, native_grid, native_network
 from nerf2real.scenes.field.engine.layout import (
   CHUNK_SAMPLES,
   AdamW,
+  Floats,
   Model,
   Occupancy,
   Optimised,
@@ -69,67 +70,51 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Functions:
     "CAPACITY": CHUNK_SAMPLES,
     "stride": stride,
   }
-  floats = wp.array(dtype=wp.float32)
 
   def native(body: str) -> Any:
     return wp.func_native(snippet(body, **constants))
 
   @native(native_grid.PLACE)
-  def place(worker: Worker, settings: Settings, begin: wp.int32, end: wp.int32): ...
+  def place(worker: Worker, settings: Settings, begin: int, end: int): ...
 
   @native(native_grid.ENCODE)
-  def encode(worker: Worker, model: Model, begin: wp.int32, end: wp.int32): ...
+  def encode(worker: Worker, model: Model, begin: int, end: int): ...
 
   @native(native_network.BASE_FORWARD)
-  def base_forward(worker: Worker, model: Model, begin: wp.int32, end: wp.int32): ...
+  def base_forward(worker: Worker, model: Model, begin: int, end: int): ...
 
   @native(native_grid.OPACITY)
-  def opacity(worker: Worker, settings: Settings, begin: wp.int32, end: wp.int32): ...
+  def opacity(worker: Worker, settings: Settings, begin: int, end: int): ...
 
   # Written out: Warp looks for this decorator in the source where something is returned.
   @wp.func_native(snippet(native_grid.KEEP_VISIBLE, **constants))
-  def keep_visible(worker: Worker, rays: wp.int32, threshold: wp.float32) -> wp.int32: ...
+  def keep_visible(worker: Worker, rays: int, threshold: float) -> wp.int32: ...
 
   @native(native_network.VIEW_FORWARD)
-  def view_forward(
-    worker: Worker, model: Model, settings: Settings, begin: wp.int32, end: wp.int32
-  ): ...
+  def view_forward(worker: Worker, model: Model, settings: Settings, begin: int, end: int): ...
 
   @native(native_network.VIEW_BACKWARD)
-  def view_backward(worker: Worker, model: Model, begin: wp.int32, end: wp.int32): ...
+  def view_backward(worker: Worker, model: Model, begin: int, end: int): ...
 
   @native(native_network.BASE_BACKWARD)
-  def base_backward(
-    worker: Worker, model: Model, begin: wp.int32, end: wp.int32, kept_at: wp.int32
-  ): ...
+  def base_backward(worker: Worker, model: Model, begin: int, end: int, kept_at: int): ...
 
   @native(native_network.NETWORK_GRADIENT)
   def network_gradient(
-    worker: Worker,
-    begin: wp.int32,
-    end: wp.int32,
-    with_view: wp.int32,
-    part: wp.int32,
-    parts: wp.int32,
+    worker: Worker, begin: int, end: int, with_view: int, part: int, parts: int
   ): ...
 
   @native(native_grid.SCATTER)
   def scatter_points(
-    gradient: floats, worker: Worker, model: Model, begin: wp.int32, end: wp.int32, level: wp.int32
+    gradient: Floats, worker: Worker, model: Model, begin: int, end: int, level: int
   ): ...
 
   @native(native_grid.ADAM)
-  def adam_range(optimised: Optimised, how: AdamW, begin: wp.int32, end: wp.int32): ...
+  def adam_range(optimised: Optimised, how: AdamW, begin: int, end: int): ...
 
   @wp.func
   def march_ray(
-    grids: Occupancy,
-    s: Settings,
-    w: Worker,
-    seed: wp.uint64,
-    index: wp.int64,
-    r: wp.int32,
-    at: wp.int32,
+    grids: Occupancy, s: Settings, w: Worker, seed: wp.uint64, index: wp.int64, r: int, at: int
   ) -> wp.int32:
     """Marches column r of the rays, see march."""
     origin = wp.vec3(w.rays[r], w.rays[ray_columns + r], w.rays[2 * ray_columns + r])

@@ -11,6 +11,8 @@ from nerf2real.scenes.field.field import FieldSettings
 
 CHUNK_RAYS = 128  # of a chunk at most
 CHUNK_SAMPLES = 768  # chosen: a thread's activations stay in a second-level cache of 1 MB
+Floats = wp.array(dtype=wp.float32)
+Ints = wp.array(dtype=wp.int32)
 MULTIPLE = 8  # of the widths: a tile of the matrix products, see `native`
 # An odd number of cache lines, as rows a power of two apart would share a cache's sets.
 STRIDE = CHUNK_SAMPLES + 48
@@ -121,16 +123,16 @@ class Pictures:
   """Training pictures: K levels of blur of N pictures, see views.BlurPyramid."""
 
   pixels: wp.array(dtype=wp.uint8)  # every level [N, h, w, 3] behind the other
-  starts: wp.array(dtype=wp.int32)  # [K]: where a level starts in `pixels`
-  heights: wp.array(dtype=wp.int32)  # [K]
-  widths: wp.array(dtype=wp.int32)  # [K]
-  factors: wp.array(dtype=wp.float32)  # [K]: how much smaller a level's pictures are
-  blurs: wp.array(dtype=wp.float32)  # [K]: standard deviation [pixel of the full size]
+  starts: Ints  # [K]: where a level starts in `pixels`
+  heights: Ints  # [K]
+  widths: Ints  # [K]
+  factors: Floats  # [K]: how much smaller a level's pictures are
+  blurs: Floats  # [K]: standard deviation [pixel of the full size]
   directions: wp.array(dtype=wp.vec3)  # [H * W]: camera rays, z = 1
   rotations: wp.array(dtype=wp.mat33)  # [N]: unit frame from camera
   origins: wp.array(dtype=wp.vec3)  # [N]
   anchors: wp.array(dtype=wp.vec4)  # [A]: picture, pixel x and y, distance along the ray [unit]
-  empty: wp.array(dtype=wp.int32)  # [E]: cells of the unit cube known to be empty
+  empty: Ints  # [E]: cells of the unit cube known to be empty
 
 
 @wp.struct
@@ -166,48 +168,51 @@ class Occupancy:
 
   inner_size: wp.int32  # cells along an axis of the unit cube
   inner_distance: wp.array(dtype=wp.uint8)  # cells, 0 where occupied
-  inner_density: wp.array(dtype=wp.float32)  # [1/unit]
+  inner_density: Floats  # [1/unit]
   outer_size: wp.int32  # the same for the whole squashed space
   outer_distance: wp.array(dtype=wp.uint8)
-  outer_density: wp.array(dtype=wp.float32)
+  outer_density: Floats
 
 
 @wp.struct
 class Model:
   """The field's parameters."""
 
-  table: wp.array(dtype=wp.float32)  # [L, T, 2]
-  levels: wp.array(dtype=wp.int32)  # [4, L], see encoding.level_rows
+  table: Floats  # [L, T, 2]
+  levels: Ints  # [4, L], see encoding.level_rows
   entries: wp.int32  # T
-  weights: wp.array(dtype=wp.float32)  # both networks', see Shape
+  weights: Floats  # both networks', see Shape
 
 
 @wp.struct
 class Worker:
   """Work arrays of a CPU thread, or of a GPU."""
 
-  work: wp.array(dtype=wp.float32)  # [rows, samples], see Rows
-  rays: wp.array(dtype=wp.float32)
+  work: Floats  # [rows, samples], see Rows
+  rays: Floats
   """[14, rays]: origin, direction, target, footprint, background, anchor or 0."""
-  ray_of: wp.array(dtype=wp.int32)  # [samples]
-  first: wp.array(dtype=wp.int32)  # [rays + 1]: a ray's first sample
-  last: wp.array(dtype=wp.int32)  # [rays]: behind a ray's last visible sample
-  gradient: wp.array(dtype=wp.float32)  # of both networks
-  kept: wp.array(dtype=wp.float32)  # [3 + 2 L, S]: coordinates and features' gradients of a step
+  ray_of: Ints  # [samples]
+  first: Ints  # [rays + 1]: a ray's first sample
+  last: Ints  # [rays]: behind a ray's last visible sample
+  gradient: Floats  # of both networks
+  kept: Floats  # [3 + 2 L, S]: coordinates and features' gradients of a step
   kept_stride: wp.int32  # S
   figures: wp.array(dtype=wp.float64)
   """[6]: rays, kept samples, marched samples; sums over the rays of squared error, Charbonnier loss
   and distortion loss."""
 
 
+Workers = wp.array(dtype=Worker)
+
+
 @wp.struct
 class Optimised:
   """Parameters with their gradient and Adam's moments."""
 
-  values: wp.array(dtype=wp.float32)
-  gradient: wp.array(dtype=wp.float32)
-  first: wp.array(dtype=wp.float32)
-  second: wp.array(dtype=wp.float32)
+  values: Floats
+  gradient: Floats
+  first: Floats
+  second: Floats
 
 
 @wp.struct

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from nerf2real.scenes.field.engine import native, native_grid
-from nerf2real.scenes.field.engine.layout import Pictures, Settings, Shape, Worker
+from nerf2real.scenes.field.engine.layout import Floats, Pictures, Settings, Shape, Worker
 from nerf2real.scenes.field.engine.rays import squash, uniform
 
 _EMPTY_SLOPE = 0.1 * math.log2(10.0)  # of a variance input by the deviation's decimal logarithm
@@ -24,18 +24,18 @@ class Losses(NamedTuple):
 
 
 @wp.func_native(native.snippet(native_grid.SQUAREPLUS, lanes=1))
-def squareplus(z: wp.float32) -> wp.float32: ...
+def squareplus(z: float) -> wp.float32: ...
 
 
 @wp.func
-def squareplus_slope(z: wp.float32) -> wp.float32:
+def squareplus_slope(z: float) -> wp.float32:
   """Derivative of squareplus."""
   root = wp.sqrt(z * z + 4.0)
   return wp.where(z > 0.0, 0.5 * (1.0 + z / root), 2.0 / (root * (root - z)))
 
 
 @wp.func
-def spacing(t: wp.float32) -> wp.float32:
+def spacing(t: float) -> wp.float32:
   """Normalised distance of the distortion loss, see sampling.spacing."""
   return wp.where(t < 1.0, 0.5 * t, 1.0 - 0.5 / t)
 
@@ -53,10 +53,8 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
   at_extent = stride * (rows.INPUT + 2 * shape.levels)
   at_specular = at_color + 3 * stride
 
-  floats = wp.array(dtype=wp.float32)
-
   @wp.func
-  def ray_losses(w: Worker, s: Settings, r: wp.int32) -> wp.vec3:
+  def ray_losses(w: Worker, s: Settings, r: int) -> wp.vec3:
     """Composites a ray, adds its losses' gradients; returns squared error and both losses.
 
     Gradients: dC/dsigma_i = length_i (T_{i+1} c_i - sum_{j>i} w_j c_j), and likewise for the
@@ -128,9 +126,7 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
     return wp.vec3(square, photometric, distortion)
 
   @wp.func
-  def draw_empty(
-    p: Pictures, s: Settings, work: floats, seed: wp.uint64, index: wp.int64, n: wp.int32
-  ):
+  def draw_empty(p: Pictures, s: Settings, work: Floats, seed: wp.uint64, index: wp.int64, n: int):
     """Draws a point in a cell known to be empty as sample n."""
     size = s.empty_size
     scale = 2.0 / wp.float32(size)
@@ -149,7 +145,7 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
       work[at_extent + a * stride + n] = extent
 
   @wp.func
-  def empty_loss(s: Settings, work: floats, weight: wp.float32, n: wp.int32):
+  def empty_loss(s: Settings, work: Floats, weight: float, n: int):
     """Writes D_OUT of sample n for the loss weight * log(1 + density)."""
     z = s.density_gain * work[at_out + n] + s.density_bias
     density = s.density_scale * squareplus(z)
@@ -160,7 +156,7 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
     )
 
   @wp.func
-  def clear(work: floats, begin: wp.int32, end: wp.int32):
+  def clear(work: Floats, begin: int, end: int):
     """Lets samples have no gradient."""
     for n in range(begin, end):
       for i in range(3):

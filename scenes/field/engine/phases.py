@@ -11,9 +11,18 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from nerf2real.scenes.field.engine.device import OPTIONS
+from nerf2real.scenes.field.engine.device import WIDE_OPTIONS
 from nerf2real.scenes.field.engine.functions import Functions
-from nerf2real.scenes.field.engine.layout import Model, Occupancy, Pictures, Settings, Worker
+from nerf2real.scenes.field.engine.layout import (
+  Floats,
+  Ints,
+  Model,
+  Occupancy,
+  Pictures,
+  Settings,
+  Worker,
+  Workers,
+)
 from nerf2real.scenes.field.engine.native import PADDING
 from nerf2real.scenes.field.engine.rays import draw_ray
 
@@ -39,23 +48,17 @@ def build(f: Functions) -> Phases:
     stride * row for row in (rows.ALPHA, rows.WEIGHT, rows.THROUGH)
   )
   ray_losses, draw_empty, empty_loss, clear = f.losses
-  floats, ints = wp.array(dtype=wp.float32), wp.array(dtype=wp.int32)
 
   @wp.func
-  def is_visible(w: Worker, n: wp.int32, total: wp.int32) -> wp.bool:
+  def is_visible(w: Worker, n: int, total: int) -> wp.bool:
     """Whether a ray has sample n and sees it."""
     if n >= total:
       return False
     return n >= w.first[w.ray_of[n]] and n < w.last[w.ray_of[n]]
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
   def draw(
-    p: Pictures,
-    s: Settings,
-    grids: Occupancy,
-    workers: wp.array(dtype=Worker),
-    seed: wp.uint64,
-    used: ints,
+    p: Pictures, s: Settings, grids: Occupancy, workers: Workers, seed: wp.uint64, used: Ints
   ):
     """Draws a ray and finds room for its samples; a ray without room gets none."""
     r = wp.tid()
@@ -74,18 +77,18 @@ def build(f: Functions) -> Phases:
     wp.atomic_add(w.figures, 0, wp.float64(1.0))
     wp.atomic_add(w.figures, 2, wp.float64(found))
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
   def forward(
     p: Pictures,
     s: Settings,
     m: Model,
-    workers: wp.array(dtype=Worker),
+    workers: Workers,
     seed: wp.uint64,
-    used: ints,
-    first: wp.int32,
-    spare: wp.int32,
-    size: wp.int32,
-    weight: wp.float32,
+    used: Ints,
+    first: int,
+    spare: int,
+    size: int,
+    weight: float,
   ):
     """Base network at samples from `first` on, and the gradient at points known to be empty."""
     begin = first + wp.tid() * size
@@ -105,8 +108,8 @@ def build(f: Functions) -> Phases:
       else:
         f.opacity(w, s, begin, end)
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def see(workers: wp.array(dtype=Worker), threshold: wp.float32):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def see(workers: Workers, threshold: float):
     """Weights of a ray's samples, up to the last one that is visible."""
     r = wp.tid()
     w = workers[0]
@@ -121,38 +124,24 @@ def build(f: Functions) -> Phases:
     w.last[r] = n
     wp.atomic_add(w.figures, 1, wp.float64(n - w.first[r]))
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def color(
-    s: Settings,
-    m: Model,
-    workers: wp.array(dtype=Worker),
-    used: ints,
-    first: wp.int32,
-    size: wp.int32,
-  ):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def color(s: Settings, m: Model, workers: Workers, used: Ints, first: int, size: int):
     """Colours of the samples."""
     begin = first + wp.tid() * size
     w = workers[0]
     if begin < wp.min(used[0], stride - PADDING):
       f.view_forward(w, m, s, begin, begin + size)
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def compare(s: Settings, workers: wp.array(dtype=Worker)):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def compare(s: Settings, workers: Workers):
     """Losses of a ray and their gradient at its samples."""
     w = workers[0]
     losses = ray_losses(w, s, wp.tid())
     for i in range(3):
       wp.atomic_add(w.figures, 3 + i, wp.float64(losses[i]))
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def backward(
-    m: Model,
-    workers: wp.array(dtype=Worker),
-    used: ints,
-    first: wp.int32,
-    spare: wp.int32,
-    size: wp.int32,
-  ):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def backward(m: Model, workers: Workers, used: Ints, first: int, spare: int, size: int):
     """The networks backwards; `kept` gets every sample, those that nobody sees with zeros."""
     begin = first + wp.tid() * size
     end = begin + size
@@ -166,10 +155,8 @@ def build(f: Functions) -> Phases:
         f.view_backward(w, m, begin, end)
       f.base_backward(w, m, begin, end, 0)
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def sum_products(
-    workers: wp.array(dtype=Worker), used: ints, first: wp.int32, size: wp.int32, parts: wp.int32
-  ):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def sum_products(workers: Workers, used: Ints, first: int, size: int, parts: int):
     """The networks' gradient: a thread does a part of the matrices and `size` samples."""
     part, stretch = wp.tid()
     begin = first + stretch * size
@@ -179,15 +166,8 @@ def build(f: Functions) -> Phases:
       end = wp.min(begin + size, total)
       f.network_gradient(w, begin, end, 1, part, parts)
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-  def scatter(
-    gradient: floats,
-    workers: wp.array(dtype=Worker),
-    m: Model,
-    used: ints,
-    first: wp.int32,
-    size: wp.int32,
-  ):
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def scatter(gradient: Floats, workers: Workers, m: Model, used: Ints, first: int, size: int):
     """The table's gradient: a thread does a level and `size` samples."""
     level, stretch = wp.tid()
     begin = first + stretch * size

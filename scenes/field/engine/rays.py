@@ -9,18 +9,18 @@ the cube samples are `step` apart, outside `OUTER_STEP * step * |x|_max`.
 import warp as wp
 
 from nerf2real.scenes.field.engine import native, native_grid
-from nerf2real.scenes.field.engine.layout import Occupancy, Pictures, Settings
+from nerf2real.scenes.field.engine.layout import Floats, Occupancy, Pictures, Settings
 
 FAR = 16.0  # chosen: rays end here [unit]; squashed to 1.94 of 2
 OUTER_STEP = 2.0  # chosen: outside, intervals are this many steps times |x|_max
 
 
 @wp.func_native(native_grid.UNIFORM)
-def uniform(seed: wp.uint64, index: wp.int64, dimension: wp.int32) -> wp.float32: ...
+def uniform(seed: wp.uint64, index: wp.int64, dimension: int) -> wp.float32: ...
 
 
 @wp.func
-def look_up(p: Pictures, level: wp.int32, image: wp.int32, px: wp.int32, py: wp.int32) -> wp.vec3:
+def look_up(p: Pictures, level: int, image: int, px: int, py: int) -> wp.vec3:
   """Bilinear colour in [0, 1] at the centre of full-size pixel (px, py)."""
   height, width = p.heights[level], p.widths[level]
   start = p.starts[level] + image * height * width * 3
@@ -45,13 +45,7 @@ def look_up(p: Pictures, level: wp.int32, image: wp.int32, px: wp.int32, py: wp.
 
 @wp.func
 def draw_ray(
-  p: Pictures,
-  s: Settings,
-  seed: wp.uint64,
-  index: wp.int64,
-  rays: wp.array(dtype=wp.float32),
-  size: wp.int32,
-  r: wp.int32,
+  p: Pictures, s: Settings, seed: wp.uint64, index: wp.int64, rays: Floats, size: int, r: int
 ):
   """Draws a pixel and a blur, or an anchor; writes column r of Worker.rays."""
   images = p.origins.shape[0]
@@ -101,7 +95,7 @@ def largest(p: wp.vec3) -> wp.float32:
 
 
 @wp.func_native(native.snippet(native_grid.SQUASH, lanes=1))
-def squash(p: wp.vec3, norm: wp.float32) -> wp.vec3:
+def squash(p: wp.vec3, norm: float) -> wp.vec3:
   """Grid coordinates in [0, 1]^3 of a point whose max(1, |x|_max) is `norm`."""
   ...
 
@@ -112,10 +106,10 @@ def march(
   s: Settings,
   origin: wp.vec3,
   direction: wp.vec3,
-  jitter: wp.float32,
-  work: wp.array(dtype=wp.float32),
-  stride: wp.int32,
-  at: wp.int32,
+  jitter: float,
+  work: Floats,
+  stride: int,
+  at: int,
 ) -> wp.int32:
   """Writes the middles and lengths (rows 0 and 1) of a ray's intervals in occupied cells.
 

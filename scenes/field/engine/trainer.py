@@ -186,12 +186,8 @@ class FusedTrainer:
   def add_gradient(self, seed: int, *, rays: int, threshold: float) -> None:
     """Fills the gradients and the figures from random rays, in phases."""
     engine, device = self.engine, self.device
-    phases, numbers, model, workers = (
-      engine.phases,
-      engine.numbers,
-      engine.model,
-      engine.worker_array,
-    )
+    phases, numbers, model = engine.phases, engine.numbers, engine.model
+    workers = engine.worker_array
     # A thread does a vector of samples on a CPU, one elsewhere.
     block = PADDING if device.is_cpu else 1
     used, spare = self._used, self._spare
