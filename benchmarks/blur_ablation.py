@@ -18,10 +18,12 @@ import cv2
 import numpy as np
 
 from benchmarks import harness
+from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import filming, yardstick
 from nerf2real.scenes.field import training as train
-from nerf2real.scenes.field.fused.trainer import FusedField
+from nerf2real.scenes.field.engine.device import num_threads
+from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.quality.image_quality import psnr, ssim
 
@@ -91,15 +93,24 @@ def robot_views() -> dict[str, Views]:
   }
 
 
-def score(evaluator: FusedField, views: Views, *, told_angle: float) -> dict[str, harness.Value]:
+def picture(renderer: Renderer, camera: Camera, pose: np.ndarray, *, told_angle: float):
+  """Renders uint8 [H, W, 3] as if the camera's pixels spanned `told_angle` [rad]."""
+  rays = camera.rays()
+  directions = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ pose[:3, :3].T
+  origins = np.broadcast_to(pose[:3, 3], directions.shape)
+  color, _, _ = renderer.render_rays(origins.reshape(-1, 3), directions.reshape(-1, 3), told_angle)
+  return np.rint(255 * np.clip(color, 0, 1)).astype(np.uint8).reshape(rays.shape)
+
+
+def score(renderer: Renderer, views: Views, *, told_angle: float) -> dict[str, harness.Value]:
   """Mean PSNR [dB] and SSIM over views; the field is told that pixels span `told_angle` [rad]."""
   pairs = [
-    (evaluator.render(views.camera, pose, pixel_angle=told_angle)[0], truth)
+    (picture(renderer, views.camera, pose, told_angle=told_angle), truth)
     for pose, truth in zip(views.world_from_camera, views.images, strict=True)
   ]
   return {
-    "psnr_db": float(np.mean([psnr(picture, truth) for picture, truth in pairs])),
-    "ssim": float(np.mean([ssim(picture, truth) for picture, truth in pairs])),
+    "psnr_db": float(np.mean([psnr(drawn, truth) for drawn, truth in pairs])),
+    "ssim": float(np.mean([ssim(drawn, truth) for drawn, truth in pairs])),
   }
 
 
@@ -122,13 +133,13 @@ def main(settings: Settings) -> None:
       "training_s": report.seconds,
       "samples_per_s": report.samples_per_second,
     }
-    evaluator = FusedField(field, settings=chosen)
+    renderer = Renderer(field, threads=num_threads())
     for key, views in sets.items():
       angles = {"": views.camera.pixel_angle}
       if not blur_max and views.camera.pixel_angle > field.training_pixel_angle:
         angles[" told the training pixel"] = field.training_pixel_angle
       for told, angle in angles.items():
-        figures[f"{name} {key}{told}"] = row = score(evaluator, views, told_angle=angle)
+        figures[f"{name} {key}{told}"] = row = score(renderer, views, told_angle=angle)
         scores[key].setdefault(name, []).append(float(row["psnr_db"]))  # type: ignore[arg-type]
   for key, by_blur in scores.items():
     gain = max(by_blur["with_blur"]) - max(by_blur["without_blur"])

@@ -1,4 +1,4 @@
-"""Times the field's renderer beside MuJoCo's own and a plain JAX render of the same field.
+"""Times the field's renderer beside MuJoCo's own.
 
 All of them draw the same views of the built-in room, taking turns on one core, and are compared
 with the true picture (each pixel the mean over its area). MuJoCo draws the true geometry with the
@@ -30,7 +30,6 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes import bundle
 from nerf2real.scenes.builtin import furniture, room
 from nerf2real.scenes.field.field import Field
-from nerf2real.scenes.field.render import reference as render_reference
 from nerf2real.scenes.field.render import renderer as render
 from nerf2real.scenes.quality.image_quality import psnr
 
@@ -57,8 +56,6 @@ class Settings(harness.Options):
   """With a field: the similarity (JSON) that maps its frame to the room's; the bundle knows its."""
   views: int = 40
   """Views that are drawn."""
-  jax_views: int = 3
-  """Views that the slow JAX render draws; 0: leave it out."""
   repeats: int = 3
   """Times that each view is drawn."""
   core: int = 0
@@ -132,7 +129,7 @@ class MujocoDrawer:
 
 
 def measure(
-  draws: dict[str, Draw], limits: dict[str, int], truth: list[np.ndarray], repeats: int
+  draws: dict[str, Draw], truth: list[np.ndarray], repeats: int
 ) -> dict[str, dict[str, harness.Value]]:
   """Lets the drawers take turns; returns their times and PSNR by name.
 
@@ -142,18 +139,18 @@ def measure(
   """
   count = len(truth)
 
-  def quality(draw: Draw, views: int) -> float:
-    return float(np.mean([psnr(draw(view), truth[view]) for view in range(views)]))
+  def quality(draw: Draw) -> float:
+    return float(np.mean([psnr(draw(view), truth[view]) for view in range(count)]))
 
   calls = {name: lambda i, draw=draw: draw(i % count) for name, draw in draws.items()}
-  times = harness.interleave(calls, rounds=count * repeats, limits=limits)
+  times = harness.interleave(calls, rounds=count * repeats)
   return {
     name: {
       "median_ms": (spread := times[name].figures())["processor_median_ms"],
       "p95_ms": spread["processor_p95_ms"],
       "elapsed_ms": spread["median_ms"],
-      "psnr_db": quality(draw, views := min(limits.get(name, count), count)),
-      "views": views,
+      "psnr_db": quality(draw),
+      "views": count,
     }
     for name, draw in draws.items()
   }
@@ -180,19 +177,12 @@ def main(settings: Settings) -> None:
     def fused(view: int, camera: Camera = camera) -> np.ndarray:
       return renderer.render(camera, unit_poses[view])[0]
 
-    def plain(view: int, camera: Camera = camera) -> np.ndarray:
-      return render_reference.render_picture(
-        field, None, camera, unit_poses[view], settings=renderer.settings
-      )[0]
-
     draws: dict[str, Draw] = {
       "field_warp": fused,
-      **({"field_plain_jax": plain} if settings.jax_views else {}),
       "mujoco_fast_flags": fast.draw,
       "mujoco_default_flags": standard.draw,
     }
-    limits = {"field_plain_jax": settings.jax_views}
-    for name, row in measure(draws, limits, truth, settings.repeats).items():
+    for name, row in measure(draws, truth, settings.repeats).items():
       figures[f"{height}x{width}_{name}"] = row
     fast.close()
     standard.close()

@@ -28,6 +28,22 @@ def is_dense(resolution: int, entries: int) -> bool:
   return (resolution + 1) ** 3 <= entries
 
 
+def level_rows(resolutions: Sequence[int], entries: int) -> np.ndarray:
+  """Returns what kernels need to index the levels' tables: uint32 [4, L].
+
+  The rows are the strides of y and z (x has 1), a mask and the number of cells along an axis. A
+  vertex has row x + y stride_y + z stride_z where the mask is 0 (a dense level), else
+  (x ^ y stride_y ^ z stride_z) & mask, see `entry_index`.
+  """
+  columns = [
+    (cells + 1, (cells + 1) ** 2, 0, cells)
+    if is_dense(cells, entries)
+    else (*HASH_PRIMES[1:], entries - 1, cells)
+    for cells in resolutions
+  ]
+  return np.array(columns, np.uint32).T.copy()
+
+
 def entry_index(vertices: jax.Array, *, resolution: int, entries: int) -> jax.Array:
   """Maps grid vertices uint32 [..., 3] of a level to rows of its table [...]."""
   x, y, z = vertices[..., 0], vertices[..., 1], vertices[..., 2]
@@ -91,18 +107,14 @@ def spherical_harmonics(directions: jax.Array) -> jax.Array:
   )
 
 
-def blur_footprint(blur: jax.Array, *, rule: str) -> jax.Array:
-  """Factor by which a Gaussian blur [pixel] widens a pixel's variance.
+def blur_footprint(blur: jax.Array) -> jax.Array:
+  """Factor 1 + 12 blur^2 by which a Gaussian blur [pixel] widens a pixel's variance.
 
-  "additive": variances add, 1 + 12 blur^2, because a pixel is a box of variance 1/12 (ours; it
-  tells the renderer the blur that equals a coarser camera's pixel). "paper": 1 + blur -
-  sigma_min with sigma_min = 0 (NeRF2Real, section NeRF training).
+  Variances add, because a pixel is a box of variance 1/12: it is the blur that equals a coarser
+  camera's pixel. The paper widens it by 1 + blur - sigma_min instead (NeRF2Real, section NeRF
+  training), which no camera's pixel equals.
   """
-  if rule == "additive":
-    return 1.0 + 12.0 * blur * blur
-  if rule == "paper":
-    return 1.0 + blur
-  raise ValueError(f"Unknown footprint rule {rule!r}; expected 'additive' or 'paper'.")
+  return 1.0 + 12.0 * blur * blur
 
 
 def sample_variance(

@@ -57,13 +57,10 @@ class FieldSettings:
   """Density [1/unit] per unit of squareplus. Ours: with 10 the tail of squareplus leaves fog."""
   specular_bias: float = -3.0
   """Added before the specular colour's sigmoid, so that colour starts diffuse. Ours."""
-  footprint_rule: str = "additive"
-  """How blur enters the variance: see `encoding.blur_footprint`."""
   march_step: float = 0.008
   """Interval [unit] between samples inside the unit cube that the field was trained with."""
 
   def __post_init__(self):
-    encoding.blur_footprint(np.float32(0), rule=self.footprint_rule)
     if self.levels < 1 or self.features < 1 or not 4 <= self.log2_table_size <= 24:
       raise ValueError(
         f"Found levels={self.levels}, features={self.features}, "
@@ -215,7 +212,14 @@ class Field:
           f"{path} has format version {metadata['format_version']}, this program reads up to "
           f"{FORMAT_VERSION}; update the program."
         )
-      settings = from_plain(json.loads(metadata["settings"]), FieldSettings, source=path)
+      values = json.loads(metadata["settings"])
+      rule = values.pop("footprint_rule", "additive")  # written until there was one rule only
+      if rule != "additive":
+        raise ValueError(
+          f"{path} was trained with footprint_rule={rule!r}, which this program no longer renders; "
+          "expected 'additive': train the field again."
+        )
+      settings = from_plain(values, FieldSettings, source=path)
       params = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}  # noqa: SIM118
     for name, shape in settings.shapes.items():
       if name not in params or params[name].shape != shape:

@@ -5,12 +5,12 @@ x + G (y + G z). It is not stored: building it takes a second.
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import scipy.ndimage
 import warp as wp
 
+from nerf2real.scenes.field.engine.device import Device
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render import kernels as render_kernels
 from nerf2real.scenes.field.render import weights as render_weights
@@ -75,7 +75,7 @@ class Occupancy:
 
 
 def build(
-  field: Field, *, settings: OccupancySettings | None = None, device: str = "cpu"
+  field: Field, *, settings: OccupancySettings | None = None, device: Device | None = None
 ) -> Occupancy:
   """Finds a field's matter, from coarse cells to fine ones.
 
@@ -85,12 +85,13 @@ def build(
   Args:
     field: A trained field.
     settings: How finely to look.
-    device: Warp's name of the device.
+    device: Where to look; the CPU if None.
 
   Returns:
     The occupancy over the squashed space.
   """
   settings = settings or OccupancySettings()
+  device = device or Device(threads=1)
   packed = render_weights.pack(field.settings, field.params)
   kernel = render_kernels.build(packed.layout).density
   data = render_kernels.upload(packed, field.settings.march_step, device)
@@ -100,10 +101,9 @@ def build(
   for shrink in (4, 2, 1):
     side = settings.cells // shrink
     chosen = np.flatnonzero(candidates).astype(np.int32)
-    largest = wp.empty(len(chosen), dtype=wp.float32, device=device)
-    cells: Any = wp.array(chosen, dtype=wp.int32, device=device)
-    inputs = [data, cells, side, deviations, largest]
-    wp.launch(kernel, dim=len(chosen), inputs=inputs, device=device)
+    largest = device.zeros(len(chosen))
+    inputs = [data, device.put(chosen), side, deviations, largest]
+    device.launch(kernel, inputs, dim=len(chosen))
     least = settings.density if shrink == 1 else settings.coarse_density
     occupied.ravel()[chosen] = largest.numpy() > least
     if shrink > 1:

@@ -223,7 +223,7 @@ def draw_rays(
   rotation = pictures.poses[image, :, :3]
   directions = jnp.einsum("rij,rj->ri", rotation, pictures.directions[y, x])
   directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
-  footprints = encoding.blur_footprint(blur, rule=settings.field.footprint_rule)
+  footprints = encoding.blur_footprint(blur)
   return Rays(pictures.poses[image, :, 3], directions, targets, footprints, distances)
 
 

@@ -12,7 +12,9 @@ class TrainSettings:
   field: FieldSettings = FieldSettings()
   """The field's shape."""
   engine: str = "fused"
-  """"fused": numba kernels for a CPU. "jax": the reference, on a GPU where there is one."""
+  """"fused": Warp kernels. "jax": the reference, on a GPU where there is one."""
+  device: str = "cpu"
+  """Where the engine "fused" trains: "cpu" or, with its kernels in phases, "cuda"."""
   max_steps: int = 30_000
   """Steps after which training ends."""
   max_seconds: float | None = 290.0

@@ -1,7 +1,8 @@
 """Trains a radiance field on posed pictures; can be interrupted and continued.
 
-Two engines do the steps: the fused kernels for CPU cores, and JAX as the reference and for GPUs.
-Both train the same field and write the same file.
+Two engines do the steps: the fused Warp kernels (`engine`), and JAX as the reference, which is the
+paper's recipe with proposal sampling (`reference_training`). Both train the same field and write
+the same file.
 """
 
 import dataclasses
@@ -9,6 +10,7 @@ import hashlib
 import json
 import math
 import time
+import warnings
 from pathlib import Path
 from typing import Protocol
 
@@ -18,18 +20,19 @@ import safetensors.numpy
 from nerf2real.core import files
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.serialization import to_plain
+from nerf2real.scenes.field.engine.trainer import FusedTrainer
 from nerf2real.scenes.field.field import Field
-from nerf2real.scenes.field.fused.trainer import FusedTrainer
 from nerf2real.scenes.field.reference_training import ReferenceTrainer
 from nerf2real.scenes.field.settings import TrainSettings, preset
 from nerf2real.scenes.field.views import Views
 
 __all__ = ["TrainError", "TrainReport", "TrainSettings", "learning_rate", "preset", "train"]
 
-CHECKPOINT_SECONDS = 60.0  # ours: a checkpoint takes about 0.2 s
-_RECORD_SECONDS = 2.0  # ours: distance of the points of the report's curve
+CHECKPOINT_SECONDS = 60.0  # chosen: a checkpoint takes about 0.2 s
+_RECORD_SECONDS = 2.0  # chosen: distance of the points of the report's curve
 _WARMUP_START = 0.01  # the warm-up starts at this fraction of the learning rate, as in multinerf
 _CHECKPOINT = "training.safetensors"
+_CHECKPOINT_FORMAT = "2"  # of the arrays; files that name none have format 1
 
 
 class TrainError(ValueError):
@@ -111,8 +114,11 @@ def train(
     raise TrainError(
       f"Found {len(views)} training pictures; a field needs at least 3, and a room about 100."
     )
-  make = FusedTrainer if settings.engine == "fused" else ReferenceTrainer
-  trainer: Trainer = make(views, settings, seed=seed, initial=initial)
+  trainer: Trainer
+  if settings.engine == "fused":
+    trainer = FusedTrainer(views, settings, seed=seed, initial=initial, device=settings.device)
+  else:
+    trainer = ReferenceTrainer(views, settings, seed=seed, initial=initial)
   checkpoint = Path(checkpoint_dir) / _CHECKPOINT if checkpoint_dir is not None else None
   key = _run_key(views, settings, seed)
   spent, resumed = 0.0, None
@@ -190,7 +196,7 @@ def _run_key(views: Views, settings: TrainSettings, seed: int) -> str:
 
 
 def _save_checkpoint(path: Path, key: str, seconds: float, arrays: dict[str, np.ndarray]) -> None:
-  metadata = {"key": key, "seconds": repr(seconds)}
+  metadata = {"format": _CHECKPOINT_FORMAT, "key": key, "seconds": repr(seconds)}
   files.write_atomically(path, safetensors.numpy.save(arrays, metadata=metadata))
 
 
@@ -200,6 +206,13 @@ def _load_checkpoint(path: Path, key: str) -> tuple[float, dict[str, np.ndarray]
     return None
   with safetensors.safe_open(path, "numpy") as file:
     metadata = file.metadata() or {}
+    if (found := metadata.get("format", "1")) != _CHECKPOINT_FORMAT:
+      warnings.warn(
+        f"{path} is a checkpoint of format {found}, expected {_CHECKPOINT_FORMAT}: training starts "
+        "from the beginning and writes it anew.",
+        stacklevel=3,
+      )
+      return None
     if metadata.get("key") != key:
       return None
     return float(metadata["seconds"]), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

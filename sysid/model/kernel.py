@@ -22,9 +22,9 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from nerf2real.core.kernel_cache import discard_stale
 from nerf2real.suite.effects import gear_train
 from nerf2real.suite.effects.backlash import LINK_SHARE, ROTOR_WITHOUT_ARMATURE
+from nerf2real.sysid.model.kernel_cache import discard_stale
 
 Array = np.ndarray
 

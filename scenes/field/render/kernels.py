@@ -7,20 +7,18 @@ Empty-space skipping therefore changes the time, not the picture.
 # mypy: ignore-errors
 # Kernels are Python only in their syntax: their annotations are Warp's.
 
-import ctypes.util
 import functools
-import os
-import sys
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from nerf2real.scenes.field.render import native as render_native
+from nerf2real.scenes.field.engine.device import OPTIONS, Device
+from nerf2real.scenes.field.engine.native import snippet
+from nerf2real.scenes.field.engine.rays import largest, squash
+from nerf2real.scenes.field.render import native
 from nerf2real.scenes.field.render.weights import Layout, Packed
 
 MEDIAN = 0.5  # transmittance at which the depth is read
-# On a CPU clang's -march=native (Warp's default) is what makes the loops 256 or 512 bits wide.
-_OPTIONS = {"fast_math": True, "optimization_level": 3}
 _Result = wp.types.vector(5, wp.float32)  # colour 3, opacity, distance
 
 
@@ -47,7 +45,7 @@ class MarchData:
   far: wp.float32  # [unit]
   stop: wp.float32  # transmittance at which a ray ends
   weight_floor: wp.float32  # samples that count less get no colour
-  specular_samples: wp.int32  # 1: the view network is asked for every sample, 0: once a ray
+  specular_samples: wp.int32  # 1: the view network runs for every sample, 0: once a ray
   pixel_angle: wp.float32  # [rad]
 
 
@@ -62,14 +60,14 @@ class Kernels(NamedTuple):
 @functools.cache
 def build(layout: Layout) -> Kernels:
   """Defines the kernels for a field's layout; Warp compiles them at their first launch."""
-  start_quietly()
   outputs = wp.types.vector(layout.outputs, wp.float32)
   view = wp.types.vector(layout.view_width, wp.float32)
   view_constants = {"VIEW": layout.view_width, "BOTTLENECK": layout.bottleneck}
 
   @wp.func_native(
-    render_native.snippet(
-      render_native.BASE,
+    snippet(
+      native.BASE,
+      lanes=1,
       PADDED=layout.padded_levels,
       WIDTH=layout.width,
       OUTPUTS=layout.outputs,
@@ -84,16 +82,16 @@ def build(layout: Layout) -> Kernels:
     v: wp.vec3,
   ) -> outputs: ...
 
-  @wp.func_native(render_native.snippet(render_native.VIEW_HIDDEN, **view_constants))
+  @wp.func_native(snippet(native.VIEW_HIDDEN, lanes=1, **view_constants))
   def view_hidden(weights: wp.array(dtype=wp.float32), d: wp.vec3) -> view: ...
 
-  @wp.func_native(render_native.snippet(render_native.DIFFUSE))
+  @wp.func_native(snippet(native.DIFFUSE, lanes=1))
   def diffuse(base: outputs) -> wp.vec3: ...
 
-  @wp.func_native(render_native.snippet(render_native.SPECULAR, **view_constants))
+  @wp.func_native(snippet(native.SPECULAR, lanes=1, **view_constants))
   def specular(weights: wp.array(dtype=wp.float32), base: outputs, hidden: view) -> wp.vec3: ...
 
-  @wp.func_native(render_native.snippet(render_native.OPACITY))
+  @wp.func_native(snippet(native.OPACITY, lanes=1))
   def opacity_of(x: wp.float32) -> wp.float32: ...
 
   @wp.func
@@ -126,14 +124,11 @@ def build(layout: Layout) -> Kernels:
       if distance > how.far:
         break
       position = origin + direction * distance
-      norm = wp.max(wp.max(wp.abs(position[0]), wp.abs(position[1])), wp.abs(position[2]))
+      norm = largest(position)
       outer = wp.max(norm, 1.0)
-      squash = (2.0 - 1.0 / outer) / outer
-      grid = (position * squash + wp.vec3(2.0, 2.0, 2.0)) * 0.25
+      grid = squash(position, outer)
       scaled = grid * wp.float32(how.cells)
-      x = wp.clamp(wp.int32(scaled[0]), 0, how.cells - 1)
-      y = wp.clamp(wp.int32(scaled[1]), 0, how.cells - 1)
-      z = wp.clamp(wp.int32(scaled[2]), 0, how.cells - 1)
+      x, y, z = wp.int32(scaled[0]), wp.int32(scaled[1]), wp.int32(scaled[2])
       empty = wp.int32(how.distance[x + how.cells * (y + how.cells * z)])
       if empty > 0:
         clear = wp.float32(0.0)
@@ -183,7 +178,7 @@ def build(layout: Layout) -> Kernels:
       total = total * opacity
     return _Result(total[0], total[1], total[2], opacity, median)
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=_OPTIONS)
+  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
   def frame(
     field: FieldData,
     how: MarchData,
@@ -203,7 +198,7 @@ def build(layout: Layout) -> Kernels:
       color[image, pixel, channel] = wp.uint8(wp.clamp(result[channel] * 255.0 + 0.5, 0.0, 255.0))
     depth[image, pixel] = result[4] / slant
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=_OPTIONS)
+  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
   def rays(
     field: FieldData,
     how: MarchData,
@@ -221,13 +216,13 @@ def build(layout: Layout) -> Kernels:
     opacity[ray] = result[3]
     distance[ray] = result[4]
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=_OPTIONS)
+  @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
   def density(
     field: FieldData,
     cells: wp.array(dtype=wp.int32),
     side: wp.int32,
     deviations: wp.vec2,
-    largest: wp.array(dtype=wp.float32),
+    densest: wp.array(dtype=wp.float32),
   ):
     """Largest density of a cell's corners and centre, for both sample sizes in turn."""
     thread = wp.tid()
@@ -242,7 +237,7 @@ def build(layout: Layout) -> Kernels:
       if point == 8:
         offset = wp.vec3(0.5, 0.5, 0.5)
       p = (corner + offset) / wp.float32(side)
-      squashed = wp.max(wp.max(wp.abs(p[0] - 0.5), wp.abs(p[1] - 0.5)), wp.abs(p[2] - 0.5)) * 4.0
+      squashed = largest(p - wp.vec3(0.5, 0.5, 0.5)) * 4.0
       norm = wp.where(squashed > 1.0, 1.0 / wp.max(2.0 - squashed, 1e-3), 1.0)
       deviation = deviations[(x + y + z) % 2] * norm
       variance = deviation * deviation
@@ -250,40 +245,17 @@ def build(layout: Layout) -> Kernels:
         field.table, field.levels, field.base, p, wp.vec3(variance, variance, variance)
       )
       found = wp.max(found, base[0])
-    largest[thread] = found
+    densest[thread] = found
 
   return Kernels(frame, rays, density)
 
 
-def upload(packed: Packed, variance_step: float, device: str) -> Any:
+def upload(packed: Packed, variance_step: float, device: Device) -> Any:
   """Copies a packed field to a device."""
   data = FieldData()
-  data.table = wp.array(packed.table, dtype=wp.uint32, device=device)
-  data.levels = wp.array(packed.levels, dtype=wp.uint32, device=device)
-  data.base = wp.array(packed.base, dtype=wp.float32, device=device)
-  data.view = wp.array(packed.view, dtype=wp.float32, device=device)
+  data.table = device.put(packed.table)
+  data.levels = device.put(packed.levels)
+  data.base = device.put(packed.base)
+  data.view = device.put(packed.view)
   data.variance_step = variance_step
   return data
-
-
-def start_quietly() -> None:
-  """Starts Warp without its banner and without its warning that a machine has no GPU.
-
-  That warning comes from compiled code, past Python's streams, so where there is no driver the
-  process's standard error is turned away while Warp starts.
-  """
-  level = wp.config.log_level
-  wp.config.log_level = wp.LOG_ERROR
-  if ctypes.util.find_library("cuda"):
-    wp.init()
-  else:
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-      os.dup2(nowhere, 2)
-      wp.init()
-    finally:
-      os.dup2(kept, 2)
-      os.close(kept)
-      os.close(nowhere)
-  wp.config.log_level = max(level, wp.LOG_WARNING)

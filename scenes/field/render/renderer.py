@@ -1,6 +1,5 @@
 """Renders a trained field: one ray a pixel through the camera's own lens, colour and depth."""
 
-import concurrent.futures
 import dataclasses
 import functools
 import math
@@ -12,6 +11,7 @@ import warp as wp
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.field import occupancy as occupancy_lib
+from nerf2real.scenes.field.engine.device import Device
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render import kernels as render_kernels
 from nerf2real.scenes.field.render import weights as render_weights
@@ -24,7 +24,7 @@ class RenderSettings:
   """How rays are marched."""
 
   step: float = 0.008
-  """Finest interval between samples [unit]; 2 cm in a room of 5 m. Ours, from pictures of the
+  """Finest interval between samples [unit]; 2 cm in a room of 5 m. From pictures of the
   built-in room: 0.006 gains 0.2 dB and takes a tenth longer, 0.016 loses 1.3 dB or more."""
   steps_per_footprint: float = 1.4
   """Intervals grow with the pixel's footprint: at least so many of them in its width. Ours."""
@@ -57,20 +57,6 @@ class RenderSettings:
     return max(1, min(footprint, math.ceil(_MAX_GROWTH_DISTANCE / self.step)))
 
 
-def field_pixel_angle(field: Field, pixel_angle: float) -> float:
-  """Returns the pixel angle to put into the variance so that the field sees this camera's pixel.
-
-  With the additive rule it is the camera's own. With the paper's rule, a pixel r times as wide as
-  the training pixel equals a blur sigma with 1/12 + sigma^2 = r^2 / 12, which training told the
-  field as the training pixel's variance times 1 + sigma.
-  """
-  if field.settings.footprint_rule == "additive":
-    return pixel_angle
-  ratio = max(1.0, pixel_angle / field.training_pixel_angle)
-  blur = math.sqrt((ratio * ratio - 1.0) / 12.0)
-  return field.training_pixel_angle * math.sqrt(1.0 + blur)
-
-
 class Renderer:
   """A field on a device, ready to render; calls from several threads are independent.
 
@@ -98,20 +84,16 @@ class Renderer:
     Raises:
       ValueError: If there is no such device.
     """
-    render_kernels.start_quietly()
-    if device.startswith("cuda") and not wp.is_cuda_available():
-      raise ValueError(f"No CUDA device was found for device={device!r}; use device='cpu'.")
     self.field = field
     self.settings = settings or RenderSettings()
-    self.device = device
-    self._threads = threads if device == "cpu" else 1
+    self._device = Device(device, threads=threads if device == "cpu" else 1)
     if occupancy is None:
-      occupancy = occupancy_lib.build(field, device=device)
+      occupancy = occupancy_lib.build(field, device=self._device)
     self.occupancy = occupancy
     packed = render_weights.pack(field.settings, field.params)
     self._kernels = render_kernels.build(packed.layout)
-    self._data = render_kernels.upload(packed, field.settings.march_step, device)
-    self._distance: Any = wp.array(occupancy.distance.ravel(), dtype=wp.uint8, device=device)
+    self._data = render_kernels.upload(packed, field.settings.march_step, self._device)
+    self._distance: Any = self._device.put(occupancy.distance.ravel())
     self._camera_rays = functools.lru_cache(maxsize=16)(self._upload_rays)
     self._march = functools.lru_cache(maxsize=16)(self._march_data)
 
@@ -138,14 +120,14 @@ class Renderer:
       raise ValueError(f"Expected poses [N, 4, 4], found shape {poses.shape}.")
     rays = self._camera_rays(camera)
     shape = (len(poses), camera.height * camera.width)
-    color = wp.empty((*shape, 3), dtype=wp.uint8, device=self.device)
-    depth = wp.empty(shape, dtype=wp.float32, device=self.device)
-    places: Any = wp.array(poses, dtype=wp.mat44, device=self.device)
+    color = wp.empty((*shape, 3), dtype=wp.uint8, device=self._device.name)
+    depth = wp.empty(shape, dtype=wp.float32, device=self._device.name)
+    places = self._device.put(poses, wp.mat44)
     fixed = (self._data, self._march(camera.pixel_angle), places)
 
     def draw(first: int, last: int) -> None:
       inputs = [*fixed, rays[first:last], color[:, first:last], depth[:, first:last]]
-      self._launch(self._kernels.frame, (len(poses), last - first), inputs)
+      self._device.launch(self._kernels.frame, inputs, dim=(len(poses), last - first))
 
     self._share(draw, shape[1])
     size = (len(poses), camera.height, camera.width)
@@ -176,36 +158,28 @@ class Renderer:
         f"Directions must have unit length, found {lengths.min():.4g} to {lengths.max():.4g}."
       )
     count = len(origins)
-    color = wp.empty((count, 3), dtype=wp.float32, device=self.device)
-    distance = wp.empty(count, dtype=wp.float32, device=self.device)
-    opacity = wp.empty(count, dtype=wp.float32, device=self.device)
-    starts: Any = wp.array(origins, dtype=wp.vec3, device=self.device)
-    ways: Any = wp.array(directions, dtype=wp.vec3, device=self.device)
+    color = wp.empty((count, 3), dtype=wp.float32, device=self._device.name)
+    distance = wp.empty(count, dtype=wp.float32, device=self._device.name)
+    opacity = wp.empty(count, dtype=wp.float32, device=self._device.name)
+    starts, ways = self._device.put(origins, wp.vec3), self._device.put(directions, wp.vec3)
     fixed = (self._data, self._march(pixel_angle))
     arrays = (starts, ways, color, distance, opacity)
 
     def draw(first: int, last: int) -> None:
       inputs = [*fixed, *(array[first:last] for array in arrays)]
-      self._launch(self._kernels.rays, last - first, inputs)
+      self._device.launch(self._kernels.rays, inputs, dim=last - first)
 
     self._share(draw, count)
     return color.numpy(), distance.numpy(), opacity.numpy()
 
-  def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list[Any]) -> None:
-    wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_tape=False)
-
   def _share(self, draw: Callable[[int, int], None], count: int) -> None:
     """Lets the threads draw equal parts of `count` rays."""
-    if self._threads < 2 or count < self._threads:
-      draw(0, count)
-      return
-    borders = [count * part // self._threads for part in range(self._threads + 1)]
-    with concurrent.futures.ThreadPoolExecutor(self._threads) as pool:
-      list(pool.map(draw, borders[:-1], borders[1:]))
+    stretches = self._device.share(count)
+    self._device.run(lambda thread: draw(*stretches[thread]))
 
   def _upload_rays(self, camera: Camera) -> Any:
     rays = camera.rays().reshape(-1, 3).astype(np.float32)
-    return wp.array(rays, dtype=wp.vec3, device=self.device)
+    return self._device.put(rays, wp.vec3)
 
   def _march_data(self, pixel_angle: float) -> Any:
     how: Any = render_kernels.MarchData()
@@ -216,5 +190,5 @@ class Renderer:
     how.near, how.far = self.settings.near, self.settings.far
     how.stop, how.weight_floor = self.settings.stop, self.settings.weight_floor
     how.specular_samples = int(self.settings.specular_per_sample)
-    how.pixel_angle = field_pixel_angle(self.field, pixel_angle)
+    how.pixel_angle = pixel_angle
     return how

@@ -14,7 +14,7 @@ from nerf2real.scenes.field import encoding
 
 _LANES = 8  # levels are padded to a multiple of the lanes of a 256-bit vector
 _OUTPUT_LANES = 16  # the base network's outputs are padded to a 512-bit vector
-_LEVEL_ROWS = 5  # offset, stride y, stride z, mask, cells
+_LEVEL_ROWS = 5  # offset, and the rows of encoding.level_rows
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,16 +72,14 @@ def pack(settings: Any, params: Any) -> Packed:
   entries = 2**settings.log2_table_size
   rows = np.zeros((_LEVEL_ROWS, padded), np.uint32)
   rows[4] = 1
+  rows[1:, :count] = encoding.level_rows(settings.resolutions, entries)
   words, offset = [], 0
   w1 = array["base_w1"]
   first = np.zeros((padded, settings.width))
   second = np.zeros((padded, settings.width))
   for level, cells in enumerate(settings.resolutions):
-    side = cells + 1
-    dense = encoding.is_dense(cells, entries)
-    used = side**3 if dense else entries
-    strides = (side, side * side) if dense else encoding.HASH_PRIMES[1:]
-    rows[:, level] = (offset, *strides, 0 if dense else entries - 1, cells)
+    used = (cells + 1) ** 3 if encoding.is_dense(cells, entries) else entries
+    rows[0, level] = offset
     level_words, scale = _quantise(array["table"][level, :used])
     words.append(level_words)
     offset += used

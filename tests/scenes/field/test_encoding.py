@@ -69,8 +69,17 @@ def test_variance_of_a_sample_by_monte_carlo():
   np.testing.assert_allclose(found, expected, rtol=0.02)
 
 
-def test_footprint_rules():
-  assert float(encoding.blur_footprint(jnp.float32(2.0), rule="additive")) == 49.0
-  assert float(encoding.blur_footprint(jnp.float32(2.0), rule="paper")) == 3.0
-  with pytest.raises(ValueError, match="expected 'additive' or 'paper'"):
-    encoding.blur_footprint(jnp.float32(2.0), rule="other")
+def test_blur_widens_a_pixel_by_its_variance():
+  assert float(encoding.blur_footprint(jnp.float32(2.0))) == 49.0
+
+
+@pytest.mark.parametrize("cells", [7, 40])
+def test_level_rows_index_as_entry_index_does(cells):
+  entries = 1 << 10
+  y_stride, z_stride, mask, found_cells = encoding.level_rows([3, cells], entries)[:, 1]
+  vertices = np.random.default_rng(0).integers(0, cells + 1, (50, 3)).astype(np.uint32)
+  x, y, z = vertices[:, 0], vertices[:, 1] * y_stride, vertices[:, 2] * z_stride
+  row = (x ^ y ^ z) & mask if mask else x + y + z
+  expected = encoding.entry_index(jnp.asarray(vertices), resolution=cells, entries=entries)
+  np.testing.assert_array_equal(row, expected)
+  assert found_cells == cells and (mask == 0) == encoding.is_dense(cells, entries)

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from nerf2real.core.serialization import to_plain
 from nerf2real.scenes.field.field import Field, FieldSettings, init_params, query, query_density
 from nerf2real.scenes.field.settings import preset
 
@@ -47,7 +48,7 @@ def test_density_does_not_depend_on_direction():
 
 def test_file_keeps_everything_and_rounds_only_the_table(tmp_path):
   params = init_params(jax.random.PRNGKey(0), SETTINGS)
-  settings = dataclasses.replace(SETTINGS, footprint_rule="paper", march_step=0.02)
+  settings = dataclasses.replace(SETTINGS, march_step=0.02)
   Field(settings, params, 0.00123).save(tmp_path / "field.safetensors")
   assert [p.name for p in tmp_path.iterdir()] == ["field.safetensors"]
   found = Field.load(tmp_path / "field.safetensors")
@@ -68,11 +69,25 @@ def test_file_of_another_kind_is_refused(tmp_path):
     Field.load(tmp_path / "a.safetensors")
 
 
+@pytest.mark.parametrize("rule", ["additive", "paper"])
+def test_files_with_the_former_footprint_rule(tmp_path, monkeypatch, rule):
+  path = tmp_path / "field.safetensors"
+  with monkeypatch.context() as before:
+    former = {**to_plain(SETTINGS), "footprint_rule": rule}
+    before.setattr("nerf2real.scenes.field.field.to_plain", lambda settings: former)
+    Field(SETTINGS, init_params(jax.random.PRNGKey(0), SETTINGS), 0.002).save(path)
+  if rule == "additive":
+    assert Field.load(path).settings == SETTINGS
+    return
+  with pytest.raises(
+    ValueError, match=r"field\.safetensors was trained with footprint_rule='paper'"
+  ):
+    Field.load(path)
+
+
 def test_settings_refuse_nonsense():
   with pytest.raises(ValueError, match="levels=0"):
     FieldSettings(levels=0)
-  with pytest.raises(ValueError, match="expected 'additive' or 'paper'"):
-    FieldSettings(footprint_rule="cubic")
 
 
 def test_paper_preset_holds_the_papers_table():

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from nerf2real.scenes.field import training as train
+from nerf2real.scenes.field.engine.trainer import FusedTrainer
 from nerf2real.scenes.field.field import Field, FieldSettings
-from nerf2real.scenes.field.fused import trainer as fused
+from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.quality import image_quality
 from tests.scenes import box_views
 
@@ -49,13 +50,16 @@ def trained(views):
 def test_fused_training_reproduces_views_it_has_not_seen(trained):
   field, report = trained
   held_out = box_views.make_views(3, width=64, height=48, seed=100)
-  evaluator = fused.FusedField(field, settings=FAST)
+  renderer = Renderer(field)
   figures = []
   for index in range(3):
-    picture, depth, opacity = evaluator.render(held_out.camera, held_out.world_from_camera[index])
+    picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
     figures.append(image_quality.psnr(picture, held_out.images[index]))
-    assert opacity.mean() > 0.95
     origin, directions = held_out.rays(index)
+    origins = np.broadcast_to(origin, directions.shape).reshape(-1, 3)
+    flat = directions.reshape(-1, 3)
+    _, _, opacity = renderer.render_rays(origins, flat, held_out.camera.pixel_angle)
+    assert opacity.mean() > 0.95
     z = held_out.camera.rays()
     truth = box_views.wall_distance(origin, directions) / np.linalg.norm(z, axis=-1)
     assert np.median(np.abs(depth - truth)) < 0.1
@@ -99,6 +103,19 @@ def test_a_checkpoint_of_other_settings_is_not_used(views, tmp_path, monkeypatch
   assert report.resumed_at_step is None
 
 
+def test_a_checkpoint_of_another_format_is_not_used(views, tmp_path, monkeypatch):
+  monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
+  short = dataclasses.replace(FAST, max_steps=4)
+  with monkeypatch.context() as before:
+    before.setattr(train, "_CHECKPOINT_FORMAT", "1")
+    train.train(views, short, checkpoint_dir=tmp_path)
+  with pytest.warns(
+    UserWarning, match=r"training\.safetensors is a checkpoint of format 1, expected"
+  ):
+    _, report = train.train(views, short, checkpoint_dir=tmp_path)
+  assert report.resumed_at_step is None and report.steps == 4
+
+
 def test_known_points_make_the_geometry_better(trained):
   """With as many steps, the field with anchors comes nearer to the walls."""
   anchored = box_views.make_views(60, width=64, height=48, anchors=40)
@@ -106,10 +123,10 @@ def test_known_points_make_the_geometry_better(trained):
   held_out = box_views.make_views(4, width=64, height=48, seed=100)
   errors = []
   for candidate in (trained[0], field):
-    evaluator = fused.FusedField(candidate, settings=FAST)
+    renderer = Renderer(candidate)
     off = []
     for index in range(4):
-      _, depth, _ = evaluator.render(held_out.camera, held_out.world_from_camera[index])
+      _, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
       origin, directions = held_out.rays(index)
       norms = np.linalg.norm(held_out.camera.rays(), axis=-1)
       off.append(np.abs(depth - box_views.wall_distance(origin, directions) / norms))
@@ -129,7 +146,7 @@ def test_reference_training_lowers_the_loss_and_the_file_is_the_same(tmp_path, m
 
 
 def test_training_that_diverges_says_so_in_one_line(views):
-  initial = fused.FusedTrainer(views, FAST, seed=0).field()
+  initial = FusedTrainer(views, FAST, seed=0).field()
   initial.params["base_b2"][:] = np.nan
   with pytest.raises(train.TrainError, match=r"^Training failed at step 1: .* is not finite") as e:
     train.train(views, FAST, initial=initial)

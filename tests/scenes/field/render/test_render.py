@@ -12,9 +12,9 @@ import warp as wp
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.field.field import Field, FieldSettings
 from nerf2real.scenes.field.occupancy import Occupancy
-from nerf2real.scenes.field.render import reference as render_reference
 from nerf2real.scenes.field.render import renderer as render
 from tests.scenes import analytic_fields
+from tests.scenes.field.render import reference as render_reference
 
 BALL = np.array([0.5, 0.3, 0.8])
 MATTER = 192.4  # density [1/unit] of analytic matter: 10 squareplus(3 * 64 / sqrt(63) - 5)
@@ -62,7 +62,7 @@ def wall() -> render.Renderer:
     ({"levels": 8, "log2_table_size": 14}, 0.002),
     ({"levels": 8, "log2_table_size": 14}, 0.03),
     ({"levels": 9, "log2_table_size": 13, "bottleneck": 7, "view_width": 16}, 0.01),
-    ({"levels": 3, "log2_table_size": 15, "footprint_rule": "paper", "width": 32}, 0.02),
+    ({"levels": 3, "log2_table_size": 15, "width": 32}, 0.02),
   ],
 )
 def test_agrees_with_the_jax_reference(shape, angle):
@@ -212,17 +212,6 @@ def test_reference_picture_agrees(wall):
   color, depth = wall.render(camera, np.eye(4))
   assert np.abs(color.astype(int) - expected[0]).max() <= 3
   np.testing.assert_allclose(depth, expected[1], atol=FINE.step)
-
-
-def test_paper_rule_asks_for_the_blur_that_equals_the_pixel():
-  additive, paper = (
-    Field(FieldSettings(footprint_rule=rule), {}, 0.002) for rule in ("additive", "paper")
-  )
-  assert render.field_pixel_angle(additive, 0.03) == 0.03
-  assert render.field_pixel_angle(paper, 0.002) == pytest.approx(0.002)
-  # Five times as wide: 1/12 + s^2 = 25/12, s = sqrt(2); variance times 1 + sqrt(2).
-  expected = 0.002 * np.sqrt(1 + np.sqrt(2))
-  assert render.field_pixel_angle(paper, 0.01) == pytest.approx(expected)
 
 
 def test_wrong_input_is_refused(wall):

@@ -1,7 +1,6 @@
 """The renderer's reference in JAX: the same samples as the kernels, all of them, nothing skipped.
 
-Plain and slow on purpose: tests compare the kernels with it, the benchmark times it. Shapes: R
-rays, S samples.
+Plain and slow on purpose: tests compare the kernels with it. Shapes: R rays, S samples.
 """
 
 import functools
@@ -79,7 +78,6 @@ def render_rays(
   """Does what `Renderer.render_rays` does; no occupancy: samples everywhere."""
   distances, lengths = lattice(settings, pixel_angle)
   params = {name: jnp.asarray(value) for name, value in field.params.items()}
-  angle = render.field_pixel_angle(field, pixel_angle)
   colors, medians, opacities = [], [], []
   for first in range(0, len(origins), _CHUNK):
     origin, direction = origins[first : first + _CHUNK], directions[first : first + _CHUNK]
@@ -92,7 +90,7 @@ def render_rays(
       jnp.broadcast_to(direction[:, None], points.shape),
       jnp.asarray(distances),
       jnp.asarray(trained),
-      pixel_angle=angle,
+      pixel_angle=pixel_angle,
     )
     color, opacity, before = composite(
       field.settings, params, points, direction, variances, lengths, occupied

@@ -1,0 +1,164 @@
+"""Rays in Warp: random numbers, pixels, marching through two occupancy grids.
+
+The inner grid covers the unit cube; the outer one the whole squashed space of `contraction`. Inside
+the cube samples are `step` apart, outside `OUTER_STEP * step * |x|_max`.
+"""
+# mypy: ignore-errors
+# Kernels are Python only in their syntax: their annotations are Warp's.
+
+import warp as wp
+
+from nerf2real.scenes.field.engine import native, native_grid
+from nerf2real.scenes.field.engine.layout import Floats, Occupancy, Pictures, Settings
+
+FAR = 16.0  # chosen: rays end here [unit]; squashed to 1.94 of 2
+OUTER_STEP = 2.0  # chosen: outside, intervals are this many steps times |x|_max
+
+
+@wp.func_native(native_grid.UNIFORM)
+def uniform(seed: wp.uint64, index: wp.int64, dimension: int) -> wp.float32: ...
+
+
+@wp.func
+def look_up(p: Pictures, level: int, image: int, px: int, py: int) -> wp.vec3:
+  """Bilinear colour in [0, 1] at the centre of full-size pixel (px, py)."""
+  height, width = p.heights[level], p.widths[level]
+  start = p.starts[level] + image * height * width * 3
+  inverse = 1.0 / p.factors[level]
+  fx = wp.max((wp.float32(px) + 0.5) * inverse - 0.5, 0.0)
+  fy = wp.max((wp.float32(py) + 0.5) * inverse - 0.5, 0.0)
+  x0 = wp.min(wp.int32(fx), width - 1)
+  y0 = wp.min(wp.int32(fy), height - 1)
+  x1 = wp.min(x0 + 1, width - 1)
+  y1 = wp.min(y0 + 1, height - 1)
+  fx -= wp.float32(x0)
+  fy -= wp.float32(y0)
+  result = wp.vec3()
+  for c in range(3):
+    upper = wp.float32(p.pixels[start + (y0 * width + x0) * 3 + c]) * (1.0 - fx)
+    upper += wp.float32(p.pixels[start + (y0 * width + x1) * 3 + c]) * fx
+    lower = wp.float32(p.pixels[start + (y1 * width + x0) * 3 + c]) * (1.0 - fx)
+    lower += wp.float32(p.pixels[start + (y1 * width + x1) * 3 + c]) * fx
+    result[c] = (upper * (1.0 - fy) + lower * fy) * wp.static(1.0 / 255.0)
+  return result
+
+
+@wp.func
+def draw_ray(
+  p: Pictures, s: Settings, seed: wp.uint64, index: wp.int64, rays: Floats, size: int, r: int
+):
+  """Draws a pixel and a blur, or an anchor; writes column r of Worker.rays."""
+  images = p.origins.shape[0]
+  height, width = p.heights[0], p.widths[0]
+  image = wp.min(wp.int32(uniform(seed, index, 0) * wp.float32(images)), images - 1)
+  px = wp.min(wp.int32(uniform(seed, index, 1) * wp.float32(width)), width - 1)
+  py = wp.min(wp.int32(uniform(seed, index, 2) * wp.float32(height)), height - 1)
+  goal = wp.float32(0.0)
+  blur = wp.float32(0.0)
+  count = p.anchors.shape[0]
+  if count > 0 and uniform(seed, index, 9) < s.anchor_fraction:
+    anchor = p.anchors[wp.min(wp.int32(uniform(seed, index, 10) * wp.float32(count)), count - 1)]
+    image = wp.int32(anchor[0])
+    px = wp.int32(anchor[1])
+    py = wp.int32(anchor[2])
+    goal = anchor[3]
+  elif s.blur_max > 0.0 and uniform(seed, index, 3) >= s.blur_sharp:
+    blur = s.blur_max * wp.pow(uniform(seed, index, 4), s.blur_power)
+  direction = p.rotations[image] * wp.normalize(p.directions[py * width + px])
+  origin = p.origins[image]
+  level = wp.int32(0)
+  while level + 1 < p.blurs.shape[0] and p.blurs[level + 1] <= blur:
+    level += 1
+  color = look_up(p, level, image, px, py)
+  if level + 1 < p.blurs.shape[0]:
+    low = p.blurs[level] * p.blurs[level]
+    high = p.blurs[level + 1] * p.blurs[level + 1]
+    mix = (blur * blur - low) / (high - low)
+    if mix > 0.0:
+      color += mix * (look_up(p, level + 1, image, px, py) - color)
+  for c in range(3):
+    rays[c * size + r] = origin[c]
+    rays[(3 + c) * size + r] = direction[c]
+    rays[(6 + c) * size + r] = color[c]
+    background = wp.float32(0.0)
+    if s.random_background > 0:
+      background = uniform(seed, index, 6 + c)
+    rays[(10 + c) * size + r] = background
+  rays[9 * size + r] = 1.0 + 12.0 * blur * blur
+  rays[13 * size + r] = goal
+
+
+@wp.func
+def largest(p: wp.vec3) -> wp.float32:
+  """Maximum norm."""
+  return wp.max(wp.max(wp.abs(p[0]), wp.abs(p[1])), wp.abs(p[2]))
+
+
+@wp.func_native(native.snippet(native_grid.SQUASH, lanes=1))
+def squash(p: wp.vec3, norm: float) -> wp.vec3:
+  """Grid coordinates in [0, 1]^3 of a point whose max(1, |x|_max) is `norm`."""
+  ...
+
+
+@wp.func
+def march(
+  grids: Occupancy,
+  s: Settings,
+  origin: wp.vec3,
+  direction: wp.vec3,
+  jitter: float,
+  work: Floats,
+  stride: int,
+  at: int,
+) -> wp.int32:
+  """Writes the middles and lengths (rows 0 and 1) of a ray's intervals in occupied cells.
+
+  Returns their number. Nothing is written where `at` is negative.
+  """
+  count = wp.int32(0)
+  step = s.step
+  t = s.near + jitter * step
+  size = grids.inner_size
+  half_size = wp.float32(size) * 0.5
+  outer_size = grids.outer_size
+  outer_scale = wp.float32(outer_size)
+  outer_cell = 2.0 / outer_scale
+  depth = wp.float32(0.0)
+  stride_per_cell = 1.0 / half_size / (largest(direction) * step)
+  while t < FAR and count < s.ray_samples and depth <= s.depth_limit:
+    middle = t + 0.5 * step
+    p = origin + middle * direction
+    norm = largest(p)
+    if norm < 1.0:
+      q = (p + wp.vec3(1.0, 1.0, 1.0)) * half_size
+      index = (wp.int32(q[0]) * size + wp.int32(q[1])) * size + wp.int32(q[2])
+      away = wp.int32(grids.inner_distance[index])
+      if away == 0:
+        if at >= 0:
+          work[at + count] = middle
+          work[stride + at + count] = step
+        count += 1
+        depth += grids.inner_density[index] * step
+        t += step
+      else:
+        whole = wp.int32(wp.float32(away - 1) * stride_per_cell)
+        t += step * wp.float32(wp.max(whole, 1))
+    else:
+      length = OUTER_STEP * step * norm
+      middle = t + 0.5 * length
+      p = origin + middle * direction
+      norm = wp.max(1.0, largest(p))
+      q = squash(p, norm) * outer_scale
+      index = (wp.int32(q[0]) * outer_size + wp.int32(q[1])) * outer_size + wp.int32(q[2])
+      away = wp.int32(grids.outer_distance[index])
+      if away == 0:
+        if at >= 0:
+          work[at + count] = middle
+          work[stride + at + count] = length
+        count += 1
+        depth += grids.outer_density[index] * length
+        t += length
+      else:
+        # Squashing shrinks lengths by norm / 2 at least.
+        t += wp.max(wp.float32(away - 1) * outer_cell * norm, length)
+  return count

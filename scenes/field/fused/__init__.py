@@ -1,1 +1,0 @@
-"""Field training on CPU cores with fused numba kernels."""

@@ -1,0 +1,307 @@
+"""The fused Warp kernels against JAX: gradients in chunks and in phases, densities; marching."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import warp as wp
+from scipy.ndimage import distance_transform_cdt
+
+from nerf2real.scenes.field import losses as field_losses
+from nerf2real.scenes.field import sampling
+from nerf2real.scenes.field import training as train
+from nerf2real.scenes.field.encoding import sample_variance
+from nerf2real.scenes.field.engine import chunks, functions, layout, occupancy, parameters, phases
+from nerf2real.scenes.field.engine.device import OPTIONS, Device
+from nerf2real.scenes.field.engine.engine import Engine
+from nerf2real.scenes.field.engine.rays import march
+from nerf2real.scenes.field.engine.trainer import FusedTrainer
+from nerf2real.scenes.field.field import Field, FieldSettings, init_params, query, query_density
+from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.field.settings import TrainSettings
+from nerf2real.scenes.quality import image_quality
+from tests.scenes import box_views
+
+SETTINGS = TrainSettings(
+  field=FieldSettings(
+    log2_table_size=10, growth=1.3, base_resolution=4, march_step=0.1, density_scale=3.0
+  ),
+  batch_samples=1 << 10,
+  ray_samples=64,
+  distortion_weight=0.3,
+  depth_limit=1e9,
+  blur_max=2.0,
+  inner_cells=16,
+  outer_cells=16,
+)
+FAST = TrainSettings(
+  field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
+  max_steps=300,
+  max_seconds=None,
+  batch_samples=1 << 14,
+  inner_cells=32,
+  outer_cells=16,
+  occupancy_samples=1 << 13,
+  occupancy_start=96,
+  occupancy_sweep_steps=160,
+  blur_max=1.0,
+  warmup_steps=16,
+)
+SEED, BUDGET = 5, 300
+
+
+def _rough_field(pixel_angle=0.05):
+  """A field with parameters far from their initial values, so that every term matters."""
+  rng = np.random.default_rng(0)
+  params = {
+    name: np.array(value + rng.normal(size=value.shape) * (0.3 if name == "table" else 0.1), "f4")
+    for name, value in init_params(jax.random.PRNGKey(0), SETTINGS.field).items()
+  }
+  return Field(SETTINGS.field, params, pixel_angle)
+
+
+def _backward(*, phased=False, with_empty=False, rays=0):
+  """A trainer after one gradient, its worker's figures and the gradient by name."""
+  views = box_views.make_views(3, width=16, height=16, anchors=40)
+  initial = _rough_field(views.camera.pixel_angle)
+  trainer = FusedTrainer(views, SETTINGS, seed=1, initial=initial, phased=phased)
+  assert trainer.pictures.empty.size > 100
+  if not with_empty:
+    trainer.pictures.empty = wp.zeros(0, dtype=wp.int32, device="cpu")
+  if phased:
+    trainer.add_gradient(SEED, rays=rays, threshold=0.0)
+  else:
+    trainer.work(0, SEED, budget=BUDGET, threshold=0.0)
+    for level in range(trainer.engine.shape.levels):
+      trainer.scatter(level)
+  gradient = parameters.unflatten(SETTINGS.field, trainer.engine.workers[0].gradient.numpy())
+  gradient["table"] = trainer.table.gradient.numpy().reshape(SETTINGS.field.shapes["table"])
+  return trainer, trainer.figures()[0], gradient
+
+
+@pytest.fixture(scope="module")
+def backward():
+  return _backward()
+
+
+def _reference_losses(params, trainer, count):
+  """The same rays and samples in JAX: sums of the Charbonnier and the distortion loss."""
+  worker = trainer.engine.workers[0]
+  rays = worker.rays.numpy().reshape(14, -1).T[:count]
+  first = worker.first.numpy()[: count + 1]
+  work = worker.work.numpy().reshape(-1, layout.STRIDE)
+  most = np.diff(first).max()
+  distance, length = np.ones((count, most), np.float32), np.zeros((count, most), np.float32)
+  for ray in range(count):
+    samples = slice(first[ray], first[ray + 1])
+    distance[ray, : samples.stop - samples.start] = work[0, samples]
+    length[ray, : samples.stop - samples.start] = work[1, samples]
+  origins, directions, targets = rays[:, :3], rays[:, 3:6], rays[:, 6:9]
+  positions = origins[:, None] + directions[:, None] * distance[..., None]
+  along = jnp.broadcast_to(directions[:, None], positions.shape)
+  interval = SETTINGS.field.march_step * jnp.maximum(jnp.abs(positions).max(-1), 1.0)
+  variance = sample_variance(
+    along,
+    distance,
+    interval,
+    pixel_angle=trainer.engine.numbers.pixel_angle,
+    footprint=rays[:, 9, None],
+  )
+  density, color = query(SETTINGS.field, params, positions, variance, along)
+  weights = sampling.interval_weights(density, length)
+  rest = 1 - weights.sum(1)
+  total = (weights[..., None] * color).sum(1) + rest[:, None] * rays[:, 10:13]
+  photometric = field_losses.charbonnier(total, targets, padding=1e-3) * count
+  extent = sampling.spacing(distance + length / 2) - sampling.spacing(distance - length / 2)
+  order = jnp.argsort(distance + (length == 0) * 1e3, axis=-1)
+
+  def sort(values):
+    return jnp.take_along_axis(values, order, axis=-1)
+
+  distortion = field_losses.distortion_of_intervals(
+    sort(weights), sort(sampling.spacing(distance)), sort(extent)
+  ).sum()
+  goals = sampling.spacing(rays[:, 13])
+  off = (weights * jnp.abs(sampling.spacing(distance) - goals[:, None])).sum(1) + rest * (1 - goals)
+  anchored = SETTINGS.anchor_weight * jnp.where(rays[:, 13] > 0, off, 0).sum()
+  loss = photometric + SETTINGS.distortion_weight * distortion + anchored
+  return loss, (photometric, distortion)
+
+
+def test_gradients_agree_with_autodiff(backward):
+  trainer, figures, gradient = backward
+  params = _rough_field().params
+  (_, (photometric, distortion)), expected = jax.value_and_grad(_reference_losses, has_aux=True)(
+    params, trainer, int(figures[0])
+  )
+  np.testing.assert_allclose(figures[4], photometric, rtol=1e-5)
+  np.testing.assert_allclose(figures[5], distortion, rtol=1e-5)
+  for name, value in expected.items():
+    error = np.linalg.norm(gradient[name] - value) / np.linalg.norm(value)
+    assert error < 1e-4, (name, error)
+
+
+@pytest.mark.parametrize("with_empty", [False, True])
+def test_phases_have_the_gradient_of_chunks(with_empty):
+  _, figures, gradient = _backward(with_empty=with_empty)
+  trainer, *_ = phases = _backward(phased=True, with_empty=with_empty, rays=int(figures[0]))
+  np.testing.assert_allclose(phases[1][[0, 2, 3, 4, 5]], figures[[0, 2, 3, 4, 5]], rtol=1e-6)
+  if with_empty:  # as many points as all threads have together, of the same mean weight
+    assert trainer.engine.numbers.empty_samples >= SETTINGS.empty_samples
+    return
+  for name, value in gradient.items():
+    error = np.linalg.norm(phases[2][name] - value) / np.linalg.norm(value)
+    assert error < 1e-5, (name, error)
+
+
+@pytest.mark.parametrize("phased", [False, True])
+def test_empty_space_has_the_gradient_of_its_density(backward, phased):
+  """The difference that empty cells make, against autodiff of weight * log(1 + density)."""
+  without = backward[2]
+  trainer, figures, gradient = _backward(phased=phased, with_empty=True, rays=int(backward[1][0]))
+  count = trainer.engine.numbers.empty_samples
+  worker = trainer.engine.workers[0]
+  kept = worker.kept.numpy().reshape(-1, worker.kept_stride)
+  start = 0 if phased else int(figures[1]) - count
+  points = 4 * kept[:3, start : start + count].T - 2
+  assert (np.abs(points) < box_views.HALF_SIZE).all()  # within the walls
+  extents = worker.work.numpy().reshape(-1, trainer.engine.stride)[
+    trainer.engine.shape.rows.INPUT + 2 * SETTINGS.field.levels, :count
+  ]
+  variances = np.exp2((extents - 1) * 20)[:, None].repeat(3, axis=1)
+  assert 1e-6 < variances.min() < 2e-6 and 5e-3 < variances.max() < 1e-2
+
+  def loss(params):
+    density = query_density(SETTINGS.field, params, points, variances)
+    return figures[0] * SETTINGS.empty_weight * jnp.log1p(density).mean()
+
+  expected = jax.grad(loss)(_rough_field().params)
+  for name in ("table", "base_w1", "base_b1", "base_w2", "base_b2"):
+    change = gradient[name] - without[name]
+    error = np.linalg.norm(change - expected[name]) / np.linalg.norm(expected[name])
+    assert error < 1e-3, (name, error)
+
+
+def test_rays_are_pixels_of_the_pictures(backward):
+  trainer, figures, _ = backward
+  rays = trainer.engine.workers[0].rays.numpy().reshape(14, -1).T[: int(figures[0])]
+  sharp = rays[rays[:, 9] == 1.0]
+  assert 3 < len(sharp) < len(rays)
+  distance = box_views.wall_distance(sharp[:, :3], sharp[:, 3:6])
+  expected = box_views.wall_color(sharp[:, :3] + distance[:, None] * sharp[:, 3:6])
+  np.testing.assert_allclose(sharp[:, 6:9], expected, atol=3e-3)
+  anchored = rays[:, 13] > 0
+  assert 0 < anchored.sum() < len(rays)
+  distance = box_views.wall_distance(rays[anchored, :3], rays[anchored, 3:6])
+  np.testing.assert_allclose(rays[anchored, 13], distance, rtol=1e-4)
+
+
+def test_densities_agree_with_the_field():
+  field = _rough_field()
+  rng = np.random.default_rng(3)
+  positions = (rng.normal(size=(3000, 3)) * 1.5).astype(np.float32)
+  found = Engine(field.settings, field.params, Device()).densities(positions, sigma=0.01)
+  variances = np.full((3000, 3), 1e-4, np.float32)
+  expected = query_density(field.settings, field.params, positions, variances)
+  np.testing.assert_allclose(found, expected, rtol=2e-4)
+
+
+def _distances(occupied):
+  device = Device()
+  result = device.zeros(occupied.size, np.uint8)
+  occupancy.distances(device, occupied, result)
+  return result.numpy().reshape(occupied.shape)
+
+
+def test_distances_agree_with_scipy():
+  occupied = np.random.default_rng(0).random((20, 20, 20)) < 0.002
+  expected = np.minimum(distance_transform_cdt(~occupied, metric="chessboard"), 12)
+  np.testing.assert_array_equal(_distances(occupied), expected)
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+def _march(
+  grids: layout.Occupancy,
+  settings: layout.Settings,
+  origins: wp.array(dtype=wp.vec3),
+  directions: wp.array(dtype=wp.vec3),
+  samples: wp.array(dtype=wp.float32),
+  stride: wp.int32,
+  counts: wp.array(dtype=wp.int32),
+):
+  ray = wp.tid()
+  counts[ray] = march(
+    grids, settings, origins[ray], directions[ray], 0.0, samples, stride, ray * 512
+  )
+
+
+def test_march_visits_every_occupied_cell_on_its_way():
+  rng = np.random.default_rng(1)
+  size, rays, step = 16, 20, 0.01
+  occupied = rng.random((size,) * 3) < 0.05
+  device = Device()
+  grids, settings = layout.Occupancy(), layout.Settings()
+  grids.inner_size, grids.outer_size = size, 4
+  grids.inner_distance = device.put(_distances(occupied).ravel())
+  grids.inner_density = device.zeros(size**3)
+  grids.outer_distance = device.put(np.full(64, 6, np.uint8))
+  grids.outer_density = device.zeros(64)
+  settings.step, settings.depth_limit, settings.ray_samples = step, 1e9, 512
+  origins = rng.uniform(-0.5, 0.5, (rays, 3)).astype(np.float32)
+  directions = rng.normal(size=(rays, 3))
+  directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
+  samples, counts = device.zeros(2 * rays * 512), device.zeros(rays, np.int32)
+  places = device.put(origins, wp.vec3), device.put(directions, wp.vec3)
+  device.launch(_march, [grids, settings, *places, samples, rays * 512, counts], dim=rays)
+  lengths = samples.numpy().reshape(2, rays, 512)[1]
+  for ray, count in enumerate(counts.numpy()):
+    t = np.arange(step / 2, 3.5, step)
+    points = origins[ray] + t[:, None] * directions[ray]
+    points = points[np.abs(points).max(-1) < 1]
+    cells = ((points + 1) * size / 2).astype(int)
+    expected = np.flatnonzero(occupied[cells[:, 0], cells[:, 1], cells[:, 2]]).size
+    assert abs(count - expected) <= 2  # rounding at the faces of cells
+    np.testing.assert_allclose(lengths[ray, :count], step)
+
+
+@pytest.fixture(scope="module")
+def views():
+  return box_views.make_views(60, width=64, height=48)
+
+
+def _train(views, steps=FAST.max_steps, **options):
+  trainer = FusedTrainer(views, FAST, seed=0, **options)
+  for step in range(steps):
+    trainer.step(train.learning_rate(FAST, step / FAST.max_steps, step))
+  return trainer
+
+
+@pytest.mark.parametrize("phased", [False, True])
+def test_training_reproduces_views_it_has_not_seen(views, phased):
+  held_out = box_views.make_views(3, width=64, height=48, seed=100)
+  renderer = Renderer(_train(views, phased=phased).field())
+  figures = []
+  for index in range(3):
+    picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
+    figures.append(image_quality.psnr(picture, held_out.images[index]))
+    origin, directions = held_out.rays(index)
+    z = held_out.camera.rays()
+    truth = box_views.wall_distance(origin, directions) / np.linalg.norm(z, axis=-1)
+    assert np.median(np.abs(depth - truth)) < 0.1
+  assert np.mean(figures) > 25
+
+
+def test_shapes_that_the_kernels_cannot_run_are_refused():
+  with pytest.raises(ValueError, match=r"levels \* features = 10"):
+    layout.Shape.of(FieldSettings(levels=5))
+
+
+def test_every_kernel_compiles_for_cuda(tmp_path):
+  shape = layout.Shape.of(dataclasses.replace(SETTINGS.field, levels=4))
+  made = functions.build(shape, layout.STRIDE, layout.CHUNK_RAYS)
+  kernels = chunks.build(made)._asdict() | phases.build(made)._asdict()
+  for name, kernel in (kernels | {"distance": occupancy.distance_along}).items():
+    wp.compile_aot_module(kernel.module, arch=90, module_dir=str(tmp_path / name), use_ptx=True)
+    assert list((tmp_path / name).glob("*.ptx"))
