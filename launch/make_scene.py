@@ -38,7 +38,7 @@ class Arguments:
   camera_height: float | None = None
   """Median height of the camera above the floor [m]: gives the scale where there is no marker."""
   override: Path | None = None
-  """YAML or JSON that fixes floor, scale, yaw, extent by hand; see scenes/geometry/overrides.py."""
+  """YAML or JSON that fixes floor, scale, yaw, extent; see scenes/alignment/overrides.py."""
   baseline: Literal["none", "colmap"] | None = None
   """"colmap" adds the Poisson mesh of the COLMAP points to the report."""
   name: str | None = None

@@ -260,17 +260,26 @@ def test_shipped_film_and_truth_belong_together():
   np.testing.assert_allclose(truth["marker"]["corners"], furniture.marker_corners())
 
 
-def test_making_a_scene_loads_no_robot():
+def test_making_a_scene_loads_no_robot(tmp_path):
   """The room and the script that makes scenes need nothing above scenes."""
   root = Path(__file__).parents[3]
-  program = (
-    "import sys, runpy; runpy.run_path(sys.argv[1], run_name='loaded');"
-    "print(*(name for name in sys.modules if name.startswith('nerf2real.')))"
-  )
+  program = """
+import runpy, sys
+script = runpy.run_path(sys.argv[1], run_name="loaded")
+try:
+  script["run"](script["Arguments"](capture="missing.mp4", out=script["Path"]("unused")))
+except ValueError as error:
+  assert "missing.mp4" in str(error)
+print(*(name for name in sys.modules if name.startswith("nerf2real.")))
+"""
   script = root / "launch" / "make_scene.py"
   result = subprocess.run(
-    [sys.executable, "-c", program, script], cwd=root, capture_output=True, text=True, check=True
+    [sys.executable, "-c", program, script],
+    cwd=tmp_path,
+    capture_output=True,
+    text=True,
+    check=True,
   )
   packages = {name.split(".")[1] for name in result.stdout.split()}
-  assert packages == {"core", "scenes"}
+  assert packages == {"core", "scenes", "launch"}
   assert "nerf2real.scenes.builtin.yardstick" in result.stdout.split()
