@@ -17,7 +17,7 @@ class TrainSettings:
   """Where the engine "fused" trains: "cpu" or, with its kernels in phases, "cuda"."""
   max_steps: int = 6000
   """Steps after which training ends. Chosen: in the built-in room 6,000 steps gave 30.1 dB on
-  held-out views, 15,164 with all else equal 28.7; why more steps harm is open."""
+  held-out views, another run of 15,164 gave 28.7; why more steps harm is open."""
   max_seconds: float | None = 290.0
   """Seconds after which training ends, or None. The schedule runs over whichever ends first."""
   learning_rate: float = 1e-2
