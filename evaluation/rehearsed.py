@@ -1,6 +1,7 @@
 """The virtual robot as a plant: reached over its wires, placed and watched as by an observer."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,11 @@ from nerf2real.evaluation import perturbations
 from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial, make_intruder
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.safety.monitor import Reason
+from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.camera import VirtualCamera
+from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
@@ -51,6 +55,8 @@ class RehearsedPlant(Plant):
     *,
     image_size: tuple[int, int] | None,
     robot_seed: int | None = 1,
+    altered: Sequence[Undeclared] = (),
+    session: float = 0.0,
     world: str = "room",
     time_limit: float | None = None,
     record: Path | None = None,
@@ -63,6 +69,8 @@ class RehearsedPlant(Plant):
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the policy's picture; None for no camera.
       robot_seed: Which robot: the seed of what is hidden in it; None: as in the data sheets.
+      altered: Undeclared effects that the robot has besides.
+      session: Time that its battery was in use before [s].
       world: "room" or "floor", see `VirtualRobot`.
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
@@ -72,11 +80,18 @@ class RehearsedPlant(Plant):
     self._starts = protocols.scene_starts(scene)
     self._workspace = find_workspace(scene) if protocol == BALL else None
     self._intruder = make_intruder(self, self._starts)
+    if altered:
+      self.plant_id += ", altered"
+    hidden = Hidden.none() if robot_seed is None else Hidden.draw(robot_seed)
+    motors = dataclasses.replace(hidden.motors, battery_age=session)
+    hidden = dataclasses.replace(hidden, motors=motors)
+    build = undeclared.build(hidden, VirtualCamera(), altered)
     self.robot = VirtualRobot(
       world=world,
       seed=robot_seed,
+      hidden=build.hidden,
       stepped=True,
-      camera=None if image_size is None else VirtualCamera(),
+      camera=None if image_size is None else build.camera,
       ball=protocol == BALL,
       furnish=None if self._intruder is None else self._intruder.add_to_spec,
     )

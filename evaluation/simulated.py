@@ -28,6 +28,7 @@ class SimulatedPlant(Plant):
     *,
     image_size: tuple[int, int] | None,
     effects: Any = None,
+    draw_effects: bool = False,
     seed: int = 0,
     time_limit: float | None = None,
   ):
@@ -39,6 +40,7 @@ class SimulatedPlant(Plant):
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the picture; None for no camera.
       effects: An effects.json, or effects.
+      draw_effects: Whether every episode draws the effects' values from their intervals.
       seed: Of what differs between episodes, with the trial's own.
       time_limit: Length of an episode [s]; the task's own if None.
     """
@@ -50,6 +52,7 @@ class SimulatedPlant(Plant):
       TASKS[protocol],
       scene=scene,
       effects=effects,
+      draw_effects=draw_effects,
       image_size=image_size,
       random=seed,
       randomisation=dataclasses.replace(RandomisationSettings(), pushes=False),
