@@ -18,6 +18,7 @@ import numpy as np
 
 from nerf2real.agents.distill import settings as stages
 from nerf2real.agents.distill import student
+from nerf2real.agents.distill.beginning import begin_with
 from nerf2real.agents.distill.checkpoint import STATE, Counters, load_state, save_state
 from nerf2real.agents.distill.dataset import UNROLL_FIELDS, Dataset, Streams, Unroll
 from nerf2real.agents.distill.features import FeatureCache
@@ -90,6 +91,9 @@ class Learner:
     self._updates = make_updates(settings, self._layout)
     self._state = self._updates.init(jax.random.PRNGKey(seed))
     self._counters = Counters()
+    if settings.init_from:  # its student drives from the first frame on
+      self._state = begin_with(self._state, load_arrays(Path(settings.init_from)))
+      self._counters = Counters(begun=0)
     if resume:
       self._state, self._counters = load_state(run / STATE, like=self._state)
     write_json(run / SETTINGS, settings)
@@ -112,7 +116,7 @@ class Learner:
     self._stop = threading.Event()
     self._last: dict[str, float] = {}  # times of the last periodical work
     self._evaluation: dict[str, Any] = {}  # the last one
-    self._is_fit = False  # whether encoder and policy belong together now
+    self._is_fit = bool(settings.init_from)  # whether encoder and policy belong together now
     self._compiled: set[str] = set()  # kinds of stages whose update was called
     self._recent: list[dict[str, jax.Array]] = []
     self._last_figures = (time.monotonic(), self._data.frames, self._counters.updates)
@@ -131,7 +135,9 @@ class Learner:
       },
     )
     self._set_status()
-    if (run / POLICY).exists():
+    if settings.init_from and not resume:
+      self._publish()
+    elif (run / POLICY).exists():
       self._link.publish_parameters(
         load_arrays(run / POLICY), version=max(1, self._counters.updates)
       )
@@ -185,6 +191,7 @@ class Learner:
       labels=self._data.arrays["label"][frames],
       layout=self._layout,
       min_spread=self._settings.min_action_spread,
+      keep_policy=bool(self._settings.init_from),
     )
     _log.info("Training begins with %d frames.", self._data.frames)
 

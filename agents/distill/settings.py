@@ -64,6 +64,8 @@ class DistillSettings:
   """Where data are collected, as `agents.processes.environments` names it, without pushes."""
   teacher: str = "quick"
   """One of `teacher.TEACHERS`, or the folder of an exported policy."""
+  init_from: str = ""
+  """Folder of an exported policy that the student begins with; random weights if empty."""
   agent: DmpoConfig = DmpoConfig(network=NetworkConfig(init_stddev=0.1))
   """The student's networks and augmentation; the exported policy carries them. Noise of 0.1 leaves
   a walking robot on its feet, so that DMPO may go on from the student."""
@@ -147,6 +149,20 @@ def nerf_nav() -> DistillSettings:
   )
 
 
+def adapt() -> DistillSettings:
+  """Navigation: a student that walks already is trained on, in minutes, where something changed."""
+  return DistillSettings(
+    environment="suite:nerf_nav",
+    mixture=MixtureSettings(first_share=0.5, anneal_frames=20_000),
+    # The encoder has learned; what the change asks of it, the last part gives.
+    stages=(Stage(kind=POLICY, share=0.4), Stage(kind=END_TO_END, share=0.6)),
+    settling=0,
+    first_frames=4_000,
+    learning_rate=3e-4,
+    evaluation_period=3_600.0,
+  )
+
+
 def tiny() -> DistillSettings:
   """Everything very small: to try the machinery in seconds."""
   network = NetworkConfig(
@@ -180,7 +196,11 @@ def tiny() -> DistillSettings:
   )
 
 
-PRESETS: Mapping[str, Callable[[], DistillSettings]] = {"nerf_nav": nerf_nav, "tiny": tiny}
+PRESETS: Mapping[str, Callable[[], DistillSettings]] = {
+  "nerf_nav": nerf_nav,
+  "adapt": adapt,
+  "tiny": tiny,
+}
 
 
 def preset(name: str) -> DistillSettings:
