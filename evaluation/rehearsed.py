@@ -14,8 +14,7 @@ from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial, make_i
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.safety.monitor import Reason
 from nerf2real.real.virtual import undeclared
-from nerf2real.real.virtual.camera import VirtualCamera
-from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual.camera import LENS
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite import protocols
@@ -82,10 +81,7 @@ class RehearsedPlant(Plant):
     self._intruder = make_intruder(self, self._starts)
     if altered:
       self.plant_id += ", altered"
-    hidden = Hidden.none() if robot_seed is None else Hidden.draw(robot_seed)
-    motors = dataclasses.replace(hidden.motors, battery_age=session)
-    hidden = dataclasses.replace(hidden, motors=motors)
-    build = undeclared.build(hidden, VirtualCamera(), altered)
+    build = undeclared.build(robot_seed, altered, age=session)
     self.robot = VirtualRobot(
       world=world,
       seed=robot_seed,
@@ -110,6 +106,8 @@ class RehearsedPlant(Plant):
     if image_size is not None:
       self._camera = CoveredCamera(connection.camera)
       connection = dataclasses.replace(connection, camera=self._camera)
+      if self._recorder is not None:
+        self._recorder.camera_info(self.robot.clock.wall(self.robot.clock.now()), LENS)
     return real.load(
       TASKS[self.protocol],
       robot=connection,

@@ -146,6 +146,11 @@ class Body:
         data.eq_active[self._weld] = 1
       self._lowering = not held
 
+  def turn(self, yaw: float) -> None:
+    """Turns the hand that holds the robot to a heading [rad]."""
+    with self.lock:
+      self.data.mocap_quat[self._hand] = rotations.yaw_quaternion(yaw)
+
   def advance(self, time: float) -> None:
     """Simulates up to a time [s]."""
     with self.lock:

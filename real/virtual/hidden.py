@@ -16,7 +16,6 @@ class Load(NamedTuple):
   position: tuple[float, float, float]  # m in the link
 
 
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Hidden:
   """The virtual robot's own physics, where it may differ from the simulation of `suite`."""

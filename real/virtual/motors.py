@@ -55,7 +55,7 @@ class MotorParameters:
   battery_resistance: float = 0.08
   """Ohm."""
   battery_course: tuple[tuple[float, float], ...] = ()
-  """(s in use, V without load), with straight lines between; constant `battery_voltage` if empty."""
+  """(s in use, V without load), straight lines between; constant `battery_voltage` if empty."""
   battery_age: float = 0.0
   """s that the battery was in use when the robot was switched on."""
   rest_friction: float = 0.0

@@ -5,7 +5,7 @@ its units and its meaning; the others are outside that library. CASES are sets o
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -97,7 +97,9 @@ def _payload(build: Build, target: str | None, values: tuple[float, ...]) -> Bui
 
 
 def _floor_slope(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
-  return build._replace(hidden=dataclasses.replace(build.hidden, floor_slope=values))
+  return build._replace(
+    hidden=dataclasses.replace(build.hidden, floor_slope=(values[0], values[1]))
+  )
 
 
 def _supply_course(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
@@ -124,9 +126,7 @@ KINDS: Mapping[str, Kind] = {
     ("fall", "full", "seconds"), _supply_course, defaults=(12.5, 1200.0), in_library=False
   ),
   # N m, s: dry friction that a joint gains while it rests, and how fast.
-  "rest_friction": Kind(
-    ("torque", "time"), _rest_friction, defaults=(0.3,), in_library=False
-  ),
+  "rest_friction": Kind(("torque", "time"), _rest_friction, defaults=(0.3,), in_library=False),
 }
 
 _SLOPE = float(np.deg2rad(2.5))
@@ -163,7 +163,7 @@ def parse(text: str) -> list[Undeclared]:
 
 def _target(kind: str, target: str | None) -> str | None:
   known = KINDS[kind].targets
-  if target is None and kind == "payload" or target is not None and target not in known:
+  if (target is None and kind == "payload") or (target is not None and target not in known):
     expected = f"one of {', '.join(known)}" if known else f"no target: {kind}:..."
     raise ValueError(f"Found the target {target!r} of {kind}, expected {expected}.")
   return target
@@ -186,12 +186,25 @@ def parse_all(texts: Iterable[str]) -> tuple[Undeclared, ...]:
   return tuple(effect for text in texts for effect in parse(text))
 
 
-def build(robot: Hidden, camera: VirtualCamera, effects: Sequence[Undeclared]) -> Build:
+def put_in(made: Build, effects: Iterable[Undeclared]) -> Build:
   """Returns a robot and its camera with undeclared effects put in."""
-  made = Build(robot, camera)
   for effect in effects:
     made = KINDS[effect.kind].put(made, effect.target, effect.values)
   return made
+
+
+def build(seed: int | None, effects: Iterable[Undeclared] = (), *, age: float = 0.0) -> Build:
+  """Returns what a virtual robot with undeclared effects is built from.
+
+  Args:
+    seed: Of the robot's own build; None: as in the data sheets.
+    effects: What it has besides.
+    age: Time that its battery was in use before [s].
+  """
+  hidden = Hidden.none() if seed is None else Hidden.draw(seed)
+  motors = dataclasses.replace(hidden.motors, battery_age=age)
+  made = Build(dataclasses.replace(hidden, motors=motors), VirtualCamera())
+  return put_in(made, effects)
 
 
 def draw(seed: int) -> tuple[Undeclared, ...]:

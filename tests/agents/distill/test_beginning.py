@@ -43,9 +43,7 @@ def _act(policy, seed=0):
 
 def test_it_acts_as_the_policy_did_also_once_inputs_are_standardised(exported):
   updates = learning.make_updates(TINY, LAYOUT)
-  state = beginning.begin_with(
-    updates.init(jax.random.PRNGKey(9)), export.load_arrays(exported)
-  )
+  state = beginning.begin_with(updates.init(jax.random.PRNGKey(9)), export.load_arrays(exported))
   rows = np.random.default_rng(1).normal(2.0, 3.0, (99, 5))
   labels = np.random.default_rng(2).normal(0.3, 0.2, (99, 4)).astype(np.float32)
   scaled = learning.standardised(

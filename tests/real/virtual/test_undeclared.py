@@ -18,8 +18,7 @@ KNEE = constants.JOINT_NAMES.index("l_knee")
 
 
 def _build(*texts, seed=None):
-  robot = Hidden.none() if seed is None else Hidden.draw(seed)
-  return undeclared.build(robot, VirtualCamera(noise=0.0), undeclared.parse_all(texts))
+  return undeclared.build(seed, undeclared.parse_all(texts))
 
 
 def _motors(*texts):
@@ -104,7 +103,7 @@ def test_nothing_hidden_is_the_same_robot():
     Hidden.draw(3), motors=None
   )
   np.testing.assert_array_equal(build.hidden.motors.strength, Hidden.draw(3).motors.strength)
-  assert build.camera == VirtualCamera(noise=0.0)
+  assert build.camera == VirtualCamera()
 
 
 def test_late_commands_act_late():

@@ -9,6 +9,7 @@ import pytest
 
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.evaluation.loop import closing, gap, motions, recording
+from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.launch import close_loop as script
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 from nerf2real.suite.op3 import constants
@@ -78,8 +79,8 @@ def test_an_unreachable_robot_is_one_line(monkeypatch, capsys, tmp_path):
 
 @pytest.mark.slow
 def test_the_loop_closes_on_the_virtual_robot(tmp_path):
-  content = closing.close_loop(tmp_path, seed=1, seconds=6.0).content
-  model = mujoco.MjModel.from_xml_path(str(tmp_path / "declared.xml"))
+  content = closing.close_loop(LoopSettings(out=tmp_path, seed=1, seconds=6.0)).content
+  model = mujoco.MjModel.from_xml_path(str(tmp_path / "identified/declared.xml"))
   for name in ("sweep", "slow", "steps", "mixed"):
     log = read_log(tmp_path / f"{name}.mcap")
     check_against_model(log, model)
@@ -88,7 +89,7 @@ def test_the_loop_closes_on_the_virtual_robot(tmp_path):
   assert content["verdict"] in ("effects", "unexplained")  # the virtual servos are other ones
   assert "load_friction" in {e["kind"] for e in [*content["effects"], *content["alternatives"]]}
   assert content["error"]["train"]["after"] < content["error"]["train"]["before"]
-  assert json.loads((tmp_path / "identified/report.json").read_text()) == content
+  assert json.loads((tmp_path / "identified/finding.json").read_text()) == content
   assert read_effects(tmp_path / "identified/effects.json")
   table = (tmp_path / "gap.md").read_text()
   assert all(f"| {name} |" in table for name in constants.JOINT_NAMES)
