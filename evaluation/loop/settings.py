@@ -27,7 +27,7 @@ class LoopSettings:
   camera: str = "0"
   """A robot's camera: device number, file or URL."""
   hidden: tuple[str, ...] = ()
-  """Undeclared effects of the virtual robot: such as command_delay:0.045, a case (weak_knee), a file
+  """Undeclared effects of the virtual robot: command_delay:0.045, a case such as weak_knee, a file
   with one a line, or "drawn" by the seed; printed at the end alone."""
   seed: int = 1
   """Of the virtual robot: its own build, and what "drawn" draws."""
