@@ -26,6 +26,10 @@ class LoopSettings:
   """Serial port such as /dev/ttyUSB0, or "virtual"."""
   camera: str = "0"
   """A robot's camera: device number, file or URL."""
+  offsets: Path | None = None
+  """A robot's offset.yaml."""
+  lens: Path | None = None
+  """Its camera's camera_info YAML: with it the stand is filmed, and the camera identified."""
   hidden: tuple[str, ...] = ()
   """Undeclared effects of the virtual robot: command_delay:0.045, a case such as weak_knee, a file
   with one a line, or "drawn" by the seed; printed at the end alone."""
@@ -52,6 +56,11 @@ class LoopSettings:
   """Collectors of the distillation."""
   out: Path = Path("out/loop")
   """Folder of everything; the same command goes on in it."""
+
+  @property
+  def camera_source(self) -> int | str:
+    """The robot's camera: a device's number, or a file or URL."""
+    return int(self.camera) if self.camera.isdigit() else self.camera
 
 
 def policy_folder(settings: LoopSettings) -> Path | None:

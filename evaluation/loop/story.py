@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nerf2real.agents.processes.training import Scripts
+from nerf2real.core.camera_info import read_camera_info
 from nerf2real.core.serialization import to_plain, write_json
-from nerf2real.evaluation.episodes import Episode, Store
+from nerf2real.evaluation.episodes import OUTCOMES, Episode, Store
 from nerf2real.evaluation.loop import machines, naming, recording, training, trials
 from nerf2real.evaluation.loop.comparing import Comparison, compare
 from nerf2real.evaluation.loop.naming import Named
@@ -101,8 +102,10 @@ def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
   seconds, out = settings.seconds, settings.out
   wanted = [out / "stand" / f"{name}.mcap" for name in (*_logs(), recording.FLOOR)]
   if settings.robot != recording.VIRTUAL:
-    connection = Connection(port=settings.robot)
-    recording.record_stand(out / "stand", connection, None, seconds=seconds)
+    lens = None if settings.lens is None else read_camera_info(settings.lens)
+    camera = None if lens is None else settings.camera_source
+    connection = Connection(port=settings.robot, camera=camera, offsets=settings.offsets)
+    recording.record_stand(out / "stand", connection, None, seconds=seconds, lens=lens)
     recording.record_floor(out / "stand", connection, None)
     return settings.reference
   age = trials.session_seconds(settings, BEFORE)
@@ -135,8 +138,30 @@ def summary(story: Story) -> dict[str, Any]:
     "trained": None if story.trained is None else to_plain(story.trained),
     "hidden": None if story.comparison is None else to_plain(story.comparison),
     "recovered": recovered(story),
+    "gap_to_robot": {name: to_plain(found) for name, found in gaps(story).items()},
+    "recorded_s": story.settings.seconds * len(_logs()),
     "seconds": {name: round(value, 1) for name, value in story.times.items()},
   }
+
+
+class Gap(NamedTuple):
+  """How far a simulation's trials are from the robot's before."""
+
+  success: float  # share in the simulation less the robot's
+  outcomes: float  # total variation distance between how the trials ended, 0 to 1
+
+
+def gaps(story: Story) -> dict[str, Gap]:
+  """Returns the gaps between simulation and robot, without and with the effects."""
+  robot = story.tallies[BEFORE]
+
+  def gap(found: Tally) -> Gap:
+    shares = ((t.outcomes[o] / t.trials for o in OUTCOMES) for t in (found, robot))
+    kinds = (abs(here - there) for here, there in zip(*shares, strict=True))
+    return Gap(found.share - robot.share, sum(kinds) / 2)
+
+  tallies = story.tallies
+  return {name: gap(tallies[name]) for name in (NOMINAL, WITH_EFFECTS) if name in tallies}
 
 
 def recovered(story: Story) -> float | None:

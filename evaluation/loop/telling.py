@@ -3,8 +3,8 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from nerf2real.core.floor_map import FloorMap
 from nerf2real.core.pages import charts, page
 from nerf2real.core.pages.blocks import (
   Block,
@@ -34,50 +34,47 @@ _HEIGHT = 360  # of maps [pixel]
 _NOTHING = "-"
 
 
+_LEAD = (
+  "A policy meets a robot with something that nobody declared: the robot's own recordings name it, "
+  "the simulation gets it, and the policy is trained on."
+)
+_VIRTUAL = " Robot means a virtual robot here; no figure of this page is of hardware."
+
+
 def write(path: Path, story: Story) -> None:
   """Writes the page."""
-  scene = open_scene(story.settings.scene)
+  floor = maps.draw_floor(open_scene(story.settings.scene), height=_HEIGHT)
+  before, simulated, after = (
+    _paths(story, floor, title, text, names)
+    for title, text, names in (
+      (
+        "Before",
+        "Paths of the same trials, seen from above; a dot is where a failure ended.",
+        (loop.HEALTHY, loop.BEFORE),
+      ),
+      (
+        "In the simulation",
+        "The same trials without and with the effects, drawn from their intervals every episode: "
+        f"where the finding is right, the policy fails here as on the robot. {_gaps(story)}",
+        (loop.NOMINAL, loop.WITH_EFFECTS),
+      ),
+      ("After", "The same trials on the same robot.", (loop.BEFORE, loop.AFTER)),
+    )
+  )
+  settings = Preformatted(json.dumps(to_plain(story.settings), indent=1))
   sections = [
     Section("Five numbers", "", [Figures(five_numbers(story))]),
-    _paths(
-      story,
-      scene,
-      "Before",
-      "Paths of the same trials, seen from above; a dot is where a failure ended.",
-      (loop.HEALTHY, loop.BEFORE),
-    ),
+    before,
     _finding(story.named),
-    _paths(
-      story,
-      scene,
-      "In the simulation",
-      "The same trials without and with the effects, drawn from their intervals every episode: "
-      "where the finding is right, the policy fails here as it does on the robot.",
-      (loop.NOMINAL, loop.WITH_EFFECTS),
-    ),
+    simulated,
     _training(story),
-    _paths(
-      story,
-      scene,
-      "After",
-      "The same trials on the same robot.",
-      (loop.BEFORE, loop.AFTER),
-    ),
+    after,
     _outcomes(list(story.tallies.values())),
     *([] if story.comparison is None else [_hidden(story.comparison)]),
     Section("Time", "", [Times(story.times)]),
-    Section(
-      "Settings",
-      "",
-      [Details("all", [Preformatted(json.dumps(to_plain(story.settings), indent=1))])],
-    ),
+    Section("Settings", "", [Details("all", [settings])]),
   ]
-  lead = (
-    "A policy meets a robot with something that nobody declared: the robot's own recordings name "
-    "it, the simulation gets it, and the policy is trained on."
-  )
-  if story.settings.robot == "virtual":
-    lead += " Robot means a virtual robot here; no figure of this page is of hardware."
+  lead = _LEAD + (_VIRTUAL if story.settings.robot == "virtual" else "")
   page.write(path, page.Page("The loop closed", lead, sections, origin=page.Origin.of_process()))
 
 
@@ -112,12 +109,17 @@ def as_text(story: Story) -> str:
   return "\n".join(["", *lines])
 
 
+def _gaps(story: Story) -> str:
+  """Returns how far the simulation's success is from the robot's, in words."""
+  parts = [f"{100 * gap.success:+.0f} points ({name})" for name, gap in loop.gaps(story).items()]
+  return f"Success against the robot's before: {', '.join(parts)}."
+
+
 def _percent(found: Tally | None) -> str:
   return _NOTHING if found is None else str(found)
 
 
-def _paths(story: Story, scene: Any, title: str, text: str, names: Sequence[str]) -> Section:
-  floor = maps.draw_floor(scene, height=_HEIGHT)
+def _paths(story: Story, floor: FloorMap, title: str, text: str, names: Sequence[str]) -> Section:
   cells = [
     Picture(maps.draw_paths(floor, story.episodes[name]), f"{name}: {story.tallies[name]}")
     for name in names

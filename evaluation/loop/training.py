@@ -91,6 +91,11 @@ def train(
         f"The training ended after {_minutes(run):.1f} of {settings.minutes:g} minutes: the same "
         "command goes on with it."
       )
+  if not (run / POLICY / "policy.json").exists():
+    raise RuntimeError(
+      f"The training gave no policy in {_minutes(run):.1f} minutes, too few for a first student: "
+      f"the same command with more than --minutes {settings.minutes:g} goes on with it."
+    )
   info = json.loads((run / POLICY / "policy.json").read_text())["info"]
   return Trained(run / POLICY, teacher, teachers, count, _minutes(run), int(info["steps"]))
 

@@ -170,16 +170,17 @@ def _make_plant(
     )
   from nerf2real.evaluation.operated import OperatedPlant
 
-  camera: Any = int(settings.camera) if settings.camera.isdigit() else settings.camera
   return OperatedPlant(
     scene,
     NAVIGATION,
     robot=settings.robot,
-    camera=camera,
+    camera=settings.camera_source,
     image_size=policy.image_size,
     robot_name=settings.robot,
     time_limit=settings.time_limit,
     record=log,
+    offsets=settings.offsets,
+    lens=settings.lens,
   )
 
 

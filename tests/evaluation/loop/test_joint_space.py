@@ -52,6 +52,21 @@ def test_a_gate_notes_only_what_comes_while_it_is_open():
   assert notes.seen == [2, 3]
 
 
+def test_a_log_appears_whole_and_is_kept(tmp_path):
+  path = tmp_path / "slow.mcap"
+
+  def stop(gate):
+    raise RuntimeError("the robot fell")
+
+  with pytest.raises(RuntimeError, match="fell"):
+    recording.record(path, stop)
+  assert not path.exists()
+  recording.record(path, lambda gate: None)
+  whole = path.read_bytes()
+  recording.record(path, stop)  # not played again
+  assert whole and path.read_bytes() == whole
+
+
 def test_effects_change_how_the_suite_moves(tmp_path):
   effects = [
     Effect("parameter_error", "l_knee", {"damping": 1.1, "gain": 0.95}),

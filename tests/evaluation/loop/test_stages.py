@@ -198,6 +198,9 @@ def test_five_numbers_and_what_came_back(tmp_path):
   assert "hidden: command_delay:0.045; named: command_delay: delay 0.044 (0.04 to 0.05)" in text
   summary = story.summary(told)
   assert json.loads(json.dumps(summary)) == summary
+  # Of robot (3 falls, 1 collision) and simulation (3 falls, 1 success) one trial in four differs.
+  assert story.gaps(told)[story.WITH_EFFECTS] == pytest.approx((0.25, 0.25))
+  assert story.gaps(told)[story.NOMINAL] == pytest.approx((1.0, 1.0))
   assert summary["success"][story.AFTER]["successes"] == 2 and summary["hidden"]["wrong"] == []
 
 

@@ -1,4 +1,4 @@
-"""The loop with a policy from end to end: with a finding that is there already, and whole (slow)."""
+"""The loop with a policy from end to end: going on from a finding, and whole (slow)."""
 
 import json
 import os
@@ -17,7 +17,7 @@ SCRIPT = Path(__file__).parents[3] / "launch" / "close_loop.py"
 
 def _run(out, *extra):
   command = [sys.executable, str(SCRIPT), "--policy", "walker", "--preset", "tiny", "--trials", "1"]
-  command += ["--minutes", "0.1", "--time-limit", "1", "--teacher", "quick", "--out", str(out)]
+  command += ["--minutes", "0.3", "--time-limit", "1", "--teacher", "quick", "--out", str(out)]
   environment = os.environ | {"PYTHONPATH": str(SCRIPT.parents[1])}
   return subprocess.run(
     [*command, *extra], env=environment, capture_output=True, text=True, timeout=1800
