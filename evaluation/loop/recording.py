@@ -120,14 +120,24 @@ def _turn(environment: Any, still: np.ndarray, robot: Any, angle: float) -> None
   yaw, steps = robot.truth().yaw, round(angle / _TURNING / _STEP)
   for step in range(1, steps + 1):
     robot.turn(yaw + angle * step / steps)
-    environment.step(still)
+    _step(environment, still)
   robot.hold(False)
   _hold_pose(environment, still, 1.0)
 
 
 def _hold_pose(environment: Any, still: np.ndarray, seconds: float) -> None:
   for _ in range(round(seconds / _STEP)):
-    environment.step(still)
+    _step(environment, still)
+
+
+def _step(environment: Any, action: np.ndarray) -> Any:
+  """Takes a control step; raises RuntimeError where the robot stopped."""
+  timestep = environment.step(action)
+  if timestep.last():
+    raise RuntimeError(
+      f"Found the episode ended before its motion ({environment.stop}): look at the robot."
+    )
+  return timestep
 
 
 def play_actions(
@@ -161,14 +171,9 @@ def play_actions(
         if lens is not None:
           clock = environment.bus.clock
           recorder.camera_info(clock.wall(clock.now()), lens)
-      timestep = environment.step(action)
+      timestep = _step(environment, action)
       if index >= lifting:
         rows.append(timestep.observation["joint_positions"][-1].copy())
-      if timestep.last():
-        raise RuntimeError(
-          f"Found the episode ended after {len(rows)} steps ({environment.stop}), expected"
-          f" {len(actions)}: look at the robot."
-        )
     if recorder is not None:
       recorder.open = False
   return np.array(rows)
