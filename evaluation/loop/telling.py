@@ -95,13 +95,13 @@ def five_numbers(story: Story) -> list[Figure]:
     )
     for name, meaning in wanted
   ]
-  value = _NOTHING if share is None else f"{100 * share:.0f}"
-  return [*figures, Figure("lost success that came back", value, "%", "after against before")]
+  value = _NOTHING if share is None else f"{100 * share:.0f} %"
+  return [*figures, Figure("lost success that came back", value, "", "after against before")]
 
 
 def as_text(story: Story) -> str:
   """Returns the numbers, and what was named beside what was hidden, in lines."""
-  lines = [f"{f.name}: {f.value}{f' {f.unit}' if f.unit else ''}" for f in five_numbers(story)]
+  lines = [f"{f.name}: {f.value}" for f in five_numbers(story)]
   if story.comparison is not None:
     rows = story.comparison.rows
     lines += [f"hidden: {row.hidden}; named: {row.named or 'nothing'}" for row in rows]

@@ -103,10 +103,12 @@ def run(
   session = _Session(settings.out / "trials" / f"{_slug(condition.name)}.json")
   with contextlib.closing(_make_plant(settings, condition, scene, policy, session)) as plant:
     plant.plant_id = label
-    begun = _clock(plant)
+    robot = getattr(plant, "robot", None)  # a virtual one, whose battery is to go on
+    begun = 0.0 if robot is None else robot.clock.now()
 
     def report(episode: Episode, number: int, count: int) -> None:
-      session.note(_clock(plant) - begun)
+      if robot is not None:
+        session.note(robot.clock.now() - begun)
       say(f"  {number}/{count} {episode.outcome} after {episode.duration:.1f} s")
 
     runner.run_all(plant, policy, chosen, store=store, report=report)
@@ -202,11 +204,6 @@ class _Session:
 def session_seconds(settings: LoopSettings, name: str) -> float:
   """Returns how long the robot of a condition has been on [s]."""
   return _Session(settings.out / "trials" / f"{_slug(name)}.json").seconds
-
-
-def _clock(plant: Any) -> float:
-  """Returns the time of a virtual robot [s]; 0 of other plants, which keep no battery."""
-  return float(plant.robot.clock.now()) if hasattr(plant, "robot") else 0.0
 
 
 def _slug(name: str) -> str:
