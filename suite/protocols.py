@@ -20,12 +20,14 @@ WORKSPACE_SIZE = 3.0  # m, ball pushing, paper
 CELL_SIZE = 1.0  # m, the target square; the workspace is 3 x 3 cells
 TARGET_CELL = (1, 1)  # the corner, in cells from the centre cell: +x, +y
 BALL_TIME_LIMIT = 60.0  # s, paper
-WALL_SPREAD = 0.1  # m, ours: the paper says "near the center" of the cell
-START_SEED = 20221010  # ours
+WALL_SPREAD = 0.1  # m; chosen for the paper's "near the center" of the cell
+START_SEED = 20221010  # chosen: fixed, so that every evaluation has the same starts
 START_ROOM = 0.15  # m around a start beyond what the robot needs to stand: as at the scene's goals
-MIN_GOAL_DISTANCE = 1.0  # m between a start and every goal, where the scene has such places: ours
-_START_GRID = 0.1  # m between the places among which starts are chosen: ours
-_START_ROOM_STEP = 0.05  # m by which less room is taken where the scene has no better: ours
+MIN_GOAL_DISTANCE = 1.0  # m between a start and every goal, where the scene has places; chosen
+_START_GRID = 0.1  # m between the candidates of starts; chosen: finer than the robot is wide
+_START_ROOM_STEP = (
+  0.05  # m by which the room is reduced where the scene has too few; chosen: a cell
+)
 
 
 class NavigationTrial(NamedTuple):

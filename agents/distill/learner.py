@@ -194,7 +194,7 @@ class Learner:
       )
       self._recent.append(metrics)
       done += 1
-      # While the encoder learns, and until the policy has learned its new features, they do not fit.
+      # They do not fit while the encoder learns, nor until the policy has learned its features.
       self._is_fit = kind == stages.END_TO_END or (
         kind == stages.POLICY and done >= self._settings.settling
       )

@@ -15,8 +15,8 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 
-STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; ours, so that
-# pictures of different resolution are comparable; pictures are never enlarged
+STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; chosen: less than any
+# phone's video, so that resolutions are comparable; pictures are never enlarged
 DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged
 
 

@@ -12,8 +12,10 @@ import numpy as np
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.field import photometry
 
-BLUR_LEVELS = (0.0, 0.7, 1.4, 2.8, 5.6, 12.0)  # ours: about an octave apart, up to the paper's 12
-_SAMPLES_PER_BLUR = 1.4  # ours: a level is stored smaller while its blur stays this many pixels
+BLUR_LEVELS = (0.0, 0.7, 1.4, 2.8, 5.6, 12.0)  # chosen: an octave apart, up to the paper's 12
+_SAMPLES_PER_BLUR = (
+  1.4  # pixels of a smaller level in its blur, at least; chosen: above Nyquist's 1
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,7 +33,7 @@ class GaitSettings:
   """Parameters of the gait; all but the first three were found by search."""
 
   stop_time: float = 0.4
-  """s over which steps grow from nothing and shrink again; ours."""
+  """s over which steps grow from nothing and shrink again; chosen: about a period."""
   max_turn: float = 0.25
   """rad of hip yaw in a turning step; the joints' limit is 0.3."""
   period: float = 0.4241

@@ -77,7 +77,7 @@ TORSO_LINK = "body_link"
 # A robot has fallen below either; chosen: 60 degrees, little more than half the standing height.
 MIN_UPRIGHT = 0.5  # cosine of the torso's tilt
 MIN_HEIGHT = 0.14  # m of the torso's origin above the floor (standing: 0.246)
-IMU_POSITION = (-0.01, 0.0, 0.05)  # m in the torso: ours, near where the OpenCR board sits
+IMU_POSITION = (-0.01, 0.0, 0.05)  # m in the torso; chosen: near the OpenCR board
 EXCLUDED_CONTACTS = (("l_hip_yaw_link", "l_hip_pitch_link"), ("r_hip_yaw_link", "r_hip_pitch_link"))
 FOOT_LINKS = ("l_ank_roll_link", "r_ank_roll_link")
 

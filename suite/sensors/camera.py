@@ -20,8 +20,10 @@ from nerf2real.suite.op3 import constants, op3
 
 DEPTH, OVERLAY = "depth", "overlay"
 _DISPLAY_GAMMA = 2.2  # of the pictures: light = value ** 2.2
-_LIGHT_DIRECTION = np.array([0.3, 0.2, 0.933])  # towards the light, in the world; ours
-_AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; ours
+_LIGHT_DIRECTION = np.array(
+  [0.3, 0.2, 0.933]
+)  # towards the light, in the world; chosen: a lamp above
+_AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; chosen
 _CULLING_SLACK = 1e-3  # rad added to the cone around a geom
 
 
