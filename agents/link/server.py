@@ -38,10 +38,12 @@ Insert = Callable[[Mapping[str, np.ndarray], int, int], int]
 class ActorRecord:
   """What the learner knows of an actor."""
 
-  heard: float  # monotonic time of its last message [s]
+  heard: float
+  """Monotonic time of its last message [s]."""
   alive: bool = True
   parameters_version: int = 0
-  refused: int = 0  # trajectories that did not fit the replay
+  refused: int = 0
+  """Trajectories that did not fit the replay."""
 
 
 @dataclasses.dataclass

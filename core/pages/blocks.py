@@ -95,7 +95,8 @@ class Figure:
   value: Any
   unit: str = ""
   meaning: str = ""
-  good: str = ""  # which values are good, such as "higher" or "below 1"
+  good: str = ""
+  """Which values are good, such as "higher" or "below 1"."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +138,8 @@ class Chart(Block):
 
   kind = "chart"
   figure: go.Figure
-  tools: bool = False  # shows plotly's buttons
+  tools: bool = False
+  """Shows plotly's buttons."""
 
   @property
   def content(self) -> dict[str, Any]:

@@ -36,10 +36,13 @@ class _Lens:
 
   width: int
   height: int
-  tan_x: float  # half the pinhole picture's extent at z = 1
+  tan_x: float
+  """Half the pinhole picture's extent at z = 1."""
   tan_y: float
-  maps: tuple[np.ndarray, np.ndarray]  # for cv2.remap, one sample a sub-pixel
-  depth_maps: tuple[np.ndarray, np.ndarray]  # one sample a pixel
+  maps: tuple[np.ndarray, np.ndarray]
+  """For cv2.remap, one sample a sub-pixel."""
+  depth_maps: tuple[np.ndarray, np.ndarray]
+  """One sample a pixel."""
 
 
 def _sampling(camera: Camera, lens_size, factor: int) -> tuple[np.ndarray, np.ndarray]:

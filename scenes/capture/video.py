@@ -28,20 +28,28 @@ class CaptureError(ValueError):
 class Frame:
   """A picture chosen from a video."""
 
-  index: int  # number of the frame in the video
-  time: float  # presentation time [s]
-  sharpness: float  # variance of the Laplacian at the standard size [grey level^2]
-  image: np.ndarray  # upright BGR picture uint8 [H, W, 3]
+  index: int
+  """Number of the frame in the video."""
+  time: float
+  """Presentation time [s]."""
+  sharpness: float
+  """Variance of the Laplacian at the standard size [grey level^2]."""
+  image: np.ndarray
+  """Upright BGR picture uint8 [H, W, 3]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoInfo:
   """Facts of a video's header and packets, without decoding."""
 
-  num_frames: int  # packets of the video stream
-  declared_frames: int  # what the header promises; 0 where it does not say
-  frames_per_second: float  # mean rate [1/s]; 0 where unknown
-  codec: str  # name of the codec
+  num_frames: int
+  """Packets of the video stream."""
+  declared_frames: int
+  """What the header promises; 0 where it does not say."""
+  frames_per_second: float
+  """Mean rate [1/s]; 0 where unknown."""
+  codec: str
+  """Name of the codec."""
 
   @property
   def duration(self) -> float:

@@ -185,7 +185,8 @@ class Field:
 
   settings: FieldSettings
   params: dict[str, Any]
-  training_pixel_angle: float  # angle that a pixel of the training pictures spans [rad]
+  training_pixel_angle: float
+  """Angle that a pixel of the training pictures spans [rad]."""
 
   def save(self, path: str | Path) -> None:
     """Writes a safetensors file; the table and nothing else is rounded to float16."""

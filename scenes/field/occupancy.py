@@ -43,7 +43,8 @@ class OccupancySettings:
 class Occupancy:
   """Distance to the nearest cell with matter in cells (maximum norm), 0 in matter."""
 
-  distance: np.ndarray  # uint8 [G, G, G], axes z, y, x
+  distance: np.ndarray
+  """uint8 [G, G, G], axes z, y, x."""
 
   @property
   def cells(self) -> int:

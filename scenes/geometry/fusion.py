@@ -24,10 +24,14 @@ _MAX_VOXELS = 60_000_000  # 0.5 GB of values and weights
 class DepthViews:
   """Depth pictures with their poses, all in one frame and one unit of length."""
 
-  camera: cameras.Camera  # of the depth pictures; its size is theirs
-  frame_from_camera: np.ndarray  # float64 [N, 4, 4], OpenCV camera axes
-  depth: np.ndarray  # float32 [N, H, W], z-depth; inf or nan: nothing was hit
-  color: np.ndarray | None = None  # uint8 [N, H, W, 3]
+  camera: cameras.Camera
+  """Of the depth pictures; its size is theirs."""
+  frame_from_camera: np.ndarray
+  """float64 [N, 4, 4], OpenCV camera axes."""
+  depth: np.ndarray
+  """float32 [N, H, W], z-depth; inf or nan: nothing was hit."""
+  color: np.ndarray | None = None
+  """uint8 [N, H, W, 3]."""
 
   def __post_init__(self):
     expected = (len(self.frame_from_camera), self.camera.height, self.camera.width)

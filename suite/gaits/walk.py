@@ -74,10 +74,14 @@ class GaitSettings:
 class Command:
   """What the walker shall do."""
 
-  forward: float = 0.0  # -1 to 1: share of the full stride
-  turn: float = 0.0  # -1 to 1: share of the full turning step, positive to the left
-  step: bool = True  # False: come to a stand
-  head: tuple[float, float] | None = None  # pan, tilt [rad]; None: as in the reference pose
+  forward: float = 0.0
+  """-1 to 1: share of the full stride."""
+  turn: float = 0.0
+  """-1 to 1: share of the full turning step, positive to the left."""
+  step: bool = True
+  """False: come to a stand."""
+  head: tuple[float, float] | None = None
+  """Pan, tilt [rad]; None: as in the reference pose."""
 
 
 class Gait:

@@ -87,14 +87,22 @@ class Link:
   """One rigid link; its frame is given in the parent link at zero joint angle (SI units)."""
 
   name: str
-  parent: str  # "world" for the torso
-  position: np.ndarray  # [3] m
-  joint: str  # "free" for the torso
-  axis: np.ndarray  # [3] unit vector in the link's frame
-  mass: float  # kg
-  center: np.ndarray  # centre of mass [3] m
-  inertia_quat: np.ndarray  # [4] w x y z of the principal axes
-  inertia: np.ndarray  # principal moments [3] kg m^2
+  parent: str
+  """"world" for the torso."""
+  position: np.ndarray
+  """[3] m."""
+  joint: str
+  """"free" for the torso."""
+  axis: np.ndarray
+  """[3] unit vector in the link's frame."""
+  mass: float
+  """kg."""
+  center: np.ndarray
+  """Centre of mass [3] m."""
+  inertia_quat: np.ndarray
+  """[4] w x y z of the principal axes."""
+  inertia: np.ndarray
+  """Principal moments [3] kg m^2."""
 
 
 def read_links() -> tuple[Link, ...]:

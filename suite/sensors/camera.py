@@ -38,14 +38,22 @@ class FieldRenderer(Protocol):
 class CameraSettings:
   """Settings of the robot's camera; the defaults are neutral."""
 
-  lens: Camera | None = None  # a calibrated camera; None: no distortion, 43.3 degrees vertically
-  compositing: str = DEPTH  # "depth", or "overlay": moving objects always in front, as the paper
-  gain: float = 1.0  # factor on the light; the paper's gains are ratios of its default of 50
-  exposure: float = 1.0  # another factor on the light
-  white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors on red, green, blue light
-  noise: float = 0.0  # standard deviation of the noise at gain 1 [8-bit levels]
-  latency: float = 0.0  # s, in addition to the delay that an episode draws
-  rate: float = 1 / constants.CONTROL_TIMESTEP  # pictures a second [Hz]; between two the last stays
+  lens: Camera | None = None
+  """a calibrated camera; None: no distortion, 43.3 degrees vertically."""
+  compositing: str = DEPTH
+  """"depth", or "overlay": moving objects always in front, as the paper."""
+  gain: float = 1.0
+  """Factor on the light; the paper's gains are ratios of its default of 50."""
+  exposure: float = 1.0
+  """Another factor on the light."""
+  white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+  """Factors on red, green, blue light."""
+  noise: float = 0.0
+  """Standard deviation of the noise at gain 1 [8-bit levels]."""
+  latency: float = 0.0
+  """s, in addition to the delay that an episode draws."""
+  rate: float = 1 / constants.CONTROL_TIMESTEP
+  """Pictures a second [Hz]; between two the last stays."""
 
   def __post_init__(self):
     if self.compositing not in (DEPTH, OVERLAY):

@@ -17,7 +17,8 @@ _MIN_FREE = 0.25  # least share of the workspace that is free; chosen
 class Workspace:
   """A square along the world's axes, of 3 x 3 cells; the target is one of its corner cells."""
 
-  center: np.ndarray  # [2] m
+  center: np.ndarray
+  """[2] m."""
 
   @property
   def lower(self) -> np.ndarray:

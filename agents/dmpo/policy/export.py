@@ -29,9 +29,12 @@ class ExportedPolicy:
 
   policy: Policy
   layout: Layout
-  environment: str  # the name it was trained on
-  history: int  # observations that the agent stacks
-  info: dict[str, Any]  # counters and settings of the run
+  environment: str
+  """The name it was trained on."""
+  history: int
+  """Observations that the agent stacks."""
+  info: dict[str, Any]
+  """Counters and settings of the run."""
 
 
 def export_policy(

@@ -23,7 +23,8 @@ class Layout:
 
   padded_levels: int
   width: int
-  outputs: int  # 1 density, 3 diffuse, bottleneck, padding
+  outputs: int
+  """1 density, 3 diffuse, bottleneck, padding."""
   bottleneck: int
   view_width: int
   density_scale: float
