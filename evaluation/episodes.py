@@ -36,7 +36,7 @@ class Setting:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Moment:
-  """What a policy believed at a moment."""
+  """A policy's belief at one step."""
 
   time: float
   """s."""
@@ -86,7 +86,7 @@ class Episode:
 
   @property
   def key(self) -> tuple[Any, ...]:
-    """What tells episodes apart: an evaluation runs each once."""
+    """The identity of an episode: an evaluation runs each once."""
     return (*dataclasses.astuple(self.setting), self.index)
 
 

@@ -1,8 +1,8 @@
 """The paper's perturbed settings: a blocked camera, a moved object, a person walking around.
 
-Each is the same in simulation and around the virtual robot: bodies that no plan knows of are put
+Each is the same in simulation and around the virtual robot: bodies that are in no plan are put
 into the model before it is compiled and moved as time goes on; the camera sees them and the robot
-collides with them. For the robot they are what the operator is asked to do.
+collides with them. For the robot they are instructions to the operator.
 """
 
 from typing import Any, NamedTuple
@@ -58,7 +58,7 @@ _PERSON = (
 
 
 class Intruder:
-  """A body in the world that no plan knows of."""
+  """A body in the world that is in no plan."""
 
   def __init__(self, parts: tuple[Part, ...], path: np.ndarray, *, speed: float):
     """Creates the body.

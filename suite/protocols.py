@@ -1,7 +1,7 @@
 """Evaluation protocols of the paper, as data: which episodes are run, in which order.
 
 Paper, sections "Navigation and obstacle avoidance results" and "Ball pushing results", and the
-appendix table on the camera's gain. A protocol is a tuple of trials; a trial says where everything
+appendix table on the camera's gain. A protocol is a tuple of trials; a trial holds where everything
 starts. The paper gives the numbers of positions and orientations but not the positions themselves:
 navigation trials name them by index, and `scene_starts` draws positions of a scene from its free
 space with a fixed seed, so that they are the same for every policy.
@@ -135,7 +135,7 @@ def navigation_starts(
     free_xy: positions [N, 2] at which the robot may stand, m.
     goals: goal positions [G, 2], m.
     count: how many positions.
-    min_goal_distance: wanted distance from every goal, m; less where the scene has no such place.
+    min_goal_distance: distance from every goal, m; less where the scene has no such place.
     seed: of the first position.
 
   Returns:

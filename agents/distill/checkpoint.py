@@ -19,7 +19,7 @@ STATE = Path("checkpoints") / "newest-student.npz"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Counters:
-  """What a saved state says besides arrays."""
+  """What a saved state holds besides arrays."""
 
   updates: int = 0
   elapsed: float = 0.0

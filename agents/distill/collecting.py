@@ -1,6 +1,6 @@
 """The collector: runs labelled episodes for a learner until the run is over.
 
-A process of its own; the learner says over the link what to run, and gives the newest student. An
+A process of its own; what to run and the newest student come from the learner over the link. An
 episode is sent whole when it ends, and kept until the learner has acknowledged it.
 """
 

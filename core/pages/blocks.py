@@ -101,7 +101,7 @@ class Figure:
 
 @dataclasses.dataclass(frozen=True)
 class Figures(Block):
-  """A table of figures with unit and meaning, and with what is good where that is said of any."""
+  """A table of figures with unit and meaning, and with what is good where any row has that."""
 
   kind = "figures"
   figures: Sequence[Figure]
@@ -126,7 +126,7 @@ class Times(Block):
 
 @dataclasses.dataclass(frozen=True)
 class Legend(Block):
-  """Names of colours, any that CSS knows."""
+  """Names of colours in CSS."""
 
   kind = "legend"
   colors: Mapping[str, str]

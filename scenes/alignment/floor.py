@@ -205,7 +205,7 @@ def refine_floor(floor: Floor, points: np.ndarray, *, tolerance: float) -> Floor
 
 
 class FoundFloor(NamedTuple):
-  """The floor plane, and whether the dense points agree with the sparse ones."""
+  """The floor plane, and whether dense and sparse points give the same."""
 
   floor: Floor
   dense_trusted: bool  # False where the dense points show a floor well above the sparse ones'

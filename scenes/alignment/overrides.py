@@ -118,7 +118,7 @@ def read(path: pathlib.Path) -> Overrides:
   """Reads an override file, YAML or JSON.
 
   Raises:
-    ValueError: one line that says what is wrong with it.
+    ValueError: it is wrong; one line with the fault.
   """
   if not path.is_file():
     raise ValueError(f"The override file {path} does not exist.")

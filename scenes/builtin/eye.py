@@ -18,7 +18,7 @@ _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 
 
 def _context_class():
-  """EGL unless the environment names another way; whoever imported mujoco first decides nothing."""
+  """EGL unless the environment names another way, whoever imported mujoco first."""
   if os.environ.get("MUJOCO_GL", "egl").lower() != "egl":
     return mujoco.GLContext
   from mujoco.egl import GLContext  # here: where EGL is missing, this import itself fails

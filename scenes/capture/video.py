@@ -45,7 +45,7 @@ class VideoInfo:
   num_frames: int
   """Packets of the video stream."""
   declared_frames: int
-  """What the header promises; 0 where it does not say."""
+  """What the header promises; 0 where it has none."""
   frames_per_second: float
   """Mean rate [1/s]; 0 where unknown."""
   codec: str
@@ -85,7 +85,7 @@ def inspect_video(path: Path) -> VideoInfo:
       try:
         count = sum(1 for packet in container.demux(stream) if packet.size)
       except av.error.FFmpegError:
-        count = max(count, 1)  # decoding says where it breaks
+        count = max(count, 1)  # decoding shows where it breaks
       return VideoInfo(
         num_frames=count,
         declared_frames=stream.frames,

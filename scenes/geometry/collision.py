@@ -36,7 +36,7 @@ class CollisionSettings:
   parts: convex.ConvexSettings = dataclasses.field(default_factory=convex.ConvexSettings)
 
 
-_CORE = -0.2  # value, in truncations, below which a voxel is matter whatever its neighbours say
+_CORE = -0.2  # value, in truncations, below which a voxel is matter whatever its neighbours are
 
 
 def remove_floor(grid: fusion.Grid, *, threshold: float) -> fusion.Grid:

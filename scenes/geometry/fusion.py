@@ -84,7 +84,7 @@ class Grid(NamedTuple):
   """A signed distance grid: negative inside matter, +1 far in front, in units of the truncation."""
 
   values: np.ndarray  # float32 [X, Y, Z] in [-1, 1]; +1 where unknown
-  weights: np.ndarray  # float32 [X, Y, Z]; 0: no ray says anything
+  weights: np.ndarray  # float32 [X, Y, Z]; 0: seen by no ray
   lower: np.ndarray  # [3] centre of voxel (0, 0, 0)
   voxel: float  # edge of a voxel
   truncation: float  # distance that the value 1 stands for

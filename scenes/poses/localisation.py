@@ -22,7 +22,7 @@ _FIGURES = "localisation.json"
 
 
 class LocalisationError(ValueError):
-  """The keyframes do not connect; the message says how many did, why, and what to film."""
+  """The keyframes do not connect; the message holds how many did, why, and what to film."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -34,7 +34,7 @@ _VIEW_WIDTH = 480
 
 
 class Meaning(NamedTuple):
-  """What a figure of scene.json says."""
+  """The meaning of a figure of scene.json."""
 
   unit: str
   text: str

@@ -25,7 +25,7 @@ _HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")
 _PHASE_CORRECTION = 0.12
 _ROVING = 8  # further phases that `follow` tries in turn
 _JUMP_SHARE = 0.5  # of the present mismatch below which it takes one of them; chosen
-_LOCKABLE = 0.5  # amplitude from which a phase can be told from the legs; chosen
+_LOCKABLE = 0.5  # amplitude from which the legs determine the phase; chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

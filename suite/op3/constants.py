@@ -6,7 +6,7 @@ known when these numbers are used:
 - Table "Joint reference poses and limits": the reference of the hip pitch (-0.5553 left, 0.5553
   right) lies outside its own range (-0.45..1.57 and -1.57..0.45), and so does the reference of the
   hip roll (-0.0383 in -0.4..-0.1 and mirrored). `REFERENCE_POSE` keeps the printed values, which
-  the pose reward measures against; what the servos are told (`standing_targets`) is clipped to the
+  the pose reward measures against; the servos' targets (`standing_targets`) are clipped to the
   ranges.
 - Equation of r_pose: printed without a minus sign, although the text calls the term a
   regularisation towards the pose. `suite/tasks/rewards.py` implements a penalty (negative).

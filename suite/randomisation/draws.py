@@ -122,7 +122,7 @@ def draw_episode(
 ) -> EpisodeDraws:
   """Draws one episode.
 
-  The same numbers are taken from the generator whatever the switches say, so that turning one
+  The same numbers are taken from the generator whatever the switches, so that turning one
   variation off leaves the others as they were for the same seed.
   """
   delays = rng.uniform(*settings.delay_range, size=3) * settings.delays

@@ -60,7 +60,7 @@ def pack(settings: Any, params: Any) -> Packed:
     params: Its parameters by name.
 
   Raises:
-    ValueError: Where the field has a shape that the kernels do not know.
+    ValueError: Where the kernels do not support the field's shape.
   """
   if settings.features != 2 or settings.width % 4:
     raise ValueError(
