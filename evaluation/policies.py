@@ -34,6 +34,7 @@ class EvaluatedPolicy(Protocol):
   name: str
   policy_id: str  # digest of what it is made of
   image_size: tuple[int, int] | None  # of the pictures that it needs
+  trained_on: str  # name of its environment; empty for a policy that was not trained
 
   def reset(self, sight: Sight) -> None:
     """Begins an episode."""
@@ -59,6 +60,7 @@ class GaitPolicy:
 
   name = "gait"
   image_size: tuple[int, int] | None = None
+  trained_on = ""
   belief: Belief | None = None
 
   def __init__(self, scene: Any, protocol: str, *, settings: GaitSettings | None = None):

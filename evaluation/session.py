@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.agents.environments.loading import camera_settings
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import plant as plants
@@ -31,9 +32,21 @@ def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
 
 
 def make_plant(
-  settings: EvaluationSettings, scene: Any, image_size: tuple[int, int] | None
+  settings: EvaluationSettings,
+  scene: Any,
+  image_size: tuple[int, int] | None,
+  *,
+  trained_on: str = "",
 ) -> Plant:
-  """Returns the plant that the settings name."""
+  """Returns the plant that the settings name.
+
+  Args:
+    settings: The evaluation.
+    scene: An opened bundle.
+    image_size: Height and width of the policy's picture; None for no camera.
+    trained_on: Name of the policy's environment: a simulated camera has its rate, lens and
+      response. Robots have cameras of their own.
+  """
   record = None
   if settings.record and settings.plant != "sim":
     record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
@@ -45,6 +58,7 @@ def make_plant(
       settings.protocol,
       settings.perturb,
       image_size=image_size,
+      camera=camera_settings(trained_on),
       effects=settings.effects,
       seed=settings.seed,
       time_limit=settings.time_limit,
@@ -161,7 +175,8 @@ def _run_trials(
   say: Callable[[str], None],
 ) -> None:
   policy = load_policy(settings, scene)
-  plant = make_plant(settings, scene, policy.image_size or settings.camera_size)
+  size = policy.image_size or settings.camera_size
+  plant = make_plant(settings, scene, size, trained_on=policy.trained_on)
   chosen = choose(plants.trials(settings.protocol), count)
   try:
     runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))

@@ -69,7 +69,7 @@ class ScriptedPlant(Plant):
 class StillPolicy:
   """Stands; says that it believes to be where it is told."""
 
-  name, policy_id, image_size = "still", "0123", None
+  name, policy_id, image_size, trained_on = "still", "0123", None, ""
 
   def __init__(self, belief=None):
     self.belief = belief
