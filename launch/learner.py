@@ -20,7 +20,7 @@ import tyro
 
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
+from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
 from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 
@@ -134,7 +134,8 @@ def run(arguments: Arguments) -> None:
       what was learned was not saved.
   """
   from nerf2real.agents.processes.checkpoints import CheckpointError
-  from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+  from nerf2real.agents.processes.learner import Learner, LearnerError
+  from nerf2real.agents.processes.settings import RunSettings
 
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
   set_threads(arguments.threads)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from nerf2real.agents.processes.training import Scripts
+from nerf2real.agents.supervision.training import Scripts
 from nerf2real.core.camera_info import read_camera_info
 from nerf2real.core.serialization import to_plain, write_json
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Store

@@ -21,13 +21,13 @@ from nerf2real.core.pages.blocks import (
 )
 from nerf2real.core.pages.page import Section
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation import maps
 from nerf2real.evaluation.episodes import OUTCOMES
 from nerf2real.evaluation.loop import story as loop
 from nerf2real.evaluation.loop.comparing import Comparison, describe
 from nerf2real.evaluation.loop.naming import Named
 from nerf2real.evaluation.loop.story import Story
 from nerf2real.evaluation.loop.trials import Tally
+from nerf2real.evaluation.report import maps
 from nerf2real.suite.scene import open_scene
 
 _HEIGHT = 360  # of maps [pixel]

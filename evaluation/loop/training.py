@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 from nerf2real.agents.distill import settings as distillation
 from nerf2real.agents.distill.checkpoint import STATE
 from nerf2real.agents.distill.teacher import TEACHERS
-from nerf2real.agents.processes import training
+from nerf2real.agents.supervision import training
 from nerf2real.core.serialization import to_plain, write_json
-from nerf2real.evaluation import plants, runner
+from nerf2real.evaluation import runner
 from nerf2real.evaluation.loop.settings import LoopSettings
-from nerf2real.evaluation.plants import NAVIGATION
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import NAVIGATION
 from nerf2real.evaluation.policies import GaitPolicy
 from nerf2real.evaluation.session import choose
 
@@ -35,9 +36,11 @@ class Trained(NamedTuple):
   frames: int  # collected
 
 
-def environment_name(settings: LoopSettings, effects: Path) -> str:
-  """Returns the preset's environment with effects drawn from their intervals."""
+def environment_name(settings: LoopSettings, policy: Path | None, effects: Path) -> str:
+  """Returns the policy's environment, or the preset's, with effects from their intervals."""
   own = distillation.preset(settings.preset).environment
+  if policy is not None:
+    own = str(json.loads((policy / "policy.json").read_text())["environment"])
   path, _, query = own.partition("?")
   options = dict(urllib.parse.parse_qsl(query))
   options |= {"effects": str(effects), "draw_effects": "true"}
@@ -74,7 +77,7 @@ def train(
     if policy is not None:
       forwarded += ["--init-from", str(policy)]
     arguments = training.TrainingSettings(
-      env=environment_name(settings, effects.resolve()),
+      env=environment_name(settings, policy, effects.resolve()),
       actors=settings.actors,
       run=run,
       preset=settings.preset,
@@ -131,7 +134,7 @@ def _choose_teacher(
   if path.exists():
     kept = json.loads(path.read_text())
     return kept["teacher"], kept["successes"], kept["trials"]
-  from nerf2real.evaluation.simulated import SimulatedPlant
+  from nerf2real.evaluation.plants.simulated import SimulatedPlant
 
   chosen = choose(plants.trials(NAVIGATION), min(_TRIALS, settings.trials))
   successes: dict[str, int] = {}

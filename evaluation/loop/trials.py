@@ -11,13 +11,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from nerf2real.agents.processes.trials import Interval, clopper_pearson
+from nerf2real.agents.environments.loading import camera_settings
+from nerf2real.agents.environments.trials import Interval, clopper_pearson
 from nerf2real.core.serialization import read_json, write_json
-from nerf2real.evaluation import episodes, plants, runner
+from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.loop.settings import LoopSettings
-from nerf2real.evaluation.plants import NAVIGATION, Plant
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import NAVIGATION, Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy, resolution
 from nerf2real.evaluation.session import choose, free_name
 from nerf2real.real.virtual.undeclared import Undeclared
@@ -146,19 +148,20 @@ def _make_plant(
   settings: LoopSettings, condition: Condition, scene: Any, policy: EvaluatedPolicy, session: Any
 ) -> Plant:
   if condition.simulated:
-    from nerf2real.evaluation.simulated import SimulatedPlant
+    from nerf2real.evaluation.plants.simulated import SimulatedPlant
 
     return SimulatedPlant(
       scene,
       NAVIGATION,
       image_size=policy.image_size,
+      camera=camera_settings(policy.trained_on),
       effects=condition.effects,
       draw_effects=condition.effects is not None,
       time_limit=settings.time_limit,
     )
   log = free_name(settings.out / "trials" / f"{_slug(condition.name)}.mcap")
   if settings.robot == "virtual":
-    from nerf2real.evaluation.rehearsed import RehearsedPlant
+    from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 
     return RehearsedPlant(
       scene,
@@ -170,7 +173,7 @@ def _make_plant(
       time_limit=settings.time_limit,
       record=log,
     )
-  from nerf2real.evaluation.operated import OperatedPlant
+  from nerf2real.evaluation.plants.operated import OperatedPlant
 
   return OperatedPlant(
     scene,

@@ -8,7 +8,7 @@ import pytest
 
 from nerf2real.agents.distill import beginning, learning, settings, student
 from nerf2real.agents.distill.collecting import student_policy
-from nerf2real.agents.dmpo import export
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.core.serialization import to_plain
 from nerf2real.launch import distill_learner
 from tests.agents.distill.test_student import LAYOUT, TINY, make_state

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.evaluation.episodes import Store
 from nerf2real.evaluation.loop import (
   comparing,
@@ -141,8 +141,11 @@ def test_a_finding_is_read_again_and_says_how_much_is_explained(tmp_path):
 def test_training_draws_the_effects_of_the_finding(tmp_path):
   path = tmp_path / "effects.json"
   write_effects(path, [Effect("motor_gain", "l_knee", {"gain": 0.6}, {"gain": (0.5, 0.7)})])
-  name = training.environment_name(_settings(tmp_path), path)
+  name = training.environment_name(_settings(tmp_path), None, path)
   assert name.startswith("suite:nerf_nav?image_size=12x16&time_limit=1&effects=")
+  (tmp_path / "policy.json").write_text(json.dumps({"environment": "suite:nerf_nav?lens=l.yaml"}))
+  of_policy = training.environment_name(_settings(tmp_path), tmp_path, path)
+  assert of_policy == f"suite:nerf_nav?lens=l.yaml&effects={path}&draw_effects=true"
   environment = make_environment(name + "&pushes=false", seed=0)
   gains = set()
   for _ in range(3):
