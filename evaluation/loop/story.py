@@ -156,8 +156,9 @@ def gaps(story: Story) -> dict[str, Gap]:
   robot = story.tallies[BEFORE]
 
   def gap(found: Tally) -> Gap:
-    shares = ((t.outcomes[o] / t.trials for o in OUTCOMES) for t in (found, robot))
-    kinds = (abs(here - there) for here, there in zip(*shares, strict=True))
+    kinds = [
+      abs(found.outcomes[o] / found.trials - robot.outcomes[o] / robot.trials) for o in OUTCOMES
+    ]
     return Gap(found.share - robot.share, sum(kinds) / 2)
 
   tallies = story.tallies
