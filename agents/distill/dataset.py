@@ -11,11 +11,12 @@ import threading
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
+from nerf2real.agents.dmpo.prior import write_layout
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core import files
 
@@ -49,6 +50,17 @@ def fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
   }
 
 
+def transition_fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
+  """Further arrays of an episode, of which the files alone make use: they are a later DMPO run's
+  prior data. `action` was applied at a step, `reward` and `discount` followed it."""
+  return {
+    "action": ((layout.action_size,), np.float32),
+    "reward": ((), np.float32),
+    "discount": ((), np.float32),
+    "privileged": ((layout.privileged_size,), np.float32),
+  }
+
+
 class Dataset:
   """Episodes in the order of their arrival; every `holdout`-th is for validation.
 
@@ -66,6 +78,7 @@ class Dataset:
     """
     self._folder = folder
     self._fields = fields(layout)
+    self._written = self._fields | transition_fields(layout)
     self._holdout = holdout
     self._capacity = capacity
     self._lock = threading.Lock()
@@ -75,6 +88,7 @@ class Dataset:
     self._spans: list[Span] = []
     self._origins: list[tuple[int, int]] = []
     folder.mkdir(parents=True, exist_ok=True)
+    write_layout(folder, layout)
     for path in sorted(folder.glob("[0-9]*.npz")):
       self._read(path)
 
@@ -99,7 +113,7 @@ class Dataset:
     """Writes and keeps an episode; returns its frames.
 
     Args:
-      episode: arrays of `fields`, of one length.
+      episode: arrays of `fields` and `transition_fields`, of one length.
       key: of the actor that made it.
       number: the episode's, among that actor's.
 
@@ -107,19 +121,21 @@ class Dataset:
       ValueError: arrays are missing or of another shape, or the capacity is reached.
       OSError: it cannot be written.
     """
-    frames = self._check(episode)
+    if {"state", "reward"} <= set(episode):  # the link has counted transitions by one reward more
+      episode = {**episode, "reward": episode["reward"][: len(episode["state"])]}
+    frames = self._check(episode, self._written)
     name = f"{len(self._spans):06d}_{key:016x}_{number}.npz"
     with files.atomic_path(self._folder / name) as path:
-      np.savez(path, **{name: episode[name] for name in self._fields})  # type: ignore[arg-type]
+      np.savez(path, **{name: episode[name] for name in self._written})  # type: ignore[arg-type]
     self._append(episode, frames, (key, number))
     return frames
 
-  def _check(self, episode: Mapping[str, np.ndarray]) -> int:
-    missing = sorted(set(self._fields) - set(episode))
+  def _check(self, episode: Mapping[str, np.ndarray], wanted: Mapping[str, Any]) -> int:
+    missing = sorted(set(wanted) - set(episode))
     if missing:
       raise ValueError(f"An episode lacks {missing}.")
     frames = len(episode["state"])
-    for name, (shape, dtype) in self._fields.items():
+    for name, (shape, dtype) in wanted.items():
       array = episode[name]
       if array.shape != (frames, *shape) or array.dtype != dtype:
         raise ValueError(
@@ -141,8 +157,8 @@ class Dataset:
   def _read(self, path: Path) -> None:
     try:
       with np.load(path, allow_pickle=False) as stored:
-        episode = {name: stored[name] for name in stored.files}
-      frames = self._check(episode)
+        episode = {name: stored[name] for name in stored.files if name in self._fields}
+      frames = self._check(episode, self._fields)
     except (zipfile.BadZipFile, ValueError) as error:
       raise ValueError(f"{path} is no episode of this run: {error}") from error
     _, key, number = path.stem.split("_")

@@ -7,7 +7,7 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from nerf2real.agents.distill.dataset import fields
+from nerf2real.agents.distill.dataset import fields, transition_fields
 from nerf2real.agents.distill.schedule import Mixture
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Teacher
@@ -73,13 +73,14 @@ class EpisodeRunner:
   def run(
     self, policy: Policy | None, mixture: Mixture
   ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Runs an episode; returns its arrays (`dataset.fields`) and its figures.
+    """Runs an episode; returns its arrays (`dataset.fields`, `transition_fields`) and figures.
 
     Args:
       policy: the student; None while there is none.
       mixture: who drives how often.
     """
-    rows: dict[str, list[Any]] = {name: [] for name in fields(self._layout)}
+    kept = fields(self._layout) | transition_fields(self._layout)
+    rows: dict[str, list[Any]] = {name: [] for name in kept}
     with self.times.stage("env"):
       timestep = self._environment.reset()
     segment, state = _Segment(), policy.initial_state() if policy else None
@@ -102,6 +103,8 @@ class EpisodeRunner:
         segment.left -= 1
         label = self._teacher.label(observation, goal=goal, pose=pose)
         action = self._choose(segment, label.action, student, observation, pose)
+      with self.times.stage("env"):
+        timestep = self._environment.step(action)
       values = (
         flat.image,
         flat.state,
@@ -110,15 +113,17 @@ class EpisodeRunner:
         np.array(truth),
         float(np.linalg.norm(goal - truth.xy)),
         segment.driver,
+        action,
+        float(timestep.reward or 0.0),
+        1.0 if timestep.discount is None else float(timestep.discount),
+        flat.privileged,
       )
       for row, value in zip(rows.values(), values, strict=True):
         row.append(value)
-      with self.times.stage("env"):
-        timestep = self._environment.step(action)
       flat = self._layout.flatten(timestep.observation)
       since_success += bool(episode_success(self._environment))
     arrays: dict[str, np.ndarray] = {
-      name: np.asarray(rows[name], dtype) for name, (_, dtype) in fields(self._layout).items()
+      name: np.asarray(rows[name], dtype) for name, (_, dtype) in kept.items()
     }
     ending = getattr(task_of(self._environment), "ending", None)
     figures = {

@@ -109,6 +109,14 @@ def test_every_state_is_labelled_whoever_drives(world):
   expected = np.linalg.norm(arrays["pose"][:, :2] - goal, axis=1)
   assert arrays["goal_distance"] == pytest.approx(expected, abs=1e-4)
   assert arrays["image"].shape == (frames, 12, 16, 3) and arrays["image"].std() > 0
+  by_student = arrays["driver"] == episodes.STUDENT
+  standing = environment._environment.task.standing_action
+  assert arrays["action"][by_student] == pytest.approx(np.tile(standing, (by_student.sum(), 1)))
+  terms = environment._environment.task.reward_terms
+  assert arrays["reward"][-1] == pytest.approx(terms["total"]) and arrays["reward"].std() > 0
+  assert arrays["privileged"].shape == (frames, world[1].privileged_size)
+  assert (arrays["discount"][:-1] == 1).all()
+  assert arrays["discount"][-1] == float(environment._environment.task.ending is None)
 
 
 def test_a_teacher_by_belief_is_given_the_likeliest_pose_and_the_truth_is_kept(world):
