@@ -25,6 +25,7 @@ class Setting:
   plant_id: str  # which robot: the virtual one's seed, the robot's name
   protocol: str  # "navigation", "ball" or "gain"
   perturbation: str  # "none", or what was disturbed
+  control: str = "none"  # or what of the observations was falsified, `controls.CONTROLS`
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -34,6 +34,7 @@ class EvaluatedPolicy(Protocol):
   name: str
   policy_id: str  # digest of what it is made of
   image_size: tuple[int, int] | None  # of the pictures that it needs
+  control: str  # one of `controls.CONTROLS`; "none": its observations are the plant's
 
   def reset(self, sight: Sight) -> None:
     """Begins an episode."""
@@ -59,6 +60,7 @@ class GaitPolicy:
 
   name = "gait"
   image_size: tuple[int, int] | None = None
+  control = "none"
   belief: Belief | None = None
 
   def __init__(self, scene: Any, protocol: str, *, settings: GaitSettings | None = None):

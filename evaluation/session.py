@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.evaluation import episodes, plants, report, runner, tables
+from nerf2real.evaluation.controls import under_control
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
@@ -21,16 +22,40 @@ from nerf2real.suite import loading
 
 
 def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
-  """Returns the policy that the settings name."""
+  """Returns the policy that the settings name, with its observations falsified if they say so."""
+  policy: EvaluatedPolicy
   if settings.policy == GAIT:
-    return GaitPolicy(scene, settings.protocol)
-  return LearnedPolicy(Path(settings.policy), seed=settings.seed, stochastic=settings.stochastic)
+    policy = GaitPolicy(scene, settings.protocol)
+  else:
+    policy = LearnedPolicy(
+      Path(settings.policy), seed=settings.seed, stochastic=settings.stochastic
+    )
+  return under_control(policy, settings.control, scene=scene, protocol=settings.protocol)
+
+
+def each_plant(settings: EvaluationSettings) -> list[EvaluationSettings]:
+  """Returns the settings of every single plant that is evaluated on.
+
+  Raises:
+    ValueError: There is no virtual robot where one is wanted.
+  """
+  robots = [
+    dataclasses.replace(settings, plant="virtual", robot_seed=(s,))
+    for s in dict.fromkeys(settings.robot_seed)
+  ]
+  if settings.plant in ("virtual", "both") and not robots:
+    raise ValueError("--robot-seed names no virtual robot: expected one or more seeds.")
+  if settings.plant == "virtual":
+    return robots
+  if settings.plant == "both":
+    return [dataclasses.replace(settings, plant="sim"), *robots]
+  return [settings]
 
 
 def make_plant(
   settings: EvaluationSettings, scene: Any, image_size: tuple[int, int] | None
 ) -> Plant:
-  """Returns the plant that the settings name."""
+  """Returns the plant that the settings of one name; see `each_plant`."""
   record = None
   if settings.record and settings.plant != "sim":
     record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
@@ -54,7 +79,7 @@ def make_plant(
       settings.protocol,
       settings.perturb,
       image_size=image_size,
-      robot_seed=settings.robot_seed,
+      robot_seed=settings.robot_seed[0],
       time_limit=settings.time_limit,
       record=record,
     )
@@ -158,9 +183,11 @@ def _run_trials(
   say: Callable[[str], None],
 ) -> None:
   policy = load_policy(settings, scene)
-  plant = make_plant(settings, scene, policy.image_size or settings.camera_size)
   chosen = choose(plants.trials(settings.protocol), count)
-  try:
-    runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
-  finally:
-    plant.close()
+  for single in each_plant(settings):
+    plant = make_plant(single, scene, policy.image_size or settings.camera_size)
+    say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
+    try:
+      runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
+    finally:
+      plant.close()

@@ -69,7 +69,7 @@ class ScriptedPlant(Plant):
 class StillPolicy:
   """Stands; says that it believes to be where it is told."""
 
-  name, policy_id, image_size = "still", "0123", None
+  name, policy_id, image_size, control = "still", "0123", None, "none"
 
   def __init__(self, belief=None):
     self.belief = belief
@@ -93,6 +93,7 @@ def episode(outcome="success", *, index=0, group="navigation", **changes):
     "plant_id": "a",
     "protocol": "navigation",
     "perturbation": "none",
+    "control": "none",
   }
   fields = {"time": 10.0 if outcome == "success" else None, "duration": 12.0}
   for name, value in changes.items():
