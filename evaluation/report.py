@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from nerf2real.agents.dmpo import belief_plot
+from nerf2real.agents.dmpo.policy import belief_plot
 from nerf2real.core.floor_map import FloorMap
 from nerf2real.core.pages import page
 from nerf2real.core.pages.blocks import (

@@ -15,8 +15,8 @@ from nerf2real.agents.distill.episodes import EpisodeRunner
 from nerf2real.agents.distill.schedule import mixture_at, push_level, pushed
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import make_teacher
-from nerf2real.agents.dmpo.acting import task_of
-from nerf2real.agents.dmpo.inference import Policy
+from nerf2real.agents.dmpo.policy.acting import task_of
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.processes.environments import make_environment

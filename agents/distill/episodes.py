@@ -11,8 +11,8 @@ from nerf2real.agents.distill.dataset import fields, transition_fields
 from nerf2real.agents.distill.schedule import Mixture
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Teacher
-from nerf2real.agents.dmpo.acting import episode_success, task_of
-from nerf2real.agents.dmpo.inference import Policy, PolicyState
+from nerf2real.agents.dmpo.policy.acting import episode_success, task_of
+from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState
 from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
 from nerf2real.agents.processes.timings import StageTimes
 from nerf2real.suite.gaits.walker import Pose

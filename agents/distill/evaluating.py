@@ -12,7 +12,7 @@ import numpy as np
 
 from nerf2real.agents.distill.collecting import student_policy, wait_for_description
 from nerf2real.agents.distill.settings import DistillSettings
-from nerf2real.agents.dmpo.acting import Agent, run_episode, task_of
+from nerf2real.agents.dmpo.policy.acting import Agent, run_episode, task_of
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.processes.environments import (

@@ -25,7 +25,7 @@ from nerf2real.agents.distill.learning import make_updates, standardised
 from nerf2real.agents.distill.schedule import cosine, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
 from nerf2real.agents.distill.validation import validate
-from nerf2real.agents.dmpo.export import export_policy, load_arrays
+from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter

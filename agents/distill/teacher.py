@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import Pose, SteeringSettings, Walker
 

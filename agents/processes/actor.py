@@ -15,9 +15,9 @@ import numpy as np
 import zenoh
 from dm_control.rl import control
 
-from nerf2real.agents.dmpo import acting
 from nerf2real.agents.dmpo import config as configs
-from nerf2real.agents.dmpo.inference import Policy
+from nerf2real.agents.dmpo.policy import acting
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import ActorLink, Grant
 from nerf2real.agents.link.schema import MessageError

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
-from nerf2real.agents.dmpo.learning import TrainingState
+from nerf2real.agents.dmpo.training_state import TrainingState
 
 NEWEST, BEST = "newest", "best"
 _KEEP = {NEWEST: 2, BEST: 1}

@@ -15,8 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from nerf2real.agents.dmpo import acting, export, learning, scaling
 from nerf2real.agents.dmpo import config as configs
+from nerf2real.agents.dmpo import learning, scaling, training_state
+from nerf2real.agents.dmpo.policy import acting, export
 from nerf2real.agents.dmpo.replay import Replay, check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
@@ -289,10 +290,12 @@ class Learner:
     self._scaled = True
     seen = np.arange(self._config.trajectory_length) <= sample["last"][:, None]
     scales = scaling.measure({name: sample[name][seen] for name in scaling.NAMES}, self.layout)
-    self._state = learning.with_scaling(self._state, scales, keep_policy=bool(self._init_from))
+    self._state = training_state.with_scaling(
+      self._state, scales, keep_policy=bool(self._init_from)
+    )
 
   def _publish(self) -> None:
-    parameters = learning.served_parameters(self._state)
+    parameters = training_state.served_parameters(self._state)
     self.link.publish_parameters(parameters, version=self.limiter.updates)
 
   def _take_metrics(self) -> None:
@@ -346,7 +349,7 @@ class Learner:
     self._last_save = time.monotonic()
     self._problem = ""
     self._attempt(lambda: self._checkpoints.save(self._state, self._info()))
-    self._attempt(lambda: self._export("newest", learning.served_parameters(self._state), {}))
+    self._attempt(lambda: self._export("newest", training_state.served_parameters(self._state), {}))
     self._attempt(self.replay.flush)
 
   def _attempt(self, write: Any) -> None:
@@ -441,8 +444,8 @@ def _first_action(environment: Any, config: configs.DmpoConfig, name: str) -> np
 
 
 def _begin_with(
-  folder: Path, state: learning.TrainingState, layout: Layout
-) -> learning.TrainingState:
+  folder: Path, state: training_state.TrainingState, layout: Layout
+) -> training_state.TrainingState:
   """A fresh state with the policy of a folder; raises ValueError if it does not fit."""
   exported, arrays = export.load_policy(folder), export.load_arrays(folder)
   sizes = ("image_shape", "state_names", "state_sizes", "action_size")
@@ -452,7 +455,7 @@ def _begin_with(
       raise ValueError(
         f"{folder} cannot be begun with: its {name} is {found}, this environment's {expected}."
       )
-  return learning.with_policy(state, arrays)
+  return training_state.with_policy(state, arrays)
 
 
 class _Rates:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import acting
-from nerf2real.agents.dmpo.export import load_policy
+from nerf2real.agents.dmpo.policy import acting
+from nerf2real.agents.dmpo.policy.export import load_policy
 from nerf2real.agents.processes import cue_task, environments
 from tests.agents.processes.test_runs import finish, rows, start
 

@@ -4,7 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import belief, config, export, learning, networks
+from nerf2real.agents.dmpo import belief, config, networks, training_state
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import to_plain
 from nerf2real.evaluation import episodes, operated, plants, report, runner, session
@@ -129,7 +130,7 @@ def exported(tmp_path_factory):
   folder = tmp_path_factory.mktemp("run") / "policy"
   export.export_policy(
     folder,
-    learning.flatten_params(parameters),
+    training_state.flatten_params(parameters),
     layout=layout,
     environment="suite:nerf_nav",
     settings=to_plain(preset),

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from dm_env import specs
 
-from nerf2real.agents.dmpo import acting, config, export, inference, learning, networks
+from nerf2real.agents.dmpo import config, networks, training_state
+from nerf2real.agents.dmpo.policy import acting, export, inference
 from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.processes import environments
@@ -25,7 +26,7 @@ def _exported(folder, environment_name="agents:cue"):
   params = jax.jit(lambda key: networks.init_policy(key, PRESET.network, layout))(jax.random.key(0))
   export.export_policy(
     folder,
-    learning.flatten_params({"policy": params}),
+    training_state.flatten_params({"policy": params}),
     layout=layout,
     environment=environment_name,
     settings=to_plain(PRESET),
@@ -81,7 +82,7 @@ def test_every_transition_once_and_states_where_they_belong(cue):
 def test_exported_policy_needs_neither_jax_nor_the_simulator(cue):
   code = (
     "import sys, numpy as np\n"
-    "from agents.dmpo.export import load_policy\n"
+    "from nerf2real.agents.dmpo.policy.export import load_policy\n"
     f"p = load_policy({str(cue[0])!r}).policy\n"
     "step = p.step(np.zeros((30, 40, 3), np.uint8), np.zeros(1, np.float32), p.initial_state())\n"
     "assert np.isfinite(step.mean).all()\n"
@@ -93,7 +94,7 @@ def test_exported_policy_needs_neither_jax_nor_the_simulator(cue):
 
 def test_the_readme_s_example_runs(cue):
   folder, environment, layout = cue
-  readme = (Path(acting.__file__).parent / "README.md").read_text()
+  readme = (Path(acting.__file__).parents[1] / "README.md").read_text()
   code = readme.partition("```python\n")[2].partition("```")[0]
   code = code.replace("runs/nav/policy/best", str(folder))
   scope = {"observation": environment.reset().observation}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo.acting import task_of
+from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.processes import environments, trials
 from nerf2real.agents.processes.environments import evaluation_name, make_environment
 from nerf2real.suite import protocols

@@ -10,14 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import (
-  config,
-  export,
-  learning,
-  networks,
-  scaling,
-  specs,
-)
+from nerf2real.agents.dmpo import config, learning, networks, scaling, specs
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.replay import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions

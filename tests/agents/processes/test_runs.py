@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from nerf2real.agents.dmpo import acting
-from nerf2real.agents.dmpo.export import load_policy
+from nerf2real.agents.dmpo.policy import acting
+from nerf2real.agents.dmpo.policy.export import load_policy
 from nerf2real.agents.processes import environments
 from nerf2real.agents.processes.checkpoints import read_info
 

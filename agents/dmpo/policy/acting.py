@@ -10,7 +10,7 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from nerf2real.agents.dmpo.inference import Policy, PolicyState, PolicyStep
+from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState, PolicyStep
 from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
 
 Trajectory = dict[str, np.ndarray]

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.dmpo.inference import Policy
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core import files
 from nerf2real.core.serialization import from_plain, to_plain
@@ -47,7 +47,7 @@ def export_policy(
 
   Args:
     folder: where to; what it holds of an older policy is replaced.
-    parameters: flat named arrays, `learning.served_parameters`.
+    parameters: flat named arrays, `training_state.served_parameters`.
     layout: the environment's layout.
     environment: the environment's name.
     settings: the agent's settings as plain values, `to_plain(config)`.
