@@ -134,6 +134,27 @@ class DmpoConfig:
   first_action: str = ZERO
   """What the policy's mean is about at the start: "zero", the middle of the actions' range, or
   "standing", the task's `standing_action`. Source: reference (zero)."""
+  critic_warmup: int = 0
+  """Updates at the start in which the critic alone learns; no environment steps pay for them
+  [updates]. Source: chosen; the paper starts from scratch."""
+  burn_in: int = 12
+  """Steps of a trajectory of prior data that only unroll the LSTM, whose state there is unknown
+  [steps]. Source: chosen, 8 to 16; R2D2 (Kapturowski et al. 2019) takes 20 and 40 of 80."""
+  student_kl: float = 0.0
+  """Weight of KL(policy || policy that the run began with), summed over action dimensions. Source:
+  Haarnoja et al. 2023 and Tirumala et al. 2024 regularise to teachers so; the size is chosen."""
+  student_kl_updates: int = 0
+  """Updates after the critic's warm-up over which that weight falls to 0 along a line; 0: it does
+  not [updates]."""
+  student_kl_returns: tuple[float, float] | None = None
+  """Mean returns of acting episodes between which the weight falls to 0; None: returns do not
+  matter [reward]."""
+  frozen_encoder: bool = False
+  """Whether the image encoder stays what the run began with: the replay then holds its features in
+  place of pictures."""
+  feature_copies: int = 2
+  """Features of a frozen encoder for each picture: of the picture as it is, and of augmented ones.
+  Source: chosen."""
   history: int = 1
   """Observations stacked by the agent [steps]. The suite's arrive with the paper's 5."""
 
@@ -152,6 +173,9 @@ class DmpoConfig:
       raise ValueError(
         f"vmin must lie below vmax, found {self.network.vmin} and {self.network.vmax}."
       )
+    returns = self.student_kl_returns
+    if returns is not None and not returns[0] < returns[1]:
+      raise ValueError(f"student_kl_returns must rise, found {returns}.")
     if self.replay_steps < self.min_replay_steps:
       raise ValueError(
         f"replay_steps ({self.replay_steps}) must hold min_replay_steps ({self.min_replay_steps})."
