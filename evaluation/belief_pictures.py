@@ -10,7 +10,7 @@ from nerf2real.agents.dmpo.policy import belief_plot
 from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.agents.dmpo.specs import planar_pose
-from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.scenes.geometry import floor_picture
 
 _SCALE = 80  # pixel/m

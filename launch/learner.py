@@ -134,7 +134,8 @@ def run(arguments: Arguments) -> None:
       what was learned was not saved.
   """
   from nerf2real.agents.processes.checkpoints import CheckpointError
-  from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+  from nerf2real.agents.processes.learner import Learner, LearnerError
+  from nerf2real.agents.processes.settings import RunSettings
 
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
   set_threads(arguments.threads)

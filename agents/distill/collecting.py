@@ -18,8 +18,8 @@ from nerf2real.agents.distill.teacher import make_teacher
 from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.processes.environments import make_environment
 from nerf2real.core.serialization import from_plain
 
 _log = logging.getLogger(__name__)

@@ -14,13 +14,13 @@ from nerf2real.agents.distill.collecting import student_policy, wait_for_descrip
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.dmpo.policy.acting import Agent, run_episode, task_of
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.processes.environments import (
+from nerf2real.agents.environments.loading import (
   evaluation_name,
   make_environment,
   trials_of,
 )
-from nerf2real.agents.processes.trials import clopper_pearson
+from nerf2real.agents.environments.trials import clopper_pearson
+from nerf2real.agents.link.client import ActorLink
 from nerf2real.core.serialization import from_plain
 
 _POLL = 1.0  # s

@@ -27,12 +27,12 @@ from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
 from nerf2real.agents.distill.validation import validate
 from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink
-from nerf2real.agents.processes.environments import make_environment
 from nerf2real.agents.processes.logs import MetricsLog
-from nerf2real.agents.processes.timings import StageTimes
+from nerf2real.agents.processes.timings import Periods, Rates, StageTimes
 from nerf2real.core.serialization import to_plain, write_json
 
 _log = logging.getLogger(__name__)
@@ -110,12 +110,12 @@ class Learner:
     self._log = MetricsLog(run, tensorboard=False)
     self._times = StageTimes()
     self._stop = threading.Event()
-    self._last: dict[str, float] = {}  # times of the last periodical work
+    self._periods = Periods()
     self._evaluation: dict[str, Any] = {}  # the last one
     self._is_fit = False  # whether encoder and policy belong together now
     self._compiled: set[str] = set()  # kinds of stages whose update was called
     self._recent: list[dict[str, jax.Array]] = []
-    self._last_figures = (time.monotonic(), self._data.frames, self._counters.updates)
+    self._rates = Rates(self._data.frames, self._counters.updates)
     self._session = sessions.listen(endpoint, link)
     self._link = LearnerLink(
       self._session,
@@ -278,21 +278,14 @@ class Learner:
 
   # ---- periodical work ----
 
-  def _due(self, name: str, period: float) -> bool:
-    now = time.monotonic()
-    if now - self._last.setdefault(name, now) < period:
-      return False
-    self._last[name] = now
-    return True
-
   def _housekeeping(self, kind: str) -> None:
     settings = self._settings
-    if self._is_fit and self._due("publish", settings.publish_period):
+    if self._is_fit and self._periods.due("publish", settings.publish_period):
       self._publish()
-    if self._due("save", settings.save_period):
+    if self._periods.due("save", settings.save_period):
       with self._times.stage("saving"):
         self._save()
-    if self._due("log", settings.log_period):
+    if self._periods.due("log", settings.log_period):
       self._check_link()
       self._drain_metrics()
       values = {name: float(np.mean([m[name] for m in self._recent])) for name in self._recent[0]}
@@ -300,7 +293,7 @@ class Learner:
       self._write("learner", values | figures | self._times.take(len(self._recent)))
       self._set_status()
       self._recent.clear()
-    if self._due("validate", _VALIDATION_PERIOD):
+    if self._periods.due("validate", _VALIDATION_PERIOD):
       with self._times.stage("validation"):
         found = validate(self._state, self._updates, data=self._data, cache=self._cache)
       self._write("validation", found)
@@ -316,23 +309,17 @@ class Learner:
       _log.info("%d frames, %s: %s", self._data.frames, source, shown)
 
   def _drain_metrics(self) -> None:
-    while not self._link.metrics.empty():
-      who, values = self._link.metrics.get()
+    for who, values in self._link.take_metrics():
       if who.startswith("evaluator"):
         self._evaluation = values
       self._write(who.partition("-")[0], values)
 
   def _set_status(self) -> None:
     """Offers the figures that `agents.processes.status_view` shows."""
-    now, frames, updates = time.monotonic(), self._data.frames, self._counters.updates
-    then, frames_then, updates_then = self._last_figures
-    self._last_figures = (now, frames, updates)
-    period = max(now - then, 1e-3)
+    frames, updates = self._data.frames, self._counters.updates
     status = {
       "steps": frames,
-      "steps_per_second": (frames - frames_then) / period,
       "updates": updates,
-      "updates_per_second": (updates - updates_then) / period,
       "filled": frames >= self._settings.first_frames,
       "return": None,
       "evaluation": None,
@@ -341,7 +328,7 @@ class Learner:
       "localisation_error": self._evaluation.get("localisation_error"),
       "replay_steps": frames,
     }
-    self._link.set_status(status)
+    self._link.set_status(status | self._rates.measure(frames, updates))
 
   def _publish(self) -> None:
     arrays = student.served_parameters(self._state.student, self._state.scales)

@@ -61,7 +61,7 @@ class DistillSettings:
   """What is distilled, and how."""
 
   environment: str
-  """Where data are collected, as `agents.processes.environments` names it, without pushes."""
+  """Where data are collected, as `agents.environments.loading` names it, without pushes."""
   teacher: str = "quick"
   """One of `teacher.TEACHERS`, or the folder of an exported policy."""
   agent: DmpoConfig = DmpoConfig(network=NetworkConfig(init_stddev=0.1))

@@ -142,8 +142,12 @@ class LearnerLink:
     with self.lock:
       self._status = dict(status)
 
+  def take_metrics(self) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the figures that came in since the last call, with their senders' names."""
+    return [self.metrics.get() for _ in range(self.metrics.qsize())]
+
   def stop_actors(self) -> None:
-    """Tells actors, when they ask next, that the run is over."""
+    """Ends the run for the actors: `stop` in all grants from now on."""
     with self.lock:
       self._stopping = True
 

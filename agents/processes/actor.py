@@ -19,11 +19,11 @@ from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.dmpo.policy import acting
 from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.environments.loading import make_environment, trials_of
+from nerf2real.agents.environments.trials import clopper_pearson
 from nerf2real.agents.link.client import ActorLink, Grant
 from nerf2real.agents.link.schema import MessageError
-from nerf2real.agents.processes.environments import make_environment, trials_of
 from nerf2real.agents.processes.timings import StageTimes
-from nerf2real.agents.processes.trials import clopper_pearson
 from nerf2real.core.serialization import from_plain
 
 _log = logging.getLogger(__name__)

@@ -14,14 +14,14 @@ from nerf2real.agents.dmpo import config, networks, training_state
 from nerf2real.agents.dmpo.policy import acting, export, inference
 from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.processes import environments
+from nerf2real.agents.environments import loading
 from nerf2real.core.serialization import to_plain
 
 PRESET = config.override(config.preset("vision_small"), {"network.lstm_size": 8})
 
 
 def _exported(folder, environment_name="agents:cue"):
-  environment = environments.make_environment(environment_name, seed=0)
+  environment = loading.make_environment(environment_name, seed=0)
   layout = Layout.of(environment)
   params = jax.jit(lambda key: networks.init_policy(key, PRESET.network, layout))(jax.random.key(0))
   export.export_policy(
@@ -115,7 +115,7 @@ def test_damaged_or_missing_policy_is_refused(tmp_path):
 
 def test_cue_needs_memory():
   """The best policy with memory gets 22; the mean action of any memoryless one gets 0."""
-  environment = environments.make_environment("agents:cue", seed=0)
+  environment = loading.make_environment("agents:cue", seed=0)
 
   def run(act):
     total = 0.0
@@ -135,7 +135,7 @@ def test_cue_needs_memory():
 
 
 def test_dm_control_by_name_with_canonical_actions_and_history():
-  environment = environments.make_environment("dm_control:cartpole:swingup", seed=1, history=3)
+  environment = loading.make_environment("dm_control:cartpole:swingup", seed=1, history=3)
   layout = Layout.of(environment)
   assert layout.image_name is None and layout.state_size == 3 * 5 and layout.action_size == 1
   first = layout.flatten(environment.reset().observation).state.reshape(-1)
@@ -161,7 +161,7 @@ def test_a_spec_scales_actions():
     def action_spec(self):
       return specs.BoundedArray((2,), np.float64, [-2, 0], [4, 1])
 
-  seen = environments.Canonical(Wide()).step(np.array([0.0, -9.0])).observation["seen"]
+  seen = loading.Canonical(Wide()).step(np.array([0.0, -9.0])).observation["seen"]
   np.testing.assert_allclose(seen, [1.0, 0.0])
 
 
@@ -175,7 +175,7 @@ def test_a_spec_scales_actions():
 )
 def test_unknown_names_are_refused(name, message):
   with pytest.raises(ValueError, match=message):
-    environments.make_environment(name, seed=0)
+    loading.make_environment(name, seed=0)
 
 
 def test_belief_error_is_measured(cue):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from dm_control.rl import control
 
-from nerf2real.agents.processes import actor, environments, trials
+from nerf2real.agents.environments import loading, trials
+from nerf2real.agents.processes import actor
 from tests.agents.processes.stubs import Reach, StubLink, description, documented
 
 CARTPOLE = "dm_control:cartpole:swingup"
@@ -21,7 +22,7 @@ def _act(link, *, seed=0, index=0):
 
 @pytest.fixture(scope="module")
 def cartpole():
-  return description(environments.make_environment(CARTPOLE, seed=0), CARTPOLE)
+  return description(loading.make_environment(CARTPOLE, seed=0), CARTPOLE)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 
 from nerf2real.agents.dmpo.policy import acting
 from nerf2real.agents.dmpo.policy.export import load_policy
-from nerf2real.agents.processes import environments
+from nerf2real.agents.environments import loading
 from nerf2real.agents.processes.checkpoints import read_info
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -118,7 +118,7 @@ def test_a_run_ends_by_itself_and_is_resumed(tmp_path):
   assert list((run / "tensorboard").iterdir())
   exported = load_policy(run / "policy" / "newest")
   agent = acting.Agent(exported.policy, exported.layout, seed=0, deterministic=True)
-  environment = environments.make_environment(exported.environment, seed=0)
+  environment = loading.make_environment(exported.environment, seed=0)
   agent.act(exported.layout.flatten(environment.reset().observation))
 
   refused = start(run, *CARTPOLE, *SMALL)

@@ -23,7 +23,7 @@ import numpy as np
 from dm_env import specs
 
 from nerf2real.agents.dmpo.specs import PRIVILEGED
-from nerf2real.agents.processes.trials import Trials
+from nerf2real.agents.environments.trials import Trials
 
 
 def make_environment(name: str, *, seed: int, history: int = 1) -> dm_env.Environment:
@@ -158,7 +158,7 @@ def trials_of(environment: Any) -> Trials | None:
 
 
 def _agents(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
-  from nerf2real.agents.processes.cue_task import CueTask
+  from nerf2real.agents.environments.cue_task import CueTask
 
   if rest != "cue":
     raise ValueError(f"agents has no task {rest!r}: expected 'cue'.")
