@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerf2real.agents.dmpo.frozen import FrozenEncoder
 from nerf2real.agents.dmpo.replay import Replay, open_stored, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import read_json, write_json
@@ -64,11 +65,11 @@ class PriorData:
     """
     folder = _find(folder)
     _check_layout(folder, layout)
-    self._names = tuple(trajectory_fields(layout, lstm_size=0))
+    names = tuple(trajectory_fields(layout, lstm_size=0))
     parts: list[Mapping[str, np.ndarray]] = []
     starts: list[bool] = []
     steps = 0
-    for trajectory, is_start in _newest_first(folder, self._names):
+    for trajectory, is_start in _newest_first(folder, names):
       parts.append(trajectory)
       starts.append(is_start)
       steps += len(trajectory["reward"]) - 1
@@ -76,15 +77,19 @@ class PriorData:
         break
     if not parts:
       raise ValueError(
-        f"{folder} holds no transitions with {', '.join(self._names)}: collect them again."
+        f"{folder} holds no transitions with {', '.join(names)}: collect them again."
       )
-    self._arrays = {name: np.concatenate([p[name] for p in parts]) for name in self._names}
+    self._arrays = {name: np.concatenate([p[name] for p in parts]) for name in names}
     ends = np.cumsum([len(part["reward"]) for part in parts]).tolist()
     begins = [0, *ends[:-1]]
     self._segments = [Segment(*s) for s in zip(begins, ends, starts, strict=True)]
     counts = np.array([s.end - s.begin - 1 for s in self._segments])
     self._last_steps = np.cumsum(counts)
     self.steps = int(counts.sum())
+
+  def encode(self, encoder: FrozenEncoder) -> None:
+    """Replaces the pictures by features of a frozen encoder."""
+    self._arrays = encoder.replace(self._arrays)
 
   def sample(
     self, rng: np.random.Generator, batch_size: int, *, length: int, burn_in: int, lstm_size: int
@@ -113,7 +118,7 @@ class PriorData:
       frames[row] = segment.begin + begin + np.minimum(np.arange(length), last[row])
       if lstm_size and not (segment.is_start and begin == 0):
         burned[row] = min(burn_in, last[row])
-    batch = {name: self._arrays[name][frames] for name in self._names}
+    batch = {name: array[frames] for name, array in self._arrays.items()}
     if lstm_size:
       zeros = np.zeros((batch_size, lstm_size), np.float32)
       batch |= {"lstm_hidden": zeros, "lstm_cell": zeros}
