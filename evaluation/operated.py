@@ -1,4 +1,4 @@
-"""A robot as a plant: a person places it, one episode after another, and says how it went."""
+"""A robot as a plant: an operator places it, one episode after another, and enters the outcome."""
 
 import contextlib
 import dataclasses
@@ -30,7 +30,7 @@ _QUESTION = "What happened? [s]uccess, [c]ollision, [f]all, [l]ost, [r]epeat the
 
 
 class RepeatError(Exception):
-  """The operator wants the episode again."""
+  """The operator chose to repeat the episode."""
 
 
 class OperatedPlant(Plant):
@@ -74,7 +74,7 @@ class OperatedPlant(Plant):
       dry_run: Everything is read, asked and computed, and nothing moves; no verdict is asked for.
       observer: Motion capture, if there is any.
       ask: Puts a question to the operator and returns the answer; None: at this terminal.
-      say: Tells the operator something.
+      say: Shows the operator a line.
     """
     super().__init__(scene, protocol, perturbation)
     self.plant_id = robot_name

@@ -1,4 +1,4 @@
-"""What an evaluation needs of a plant: set a trial up, step it, and say what an observer sees."""
+"""The protocol of plants in an evaluation: set a trial up, step it, observe the robot."""
 
 import abc
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ TASKS = {NAVIGATION: nerf_nav.NAME, GAIN: nerf_nav.NAME, BALL: ball_push.NAME}
 
 
 class Sight(NamedTuple):
-  """What an observer of an episode knows; None where nobody looks."""
+  """An observer's measurements in an episode; None without an observer."""
 
   pose: Pose | None
   ball: np.ndarray | None  # [2] m
@@ -72,7 +72,7 @@ class Plant(abc.ABC):
     """Returns what an observer sees now."""
 
   def reached(self, sight: Sight) -> bool | None:
-    """Returns whether the goal is reached; None where nobody knows."""
+    """Returns whether the goal is reached; None where it is not measured."""
     if self.protocol == BALL:
       if sight.ball is None:
         return None
@@ -87,7 +87,7 @@ class Plant(abc.ABC):
     return ""
 
   def judge(self) -> tuple[str, float | None, str] | None:
-    """Returns a person's verdict (outcome, time [s], detail); None where a pose says it all."""
+    """Returns a person's verdict (outcome, time [s], detail); None where the poses suffice."""
     return None
 
   @abc.abstractmethod

@@ -1,4 +1,4 @@
-"""What an evaluation asks of a policy, and the scripted walker as one."""
+"""The protocol of policies in an evaluation, and the scripted walker as one."""
 
 import hashlib
 import json
@@ -46,7 +46,7 @@ class EvaluatedPolicy(Protocol):
 
   @property
   def belief(self) -> Belief | None:
-    """Where it believes to be since the last action; None if it says nothing."""
+    """The believed position since the last action; None for a policy without a belief."""
 
 
 def resolution(policy: EvaluatedPolicy) -> str:
@@ -56,7 +56,7 @@ def resolution(policy: EvaluatedPolicy) -> str:
 
 
 class GaitPolicy:
-  """The scripted walker; it is told where it is, or reckons where nobody sees it."""
+  """The scripted walker, with the observed pose or by dead reckoning without one."""
 
   name = "gait"
   image_size: tuple[int, int] | None = None

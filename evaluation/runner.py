@@ -1,4 +1,4 @@
-"""Runs trials on a plant and says how each went: success, collision, fall, or lost."""
+"""Runs trials on a plant and classifies each: success, collision, fall, or lost."""
 
 import base64
 from collections.abc import Callable, Iterable

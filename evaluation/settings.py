@@ -54,4 +54,4 @@ class EvaluationSettings:
   markdown: Path | None = None
   """Writes the tables of everything in the folder to a Markdown file, too."""
   dry_run: bool = False
-  """Robot only: reads and asks everything, moves and keeps nothing; one trial without --trials."""
+  """Robot only: reads everything, puts all questions, moves and keeps nothing; one trial without --trials."""

@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.statuses import REFUSED
+from nerf2real.agents.supervision.statuses import REFUSED
 from nerf2real.core.serialization import read_json
 from nerf2real.launch import command
 from nerf2real.launch.learner import DEFAULT_ENDPOINT, set_threads

@@ -20,7 +20,7 @@ import tyro
 
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
+from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
 from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 

@@ -40,8 +40,10 @@ class _Segment:
   driver: int = TEACHER
   left: int = 0
   noise: float = 0.0
-  place: np.ndarray | None = None  # of a detour [2] [m]
-  guide: Teacher | None = None  # drives the detour
+  place: np.ndarray | None = None
+  """Of a detour [2] [m]."""
+  guide: Teacher | None = None
+  """Drives the detour."""
 
 
 class EpisodeRunner:

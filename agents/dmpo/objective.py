@@ -198,8 +198,8 @@ def _belief_loss(
 def policy_weights(discount: jax.Array, last: jax.Array) -> jax.Array:
   """How much each state counts in the policy's loss [B, T]: 1, or 0 for padding and terminal ones.
 
-  Nothing follows a terminal state: the critic is never trained there, so that its values say
-  nothing about actions. A state at which a trajectory was cut counts; another one goes on from it.
+  Nothing follows a terminal state: the critic is never trained there, so that its values rank
+  no actions. A state at which a trajectory was cut counts; another one goes on from it.
 
   Args:
     discount: the environment's after the action of each step [B, T], 0 where it terminates.

@@ -1,7 +1,7 @@
 """A policy as one folder that an actor, the evaluator and the robot load with NumPy alone.
 
 `policy.npz` holds the arrays by name, `policy.json` the layout, the settings and the digest of the
-arrays. Each file is replaced as a whole; the digest tells if the two belong together.
+arrays. Each file is replaced as a whole; by the digest the two belong together.
 """
 
 import dataclasses
@@ -29,9 +29,12 @@ class ExportedPolicy:
 
   policy: Policy
   layout: Layout
-  environment: str  # the name it was trained on
-  history: int  # observations that the agent stacks
-  info: dict[str, Any]  # counters and settings of the run
+  environment: str
+  """The name it was trained on."""
+  history: int
+  """Observations that the agent stacks."""
+  info: dict[str, Any]
+  """Counters and settings of the run."""
 
 
 def export_policy(

@@ -145,7 +145,7 @@ class Settings:
   specular_bias: wp.float32
   pixel_angle: wp.float32
   step: wp.float32
-  variance_step: wp.float32  # interval that the variance tells of, inside the unit cube
+  variance_step: wp.float32  # interval of the variance, inside the unit cube
   near: wp.float32
   depth_limit: wp.float32  # a ray's march ends where the grid's optical depth passes this
   ray_samples: wp.int32  # most samples of a ray

@@ -81,7 +81,7 @@ def rows(run, source=""):
   return [r for r in map(json.loads, lines) if r["source"].startswith(source)]
 
 
-def wait_until(condition, *, timeout=60.0):
+def wait_until(condition, *, timeout=400.0):
   deadline = time.monotonic() + timeout
   while not condition():
     assert time.monotonic() < deadline, "It did not happen in time."

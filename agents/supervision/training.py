@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.live import Live
 
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.status_view import StatusView
-from nerf2real.agents.processes.supervision import Job, LocalProcess, Process, Supervisor
+from nerf2real.agents.supervision.status_view import StatusView
+from nerf2real.agents.supervision.supervisor import Job, LocalProcess, Process, Supervisor
 
 _JOIN_TIMEOUT = 1800.0  # s; a starved machine takes minutes to build the networks, or to be free
 _POLL = 0.5  # s between looks at the processes
