@@ -17,11 +17,12 @@ import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
 from nerf2real.agents.dmpo.prior import write_layout
-from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.specs import BALL, Layout
 from nerf2real.core import files
 
 POSE_SIZE = 3  # x [m], y [m], yaw [rad]
-UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance")  # besides the pictures
+BALL_SIZE = 3  # x ahead [m], y to the left [m] of the robot, pan of its head [rad]
+_UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance", "ball")
 
 
 class Span(NamedTuple):
@@ -39,7 +40,7 @@ def fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
   """
   if layout.image_shape is None:
     raise ValueError("A distillation needs pictures: give the environment an image_size.")
-  return {
+  kept: dict[str, tuple[tuple[int, ...], type]] = {
     "image": (layout.image_shape, np.uint8),
     "state": ((layout.state_size,), np.float32),
     "label": ((layout.action_size,), np.float32),
@@ -48,6 +49,9 @@ def fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
     "goal_distance": ((), np.float32),
     "driver": ((), np.uint8),
   }
+  if layout.privileged_column(BALL) is not None:
+    kept["ball"] = ((BALL_SIZE,), np.float32)
+  return kept
 
 
 def transition_fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
@@ -103,6 +107,10 @@ class Dataset:
     """(Actor's key, number) of every episode, as `insert` was given them."""
     with self._lock:
       return list(self._origins)
+
+  def take(self, frames: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns what an unroll needs besides pictures, at frames of any shape."""
+    return {name: self.arrays[name][frames] for name in _UNROLL_FIELDS if name in self.arrays}
 
   def spans(self, *, held_out: bool) -> list[Span]:
     """Returns the episodes to train on, or those held out."""
