@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from nerf2real.agents.distill.episodes import EpisodeRunner
-from nerf2real.agents.distill.schedule import mixture_at, push_level, pushed
+from nerf2real.agents.distill.schedule import may_collect, mixture_at, push_level, pushed
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import make_teacher
 from nerf2real.agents.dmpo.policy.acting import task_of
@@ -90,7 +90,9 @@ class Collector:
         if answer is not None:
           self._policy = student_policy(answer[1], self._settings)
           self._begun = grant["steps"] if self._begun is None else self._begun
-      return int(grant["steps"])
+      if may_collect(self._settings, int(grant["steps"]), begun=self._begun):
+        return int(grant["steps"])
+      self._stop.wait(_AWAY_POLL)
     return None
 
   def _episode(self, frames: int) -> None:

@@ -88,6 +88,9 @@ class DistillSettings:
   """Frames before training begins [steps]: some 15 episodes; inputs are standardised on them."""
   max_frames: int = 400_000
   """Frames collected at most [steps]: 5 kB each in memory."""
+  teacher_frames: int = 200_000
+  """Frames collected at most before the first student is there [steps]: a fast collector would fill
+  the data set with the teacher's own paths, and none would show how a student errs."""
   holdout: int = 10
   """Every episode of that number is held out for validation."""
   learning_rate: float = 1e-3
@@ -138,6 +141,11 @@ class DistillSettings:
     total = sum(stage.share for stage in self.stages)
     if abs(total - 1.0) > 1e-6:
       raise ValueError(f"The stages' shares must sum to 1, found {total:g}.")
+    if self.teacher_frames < self.first_frames:
+      raise ValueError(
+        f"teacher_frames must be {self.first_frames} (first_frames) or more, found "
+        f"{self.teacher_frames}: training would wait for frames that nobody collects."
+      )
 
 
 def nerf_nav() -> DistillSettings:
@@ -172,6 +180,7 @@ def nerf_nav_60x80() -> DistillSettings:
     environment="suite:nerf_nav?image_size=60x80",
     agent=DmpoConfig(network=network),
     max_frames=200_000,  # 16 kB each in memory
+    teacher_frames=100_000,
   )
 
 

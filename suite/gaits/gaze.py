@@ -19,6 +19,7 @@ _HALF_VERTICAL = constants.CAMERA_VERTICAL_FOV / 2
 _HALF_HORIZONTAL = np.arctan(4 / 3 * np.tan(_HALF_VERTICAL))  # pictures are 4:3
 _LEAN = 0.08  # rad that the walking torso leans forward, and the camera with it
 _PAN = 2.3  # rad at which a sweep turns back; chosen: short of the limit in ball pushing, 2.5
+_REACHED = 0.1  # rad from that angle at which it does
 _LEAD = 0.4  # rad that a sweep's target is ahead of the head; chosen: some 2 rad/s
 _SWEEP_TILT = -0.3  # rad: from 0.4 m ahead to the walls
 _LOST = 2.0  # s without a view after which the head sweeps; chosen
@@ -83,7 +84,7 @@ class Gaze:
       self._sweeps = 0
       bearing = float(np.clip(view.bearing, -_PAN, _PAN))
       return dataclasses.replace(command, head=(bearing, _LEAN - depression(view.distance)))
-    if self._direction * pan > _PAN - _LEAD:
+    if self._direction * pan > _PAN - _REACHED:
       self._direction, self._sweeps = -self._direction, self._sweeps + 1
     target = float(np.clip(pan + self._direction * _LEAD, -_PAN, _PAN))
     behind = self._sweeps >= _SWEEPS

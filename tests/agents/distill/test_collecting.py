@@ -1,5 +1,7 @@
 """The collector: the mixture over a run, pushes in steps, and labelled episodes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,20 @@ def test_the_teacher_gives_way_to_the_student():
   assert schedule.mixture_at(mixture, 5_000, begun=5_000) == (1.0, 0.0)
   assert schedule.mixture_at(mixture, 5_050, begun=5_000) == pytest.approx((0.6, 0.25))
   assert schedule.mixture_at(mixture, 9_999, begun=5_000) == pytest.approx((0.2, 0.5))
+
+
+def test_room_is_left_for_frames_of_students():
+  found = dataclasses.replace(settings.preset("tiny"), teacher_frames=100, max_frames=300)
+  for frames, begun, expected in (
+    (99, None, True),
+    (100, None, False),
+    (100, 100, True),
+    (299, 100, True),
+    (300, 100, False),
+  ):
+    assert schedule.may_collect(found, frames, begun=begun) == expected
+  assert settings.nerf_nav().teacher_frames < settings.nerf_nav().max_frames
+  assert settings.nerf_nav_60x80().teacher_frames < settings.nerf_nav_60x80().max_frames
 
 
 def test_pushes_come_in_steps():
