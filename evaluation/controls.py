@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.evaluation.plants import BALL, Sight
+from nerf2real.evaluation.plants.plant import BALL, Sight
 from nerf2real.evaluation.policies import Belief, EvaluatedPolicy
 
 NONE, BLACK, OTHER_GOAL = "none", "black", "other_goal"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.agents.dmpo.policy import export
-from nerf2real.evaluation.plants import Sight
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation.plants import BALL, Sight
+from nerf2real.evaluation.plants.plant import BALL, Sight
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import Walker
 from nerf2real.suite.op3 import constants

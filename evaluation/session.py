@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.evaluation import episodes, plants, report, runner, tables
+from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.controls import under_control
 from nerf2real.evaluation.learned import LearnedPolicy
-from nerf2real.evaluation.plants import Plant
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
+from nerf2real.evaluation.report import page as report
+from nerf2real.evaluation.report import tables
 from nerf2real.evaluation.settings import GAIT, EvaluationSettings
 from nerf2real.suite import loading
 
@@ -60,7 +63,7 @@ def make_plant(
   if settings.record and settings.plant != "sim":
     record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
   if settings.plant == "sim":
-    from nerf2real.evaluation.simulated import SimulatedPlant
+    from nerf2real.evaluation.plants.simulated import SimulatedPlant
 
     return SimulatedPlant(
       scene,
@@ -72,7 +75,7 @@ def make_plant(
       time_limit=settings.time_limit,
     )
   if settings.plant == "virtual":
-    from nerf2real.evaluation.rehearsed import RehearsedPlant
+    from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 
     return RehearsedPlant(
       scene,
@@ -83,7 +86,7 @@ def make_plant(
       time_limit=settings.time_limit,
       record=record,
     )
-  from nerf2real.evaluation.operated import OperatedPlant
+  from nerf2real.evaluation.plants.operated import OperatedPlant
 
   camera: Any = int(settings.camera) if settings.camera.isdigit() else settings.camera
   return OperatedPlant(

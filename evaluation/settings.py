@@ -54,4 +54,5 @@ class EvaluationSettings:
   markdown: Path | None = None
   """Writes the tables of everything in the folder to a Markdown file, too."""
   dry_run: bool = False
-  """Robot only: reads everything, puts all questions, moves and keeps nothing; one trial without --trials."""
+  """Robot only: reads everything and puts all questions, moves and keeps nothing; one trial without
+  --trials."""

@@ -3,9 +3,9 @@
 import dm_env
 import numpy as np
 
-from nerf2real.evaluation import plants
 from nerf2real.evaluation.episodes import Episode, Setting
-from nerf2real.evaluation.plants import Plant, Sight
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import Plant, Sight
 from nerf2real.suite import specs
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walker import Pose

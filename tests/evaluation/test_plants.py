@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.evaluation import operated, perturbations, plants, runner
+from nerf2real.evaluation import runner
+from nerf2real.evaluation.plants import operated, perturbations
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
+from nerf2real.evaluation.plants.simulated import SimulatedPlant
 from nerf2real.evaluation.policies import GaitPolicy
-from nerf2real.evaluation.rehearsed import RehearsedPlant
-from nerf2real.evaluation.simulated import SimulatedPlant
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite import loading, protocols
 from nerf2real.suite.tasks.workspace import find_workspace

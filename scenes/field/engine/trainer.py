@@ -9,7 +9,7 @@ from nerf2real.scenes.field.anchors import EMPTY_CELLS
 from nerf2real.scenes.field.engine import layout, parameters, pictures
 from nerf2real.scenes.field.engine.device import Device
 from nerf2real.scenes.field.engine.engine import Engine
-from nerf2real.scenes.field.engine.native import PADDING
+from nerf2real.scenes.field.engine.native.vectors import PADDING
 from nerf2real.scenes.field.engine.occupancy import OccupancyGrids, distance_along
 from nerf2real.scenes.field.field import Field, init_params
 from nerf2real.scenes.field.settings import TrainSettings

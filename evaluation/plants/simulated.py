@@ -7,8 +7,8 @@ import dm_env
 import numpy as np
 
 from nerf2real import suite
-from nerf2real.evaluation import perturbations
-from nerf2real.evaluation.plants import TASKS, Plant, Sight, Trial, make_intruder
+from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.plants.plant import TASKS, Plant, Sight, Trial, make_intruder
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings

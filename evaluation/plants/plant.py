@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import dm_env
 import numpy as np
 
-from nerf2real.evaluation import perturbations
+from nerf2real.evaluation.plants import perturbations
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.protocols import BallTrial, NavigationTrial

@@ -24,8 +24,8 @@ from nerf2real.core.pages.blocks import (
   Text,
 )
 from nerf2real.core.pages.page import Section
-from nerf2real.evaluation import maps, tables
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Moment
+from nerf2real.evaluation.report import maps, tables
 
 _MOMENTS = 5  # shown of an episode's belief
 _BELIEF_EPISODES = 4  # shown of a setting
