@@ -92,7 +92,8 @@ class Collector:
           self._begun = grant["steps"] if self._begun is None else self._begun
       if may_collect(self._settings, int(grant["steps"]), begun=self._begun):
         return int(grant["steps"])
-      self._stop.wait(_AWAY_POLL)
+      self._link.flush()
+      self._stop.wait(AWAY_POLL)
     return None
 
   def _episode(self, frames: int) -> None:
