@@ -16,6 +16,7 @@ from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.controls import under_control
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants import swaps
 from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
 from nerf2real.evaluation.report import page as report
@@ -59,6 +60,7 @@ def make_plant(
   settings: EvaluationSettings, scene: Any, image_size: tuple[int, int] | None
 ) -> Plant:
   """Returns the plant that the settings of one name; see `each_plant`."""
+  swaps.check(settings.swap, plant=settings.plant, built_in=settings.scene is None)
   record = None
   if settings.record and settings.plant != "sim":
     record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
@@ -73,6 +75,7 @@ def make_plant(
       effects=settings.effects,
       seed=settings.seed,
       time_limit=settings.time_limit,
+      swap=settings.swap,
     )
   if settings.plant == "virtual":
     from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
@@ -84,6 +87,7 @@ def make_plant(
       image_size=image_size,
       robot_seed=settings.robot_seed[0],
       time_limit=settings.time_limit,
+      swap=settings.swap,
       record=record,
     )
   from nerf2real.evaluation.plants.operated import OperatedPlant
