@@ -5,7 +5,6 @@ trial's goal when it is given another one does not use the goal. Plant, trials a
 success are unchanged.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,45 +17,38 @@ NONE, BLACK, OTHER_GOAL = "none", "black", "other_goal"
 CONTROLS = (NONE, BLACK, OTHER_GOAL)
 
 
-@dataclasses.dataclass(kw_only=True)
 class ControlledPolicy:
   """A policy whose observations are falsified."""
 
-  policy: EvaluatedPolicy
-  """What acts."""
-  control: str
-  """BLACK: pictures are zero; OTHER_GOAL: the goal is another one of the scene's."""
-  goals: np.ndarray
-  """The scene's goals [G, 2] [m]."""
+  def __init__(self, policy: EvaluatedPolicy, *, control: str, goals: np.ndarray):
+    """Wraps a policy.
 
-  @property
-  def name(self) -> str:
-    return self.policy.name
-
-  @property
-  def policy_id(self) -> str:
-    return self.policy.policy_id
-
-  @property
-  def image_size(self) -> tuple[int, int] | None:
-    return self.policy.image_size
+    Args:
+      policy: What acts.
+      control: BLACK: pictures are zero; OTHER_GOAL: the goal is another one of the scene's.
+      goals: The scene's [G, 2] [m].
+    """
+    self.name, self.policy_id, self.image_size = policy.name, policy.policy_id, policy.image_size
+    self.control = control
+    self._policy, self._goals = policy, goals
 
   @property
   def belief(self) -> Belief | None:
-    return self.policy.belief
+    """Of the policy."""
+    return self._policy.belief
 
   def reset(self, sight: Sight) -> None:
-    self.policy.reset(sight)
+    self._policy.reset(sight)
 
   def act(
     self, observation: Mapping[str, np.ndarray], *, goal: np.ndarray, sight: Sight
   ) -> np.ndarray:
     if self.control == BLACK:
       dark = {n: np.zeros_like(a) if n == "camera" else a for n, a in observation.items()}
-      return self.policy.act(dark, goal=goal, sight=sight)
-    other = other_goal(self.goals, goal)
+      return self._policy.act(dark, goal=goal, sight=sight)
+    other = other_goal(self._goals, goal)
     shown = {**observation, "goal": other.astype(np.float32)}
-    return self.policy.act(shown, goal=other, sight=sight)
+    return self._policy.act(shown, goal=other, sight=sight)
 
 
 def other_goal(goals: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -91,4 +83,4 @@ def under_control(
       f"Found no other goal in the protocol {protocol!r} of {len(goals)} goals: run navigation in "
       "a scene with two or more."
     )
-  return ControlledPolicy(policy=policy, control=control, goals=goals)
+  return ControlledPolicy(policy, control=control, goals=goals)
