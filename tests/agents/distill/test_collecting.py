@@ -87,7 +87,7 @@ class _Teacher:
   def reset(self, pose):
     self.poses = []
 
-  def label(self, observation, *, goal, pose):
+  def label(self, observation, *, goal, pose, ball=None):
     self.poses.append(pose)
     return Label(np.full(20, 0.5, np.float32), np.array([1.0, -1.0], np.float32))
 
