@@ -52,7 +52,7 @@ def test_the_true_room_is_seen_from_the_fields_frame():
   scene = loading.open_scene(None)
   camera = Camera.from_vertical_fov(np.deg2rad(43.3), 40, 30)
   pose = np.eye(4)
-  pose[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]).T.T  # looking along world's x
+  pose[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looking along world's x
   pose[:3, 3] = (*np.mean(np.asarray(scene.extent), axis=0)[:2], 0.45)
   unit = scene.world_from_unit.inverse().apply_pose(pose)
   true = swaps.TrueRoom(scene)
