@@ -40,7 +40,6 @@ _LEG_SWAY, _ARM_SWAY = 0.05, 0.2  # rad
 _NOMINAL = RandomisationSettings(
   pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
 )
-MOTIONS = ("sway", "walk")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

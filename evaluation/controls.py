@@ -29,7 +29,7 @@ class ControlledPolicy:
       goals: The scene's [G, 2] [m].
     """
     self.name, self.policy_id, self.image_size = policy.name, policy.policy_id, policy.image_size
-    self.control = control
+    self.control, self.trained_on = control, policy.trained_on
     self._policy, self._goals = policy, goals
 
   @property

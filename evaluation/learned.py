@@ -44,6 +44,7 @@ class LearnedPolicy:
     self.policy_id = str(_digest(folder))
     shape = self._layout.image_shape
     self.image_size = None if shape is None else (shape[0], shape[1])
+    self.trained_on = self._loaded.environment
     self._seed, self._stochastic = seed, stochastic
     self.belief: Belief | None = None
 

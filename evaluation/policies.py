@@ -35,6 +35,7 @@ class EvaluatedPolicy(Protocol):
   policy_id: str  # digest of what it is made of
   image_size: tuple[int, int] | None  # of the pictures that it needs
   control: str  # one of `controls.CONTROLS`; "none": its observations are the plant's
+  trained_on: str  # name of its environment; empty for a policy that was not trained
 
   def reset(self, sight: Sight) -> None:
     """Begins an episode."""
@@ -61,6 +62,7 @@ class GaitPolicy:
   name = "gait"
   image_size: tuple[int, int] | None = None
   control = "none"
+  trained_on = ""
   belief: Belief | None = None
 
   def __init__(self, scene: Any, protocol: str, *, settings: GaitSettings | None = None):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.agents.environments.loading import camera_settings
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.controls import under_control
 from nerf2real.evaluation.learned import LearnedPolicy
@@ -57,9 +58,21 @@ def each_plant(settings: EvaluationSettings) -> list[EvaluationSettings]:
 
 
 def make_plant(
-  settings: EvaluationSettings, scene: Any, image_size: tuple[int, int] | None
+  settings: EvaluationSettings,
+  scene: Any,
+  image_size: tuple[int, int] | None,
+  *,
+  trained_on: str = "",
 ) -> Plant:
-  """Returns the plant that the settings of one name; see `each_plant`."""
+  """Returns the plant that the settings of one name; see `each_plant`.
+
+  Args:
+    settings: The evaluation.
+    scene: An opened bundle.
+    image_size: Height and width of the policy's picture; None for no camera.
+    trained_on: Name of the policy's environment: a simulated camera has its rate, lens and
+      response. Robots have cameras of their own.
+  """
   swaps.check(settings.swap, plant=settings.plant, built_in=settings.scene is None)
   record = None
   if settings.record and settings.plant != "sim":
@@ -72,6 +85,7 @@ def make_plant(
       settings.protocol,
       settings.perturb,
       image_size=image_size,
+      camera=camera_settings(trained_on),
       effects=settings.effects,
       seed=settings.seed,
       time_limit=settings.time_limit,
@@ -190,9 +204,10 @@ def _run_trials(
   say: Callable[[str], None],
 ) -> None:
   policy = load_policy(settings, scene)
+  size = policy.image_size or settings.camera_size
   chosen = choose(plants.trials(settings.protocol), count)
   for single in each_plant(settings):
-    plant = make_plant(single, scene, policy.image_size or settings.camera_size)
+    plant = make_plant(single, scene, size, trained_on=policy.trained_on)
     say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
     try:
       runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))

@@ -6,6 +6,7 @@ hidden in it, so that its servos, masses and sensors are those of the data sheet
 contacts and battery remain its own).
 """
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -44,11 +45,17 @@ class TrueRoom:
     self._eye.close()
 
 
-def camera_of_the_robot() -> CameraSettings:
-  """Returns a simulated camera with the virtual one's rate and, on average, its latency."""
-  camera = VirtualCamera()
+def camera_of_the_robot(camera: CameraSettings | None) -> CameraSettings:
+  """Returns a simulated camera with the virtual one's rate and, on average, its latency.
+
+  Args:
+    camera: The simulation's; None: the neutral one.
+  """
+  virtual = VirtualCamera()
   delay = float(np.mean(RandomisationSettings().delay_range))
-  return CameraSettings(rate=camera.rate, latency=max(0.0, camera.latency - delay))
+  return dataclasses.replace(
+    camera or CameraSettings(), rate=virtual.rate, latency=max(0.0, virtual.latency - delay)
+  )
 
 
 def check(swap: str, *, plant: str, built_in: bool) -> None:

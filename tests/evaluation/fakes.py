@@ -70,6 +70,7 @@ class StillPolicy:
   """Stands; says that it believes to be where it is told."""
 
   name, policy_id, image_size, control = "still", "0123", None, "none"
+  trained_on = ""
 
   def __init__(self, belief=None):
     self.belief = belief

@@ -9,6 +9,7 @@ from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.suite import loading
+from nerf2real.suite.sensors.camera import CameraSettings
 
 
 def test_what_cannot_be_swapped_is_refused():
@@ -26,7 +27,8 @@ def test_what_cannot_be_swapped_is_refused():
 
 
 def test_the_simulated_camera_takes_the_robots_timing():
-  camera = swaps.camera_of_the_robot()
+  camera = swaps.camera_of_the_robot(CameraSettings(rate=15.0, gain=1.2))
+  assert camera.gain == 1.2
   assert camera.rate == VirtualCamera().rate == 30
   assert camera.latency + 0.030 == pytest.approx(VirtualCamera().latency)
 

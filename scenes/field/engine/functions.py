@@ -1,6 +1,6 @@
 """The trainer's functions of samples and rays in Warp, for one shape of field.
 
-The arithmetic on samples is C++ (`native_grid`, `native_network`), a vector at a time. `chunks` and
+The arithmetic on samples is C++ (`native/`), a vector at a time. `chunks` and
 `phases` build kernels of these functions.
 """
 # mypy: ignore-errors
