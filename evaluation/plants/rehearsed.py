@@ -9,7 +9,7 @@ import dm_env
 import numpy as np
 
 from nerf2real import real
-from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.plants import perturbations, swaps
 from nerf2real.evaluation.plants.plant import BALL, TASKS, Sight, Trial, make_intruder
 from nerf2real.evaluation.plants.robot_plant import RobotPlant
 from nerf2real.real.virtual import undeclared
@@ -56,6 +56,7 @@ class RehearsedPlant(RobotPlant):
     world: str = "room",
     time_limit: float | None = None,
     record: Path | None = None,
+    swap: str = swaps.NONE,
   ):
     """Builds the robot and connects to it.
 
@@ -70,13 +71,16 @@ class RehearsedPlant(RobotPlant):
       world: "room" or "floor", see `VirtualRobot`.
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
+      swap: `swaps.PHYSICS`: nothing is hidden in the robot.
     """
     super().__init__(scene, protocol, perturbation, record=record)
     self.plant_id = "data sheet" if robot_seed is None else f"robot {robot_seed}"
+    known = swap == swaps.PHYSICS
+    self.plant_id += ", data sheet's physics" if known else ""
     self._intruder = make_intruder(self, self._starts)
     if altered:
       self.plant_id += ", altered"
-    build = undeclared.build(robot_seed, altered, age=session)
+    build = undeclared.build(None if known else robot_seed, altered, age=session)
     self.robot = VirtualRobot(
       world=world,
       seed=robot_seed,
