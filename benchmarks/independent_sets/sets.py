@@ -212,7 +212,7 @@ def _answer(
     "effects": [effects.describe(effect, paper) for effect in drawn],
     "mix": mix,
     "error_ratio": round(float(max(ratios, default=1.0)), 3),
-    "below_floor": bool(drawn) and max(ratios) < DETECTABLE,
+    "below_floor": bool(drawn and max(ratios) < DETECTABLE),
     "held_error": held,
     "healthy_held_error": healthy,
   }
