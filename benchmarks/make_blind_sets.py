@@ -12,14 +12,17 @@ import json
 import multiprocessing
 import pathlib
 import time
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Callable, Iterable
+from typing import Any, Literal
 
 from benchmarks import harness
 from benchmarks.blind_sets import sets
 from benchmarks.independent_sets import sets as independent_sets
 
-GENERATORS = {"blind_sets": sets.make_set, "independent_sets": independent_sets.make_set}
+GENERATORS: dict[str, Callable[..., Any]] = {
+  "blind_sets": sets.make_set,
+  "independent_sets": independent_sets.make_set,
+}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -47,7 +47,7 @@ def make_apparatus(plant: str, rng: np.random.Generator) -> Apparatus:
   return {"slider": _slider, "arm": _arm, "wheel": _wheel}[plant](rng)
 
 
-def _machine(joints: int, **values: float | list[float]) -> Machine:
+def _machine(joints: int, **values: float | np.ndarray) -> Machine:
   """Returns constants as arrays, of one machine; what is not given is absent."""
   absent = dict.fromkeys((f.name for f in dataclasses.fields(Machine) if f.name != "slides"), 0.0)
   absent |= {"gravity": GRAVITY, "dwell_time": 1.0, "patch_width": 1.0, "drift_time": 1.0}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
 import numpy as np
 
@@ -153,7 +154,7 @@ def write(path: pathlib.Path, apparatus: Apparatus, recording: Recording) -> Non
   if recording.supply is not None:
     rows += [(t, 2, i) for i, t in enumerate(recording.supply_time)]
 
-  def of(table: Array | None, index: int) -> Array | None:
+  def of(table: Array | None, index: int) -> Any:
     return None if table is None else table[index]
 
   with open_log(path) as log:

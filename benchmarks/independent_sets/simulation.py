@@ -89,7 +89,8 @@ def simulate(
     history[2, index], history[3, index] = drive.current, drive.duty
     history[4, index] = drive.volts
     q, v, rotor, rate = _midpoint(machine, accelerate, friction, torque, (q, v, rotor, rate))
-  return Trace(*history, given)
+  path, link, current, duty, volts = history
+  return Trace(path, link, current, duty, volts, given)
 
 
 def _counted(position: Array, count: Array) -> Array:

@@ -1,8 +1,9 @@
-"""Reads the JSON logs of BAM, Better Actuator Models (Rhoban, github.com/Rhoban/bam).
+"""Reads the JSON logs of BAM, Better Actuator Models (github.com/Rhoban/bam).
 
-An object with `mass`, `length`, `kp`, `vin`, `motor`, `trajectory` and `entries`, a list of
-{timestamp [s], goal_position [rad], position [rad], speed [rad/s], load, input_volts [V], temp
-[degrees Celsius], torque_enable}: raw files, and processed ones. There is one joint, without a name.
+An object with `mass`, `length`, `kp`, `vin`, `motor`, `trajectory` and `entries`; each of these has
+`timestamp` [s], `goal_position` [rad], `position` [rad], `speed` [rad/s], `load`, `input_volts` [V],
+`temp` [degrees Celsius] and `torque_enable`; files as recorded, or resampled. Source of the format:
+bam/dynamixel/record.py and bam/process.py there.
 """
 
 import json
@@ -19,15 +20,13 @@ from nerf2real.sysid.data.checks import checked
 FULL_DUTY = {"xl330": 885}
 """`load` at full duty by motor, where it is Present PWM (XL330-M288 e-manual, address 124); that of
 other motors is a load without a unit, and is not read."""
+UNNAMED = "(unnamed)"
+"""The joint of a log: the format has one servo and no name for it."""
 NEEDED = ("timestamp", "goal_position", "position")
 
 
-def read_bam(path: Path, *, joint: str = "joint") -> Log:
-  """Reads a BAM log.
-
-  Args:
-    path: a JSON file.
-    joint: name of the joint in the model.
+def read_bam(path: Path) -> Log:
+  """Reads a BAM log, whose joint is called `UNNAMED`.
 
   Raises:
     LogError: the file is no BAM log, an entry lacks a number, torque was off, or the log is too
@@ -57,7 +56,7 @@ def read_bam(path: Path, *, joint: str = "joint") -> Log:
 
   def series(position: Any = None, velocity: Any = None, effort: Any = None) -> JointSeries:
     columns = [None if v is None else v[:, None] for v in (position, velocity, effort)]
-    return JointSeries((joint,), stamps, stamps, *columns)
+    return JointSeries((UNNAMED,), stamps, stamps, *columns)
 
   load, full = read("load"), FULL_DUTY.get(str(content.get("motor", "")).lower())
   volts, heat = read("input_volts"), read("temp")
@@ -70,7 +69,7 @@ def read_bam(path: Path, *, joint: str = "joint") -> Log:
       pwm=None if load is None or full is None else series(effort=load / full),
       imu=None,
       battery=None if volts is None else ScalarSeries(stamps, stamps, volts),
-      temperatures={} if heat is None else {joint: ScalarSeries(stamps, stamps, heat)},
+      temperatures={} if heat is None else {UNNAMED: ScalarSeries(stamps, stamps, heat)},
       path=path,
     )
   )

@@ -1,4 +1,4 @@
-"""What a measured log must be to be usable, whatever its format (MCAP: `core.robot_logs.reading`)."""
+"""What a log of another format must be to be usable; of MCAP see `core.robot_logs.reading`."""
 
 import numpy as np
 
