@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -63,7 +64,7 @@ class Machine:
   measurement_delay: Array
   slides: bool = False
 
-  def change(self, **values: Array) -> "Machine":
+  def change(self, **values: Any) -> "Machine":
     """Returns a copy with other constants."""
     return dataclasses.replace(self, **values)
 

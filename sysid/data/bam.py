@@ -1,9 +1,9 @@
 """Reads the JSON logs of BAM, Better Actuator Models (github.com/Rhoban/bam).
 
 An object with `mass`, `length`, `kp`, `vin`, `motor`, `trajectory` and `entries`; each of these has
-`timestamp` [s], `goal_position` [rad], `position` [rad], `speed` [rad/s], `load`, `input_volts` [V],
-`temp` [degrees Celsius] and `torque_enable`; files as recorded, or resampled. Source of the format:
-bam/dynamixel/record.py and bam/process.py there.
+`timestamp` [s], `goal_position` [rad], `position` [rad], `speed` [rad/s], `load`,
+`input_volts` [V], `temp` [degrees Celsius] and `torque_enable`; files as recorded, or resampled.
+Source of the format: bam/dynamixel/record.py and bam/process.py there.
 """
 
 import json

@@ -48,7 +48,7 @@ def named(log: Log, model: mujoco.MjModel) -> Log:
 
   commands, states = renamed(log.commands), renamed(log.states)
   assert commands is not None and states is not None
-  heat = {driven[0]: series for series in log.temperatures.values()}
+  heat = dict(zip(driven, log.temperatures.values(), strict=False))  # of one servo, or none
   return dataclasses.replace(
     log, commands=commands, states=states, pwm=renamed(log.pwm), temperatures=heat
   )
