@@ -14,7 +14,7 @@ from nerf2real.scenes.results import Measure, SceneResults, Source
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import Stages
 
-STAGES = ".stages"  # folder of the cached stages inside a bundle
+STAGES = bundle.STAGES
 
 
 def make_scene(
