@@ -169,7 +169,7 @@ def judge_coverage(found: Coverage, poses: np.ndarray) -> list[Finding]:
     ("walls", found.shares[1], _WALL_SHARE, found.walls, found.walls_covered, "pan slowly"),
   ):
     good = share >= wanted
-    text = f"{share:.0%} of the {name} is shown by three pictures or more"
+    text = f"Three pictures or more show {share:.0%} of the {name}"
     if not good:
       text += (
         f"; film towards {_direction(places[~covered], poses)} ({advice}), where 12 o'clock is the "
