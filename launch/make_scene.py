@@ -26,8 +26,8 @@ class Arguments:
   """Makes a scene bundle from a video or pictures of a room."""
 
   capture: str
-  """A video, a folder of pictures, a COLMAP model, a transforms.json, or "builtin" for the
-  project's own room."""
+  """A video, a folder of pictures, a COLMAP model, a transforms.json, an RGB-D sequence with poses
+  (TUM's or 7-Scenes' layout), or "builtin" for the project's own room."""
   out: Path
   """Folder of the bundle."""
   preset: Literal["fast", "demo", "paper"] = "fast"

@@ -1,4 +1,4 @@
-"""Checks of captures of other kinds: a reason at once, or a verdict that making the scene reuses."""
+"""Checks of captures of other kinds: a reason at once, or a verdict that the scene reuses."""
 
 import cv2
 import numpy as np
