@@ -28,17 +28,26 @@ ROTATION_TOLERANCE = 1e-2  # of a pose's 3x3 part to a rotation
 class KnownPoses:
   """Cameras and points that came with the pictures."""
 
-  kind: str  # "colmap", "transforms" or "rgbd"
-  camera: Camera  # of the original pictures
-  files: tuple[Path, ...]  # picture of each pose
-  world_from_camera: np.ndarray  # [N, 4, 4], OpenCV camera axes, the source's frame
-  points: np.ndarray  # [P, 3], the source's frame; empty where the source has none
-  point_colors: NDArray[np.uint8]  # [P, 3]
-  point_errors: np.ndarray  # mean reprojection error [P] [pixel]
-  depth_files: tuple[Path, ...] = ()  # depth picture of each pose; empty where there is no sensor
-  depth_unit: float = rgbd.MILLIMETRE  # of the depth pictures, in the unit of the poses
+  kind: str
+  """"colmap", "transforms" or "rgbd"."""
+  camera: Camera
+  """Of the original pictures."""
+  files: tuple[Path, ...]
+  """Picture of each pose."""
+  world_from_camera: np.ndarray
+  """[N, 4, 4], OpenCV camera axes, the source's frame."""
+  points: np.ndarray
+  """[P, 3], the source's frame; empty where the source has none."""
+  point_colors: NDArray[np.uint8]
+  """[P, 3]."""
+  point_errors: np.ndarray
+  """Mean reprojection error [P] [pixel]."""
+  depth_files: tuple[Path, ...] = ()
+  """Depth picture of each pose; empty where there was no sensor."""
+  depth_unit: float = rgbd.MILLIMETRE
+  """Of the depth pictures, in the unit of the poses."""
   sightings: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4)))
-  # measured depth [A, 4]: picture, pixel x and y, distance along the pixel's ray
+  """Measured depth [A, 4]: picture, pixel x and y, distance along the pixel's ray."""
 
   def __post_init__(self):
     # JSON does not keep the columns of an array without rows.
