@@ -14,11 +14,11 @@ import numpy as np
 import rich
 from rich.table import Table
 
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.core.serialization import from_plain
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import yardstick
 from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.export.mjcf import mujoco_quaternion
 from nerf2real.scenes.export.splats.splats import Splats
 from nerf2real.scenes.export.views import render_views, renderer_of
 from nerf2real.scenes.quality import image_quality
@@ -32,10 +32,10 @@ def draw_with_mujoco_warp(splats: Splats, poses: np.ndarray, *, samples: int) ->
 
   spec = mujoco.MjSpec()
   for number, pose in enumerate(poses):
-    axes = pose[:3, :3] @ OPENGL_FROM_OPENCV
     fov = float(np.degrees(yardstick.robot_camera(_HEIGHT, _WIDTH).vertical_fov))
-    added = spec.worldbody.add_camera(name=f"view_{number}", pos=pose[:3, 3], fovy=fov)
-    added.alt.xyaxes = np.concatenate([axes[:, 0], axes[:, 1]])
+    spec.worldbody.add_camera(
+      name=f"view_{number}", pos=pose[:3, 3], quat=mujoco_quaternion(pose), fovy=fov
+    )
   # a scene needs one geom; it lies out of sight
   spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0, 0, -50])
   model = spec.compile()
@@ -73,7 +73,7 @@ def main() -> None:
   assert field is not None
   splats = Splats.load_ply(arguments.splats)
   drawn = draw_with_mujoco_warp(splats, poses, samples=arguments.samples)
-  table = Table("pictures", "against", "PSNR [dB], mean of 24", title=f"{len(splats)} splats")
+  table = Table("pictures", "against", "PSNR, dB, mean of 24", title=f"{len(splats)} splats")
   for name, found, other, with_what in (
     ("field", field, truth, "truth"),
     ("splats", drawn, truth, "truth"),

@@ -58,6 +58,13 @@ def scene_spec(
   return spec
 
 
+def mujoco_quaternion(world_from_camera: np.ndarray) -> np.ndarray:
+  """Orientation (w, x, y, z) of a MuJoCo camera at a pose [4, 4] with OpenCV axes."""
+  quaternion = np.empty(4)
+  mujoco.mju_mat2Quat(quaternion, (world_from_camera[:3, :3] @ OPENGL_FROM_OPENCV).ravel())
+  return quaternion
+
+
 def add_camera(
   spec: mujoco.MjSpec, camera: Camera, world_from_camera: np.ndarray, *, name: str
 ) -> None:
@@ -66,17 +73,16 @@ def add_camera(
     spec.visual.global_.offwidth = max(1280, camera.width)
     spec.visual.global_.offheight = max(960, camera.height)
   size = _SENSOR_WIDTH * np.array([1.0, camera.height / camera.width])
-  axes = world_from_camera[:3, :3] @ OPENGL_FROM_OPENCV
-  added = spec.worldbody.add_camera(
+  spec.worldbody.add_camera(
     name=name,
     pos=world_from_camera[:3, 3],
+    quat=mujoco_quaternion(world_from_camera),
     resolution=[camera.width, camera.height],
     sensor_size=size,
     focal_pixel=[camera.fx, camera.fy],
     # from the image point of the axis to the picture's centre
     principal_pixel=[camera.width / 2 - camera.cx, camera.height / 2 - camera.cy],
   )
-  added.alt.xyaxes = np.concatenate([axes[:, 0], axes[:, 1]])
 
 
 def add_visual(spec: mujoco.MjSpec, *, mesh: str, texture: str) -> None:

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.sources import read_transforms
 from nerf2real.scenes.export import exporting, gltf, heightfield, mjcf, nerfstudio, texture, usd
 from nerf2real.scenes.geometry import convex
@@ -95,6 +96,8 @@ def test_mujoco_opens_the_mjcf_and_its_camera_is_the_calibrated_one(parts, visua
     assert 2.0 - reach == pytest.approx(top, abs=1e-4)
   camera = model.camera("capture")
   np.testing.assert_allclose(data.cam("capture").xpos, POSE[:3, 3], atol=1e-6)
+  axes = data.cam("capture").xmat.reshape(3, 3) @ OPENGL_FROM_OPENCV
+  np.testing.assert_allclose(axes, POSE[:3, :3], atol=1e-6)
   focal, offset = np.split(model.cam_intrinsic[camera.id], 2)
   pixel = model.cam_sensorsize[camera.id] / model.cam_resolution[camera.id]
   np.testing.assert_allclose(focal / pixel, [LENS.fx, LENS.fy], rtol=1e-5)
