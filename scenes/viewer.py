@@ -150,8 +150,7 @@ def view_bundle(
   server.initial_camera.position = tuple(pose[:3, 3])
   server.initial_camera.look_at = tuple(pose[:3, 3] + pose[:3, 2])
   view = field_view.FieldView(renderer_of(bundle), bundle.world_from_unit)
-  switch = field_view.serve_field(server, view, setback=_SETBACK)
-  switch.value = splats is None
+  field_view.serve_field(server, view, setback=_SETBACK, shown=splats is None)
   _add_switches(server, _layers(server, bundle, splats))
   _add_figures(server, bundle)
   return server

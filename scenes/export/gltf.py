@@ -32,7 +32,8 @@ def write(path: Path, mesh: TexturedMesh) -> None:
   """Writes a mesh of the world frame (z up) as a .glb file, turned to y up."""
   shown = textured_trimesh(mesh)
   shown.vertices = shown.vertices @ Y_UP.T
-  scene = trimesh.Scene({"visual": shown}, metadata={"unit": "metre", "up": "y"})
+  scene = trimesh.Scene(metadata={"unit": "metre", "up": "y"})
+  scene.add_geometry(shown, geom_name="visual", node_name="visual")
   content = scene.export(file_type="glb")
   assert isinstance(content, bytes)  # other formats give text or a mapping
   files.write_atomically(path, content)

@@ -102,7 +102,8 @@ def write(
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetDefaultPrim(pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim())
     shown = _add_mesh(stage, "/World/visual", visual.vertices, visual.faces)
-    colors = np.asarray(visual.visual.vertex_colors)[:, :3] / np.float32(255)
+    looks: Any = visual.visual  # of vertices, as bundles have it
+    colors = np.asarray(looks.vertex_colors)[:, :3] / np.float32(255)
     shown.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex).Set(
       pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colors, np.float32))
     )

@@ -106,9 +106,11 @@ class Fit:
     starts[len(shown) :] = -1e3 * eye.rotation[2] - eye.rotation.T @ eye.translation
     arguments = (self.rows[padded], starts, self._spacing[padded], eye)
     gaussians, depth = self._project(*arguments)
-    arrays = tuple(np.asarray(array) for array in gaussians)
-    size = {"width": camera.width, "height": camera.height}
-    tiles = rasteriser.assign(*arrays[:3], np.asarray(depth), **size)
+    arrays = [np.asarray(array) for array in gaussians]
+    centres, conics, opacities, _ = arrays
+    tiles = rasteriser.assign(
+      centres, conics, opacities, np.asarray(depth), width=camera.width, height=camera.height
+    )
     inputs = (*tiles, *arrays, camera.width, camera.height)
     return shown, arguments, inputs, rasteriser.composite(*inputs)
 
@@ -142,7 +144,8 @@ class Fit:
     eye = projection.Eye.at(camera, world_from_camera, blur=blur)
     shown, arguments, inputs, (image, left, looked) = self._draw(camera, eye)
     error = image - truth.astype(np.float32)
-    slopes = rasteriser.composite_backward(*inputs, left, looked, (2 / error.size) * error)
+    drawn = (*inputs, left, looked, (2 / error.size) * error)
+    slopes = rasteriser.composite_backward(*drawn)  # type: ignore[call-arg]
     gradient = self._pull(*arguments, projection.Projected(*slopes))
     self._descend(shown, np.asarray(gradient)[: len(shown)], rate)
     return float(np.mean(error**2))

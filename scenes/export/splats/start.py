@@ -3,7 +3,7 @@
 Shapes: N splats, P pixels.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,7 +99,8 @@ def rows_of(points: Seeds) -> np.ndarray:
 
 def splats_of(rows: np.ndarray, points: Seeds) -> Splats:
   """Returns the splats of fitted parameters [N, 14]."""
-  offsets, log_scales, rotations, logits, colors = Parameters.of_rows(rows.astype(np.float64))
+  split: Any = Parameters.of_rows(rows.astype(np.float64))  # type: ignore[arg-type]
+  offsets, log_scales, rotations, logits, colors = split
   return Splats(
     positions=points.positions + points.spacing[:, None] * offsets,
     rotations=rotations / np.linalg.norm(rotations, axis=-1, keepdims=True),
