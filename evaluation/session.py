@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.core.files import write_atomically
+from nerf2real.core.folder_lock import lock_folder
 from nerf2real.evaluation import episodes, plants, report, runner, tables
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import Plant
@@ -113,13 +115,21 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
     The report's path; None after a dry run, which keeps nothing.
 
   Raises:
+    FolderInUseError: Another process evaluates into the folder.
     ValueError: A dry run of a plant that is no robot.
   """
   scene = loading.open_scene(settings.scene)
   if settings.dry_run:
     _dry_run(settings, scene, say)
     return None
+  with lock_folder(settings.out):
+    return _evaluate(settings, scene, say)
+
+
+def _evaluate(settings: EvaluationSettings, scene: Any, say: Callable[[str], None]) -> Path:
   store = episodes.Store(settings.out)
+  if store.duplicates:
+    say(f"left out {store.duplicates} episodes that {store.path} holds twice")
   path = settings.out / "report.html"
   try:
     _run_trials(settings, scene, store, settings.trials, say)
@@ -135,7 +145,7 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
   text = "\n".join(tables.as_text(table) for table in shown)
   say(f"\n{text}")
   if settings.markdown is not None:
-    settings.markdown.write_text(text)
+    write_atomically(settings.markdown, text)
   return path
 
 

@@ -10,13 +10,18 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import tyro
 
+from nerf2real.core.folder_lock import FolderInUseError, discarded_on, lock_folder
+
 FAILED = 1  # exit status: the input or the machine was at fault
 WRONG_ARGUMENTS = 2  # exit status, as of argparse and tyro: the same command cannot succeed
+_LEARNER = ".learner.lock"  # beside the lock of the run's supervisor
+_PATIENCE = 20.0  # s for a learner whose supervisor was killed to save what it has
 _SIGNALLED = 128  # plus the signal's number: the shell's convention
 
 DRAWING = {"MUJOCO_GL": "egl"}
@@ -34,6 +39,14 @@ class CommandError(Exception):
     """Takes the message, without "error:", and the exit status."""
     super().__init__(str(message))
     self.status = status
+
+
+class RefusedError(CommandError):
+  """Ends a command that cannot start with its arguments: nothing is left of it."""
+
+  def __init__(self, message: object):
+    """Takes the message, without "error:"."""
+    super().__init__(message, status=WRONG_ARGUMENTS)
 
 
 def main(
@@ -107,6 +120,21 @@ def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]
     yield
   finally:
     signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def learner_folder(run: Path) -> Iterator[None]:
+  """Holds the lock of a run's folder, as its one learner; a refused start leaves nothing in it.
+
+  Raises:
+    CommandError: Another learner writes the folder. This is no refusal for good: where the other
+      one was on a machine that was lost, a supervisor tries again.
+  """
+  try:
+    with discarded_on(RefusedError, run), lock_folder(run, name=_LEARNER, patience=_PATIENCE):
+      yield
+  except FolderInUseError as error:
+    raise CommandError(error) from error
 
 
 def device(camera: str | None) -> str | int | None:

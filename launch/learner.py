@@ -20,7 +20,7 @@ import tyro
 
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
+from nerf2real.agents.processes.statuses import NOT_SAVED
 from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 
@@ -133,11 +133,16 @@ def run(arguments: Arguments) -> None:
     CommandError: It cannot start with these arguments, trajectories can no longer be taken in, or
       what was learned was not saved.
   """
+  logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
+  set_threads(arguments.threads)
+  with command.learner_folder(arguments.run):
+    _learn(arguments)
+
+
+def _learn(arguments: Arguments) -> None:
   from nerf2real.agents.processes.checkpoints import CheckpointError
   from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
 
-  logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
-  set_threads(arguments.threads)
   try:
     environment, config = agent_settings(arguments)
     names = {field.name for field in dataclasses.fields(RunSettings)} - {"environment"}
@@ -153,7 +158,7 @@ def run(arguments: Arguments) -> None:
       join=arguments.connect is not None,
     )
   except (ValueError, OSError, sessions.LinkError, CheckpointError) as error:
-    raise command.CommandError(error, status=REFUSED) from error
+    raise command.RefusedError(error) from error
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())
   try:

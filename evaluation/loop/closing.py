@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf2real import sysid
+from nerf2real.core.files import atomic_path, write_atomically
+from nerf2real.core.folder_lock import lock_folder
 from nerf2real.evaluation.loop import gap, recording
 from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model
 
@@ -36,15 +38,21 @@ def close_loop(
     reuse: Takes the logs that an earlier loop left in the folder instead of moving the robot.
 
   Raises:
+    FolderInUseError: Another process closes a loop in the folder.
     RuntimeError: The recorder or the robot did not keep up.
     ValueError: The logs cannot be identified from.
   """
-  out.mkdir(parents=True, exist_ok=True)
+  with lock_folder(out):
+    return _close_loop(out, robot=robot, seed=seed, seconds=seconds, reuse=reuse)
+
+
+def _close_loop(out: Path, *, robot: str, seed: int, seconds: float, reuse: bool) -> Closed:
   model, identified = out / "declared.xml", out / "identified"
-  model.write_text(declared_model())
+  write_atomically(model, declared_model())
   if not reuse:
     moved = recording.record_motions(out, robot=robot, seed=seed, seconds=seconds)
-    np.savez(out / "standing.npz", actions=moved["actions"], positions=moved["positions"])
+    with atomic_path(out / "standing.npz") as partial:
+      np.savez(partial, actions=moved["actions"], positions=moved["positions"])
   standing = np.load(out / "standing.npz")
   content = sysid.identify(
     model,
@@ -57,5 +65,5 @@ def close_loop(
   table = gap.gap_table(standing["positions"], before, after, content)
   if robot == recording.VIRTUAL:
     table += gap.hidden_table(seed, content, identified / "details.json")
-  (out / "gap.md").write_text(table)
+  write_atomically(out / "gap.md", table)
   return Closed(content, table, identified / "report.html")
