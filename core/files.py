@@ -90,6 +90,7 @@ def append_line(path: str | Path, text: str) -> None:
     DiskFullError: The disk or the quota is exhausted.
   """
   path = Path(path)
+  existed = path.exists()
   with explain_disk_full(path), path.open("ab", buffering=0) as stream:
     before, rest = stream.tell(), memoryview(f"{text}\n".encode())
     try:
@@ -97,6 +98,8 @@ def append_line(path: str | Path, text: str) -> None:
         rest = rest[stream.write(rest) :]
     except OSError:
       stream.truncate(before)
+      if not existed:
+        path.unlink()
       raise
 
 

@@ -114,9 +114,7 @@ def _take(path: Path) -> int:
       if not _is_same(descriptor, path):
         os.close(descriptor)
         continue
-      record = {"pid": os.getpid(), "host": socket.gethostname(), "time": time.time()}
-      os.ftruncate(descriptor, 0)
-      os.write(descriptor, json.dumps(record).encode())
+      _sign(descriptor, path)
       return descriptor
     except BaseException:
       with contextlib.suppress(OSError):
@@ -137,6 +135,18 @@ def _lock(descriptor: int, path: Path) -> None:
     owner = owner_of(path.parent, name=path.name)
     if owner and not _is_dead(owner):
       raise _in_use(path) from None
+
+
+def _sign(descriptor: int, path: Path) -> None:
+  """Writes the owner into a lock's file; one that cannot hold it is removed."""
+  record = {"pid": os.getpid(), "host": socket.gethostname(), "time": time.time()}
+  try:
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, json.dumps(record).encode())
+  except OSError:
+    with contextlib.suppress(OSError):
+      path.unlink()
+    raise
 
 
 def _is_same(descriptor: int, path: Path) -> bool:

@@ -33,6 +33,7 @@ class Plant(abc.ABC):
 
   name: str  # "sim", "virtual" or "robot"
   plant_id: str = ""  # which one
+  _recorder: Any = None  # a `real.recorder.recorder.Recorder`
 
   def __init__(self, scene: Any, protocol: str, perturbation: str):
     """Notes what is evaluated.
@@ -93,6 +94,11 @@ class Plant(abc.ABC):
   @abc.abstractmethod
   def close(self) -> None:
     """Ends the plant."""
+
+  def check_recording(self) -> None:
+    """Raises OSError, after `close`, if what was to be recorded is not whole."""
+    if self._recorder is not None:
+      self._recorder.raise_failure()
 
 
 def trials(protocol: str) -> tuple[tuple[str, Trial], ...]:

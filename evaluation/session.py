@@ -174,3 +174,4 @@ def _run_trials(
     runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
   finally:
     plant.close()
+  plant.check_recording()

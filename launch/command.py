@@ -16,7 +16,7 @@ from typing import Any
 
 import tyro
 
-from nerf2real.core.folder_lock import FolderInUseError, discarded_on, lock_folder
+from nerf2real.core.folder_lock import discarded_on, lock_folder
 
 FAILED = 1  # exit status: the input or the machine was at fault
 WRONG_ARGUMENTS = 2  # exit status, as of argparse and tyro: the same command cannot succeed
@@ -127,14 +127,16 @@ def learner_folder(run: Path) -> Iterator[None]:
   """Holds the lock of a run's folder, as its one learner; a refused start leaves nothing in it.
 
   Raises:
-    CommandError: Another learner writes the folder. This is no refusal for good: where the other
-      one was on a machine that was lost, a supervisor tries again.
+    CommandError: The folder cannot be written, or another learner writes it. This is no refusal for
+      good: where the other one was on a machine that was lost, a supervisor tries again.
   """
-  try:
-    with discarded_on(RefusedError, run), lock_folder(run, name=_LEARNER, patience=_PATIENCE):
-      yield
-  except FolderInUseError as error:
-    raise CommandError(error) from error
+  with contextlib.ExitStack() as stack:
+    stack.enter_context(discarded_on(RefusedError, run))
+    try:
+      stack.enter_context(lock_folder(run, name=_LEARNER, patience=_PATIENCE))
+    except OSError as error:
+      raise CommandError(error) from error
+    yield
 
 
 def device(camera: str | None) -> str | int | None:

@@ -44,6 +44,7 @@ def run(arguments: Arguments) -> None:
   """Searches, and prints and writes every round."""
   import numpy as np
 
+  from nerf2real.core.files import write_atomically
   from nerf2real.suite.gaits import tuning, walk
 
   settings = walk.GaitSettings()
@@ -66,7 +67,7 @@ def run(arguments: Arguments) -> None:
         "walks": found.walks,
         "mean": dataclasses.asdict(found.mean),
       }
-      arguments.out.write_text(json.dumps(record, indent=1))
+      write_atomically(arguments.out, json.dumps(record, indent=1))
 
 
 def main() -> int:

@@ -19,7 +19,7 @@ from rich.live import Live
 from nerf2real.agents.link import sessions
 from nerf2real.agents.processes.status_view import StatusView
 from nerf2real.agents.processes.supervision import Job, LocalProcess, Process, Supervisor
-from nerf2real.core.files import append_line
+from nerf2real.core.files import append_line, atomic_path
 from nerf2real.core.folder_lock import FolderInUseError, discarded_on, lock_folder
 
 _JOIN_TIMEOUT = 1800.0  # s; a starved machine takes minutes to build the networks, or to be free
@@ -119,9 +119,10 @@ def make_jobs(
 
 def write_private(path: Path, text: str) -> None:
   """Writes a file that only its user may read."""
-  descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-  with os.fdopen(descriptor, "w") as stream:
-    stream.write(text)
+  with atomic_path(path) as partial:
+    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with os.fdopen(descriptor, "w") as stream:
+      stream.write(text)
 
 
 def note_launch(run: Path, command: str) -> None:

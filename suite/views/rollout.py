@@ -1,7 +1,8 @@
 """Episodes of a task as a video: third person, the robot's view, the map with a trail."""
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from rich.progress import track
 
 from nerf2real import suite
+from nerf2real.core import files
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.views.overview import TopDown
 from nerf2real.suite.views.third_person import ThirdPerson
@@ -62,6 +64,25 @@ class Video:
     self._container.close()
 
 
+@contextlib.contextmanager
+def open_video(path: Path) -> Iterator[Video]:
+  """Opens a video for writing, its folder is made; the file appears, whole, at the context's end.
+
+  What was filmed until Ctrl-C is kept, too: a video that plays.
+  """
+  path.parent.mkdir(parents=True, exist_ok=True)
+  interrupt: KeyboardInterrupt | None = None
+  with files.atomic_path(path) as partial:
+    film = Video(partial)
+    try:
+      yield film
+    except KeyboardInterrupt as error:
+      interrupt = error
+    film.close()
+  if interrupt is not None:
+    raise interrupt
+
+
 def describe(task_name: str, environment: suite.environment.Environment) -> str:
   """Returns the line of text under a frame."""
   task = environment.task
@@ -102,17 +123,12 @@ def run_episodes(
   timestep = environment.reset()
   task = environment.task
   act = make_policy(policy, task.standing_action, seed)
-  views = film = None
-  if video is not None:
-    video.parent.mkdir(parents=True, exist_ok=True)
-    third = ThirdPerson(task, environment.physics, height=_HEIGHT, width=_WIDTH)
+  if video is None:
+    return _run_steps(task_name, seconds, environment, timestep, act, None, None)
+  third = ThirdPerson(task, environment.physics, height=_HEIGHT, width=_WIDTH)
+  with open_video(video) as film:
     views = (third, TopDown(task, _HEIGHT))
-    film = Video(video)
-  try:
     return _run_steps(task_name, seconds, environment, timestep, act, views, film)
-  finally:  # an interrupted run leaves a video that plays
-    if film is not None:
-      film.close()
 
 
 def _run_steps(

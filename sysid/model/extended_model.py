@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.files import write_atomically
 from nerf2real.suite.effects import Effect
 
 _POINT = 1e-4  # m, radius of a payload: no inertia of its own
@@ -44,7 +45,7 @@ def write(source: Path, target: Path, effects: Sequence[Effect]) -> list[Effect]
     _put(spec, effect)
   spec.compile()
   _absolute(spec, source.resolve().parent)
-  target.write_text(spec.to_xml())
+  write_atomically(target, spec.to_xml())
   return left
 
 
