@@ -60,20 +60,19 @@ def lock_folder(folder: str | Path, *, name: str = FILE, patience: float = 0.0) 
         path.unlink()
       os.close(descriptor)  # after the unlinking: who locks a removed file looks again
   finally:
-    with contextlib.suppress(OSError):  # not empty: it is kept
-      for made in created:
-        made.rmdir()
+    _remove_empty(created)
 
 
 @contextlib.contextmanager
 def discarded_on(error: type[Exception], folder: str | Path) -> Iterator[None]:
   """Removes a folder that was missing before where the block raises an error of a kind."""
-  existed = Path(folder).exists()
+  missing = _missing(Path(folder))
   try:
     yield
   except error:
-    if not existed:
+    if missing:
       shutil.rmtree(folder, ignore_errors=True)
+      _remove_empty(missing)
     raise
 
 
@@ -88,10 +87,22 @@ def owner_of(folder: str | Path, *, name: str = FILE) -> dict[str, Any]:
 
 def _create(folder: Path) -> list[Path]:
   """Creates a folder with its parents; returns those that were missing, the innermost first."""
-  missing = [path for path in (folder, *folder.parents) if not path.exists()]
+  missing = _missing(folder)
   with files.explain_disk_full(folder):
     folder.mkdir(parents=True, exist_ok=True)
   return missing
+
+
+def _missing(folder: Path) -> list[Path]:
+  return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def _remove_empty(folders: list[Path]) -> None:
+  """Removes folders, the innermost first, up to one that is not empty."""
+  with contextlib.suppress(OSError):
+    for path in folders:
+      if path.exists():
+        path.rmdir()
 
 
 def _take_patiently(path: Path, patience: float) -> int:

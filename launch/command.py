@@ -22,6 +22,7 @@ FAILED = 1  # exit status: the input or the machine was at fault
 WRONG_ARGUMENTS = 2  # exit status, as of argparse and tyro: the same command cannot succeed
 _LEARNER = ".learner.lock"  # beside the lock of the run's supervisor
 _PATIENCE = 20.0  # s for a learner whose supervisor was killed to save what it has
+_LAST_PORT = 65535
 _SIGNALLED = 128  # plus the signal's number: the shell's convention
 
 DRAWING = {"MUJOCO_GL": "egl"}
@@ -88,6 +89,7 @@ def main(
     return _SIGNALLED + signal.SIGPIPE
   received = [signal.SIGINT]
   try:
+    _check_port(getattr(values[0], "port", None))
     with _terminated_as_interrupted(received):
       return function(*values) or 0
   except CommandError as error:
@@ -99,6 +101,12 @@ def main(
     return _SIGNALLED + received[-1]
   _say(f"error: {message}")
   return status
+
+
+def _check_port(port: int | None) -> None:
+  """Raises RefusedError for a number that is no port's; servers would wait for ever."""
+  if port is not None and not 0 <= port <= _LAST_PORT:
+    raise RefusedError(f"--port {port}: expected 0 (a free one) to {_LAST_PORT}, such as 8080.")
 
 
 def _say(text: str) -> None:

@@ -56,6 +56,8 @@ def settings_of(arguments: Arguments) -> Any:
   from nerf2real.agents.distill import settings
 
   if arguments.resume:
+    if not (arguments.run / settings.SETTINGS).exists():
+      raise ValueError(f"{arguments.run} holds no run to continue: leave --resume out.")
     return read_json(arguments.run / settings.SETTINGS, settings.DistillSettings)
   changes: dict[str, Any] = {
     "environment": arguments.env,

@@ -90,6 +90,8 @@ def agent_settings(arguments: Arguments) -> tuple[str, configs.DmpoConfig]:
   from nerf2real.agents.processes.checkpoints import read_info
 
   info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
+  if arguments.resume and info is None:
+    raise ValueError(f"{arguments.run} holds no checkpoint to go on from: leave --resume out.")
   if info is not None:
     environment, config = info["environment"], from_plain(info["config"], configs.DmpoConfig)
     given = arguments.env or environment

@@ -76,6 +76,16 @@ def _run_stages(
 
   capture = image_stages.keyframes(cache, film, settings.capture)
   poses = image_stages.poses(cache, capture, settings.localise)
+  marker = geometry_stages.outlook(
+    cache,
+    capture,
+    poses,
+    settings.align,
+    voxel=settings.mesh.voxel,
+    marker_side=settings.marker_side,
+    override=override,
+    override_key=override_key,
+  )
   pictures = image_stages.PosedPictures(
     capture, poses, settings.train_width, settings.held_out_every
   )
@@ -84,8 +94,8 @@ def _run_stages(
   figures = image_stages.figures(cache, field, pictures)
   world = geometry_stages.world(
     cache,
-    capture,
     poses,
+    marker,
     depth,
     settings.align,
     marker_side=settings.marker_side,

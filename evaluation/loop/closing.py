@@ -48,6 +48,8 @@ def close_loop(
 
 def _close_loop(out: Path, *, robot: str, seed: int, seconds: float, reuse: bool) -> Closed:
   model, identified = out / "declared.xml", out / "identified"
+  if reuse and not (out / "standing.npz").exists():
+    raise ValueError(f"Found no recorded motions in {out}: leave --reuse out to record them.")
   write_atomically(model, declared_model())
   if not reuse:
     moved = recording.record_motions(out, robot=robot, seed=seed, seconds=seconds)
