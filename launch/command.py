@@ -97,10 +97,23 @@ def main(
   except errors as error:
     message, status = str(error), FAILED
   except KeyboardInterrupt:
+    for number in (signal.SIGINT, signal.SIGTERM):  # a second one would only add a trace
+      signal.signal(number, signal.SIG_IGN)
     _say(f"\n{interrupted}")
     return _SIGNALLED + received[-1]
   _say(f"error: {message}")
   return status
+
+
+def _hide_interrupt(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+  """Ends in one line where Ctrl-C comes while a script still imports."""
+  if issubclass(kind, KeyboardInterrupt):
+    _say("\ninterrupted")
+  else:
+    sys.__excepthook__(kind, error, trace)
+
+
+sys.excepthook = _hide_interrupt
 
 
 def _check_port(port: int | None) -> None:
