@@ -4,29 +4,37 @@ Every evaluation adds its episodes to a folder, from which one report is made. O
 short goes on where it stopped.
 """
 
+import contextlib
 import dataclasses
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import dm_env
 import numpy as np
 
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.evaluation import episodes, plants, report, runner, tables
+from nerf2real.evaluation.driving import density
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
-from nerf2real.evaluation.settings import GAIT, EvaluationSettings
+from nerf2real.evaluation.policy_names import WALKERS, policy_folder
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite import loading
+from nerf2real.suite.views.film import Film, check_film, describe, open_film
+
+_FILMED = (60, 80)  # pixels of the robot's picture in a film, if its policy looks at none
 
 
 def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
   """Returns the policy that the settings name."""
-  if settings.policy == GAIT:
+  if settings.policy in WALKERS:
     return GaitPolicy(scene, settings.protocol)
-  return LearnedPolicy(Path(settings.policy), seed=settings.seed, stochastic=settings.stochastic)
+  folder = policy_folder(settings.policy, task=plants.TASKS[settings.protocol])
+  return LearnedPolicy(folder, seed=settings.seed, stochastic=settings.stochastic)
 
 
 def make_plant(
@@ -116,8 +124,12 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
 
   Raises:
     FolderInUseError: Another process evaluates into the folder.
-    ValueError: A dry run of a plant that is no robot.
+    ValueError: A dry run of a plant that is no robot, or a film of another plant than "sim".
   """
+  if settings.video is not None:
+    if settings.plant != "sim":
+      raise ValueError(f"--video films --plant sim, found --plant {settings.plant}.")
+    check_film(settings.video)
   scene = loading.open_scene(settings.scene)
   if settings.dry_run:
     _dry_run(settings, scene, say)
@@ -160,6 +172,26 @@ def _dry_run(settings: EvaluationSettings, scene: Any, say: Callable[[str], None
     _run_trials(settings, scene, episodes.Store(Path(folder)), settings.trials or 1, say)
 
 
+@contextlib.contextmanager
+def _filming(settings: EvaluationSettings, plant: Plant) -> Iterator[runner.Watch]:
+  """Yields what films the episodes, or does nothing."""
+  if settings.video is None:
+    yield runner.unwatched
+    return
+  with open_film(settings.video) as sink:
+    environment: Any = plant.environment
+    film = Film(environment, sink)
+
+    def watch(timestep: dm_env.TimeStep, policy: EvaluatedPolicy) -> None:
+      if timestep.first():
+        film.restart()
+      else:
+        text = describe(settings.protocol, environment.task)
+        film.add(timestep.observation, text, density=density(policy.belief, film.map_extent))
+
+    yield watch
+
+
 def _run_trials(
   settings: EvaluationSettings,
   scene: Any,
@@ -168,10 +200,14 @@ def _run_trials(
   say: Callable[[str], None],
 ) -> None:
   policy = load_policy(settings, scene)
-  plant = make_plant(settings, scene, policy.image_size or settings.camera_size)
+  size = policy.image_size or settings.camera_size
+  plant = make_plant(settings, scene, _FILMED if settings.video and size is None else size)
   chosen = choose(plants.trials(settings.protocol), count)
   try:
-    runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
+    with _filming(settings, plant) as watch:
+      runner.run_all(
+        plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)), watch=watch
+      )
   finally:
     plant.close()
   plant.check_recording()

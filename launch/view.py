@@ -1,7 +1,10 @@
 """Shows a scene bundle, or a task in it, in the browser.
 
-python launch/view.py out/livingroom
-python launch/view.py --task nerf_nav
+  python launch/view.py out/livingroom
+  python launch/view.py --task nerf_nav
+  python launch/view.py --task nerf_nav --policy runs/nav
+
+In a task the robot can be pushed: by the buttons, or by the handle above it.
 """
 
 import contextlib
@@ -25,6 +28,8 @@ class Arguments:
   """Folder of the scene bundle; the built-in room if not given."""
   task: str | None = None
   """Shows a task of the suite in the scene, such as nerf_nav, instead of the scene alone."""
+  policy: str = "walker"
+  """What acts in a task: walker, shipped, a run's folder, an exported policy's, stand or random."""
   host: str = "127.0.0.1"
   """Address to serve on; 0.0.0.0 lets other machines connect."""
   port: int = 8080
@@ -37,9 +42,19 @@ def run(arguments: Arguments) -> None:
   never = threading.Event()
   wait: Callable[[], object] = never.wait
   if arguments.task is not None:
+    from nerf2real.evaluation.driving import choose_driver
     from nerf2real.suite.viewer.task_viewer import view_task
+    from nerf2real.suite.views.drivers import SCRIPTED
 
-    viewer = view_task(arguments.task, scene=arguments.bundle, host=host, port=port)
+    chosen = choose_driver(arguments.policy, task=arguments.task)
+    viewer = view_task(
+      arguments.task,
+      scene=arguments.bundle,
+      drivers={chosen.name: chosen.make} | SCRIPTED,
+      image_size=chosen.image_size or (30, 40),
+      host=host,
+      port=port,
+    )
     server, wait = viewer.server, lambda: viewer.run(never)
   else:
     from nerf2real.scenes.bundle import Bundle

@@ -8,6 +8,7 @@ import viser
 from nerf2real import suite
 from nerf2real.suite.viewer.elements import bars
 from nerf2real.suite.viewer.task_viewer import TaskViewer
+from nerf2real.suite.views.drivers import Random
 from nerf2real.suite.views.rollout import run_episodes
 from tests.suite.synthetic import FlatRenderer, make_room
 
@@ -27,7 +28,7 @@ def room(tmp_path, monkeypatch):
 @pytest.mark.parametrize("task", suite.ALL_TASKS)
 def test_rollout_writes_a_video_of_the_length_asked_for(task, room, tmp_path):
   path = tmp_path / "videos" / "out.mp4"
-  run_episodes(task, video=path, seconds=1.0, policy="random")
+  run_episodes(task, video=path, seconds=1.0, driver=Random)
   frames = [f.to_ndarray(format="rgb24") for f in av.open(str(path)).decode(video=0)]
   assert len(frames) == 20
   height, width = frames[0].shape[:2]
@@ -38,7 +39,7 @@ def test_rollout_writes_a_video_of_the_length_asked_for(task, room, tmp_path):
 
 
 def test_rollout_reports_how_episodes_ended(room):
-  lines = run_episodes(seconds=6.0, policy="random")
+  lines = run_episodes(seconds=6.0, driver=Random)
   assert lines and all("ended by fall" in line and "no success" in line for line in lines)
 
 
