@@ -10,13 +10,17 @@ from nerf2real.evaluation import perturbations
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.protocols import BallTrial, NavigationTrial
-from nerf2real.suite.tasks import ball_push, nerf_nav, rewards
+from nerf2real.suite.tasks import catalogue, rewards
 
 Trial = NavigationTrial | BallTrial
 
 NAVIGATION, BALL, GAIN = "navigation", "ball", "gain"
 PROTOCOLS = (NAVIGATION, BALL, GAIN)
-TASKS = {NAVIGATION: nerf_nav.NAME, GAIN: nerf_nav.NAME, BALL: ball_push.NAME}
+TASKS = {
+  NAVIGATION: catalogue.NERF_NAV,
+  GAIN: catalogue.NERF_NAV,
+  BALL: catalogue.BALL_PUSH,
+}
 
 
 class Sight(NamedTuple):

@@ -23,8 +23,7 @@ from nerf2real.evaluation.plants import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
 from nerf2real.evaluation.policy_names import WALKERS, policy_folder
 from nerf2real.evaluation.settings import EvaluationSettings
-from nerf2real.suite import loading
-from nerf2real.suite.views.film import Film, check_film, describe, open_film
+from nerf2real.suite.scene import open_scene
 
 _FILMED = (60, 80)  # pixels of the robot's picture in a film, if its policy looks at none
 
@@ -129,8 +128,10 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
   if settings.video is not None:
     if settings.plant != "sim":
       raise ValueError(f"--video films --plant sim, found --plant {settings.plant}.")
+    from nerf2real.suite.views.film import check_film
+
     check_film(settings.video)
-  scene = loading.open_scene(settings.scene)
+  scene = open_scene(settings.scene)
   if settings.dry_run:
     _dry_run(settings, scene, say)
     return None
@@ -178,6 +179,8 @@ def _filming(settings: EvaluationSettings, plant: Plant) -> Iterator[runner.Watc
   if settings.video is None:
     yield runner.unwatched
     return
+  from nerf2real.suite.views.film import Film, describe, open_film
+
   with open_film(settings.video) as sink:
     environment: Any = plant.environment
     film = Film(environment, sink)

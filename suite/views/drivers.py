@@ -4,14 +4,16 @@ Learned policies come from `evaluation.driving`, with the same protocol.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from nerf2real.core.floor_map import Extent
 from nerf2real.suite.gaits.walker import Pose, Walker
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.tasks.base import RobotTask
+
+if TYPE_CHECKING:
+  from nerf2real.suite.tasks.base import RobotTask
 
 STAND, RANDOM, WALKER = "stand", "random", "walker"
 _SPREAD = 0.5  # standard deviation of random actions
@@ -38,7 +40,7 @@ MakeDriver = Callable[[Any], Driver]
 class Standing:
   """Holds the reference pose."""
 
-  def __init__(self, task: RobotTask):
+  def __init__(self, task: "RobotTask"):
     self._action = task.standing_action
 
   def restart(self) -> None:
@@ -54,7 +56,7 @@ class Standing:
 class Random(Standing):
   """Moves randomly about the reference pose."""
 
-  def __init__(self, task: RobotTask, *, seed: int = 0):
+  def __init__(self, task: "RobotTask", *, seed: int = 0):
     super().__init__(task)
     self._rng = np.random.default_rng(seed)
 
@@ -66,7 +68,7 @@ class Random(Standing):
 class Walking:
   """The scripted walker: to the goal, or pushing the ball; its pose is given to it."""
 
-  def __init__(self, task: RobotTask):
+  def __init__(self, task: "RobotTask"):
     """Takes the task; one with a ball has a workspace with a target."""
     self._task: Any = task
     pushes = hasattr(task, "workspace")
