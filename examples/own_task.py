@@ -9,6 +9,7 @@ package, an entry point of the group `nerf2real.tasks` registers it (see `suite/
 import numpy as np
 
 from nerf2real import suite
+from nerf2real.suite.tasks import rewards
 from nerf2real.suite.tasks.nerf_nav import NerfNav
 
 
@@ -21,10 +22,11 @@ class FaceGoal(NerfNav):
   def _compute_rewards(self) -> dict[str, float]:
     """Cosine of the goal's bearing, and minus the speed over the floor [m/s]."""
     ahead, left = self.relative(self.goal)[:2]
-    return {
+    terms = {
       "facing": float(ahead / max(np.hypot(ahead, left), 1e-6)),
       "staying": -float(np.hypot(*self.state.velocity[:2])),
     }
+    return rewards.combine(terms, self.weights)
 
   def _reached(self) -> bool:
     ahead, left = self.relative(self.goal)[:2]
