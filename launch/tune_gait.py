@@ -49,7 +49,10 @@ def run(arguments: Arguments) -> None:
 
   settings = walk.GaitSettings()
   if arguments.start is not None:
-    known = json.loads(arguments.start.read_text())["settings"]
+    try:
+      known = json.loads(arguments.start.read_text())["settings"]
+    except (ValueError, KeyError) as error:
+      raise ValueError(f"{arguments.start} is no result of an earlier search: {error}.") from error
     kept = {name: known[name] for name in tuning.BOUNDS if name in known}
     settings = dataclasses.replace(settings, **kept)
   names = ("generations", "population", "seconds", "worlds", "turning", "spread", "seed")
@@ -72,7 +75,7 @@ def run(arguments: Arguments) -> None:
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
-  return command.main(Arguments, run, errors=(OSError,))
+  return command.main(Arguments, run, errors=(OSError, ValueError))
 
 
 if __name__ == "__main__":

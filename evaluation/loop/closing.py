@@ -50,11 +50,11 @@ def _close_loop(out: Path, *, robot: str, seed: int, seconds: float, reuse: bool
   model, identified = out / "declared.xml", out / "identified"
   if reuse and not (out / "standing.npz").exists():
     raise ValueError(f"Found no recorded motions in {out}: leave --reuse out to record them.")
-  write_atomically(model, declared_model())
   if not reuse:
     moved = recording.record_motions(out, robot=robot, seed=seed, seconds=seconds)
     with atomic_path(out / "standing.npz") as partial:
       np.savez(partial, actions=moved["actions"], positions=moved["positions"])
+  write_atomically(model, declared_model())
   standing = np.load(out / "standing.npz")
   content = sysid.identify(
     model,

@@ -56,8 +56,13 @@ def _ignore(*_: Any, **__: Any) -> None:
 def _record(connection: Connection, out: Path, seconds: float, robot: Any) -> dict[str, np.ndarray]:
   count = round(seconds / _STEP)
   for name in (*TRAIN, *HELD):
-    with Recorder(out / f"{name}.mcap") as recorder:
-      _play(connection, motion(name, count), robot, recorder=Gate(recorder), held=True)
+    path = out / f"{name}.mcap"
+    try:
+      with Recorder(path) as recorder:
+        _play(connection, motion(name, count), robot, recorder=Gate(recorder), held=True)
+    except BaseException:  # a motion that was cut off is nothing to identify from
+      path.unlink(missing_ok=True)
+      raise
     if recorder.dropped:
       raise RuntimeError(
         f"Found {recorder.dropped} messages missing in {name}.mcap, expected none: the recorder did"
