@@ -123,7 +123,7 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
 
   Raises:
     FolderInUseError: Another process evaluates into the folder.
-    ValueError: No trials; a dry run of a plant that is no robot, or a film of another plant than "sim".
+    ValueError: No trials, a dry run of a plant that is no robot, or a film of one that is not "sim".
   """
   if settings.trials is not None and settings.trials < 1:
     raise ValueError(f"--trials {settings.trials}: expected at least 1, or none for all.")
