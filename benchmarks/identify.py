@@ -26,7 +26,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-  """What to judge."""
+  """Arguments of the benchmark."""
 
   sets: pathlib.Path = pathlib.Path("out/blind")
   """Folder of sets with answers.json."""
@@ -207,7 +207,7 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any]) -> str:
 
 
 def _right(score: scoring.Score) -> bool | None:
-  """Returns whether a set was answered as its mix asks."""
+  """Returns whether a set was answered as its mix requires."""
   if score.below_floor:
     return None
   if score.mix == "healthy":

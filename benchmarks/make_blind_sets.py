@@ -1,7 +1,7 @@
 """Makes blind sets: `python benchmarks/make_blind_sets.py --out out/blind --seed 0 --count 20`.
 
 Each set is a folder with the declared `model.xml`, three logs to identify from and two held out;
-`answers.json` beside them says what each machine has that its model lacks. The plant is
+`answers.json` beside them holds what each machine has that its model lacks. The plant is
 `blind_sets`, which shares no code with the analyser. The same seed gives the same logs.
 """
 

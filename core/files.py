@@ -29,7 +29,7 @@ class DiskFullError(OSError):
 
 
 def is_disk_full(error: BaseException) -> bool:
-  """Returns whether an error says that the disk, the quota or the file's size is exhausted."""
+  """Returns whether an error means that the disk, the quota or the file's size is exhausted."""
   return isinstance(error, OSError) and error.errno in _REASONS
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from nerf2real.agents.dmpo import belief_plot
 from nerf2real.core.floor_map import Extent
 from nerf2real.evaluation.learned import LearnedPolicy
-from nerf2real.evaluation.plants import Sight
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
 from nerf2real.evaluation.policy_names import WALKERS, policy_folder
 from nerf2real.suite.gaits.walker import Pose

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.agents.dmpo import export
-from nerf2real.evaluation.plants import Sight
+from nerf2real.agents.dmpo.policy import export
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
 
 
@@ -42,6 +42,7 @@ class LearnedPolicy:
     self.policy_id = str(_digest(folder))
     shape = self._layout.image_shape
     self.image_size = None if shape is None else (shape[0], shape[1])
+    self.trained_on = self._loaded.environment
     self._seed, self._stochastic = seed, stochastic
     self.belief: Belief | None = None
 

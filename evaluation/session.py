@@ -14,14 +14,18 @@ from typing import Any
 import dm_env
 import numpy as np
 
+from nerf2real.agents.environments.loading import camera_settings
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
-from nerf2real.evaluation import episodes, plants, report, runner, tables
+from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.driving import density
 from nerf2real.evaluation.learned import LearnedPolicy
-from nerf2real.evaluation.plants import Plant
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
 from nerf2real.evaluation.policy_names import WALKERS, policy_folder
+from nerf2real.evaluation.report import page as report
+from nerf2real.evaluation.report import tables
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite.scene import open_scene
 
@@ -37,26 +41,39 @@ def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
 
 
 def make_plant(
-  settings: EvaluationSettings, scene: Any, image_size: tuple[int, int] | None
+  settings: EvaluationSettings,
+  scene: Any,
+  image_size: tuple[int, int] | None,
+  *,
+  trained_on: str = "",
 ) -> Plant:
-  """Returns the plant that the settings name."""
+  """Returns the plant that the settings name.
+
+  Args:
+    settings: The evaluation.
+    scene: An opened bundle.
+    image_size: Height and width of the policy's picture; None for no camera.
+    trained_on: Name of the policy's environment: a simulated camera has its rate, lens and
+      response. Robots have cameras of their own.
+  """
   record = None
   if settings.record and settings.plant != "sim":
     record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
   if settings.plant == "sim":
-    from nerf2real.evaluation.simulated import SimulatedPlant
+    from nerf2real.evaluation.plants.simulated import SimulatedPlant
 
     return SimulatedPlant(
       scene,
       settings.protocol,
       settings.perturb,
       image_size=image_size,
+      camera=camera_settings(trained_on),
       effects=settings.effects,
       seed=settings.seed,
       time_limit=settings.time_limit,
     )
   if settings.plant == "virtual":
-    from nerf2real.evaluation.rehearsed import RehearsedPlant
+    from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 
     return RehearsedPlant(
       scene,
@@ -67,7 +84,7 @@ def make_plant(
       time_limit=settings.time_limit,
       record=record,
     )
-  from nerf2real.evaluation.operated import OperatedPlant
+  from nerf2real.evaluation.plants.operated import OperatedPlant
 
   camera: Any = int(settings.camera) if settings.camera.isdigit() else settings.camera
   return OperatedPlant(
@@ -123,7 +140,7 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
 
   Raises:
     FolderInUseError: Another process evaluates into the folder.
-    ValueError: No trials, a dry run of a plant that is no robot, or a film of one that is not "sim".
+    ValueError: No trials; a dry run that is of no robot, or a film that is not of "sim".
   """
   if settings.trials is not None and settings.trials < 1:
     raise ValueError(f"--trials {settings.trials}: expected at least 1, or none for all.")
@@ -206,7 +223,8 @@ def _run_trials(
 ) -> None:
   policy = load_policy(settings, scene)
   size = policy.image_size or settings.camera_size
-  plant = make_plant(settings, scene, _FILMED if settings.video and size is None else size)
+  size = _FILMED if settings.video and size is None else size
+  plant = make_plant(settings, scene, size, trained_on=policy.trained_on)
   chosen = choose(plants.trials(settings.protocol), count)
   try:
     with _filming(settings, plant) as watch:

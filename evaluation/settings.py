@@ -52,4 +52,5 @@ class EvaluationSettings:
   video: Path | None = None
   """Films the episodes that are run in simulation (.mp4, .webp or .gif)."""
   dry_run: bool = False
-  """Robot only: reads and asks everything, moves and keeps nothing; one trial without --trials."""
+  """Robot only: reads everything and puts all questions, moves and keeps nothing; one trial without
+  --trials."""

@@ -123,7 +123,7 @@ def _check_port(port: int | None) -> None:
 
 
 def _say(text: str) -> None:
-  """Prints to stderr; where that is a file on a full disk, the exit status still tells."""
+  """Prints to stderr; where that is a file on a full disk, the exit status remains."""
   with contextlib.suppress(OSError):
     print(text, file=sys.stderr, flush=True)
 

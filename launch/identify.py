@@ -27,7 +27,7 @@ class Arguments:
   """Logs on which only errors are reported."""
   reference: tuple[Path, ...] = ()
   """Logs of the same apparatus without the effect: they calibrate the declared constants first, and
-  say how bright the place is."""
+  are how bright the place is."""
   out: Path | None = None
   """Folder to write."""
   evaluate: Path | None = None

@@ -20,7 +20,7 @@ import tyro
 
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.statuses import NOT_SAVED
+from nerf2real.agents.supervision.statuses import NOT_SAVED
 from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 
@@ -143,7 +143,8 @@ def run(arguments: Arguments) -> None:
 
 def _learn(arguments: Arguments) -> None:
   from nerf2real.agents.processes.checkpoints import CheckpointError
-  from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+  from nerf2real.agents.processes.learner import Learner, LearnerError
+  from nerf2real.agents.processes.settings import RunSettings
 
   try:
     environment, config = agent_settings(arguments)

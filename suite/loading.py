@@ -52,7 +52,7 @@ def load(
     The environment, a `composer.Environment`.
 
   Raises:
-    ValueError: If an argument is none of what is expected; the message says what would be.
+    ValueError: If an argument is none of what is expected; the message lists what is.
   """
   found = find_task(task)
   camera = camera or CameraSettings()

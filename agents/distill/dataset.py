@@ -33,7 +33,7 @@ class Span(NamedTuple):
 def fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
   """Arrays of an episode by name: shape of a frame and dtype.
 
-  `label` and `command` are the teacher's, `pose` the truth, `goal_distance` [m] says how far the
+  `label` and `command` are the teacher's, `pose` the truth, `goal_distance` [m] is how far the
   goal is, `driver` who drove: 0 the teacher, 1 the student, 2 a detour.
   """
   if layout.image_shape is None:

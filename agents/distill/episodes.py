@@ -11,8 +11,8 @@ from nerf2real.agents.distill.dataset import fields
 from nerf2real.agents.distill.schedule import Mixture
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Teacher
-from nerf2real.agents.dmpo.acting import episode_success, task_of
-from nerf2real.agents.dmpo.inference import Policy, PolicyState
+from nerf2real.agents.dmpo.policy.acting import episode_success, task_of
+from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState
 from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
 from nerf2real.agents.processes.timings import StageTimes
 from nerf2real.suite.gaits.walker import Pose
@@ -40,8 +40,10 @@ class _Segment:
   driver: int = TEACHER
   left: int = 0
   noise: float = 0.0
-  place: np.ndarray | None = None  # of a detour [2] [m]
-  guide: Teacher | None = None  # drives the detour
+  place: np.ndarray | None = None
+  """Of a detour [2] [m]."""
+  guide: Teacher | None = None
+  """Drives the detour."""
 
 
 class EpisodeRunner:

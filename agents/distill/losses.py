@@ -31,7 +31,7 @@ def pose_errors(predicted: jax.Array, pose: jax.Array) -> tuple[jax.Array, jax.A
 
 def pose_loss(predicted: jax.Array, pose: jax.Array) -> jax.Array:
   """Mean absolute error of predicted pose targets [..., 4] at poses [..., 3]: robust to the few
-  pictures that show nothing to tell the place from."""
+  pictures that do not determine the place."""
   return jnp.mean(jnp.abs(predicted - pose_target(pose)))
 
 

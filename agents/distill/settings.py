@@ -50,8 +50,8 @@ class MixtureSettings:
   """Of the teacher's segments that are noisy at all."""
   belief_share: float = 0.4
   """Of the episodes, in the end, whose teacher is given the student's belief in place of the true
-  pose: labels that a student can follow, for it knows all that they depend on. Grows from 0 as the
-  teacher's share falls."""
+  pose: labels that a student can follow, for they depend on nothing that it lacks. Grows from 0 as
+  the teacher's share falls."""
   after_success: int = 20
   """Steps that an episode goes on after its success: data close to the goal [steps]."""
 
@@ -61,7 +61,7 @@ class DistillSettings:
   """What is distilled, and how."""
 
   environment: str
-  """Where data are collected, as `agents.processes.environments` names it, without pushes."""
+  """Where data are collected, as `agents.environments.loading` names it, without pushes."""
   teacher: str = "quick"
   """One of `teacher.TEACHERS`, or the folder of an exported policy."""
   agent: DmpoConfig = DmpoConfig(network=NetworkConfig(init_stddev=0.1))
@@ -119,7 +119,7 @@ class DistillSettings:
   magnified without bound."""
   blind_radius: float = 0.13
   """Distance from the goal within which labels count nothing [m]: the teacher halts where a student
-  whose localisation errs by as much cannot know that it should."""
+  whose localisation errs by as much cannot infer that it should."""
 
   publish_period: float = 15.0
   """Time between students given to the collectors [s]."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
-from nerf2real.agents.dmpo import belief, learning, networks, scaling
+from nerf2real.agents.dmpo import belief, networks, scaling, training_state
 from nerf2real.agents.dmpo.config import NetworkConfig
 from nerf2real.agents.dmpo.networks import LstmState, Params
 from nerf2real.agents.dmpo.specs import Layout
@@ -42,7 +42,7 @@ def init_student(key: jax.Array, config: NetworkConfig, layout: Layout) -> dict[
     raise ValueError("A student needs pictures and an LSTM: network.recurrent must be true.")
 
   def head(key: jax.Array, inputs: int, outputs: int) -> Params:
-    return networks._init_linear(key, inputs, outputs, _HEAD_SCALE)
+    return networks.init_linear(key, inputs, outputs, _HEAD_SCALE)
 
   encoder = {
     "resnet": policy.pop("resnet"),
@@ -64,7 +64,7 @@ def encode(encoder: Params, images: jax.Array, config: NetworkConfig) -> jax.Arr
 
 def predict_pose(encoder: Params, features: jax.Array) -> jax.Array:
   """Maps features [..., F] to pose targets [..., 4]."""
-  return networks._linear(encoder["pose"], features)
+  return networks.linear(encoder["pose"], features)
 
 
 def unroll(
@@ -96,9 +96,9 @@ def unroll(
   embedding = outputs.swapaxes(0, 1)
   hidden = networks.mlp(policy["mlp"], jnp.concatenate([embedding, state], axis=-1))
   return StudentOutput(
-    action=networks._linear(policy["mean"], hidden),
-    pose=networks._linear(policy["heads"]["pose"], embedding),
-    command=networks._linear(policy["heads"]["command"], hidden),
+    action=networks.linear(policy["mean"], hidden),
+    pose=networks.linear(policy["heads"]["pose"], embedding),
+    command=networks.linear(policy["heads"]["command"], hidden),
     embedding=embedding,
     state=last,
   )
@@ -122,5 +122,5 @@ def served_parameters(student: dict[str, Params], scales: Params) -> dict[str, n
   policy["resnet"] = student["encoder"]["resnet"]
   policy["stddev"] = jax.tree.map(np.zeros_like, jax.device_get(policy["stddev"]))
   policy = scaling.fold(jax.device_get(policy), scales)
-  flat = learning.flatten_params({"policy": policy, "belief": student["belief"]})
+  flat = training_state.flatten_params({"policy": policy, "belief": student["belief"]})
   return {name: np.asarray(array, np.float32) for name, array in flat.items()}

@@ -1,6 +1,6 @@
 """Teachers: policies that may read privileged state and label every state that is visited.
 
-DAgger (Ross, Gordon and Bagnell 2011, https://arxiv.org/abs/1011.0686) wants the expert's action at
+DAgger (Ross, Gordon and Bagnell 2011, https://arxiv.org/abs/1011.0686) needs the expert's action at
 the states that the student reaches. A teacher with a hidden state, such as a gait's phase, must
 therefore follow what the robot really did, or its labels contradict what the student sees.
 """
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import Pose, SteeringSettings, Walker
 
@@ -38,7 +38,7 @@ class Teacher(Protocol):
     """Returns what the teacher would do.
 
     Args:
-      observation: the environment's; `previous_control` says what was applied before.
+      observation: the environment's; `previous_control` is what was applied before.
       goal: where to go [2] [m].
       pose: where the robot is, the truth or a student's belief.
     """

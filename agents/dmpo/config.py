@@ -172,9 +172,9 @@ def state() -> DmpoConfig:
   - 32 trajectories of 9 observations instead of 16 of 17: less alike transitions in a batch.
   - Networks half as wide: 2.4 times the updates a second, no worse.
   - Values in [-100, 100]: such rewards sum to 100 at most with a discount of 0.99, and a symmetric
-    support makes the first critic say 0. One that began at 50 took 10,000 steps to forget it.
+    support makes the first critic's value 0. One that began at 50 took 10,000 steps to unlearn it.
   - A hundred times the bound on the out-of-bounds objective: with the paper's, the mean drifts
-    beyond 2, where every sample is clipped alike and the critic can no longer tell them apart.
+    beyond 2, where every sample is clipped alike and the critic no longer separates them.
   - First temperatures and multipliers near 1: from 10, the first 1,000 updates weigh all samples
     alike.
   - Learning rates of 1e-3: all else equal, 3e-4 reached 252 at 30,000 steps, 1e-3 498 at 15,000.

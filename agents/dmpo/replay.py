@@ -2,7 +2,7 @@
 
 Trajectories shorter than T are padded with zeros; `last` is the index of a trajectory's last
 observation, so that it holds `last` transitions (environment steps). Stored on disk, the arrays are
-memory maps: what was inserted survives the death of the process, and every entry knows the actor
+memory maps: what was inserted survives the death of the process, and every entry holds the actor
 and the number that it came with, so that nothing is inserted twice after a restart. The files are
 sparse and grow with what is inserted; an entry's space is reserved before it is written, so that a
 full disk is an OSError and not the signal SIGBUS.

@@ -1,4 +1,4 @@
-"""What the agent needs to know of an environment: which observation goes where, and how large.
+"""The layout of an environment's observations and actions: what goes where, and how large.
 
 Pictures (uint8 [H, W, 3]) go to the policy's image encoder; observations named `privileged/...` to
 the critic alone; all others, flattened, to both. `Layout.flatten` turns a dm_env observation into

@@ -1,6 +1,6 @@
 """The rate limiter: how many environment steps may be taken, and when an update is due.
 
-Credits are environment steps. An actor asks for some before it takes them; what it was granted and
+Credits are environment steps. An actor requests some before it takes them; what it was granted and
 has not delivered yet is outstanding, and returns to the pool when the actor is gone. Steps that
 fill the replay pay for no update, as in Reverb's SampleToInsertRatio with Acme's offset:
 updates = floor((steps - unpaid) / steps_per_update), so that training begins at the ratio and not
@@ -104,7 +104,7 @@ class RateLimiter:
     self.refill_until = max(self.refill_until, until)
 
   def request(self, actor: str, wanted: int, *, held: int) -> int:
-    """Grants up to `wanted` steps to an actor that says it holds `held` unspent or undelivered."""
+    """Grants up to `wanted` steps to an actor that holds `held` unspent or undelivered."""
     # The actor's own count is the truth: a reply may have been lost on the way.
     self._outstanding[actor] = held
     room = self.limit - self.steps - self.outstanding

@@ -1,6 +1,6 @@
 """The scripted walker: the gait, steered to a goal over a path, or pushing a ball.
 
-It is a baseline that needs no training: it knows where it is, from a pose that is given to it
+It is a baseline that needs no training: its pose is given to it
 (privileged in simulation, an observer's on the virtual robot) or else by dead reckoning: its own
 turning rate and the steps that it has commanded.
 """
@@ -33,7 +33,7 @@ class Pose(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SteeringSettings:
-  """How the walker steers; ours."""
+  """Steering of the walker; chosen: it reached the goals in simulation."""
 
   speed: float = 0.22
   """m/s at full stride, for dead reckoning."""
@@ -84,7 +84,7 @@ class Walker:
   def reset(self, start: Pose) -> None:
     """Begins an episode, standing at a place."""
     self._gait.reset()
-    self.pose = start  # where it believes to be
+    self.pose = start  # the estimated pose
     self._command = Command(step=False)
     self._path: np.ndarray | None = None
     self._planned = -np.inf

@@ -6,9 +6,9 @@ import pytest
 from nerf2real.agents.distill import episodes, evaluating, schedule, settings
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Label
-from nerf2real.agents.dmpo.inference import PolicyState, PolicyStep
+from nerf2real.agents.dmpo.policy.inference import PolicyState, PolicyStep
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.suite import protocols
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from nerf2real.agents.distill import learning, settings, student
 from nerf2real.agents.distill.collecting import student_policy
-from nerf2real.agents.dmpo import export, scaling
+from nerf2real.agents.dmpo import scaling
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import POSITION, ROTATION, Layout
 from nerf2real.core.serialization import to_plain
 

@@ -10,21 +10,16 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import (
-  config,
-  export,
-  learning,
-  networks,
-  scaling,
-  specs,
-)
+from nerf2real.agents.dmpo import config, learning, networks, scaling, specs
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.replay import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.processes import actor
 from nerf2real.agents.processes.checkpoints import read_info
-from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+from nerf2real.agents.processes.learner import Learner, LearnerError
+from nerf2real.agents.processes.settings import RunSettings
 from tests.agents.processes.stubs import documented
 
 ENVIRONMENT = "dm_control:cartpole:swingup"
@@ -174,10 +169,10 @@ def test_best_is_the_most_successful_on_fresh_trials(tmp_path):
   run = Run(tmp_path)
   learner, best = run.learner, tmp_path / "policy" / "best"
   learner.link._held[0] = learner.link._parameters  # as if the evaluator had fetched them
-  found = lambda: (learner._best_success, learner._best)  # noqa: E731
+  found = lambda: (learner._best.success, learner._best.best_return)  # noqa: E731
   _report(learner, success=0.9, confirmation=0, version=0, **{"return": 9.0})
-  assert learner._best_success is None and not best.exists()
-  assert learner._evaluated == 9.0
+  assert learner._best.success is None and not best.exists()
+  assert learner._best.evaluated == 9.0
   _report(learner, success=0.4, confirmation=1, version=0, **{"return": 5.0})
   assert found() == (0.4, 5.0) and best.exists()
   _report(learner, success=0.3, confirmation=1, version=0, **{"return": 50.0})
@@ -193,7 +188,7 @@ def test_best_without_success_is_the_highest_mean_return(tmp_path):
   run = Run(tmp_path)
   for result, expected in ((5.0, 5.0), (4.0, 5.0), (6.0, 6.0)):
     _report(run.learner, confirmation=0, version=0, **{"return": result})
-    assert run.learner._best == expected
+    assert run.learner._best.best_return == expected
   run.close()
 
 

@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.live import Live
 
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.status_view import StatusView
-from nerf2real.agents.processes.supervision import Job, LocalProcess, Process, Supervisor
+from nerf2real.agents.supervision.status_view import StatusView
+from nerf2real.agents.supervision.supervisor import Job, LocalProcess, Process, Supervisor
 from nerf2real.core.files import append_line, atomic_path
 from nerf2real.core.folder_lock import FolderInUseError, discarded_on, lock_folder
 

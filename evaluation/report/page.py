@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from nerf2real.agents.dmpo import belief_plot
+from nerf2real.agents.dmpo.policy import belief_plot
 from nerf2real.core.floor_map import FloorMap
 from nerf2real.core.pages import page
 from nerf2real.core.pages.blocks import (
@@ -24,8 +24,8 @@ from nerf2real.core.pages.blocks import (
   Text,
 )
 from nerf2real.core.pages.page import Section
-from nerf2real.evaluation import maps, tables
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Moment
+from nerf2real.evaluation.report import maps, tables
 
 _MOMENTS = 5  # shown of an episode's belief
 _BELIEF_EPISODES = 4  # shown of a setting

@@ -7,7 +7,7 @@ sample of the trainer lies in a work array of rows, `work[row * stride + sample]
 as scalars and broadcast. A snippet is the body of one function that Warp compiles for both.
 """
 
-# Samples of a vector on a CPU: 512 bits of float32. Any CPU that clang knows runs them, narrower
+# Samples of a vector on a CPU: 512 bits of float32. Any CPU of clang's runs them, narrower
 # ones in several registers; 8 is the better choice for a machine without AVX-512.
 CPU_LANES = 16
 PADDING = 32  # samples that a product's inner loop works on at a time: LANES * VECS on a CPU

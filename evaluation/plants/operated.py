@@ -1,4 +1,4 @@
-"""A robot as a plant: a person places it, one episode after another, and says how it went."""
+"""A robot as a plant: an operator places it, one episode after another, and enters the outcome."""
 
 import contextlib
 import dataclasses
@@ -10,30 +10,27 @@ import dm_env
 import numpy as np
 
 from nerf2real import real
-from nerf2real.evaluation import episodes, perturbations
-from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial
+from nerf2real.evaluation import episodes
+from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.plants.plant import TASKS, Sight, Trial
+from nerf2real.evaluation.plants.robot_plant import RobotPlant
 from nerf2real.real.camera.device import Controls
 from nerf2real.real.clock import RealClock, prefer_this_thread
 from nerf2real.real.loading import Connection
 from nerf2real.real.loop.settings import RobotSettings
-from nerf2real.real.recorder.recorder import Recorder
-from nerf2real.real.safety.monitor import Reason
 from nerf2real.real.safety.operator import Terminal
-from nerf2real.suite import protocols
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.protocols import DEFAULT_GAIN, BallTrial
-from nerf2real.suite.tasks.workspace import find_workspace
+from nerf2real.suite.protocols import DEFAULT_GAIN, NavigationTrial
 
 _VERDICTS = {"s": episodes.SUCCESS, "c": episodes.COLLISION, "f": episodes.FALL, "l": episodes.LOST}
 _QUESTION = "What happened? [s]uccess, [c]ollision, [f]all, [l]ost, [r]epeat the episode: "
 
 
 class RepeatError(Exception):
-  """The operator wants the episode again."""
+  """The operator chose to repeat the episode."""
 
 
-class OperatedPlant(Plant):
+class OperatedPlant(RobotPlant):
   """Episodes on a robot. Any key ends one; there is no pose unless an observer gives it."""
 
   name = "robot"
@@ -74,9 +71,9 @@ class OperatedPlant(Plant):
       dry_run: Everything is read, asked and computed, and nothing moves; no verdict is asked for.
       observer: Motion capture, if there is any.
       ask: Puts a question to the operator and returns the answer; None: at this terminal.
-      say: Tells the operator something.
+      say: Shows the operator a line.
     """
-    super().__init__(scene, protocol, perturbation)
+    super().__init__(scene, protocol, perturbation, record=record)
     self.plant_id = robot_name
     connection = Connection(port=robot) if isinstance(robot, str) else robot
     own = {"camera": camera, "offsets": offsets, "lens": lens}
@@ -87,9 +84,6 @@ class OperatedPlant(Plant):
       connection = dataclasses.replace(connection, operator=terminal)
       ask = terminal.ask
     self._observer, self._ask, self._say = observer, ask, say
-    self._starts = protocols.scene_starts(scene)
-    self._workspace = find_workspace(scene) if protocol == BALL else None
-    self._recorder = None if record is None else Recorder(record)
     self._environment = real.load(
       TASKS[protocol],
       robot=connection,
@@ -104,30 +98,13 @@ class OperatedPlant(Plant):
     self._dry_run = dry_run
     self._steps = 0
 
-  @property
-  def environment(self) -> dm_env.Environment:
-    return self._environment
-
-  @property
-  def goal(self) -> np.ndarray:
-    return self._environment.goal
-
-  @property
-  def time_limit(self) -> float:
-    return float(self._environment.time_limit)
-
   def start(self, trial: Trial) -> dm_env.TimeStep:
-    if isinstance(trial, BallTrial):
-      assert self._workspace is not None
-      robot, ball = self._workspace.starts(trial, self.scene.free_space)
-      pose = Pose(float(robot[0]), float(robot[1]), trial.robot_yaw)
-      self._say(f"Put the ball at x = {ball[0]:.2f} m, y = {ball[1]:.2f} m.")
-    else:
-      x, y = (float(value) for value in self._starts[trial.position])
-      pose = Pose(x, y, trial.yaw)
-      self._environment.set_goal(trial.goal)
+    pose, ball = self._places(trial)
+    if isinstance(trial, NavigationTrial):
       self._say(f"Goal {trial.goal + 1} at x = {self.goal[0]:.2f} m, y = {self.goal[1]:.2f} m.")
       self._set_gain(trial.camera_gain * DEFAULT_GAIN)
+    if ball is not None:
+      self._say(f"Put the ball at x = {ball[0]:.2f} m, y = {ball[1]:.2f} m.")
     if self.perturbation in perturbations.INSTRUCTIONS:
       self._say(perturbations.INSTRUCTIONS[self.perturbation])
     self._ask(
@@ -153,14 +130,8 @@ class OperatedPlant(Plant):
   def sight(self) -> Sight:
     if self._observer is not None:
       return self._observer()
-    stop = self._environment.stop
-    fallen = stop is not None and stop.reason == Reason.FALL
     pose = self._start_pose if self._steps == 0 else None
-    return Sight(pose, None, False, fallen)
-
-  def stopped(self) -> str:
-    stop = self._environment.stop
-    return "" if stop is None else f"{stop.reason}: {stop.detail}"
+    return Sight(pose, None, False, self._stopped_by_a_fall())
 
   def judge(self) -> tuple[str, float | None, str] | None:
     if self._dry_run:

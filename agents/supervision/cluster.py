@@ -15,10 +15,10 @@ from typing import Any
 from rich.console import Console
 
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes import training
-from nerf2real.agents.processes.status_view import StatusView
-from nerf2real.agents.processes.supervision import Job, LocalProcess, Process, Supervisor
-from nerf2real.agents.processes.training import RunRefusedError, Scripts, TrainingSettings
+from nerf2real.agents.supervision import training
+from nerf2real.agents.supervision.status_view import StatusView
+from nerf2real.agents.supervision.supervisor import Job, LocalProcess, Process, Supervisor
+from nerf2real.agents.supervision.training import RunRefusedError, Scripts, TrainingSettings
 
 _RESTART_WINDOW = 120.0  # s
 _END_TIMEOUT = 90.0  # s for a checkpoint at the end

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
-from nerf2real.agents.processes.supervision import Job, LocalProcess, Supervisor
+from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
+from nerf2real.agents.supervision.supervisor import Job, LocalProcess, Supervisor
 from tests.agents.processes.test_runs import CARTPOLE, SMALL, finish, rows, start, wait_until
 
 LEARNER = Job(name="learner", script=Path("learner.py"), arguments=("--run", "x"))

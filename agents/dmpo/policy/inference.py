@@ -55,7 +55,7 @@ class Policy:
     """Creates a policy.
 
     Args:
-      parameters: flat named arrays, `learning.served_parameters`.
+      parameters: flat named arrays, `training_state.served_parameters`.
       init_stddev: the network's setting of that name.
       min_stddev: the network's setting of that name.
     """

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo.acting import task_of
-from nerf2real.agents.processes import environments, trials
-from nerf2real.agents.processes.environments import evaluation_name, make_environment
+from nerf2real.agents.dmpo.policy.acting import task_of
+from nerf2real.agents.environments import loading, trials
+from nerf2real.agents.environments.loading import evaluation_name, make_environment
 from nerf2real.suite import protocols
 
 LENS = """
@@ -62,7 +62,7 @@ def test_evaluation_is_the_table_s_protocol_without_pushes():
 def test_trials_of_the_protocol_are_set_up_and_seeded():
   name = "suite:nerf_nav?protocol=navigation&time_limit=0.05"
   first, second = (make_environment(name, seed=5) for _ in range(2))
-  wrapped, other = environments.trials_of(first), environments.trials_of(second)
+  wrapped, other = loading.trials_of(first), loading.trials_of(second)
   assert wrapped.count == 54
   listed = protocols.navigation()
   assert wrapped.spread(27) == [t for t in listed if t.trial == 0]

@@ -68,8 +68,7 @@ class StatusView:
         "steps": f"{s['steps']:,} ({s['steps_per_second']:.0f}/s)",
         "updates": f"{s['updates']:,} ({s['updates_per_second']:.1f}/s)"
         + ("" if s["filled"] else ", filling the replay"),
-        "return": f"{_number(s['return'])} acting, {_number(s['evaluation'])} evaluated, "
-        f"best {_number(s['best'])}",
+        **_returns(s),
         "success": _number(s["success"]),
         "localisation error": _number(s["localisation_error"]) + " m",
         "replay": f"{s['replay_steps']:,} steps",
@@ -98,7 +97,7 @@ class StatusView:
       parts = [
         f"steps {s['steps']:,} ({s['steps_per_second']:.0f}/s)",
         f"updates {s['updates']:,} ({s['updates_per_second']:.1f}/s)",
-        *(f"{n} {s[n]:.3g}" for n in ("return", "evaluation", "success") if s[n] is not None),
+        *(f"{n} {s[n]:.3g}" for n in ("return", "evaluation", "success") if s.get(n) is not None),
         f"{s['actors']} actors",
         f"dropped {s['dropped']}",
       ]
@@ -107,6 +106,14 @@ class StatusView:
     if self.problem:
       parts.append(self.problem)
     return ", ".join(parts) or "starting"
+
+
+def _returns(status: dict[str, Any]) -> dict[str, str]:
+  """The row of returns; none for a run without returns, such as a distillation."""
+  if "return" not in status:
+    return {}
+  acting, evaluated, best = (_number(status[n]) for n in ("return", "evaluation", "best"))
+  return {"return": f"{acting} acting, {evaluated} evaluated, best {best}"}
 
 
 def _number(value: float | None) -> str:

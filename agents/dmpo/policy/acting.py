@@ -10,7 +10,7 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from nerf2real.agents.dmpo.inference import Policy, PolicyState, PolicyStep
+from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState, PolicyStep
 from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
 
 Trajectory = dict[str, np.ndarray]
@@ -90,7 +90,7 @@ class TrajectoryBuilder:
 
 
 class Agent:
-  """A policy in an episode: keeps the recurrent state and measures what the belief says."""
+  """A policy in an episode: keeps the recurrent state and measures the belief's error."""
 
   def __init__(self, policy: Policy, layout: Layout, *, seed: int, deterministic: bool = False):
     """Creates an agent.
@@ -165,6 +165,6 @@ def task_of(environment: Any) -> Any:
 
 
 def episode_success(environment: Any) -> bool | None:
-  """Whether the task says that its goal was reached in this episode; None if it does not say."""
+  """Whether the task's goal was reached in this episode; None for a task without success."""
   success = getattr(task_of(environment), "success", None)
   return None if success is None else bool(success() if callable(success) else success)

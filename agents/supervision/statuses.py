@@ -1,4 +1,4 @@
-"""Exit statuses with which the processes of a run say what their supervisor shall do.
+"""Exit statuses of a run's processes, by which the supervisor restarts or ends them.
 
 0 is the regular end; every other status than these is a death, after which a process is replaced.
 """

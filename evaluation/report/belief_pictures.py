@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from nerf2real.agents.dmpo import belief_plot
-from nerf2real.agents.dmpo.acting import task_of
-from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.agents.dmpo.policy import belief_plot
+from nerf2real.agents.dmpo.policy.acting import task_of
+from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.agents.dmpo.specs import planar_pose
-from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.scenes.geometry import floor_picture
 
 _SCALE = 80  # pixel/m

@@ -2,7 +2,7 @@
 
 For the first steps a coloured patch stands left or right in a 30x40 picture; then only the same
 noisy grey is seen. From then on each step is rewarded with side * clip(action): a policy without
-memory cannot know the side, so that its best expected return is 0; one that remembers gets
+memory cannot infer the side, so that its best expected return is 0; one that remembers gets
 `REWARDED_STEPS`. It shows that pictures, the LSTM's state, stored initial states and trajectories
 work together.
 """

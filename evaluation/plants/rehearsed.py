@@ -8,17 +8,14 @@ import dm_env
 import numpy as np
 
 from nerf2real import real
-from nerf2real.evaluation import perturbations
-from nerf2real.evaluation.plants import BALL, TASKS, Plant, Sight, Trial, make_intruder
-from nerf2real.real.recorder.recorder import Recorder
-from nerf2real.real.safety.monitor import Reason
+from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.plants.plant import BALL, TASKS, Sight, Trial, make_intruder
+from nerf2real.evaluation.plants.robot_plant import RobotPlant
 from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
-from nerf2real.suite.protocols import BallTrial, NavigationTrial
-from nerf2real.suite.tasks.workspace import find_workspace
+from nerf2real.suite.protocols import NavigationTrial
 
 
 class CoveredCamera:
@@ -38,7 +35,7 @@ class CoveredCamera:
     self._camera.close()
 
 
-class RehearsedPlant(Plant):
+class RehearsedPlant(RobotPlant):
   """Episodes on a virtual robot in the true room, faster than real time."""
 
   name = "virtual"
@@ -67,10 +64,8 @@ class RehearsedPlant(Plant):
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
     """
-    super().__init__(scene, protocol, perturbation)
+    super().__init__(scene, protocol, perturbation, record=record)
     self.plant_id = "data sheet" if robot_seed is None else f"robot {robot_seed}"
-    self._starts = protocols.scene_starts(scene)
-    self._workspace = find_workspace(scene) if protocol == BALL else None
     self._intruder = make_intruder(self, self._starts)
     self.robot = VirtualRobot(
       world=world,
@@ -83,7 +78,6 @@ class RehearsedPlant(Plant):
     if self._intruder is not None:
       self._intruder.bind(self.robot.body.model)
     self._camera: CoveredCamera | None = None
-    self._recorder = None if record is None else Recorder(record)
     try:
       self._environment = self._connect(image_size, time_limit)
     except BaseException:
@@ -104,40 +98,19 @@ class RehearsedPlant(Plant):
       recorder=self._recorder,
     )
 
-  @property
-  def environment(self) -> dm_env.Environment:
-    return self._environment
-
-  @property
-  def goal(self) -> np.ndarray:
-    return self._environment.goal
-
-  @property
-  def time_limit(self) -> float:
-    return float(self._environment.time_limit)
-
   def start(self, trial: Trial) -> dm_env.TimeStep:
     self._begin = self.robot.clock.now()
     self._hit = False
     self._disturb(0.0)
-    if isinstance(trial, BallTrial):
-      assert self._workspace is not None
-      robot, ball = self._workspace.starts(trial, self.scene.free_space)
-      pose = Pose(float(robot[0]), float(robot[1]), trial.robot_yaw)
+    pose, ball = self._places(trial)
+    if ball is not None:
       self.robot.place_ball(*ball)
-    else:
-      x, y = (float(value) for value in self._starts[trial.position])
-      pose = Pose(x, y, trial.yaw)
-      self._environment.set_goal(trial.goal)
-      self._set_gain(trial)
+    if isinstance(trial, NavigationTrial) and self.robot.camera is not None:
+      self.robot.camera.sensor.gain = trial.camera_gain
     self.robot.place(*pose)
     timestep = self._environment.reset()
     self._begin = self.robot.clock.now()
     return timestep
-
-  def _set_gain(self, trial: NavigationTrial) -> None:
-    if self.robot.camera is not None:
-      self.robot.camera.sensor.gain = trial.camera_gain
 
   def step(self, action: np.ndarray) -> dm_env.TimeStep:
     self._disturb(self.robot.clock.now() - self._begin)
@@ -155,22 +128,17 @@ class RehearsedPlant(Plant):
 
   def sight(self) -> Sight:
     truth = self.robot.truth()
-    stop = self._environment.stop
     fallen = (
       truth.touches_floor
       or truth.rotation[2, 2] < MIN_UPRIGHT
       or truth.position[2] < MIN_HEIGHT
-      or (stop is not None and stop.reason == Reason.FALL)
+      or self._stopped_by_a_fall()
     )
     pose = Pose(float(truth.position[0]), float(truth.position[1]), truth.yaw)
     ball = None if truth.ball is None else truth.ball[:2]
     # Touching the room is a failure of navigation alone (paper, "Tasks").
     touched = truth.touches_room and self.protocol != BALL
     return Sight(pose, ball, touched or self._hit, bool(fallen))
-
-  def stopped(self) -> str:
-    stop = self._environment.stop
-    return "" if stop is None else f"{stop.reason}: {stop.detail}"
 
   def close(self) -> None:
     self._environment.close()

@@ -1,8 +1,8 @@
 """The paper's perturbed settings: a blocked camera, a moved object, a person walking around.
 
-Each is the same in simulation and around the virtual robot: bodies that no plan knows of are put
+Each is the same in simulation and around the virtual robot: bodies that are in no plan are put
 into the model before it is compiled and moved as time goes on; the camera sees them and the robot
-collides with them. For the robot they are what the operator is asked to do.
+collides with them. For the robot they are instructions to the operator.
 """
 
 from typing import Any, NamedTuple
@@ -15,9 +15,9 @@ from nerf2real.suite.op3 import constants
 
 NONE, BLOCKED_CAMERA, MOVED_OBJECT, PERSON = "none", "blocked_camera", "moved_object", "person"
 PERTURBATIONS = (NONE, BLOCKED_CAMERA, MOVED_OBJECT, PERSON)
-BLOCKED = (3.0, 6.0)  # s of an episode in which the camera sees nothing: ours
-PERSON_SPEED = 0.4  # m/s: a slow walk, ours
-_CLEAR = 0.5  # m that a moved object keeps from starts and goals: ours
+BLOCKED = (3.0, 6.0)  # s of an episode without a picture; chosen: while the robot is on its way
+PERSON_SPEED = 0.4  # m/s; chosen: a slow walk
+_CLEAR = 0.5  # m between a moved object and starts and goals; chosen: room to turn the robot
 _GRID = 0.1  # m between the places that are looked at
 _PREFIX = "perturbation"
 ROBOT_PREFIX = "op3/"  # of the robot's geoms, in simulation and in the virtual robot's world
@@ -58,7 +58,7 @@ _PERSON = (
 
 
 class Intruder:
-  """A body in the world that no plan knows of."""
+  """A body in the world that is in no plan."""
 
   def __init__(self, parts: tuple[Part, ...], path: np.ndarray, *, speed: float):
     """Creates the body.

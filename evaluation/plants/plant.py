@@ -1,4 +1,4 @@
-"""What an evaluation needs of a plant: set a trial up, step it, and say what an observer sees."""
+"""The protocol of plants in an evaluation: set a trial up, step it, observe the robot."""
 
 import abc
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import dm_env
 import numpy as np
 
-from nerf2real.evaluation import perturbations
+from nerf2real.evaluation.plants import perturbations
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.protocols import BallTrial, NavigationTrial
@@ -24,7 +24,7 @@ TASKS = {
 
 
 class Sight(NamedTuple):
-  """What an observer of an episode knows; None where nobody looks."""
+  """An observer's measurements in an episode; None without an observer."""
 
   pose: Pose | None
   ball: np.ndarray | None  # [2] m
@@ -77,7 +77,7 @@ class Plant(abc.ABC):
     """Returns what an observer sees now."""
 
   def reached(self, sight: Sight) -> bool | None:
-    """Returns whether the goal is reached; None where nobody knows."""
+    """Returns whether the goal is reached; None where it is not measured."""
     if self.protocol == BALL:
       if sight.ball is None:
         return None
@@ -92,7 +92,7 @@ class Plant(abc.ABC):
     return ""
 
   def judge(self) -> tuple[str, float | None, str] | None:
-    """Returns a person's verdict (outcome, time [s], detail); None where a pose says it all."""
+    """Returns a person's verdict (outcome, time [s], detail); None where the poses suffice."""
     return None
 
   @abc.abstractmethod

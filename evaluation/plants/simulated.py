@@ -7,11 +7,12 @@ import dm_env
 import numpy as np
 
 from nerf2real import suite
-from nerf2real.evaluation import perturbations
-from nerf2real.evaluation.plants import TASKS, Plant, Sight, Trial, make_intruder
+from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.plants.plant import TASKS, Plant, Sight, Trial, make_intruder
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import CameraSettings
 from nerf2real.suite.tasks import nerf_nav
 
 
@@ -27,6 +28,7 @@ class SimulatedPlant(Plant):
     perturbation: str = perturbations.NONE,
     *,
     image_size: tuple[int, int] | None,
+    camera: CameraSettings | None = None,
     effects: Any = None,
     seed: int = 0,
     time_limit: float | None = None,
@@ -38,6 +40,7 @@ class SimulatedPlant(Plant):
       protocol: One of `plants.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the picture; None for no camera.
+      camera: Settings of the camera; the suite's own if None.
       effects: An effects.json, or effects.
       seed: Of what differs between episodes, with the trial's own.
       time_limit: Length of an episode [s]; the task's own if None.
@@ -51,6 +54,7 @@ class SimulatedPlant(Plant):
       scene=scene,
       effects=effects,
       image_size=image_size,
+      camera=camera,
       random=seed,
       randomisation=dataclasses.replace(RandomisationSettings(), pushes=False),
       time_limit=time_limit,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from nerf2real.agents.link.children import last_lines, start_child
-from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
+from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
 
 _MAX_RESTARTS = 5  # of one process within the restart window
 _OTHERS_END_TIMEOUT = 10.0  # s for actors to deliver what they have

@@ -1,7 +1,7 @@
 """A policy as one folder that an actor, the evaluator and the robot load with NumPy alone.
 
 `policy.npz` holds the arrays by name, `policy.json` the layout, the settings and the digest of the
-arrays. Each file is replaced as a whole; the digest tells if the two belong together.
+arrays. Each file is replaced as a whole; by the digest the two belong together.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.dmpo.inference import Policy
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core import files
 from nerf2real.core.serialization import from_plain, to_plain
@@ -29,9 +29,12 @@ class ExportedPolicy:
 
   policy: Policy
   layout: Layout
-  environment: str  # the name it was trained on
-  history: int  # observations that the agent stacks
-  info: dict[str, Any]  # counters and settings of the run
+  environment: str
+  """The name it was trained on."""
+  history: int
+  """Observations that the agent stacks."""
+  info: dict[str, Any]
+  """Counters and settings of the run."""
 
 
 def export_policy(
@@ -47,7 +50,7 @@ def export_policy(
 
   Args:
     folder: where to; what it holds of an older policy is replaced.
-    parameters: flat named arrays, `learning.served_parameters`.
+    parameters: flat named arrays, `training_state.served_parameters`.
     layout: the environment's layout.
     environment: the environment's name.
     settings: the agent's settings as plain values, `to_plain(config)`.

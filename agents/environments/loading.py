@@ -23,7 +23,7 @@ import numpy as np
 from dm_env import specs
 
 from nerf2real.agents.dmpo.specs import PRIVILEGED
-from nerf2real.agents.processes.trials import Trials
+from nerf2real.agents.environments.trials import Trials
 
 
 def make_environment(name: str, *, seed: int, history: int = 1) -> dm_env.Environment:
@@ -62,9 +62,7 @@ def _dm_control(rest: str, options: dict[str, str], seed: int) -> dm_env.Environ
 
 def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
   from nerf2real import suite
-  from nerf2real.core.camera_info import read_camera_info
   from nerf2real.suite.randomisation.draws import RandomisationSettings
-  from nerf2real.suite.sensors.camera import CameraSettings
 
   protocol = options.pop("protocol", None)
   known = _protocols(rest)
@@ -85,15 +83,33 @@ def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
     if not (height.isdigit() and width.isdigit()):
       raise ValueError(f"image_size must be such as 30x40 (height x width), found {text!r}.")
     arguments["image_size"] = (int(height), int(width))
-  lens = options.pop("lens", None)
-  camera = _take(options, CameraSettings(), prefix="camera_")
-  if lens is not None:
-    camera = dataclasses.replace(camera, lens=read_camera_info(Path(lens)))
+  camera = _take_camera(options)
   randomisation = _take(options, RandomisationSettings())
   environment = suite.load(
     rest, random=seed, camera=camera, randomisation=randomisation, **arguments
   )
   return environment if protocol is None else Trials(environment, known[protocol], seed=seed)
+
+
+def _take_camera(options: dict[str, str]) -> Any:
+  """Takes the options of the camera; returns its `CameraSettings`."""
+  from nerf2real.core.camera_info import read_camera_info
+  from nerf2real.suite.sensors.camera import CameraSettings
+
+  camera = _take(options, CameraSettings(), prefix="camera_")
+  if "lens" in options:
+    camera = dataclasses.replace(camera, lens=read_camera_info(Path(options.pop("lens"))))
+  return camera
+
+
+def camera_settings(name: str) -> Any:
+  """Returns the `CameraSettings` of a suite's environment, such as of the one a policy trained on.
+
+  Raises:
+    ValueError: An option of the camera is wrong.
+    OSError: The file of its lens cannot be read.
+  """
+  return _take_camera(dict(urllib.parse.parse_qsl(name.partition("?")[2])))
 
 
 def _protocols(task: str) -> dict[str, tuple[Any, ...]]:
@@ -158,7 +174,7 @@ def trials_of(environment: Any) -> Trials | None:
 
 
 def _agents(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
-  from nerf2real.agents.processes.cue_task import CueTask
+  from nerf2real.agents.environments.cue_task import CueTask
 
   if rest != "cue":
     raise ValueError(f"agents has no task {rest!r}: expected 'cue'.")
