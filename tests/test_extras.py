@@ -25,7 +25,7 @@ except real.wire.port.PortError as error:
 """
 _ACTOR = """
 import nerf2real.launch.actor, nerf2real.agents.processes.actor
-from nerf2real.agents.environments.names import make_environment
+from nerf2real.agents.environments.loading import make_environment
 environment = make_environment("suite:nerf_nav", seed=0)
 print(environment.reset().observation["camera"].shape)
 """
