@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerf2real.agents.dmpo import belief_plot
+from nerf2real.agents.dmpo.policy import belief_plot
 from nerf2real.core.floor_map import Extent
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants.plant import Sight

@@ -162,6 +162,7 @@ def _learn(arguments: Arguments) -> None:
     )
   except (ValueError, OSError, sessions.LinkError, CheckpointError) as error:
     raise command.RefusedError(error) from error
+  _say_hello(arguments, learner)
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())
   try:
@@ -172,6 +173,20 @@ def _learn(arguments: Arguments) -> None:
     raise command.CommandError(
       f"The run ended and was not saved: {learner.problem}", status=NOT_SAVED
     )
+
+
+def _say_hello(arguments: Arguments, learner: Any) -> None:
+  """Logs where the learner listens, what it goes on from and what it computes on."""
+  import jax
+
+  device = jax.devices()[0]
+  counts = f"{learner.limiter.steps:,} steps and {learner.limiter.updates:,} updates"
+  logging.info(
+    "Listening at %s." if not arguments.connect else "Joined %s.",
+    arguments.connect or arguments.listen,
+  )
+  logging.info("Resumed with %s." if arguments.resume else "A new run: %s.", counts)
+  logging.info("Updates on %s (%s).", device.device_kind, device.platform)
 
 
 def main() -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.core.pages import page
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.suite.effects.files import from_list, to_list
@@ -34,6 +35,7 @@ from nerf2real.sysid.selection.identification import (
 )
 from nerf2real.sysid.sensors import sensing
 
+_ANALYSIS, _SENSORS, _ERRORS = 0.8, 0.85, 0.95  # shares of the work done after each, about
 _LISTED = 6  # alternatives in the report
 
 
@@ -45,6 +47,7 @@ def identify(
   reference: Sequence[Path] = (),
   out: Path,
   settings: Settings | None = None,
+  progress: Progress = no_progress,
 ) -> dict[str, Any]:
   """Finds the effect that a model lacks and writes down what it found.
 
@@ -57,6 +60,7 @@ def identify(
     reference: logs of the same apparatus without the effect; they calibrate the constants first.
     out: folder to write.
     settings: thresholds and effort.
+    progress: called with the fraction done and a text.
 
   Returns:
     The content of report.json.
@@ -78,7 +82,14 @@ def identify(
   _check_joints(logs, [*others, *healthy])
   with lock_folder(out):
     return _identify(
-      Path(model), compiled, logs, held=others, reference=healthy, out=Path(out), settings=settings
+      Path(model),
+      compiled,
+      logs,
+      held=others,
+      reference=healthy,
+      out=Path(out),
+      settings=settings,
+      progress=progress,
     )
 
 
@@ -91,15 +102,19 @@ def _identify(
   reference: list[Log],
   out: Path,
   settings: Settings,
+  progress: Progress,
 ) -> dict[str, Any]:
   """Analyses logs that were read, and writes; see `identify`."""
   began = time.perf_counter()
-  found = analyse(compiled, logs, reference=reference, settings=settings)
+  analysing = part(progress, 0.0, _ANALYSIS)
+  found = analyse(compiled, logs, reference=reference, settings=settings, progress=analysing)
+  progress(_ANALYSIS, "sensors and floor")
   sensed = sensing.find(compiled, logs, reference)
   if sensed.effects:
     found.objects += sensed.effects
     found.effects += sensed.rows
     found.verdict = "effects" if found.verdict == "none" else found.verdict
+  progress(_SENSORS, "errors on the logs")
   whole = [*found.calibration, *found.objects, *found.learned]
   content: dict[str, Any] = {
     "verdict": found.verdict,
@@ -145,6 +160,7 @@ def _identify(
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
   details = _details(found, model, whole, sensed)
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
+  progress(_ERRORS, "report")
   content["seconds"] = round(time.perf_counter() - began, 1)
   made = report.page(found, content, details, held, whole, settings.window_s)
   page.write(out / "report.html", made)
