@@ -112,9 +112,8 @@ def test_tune_gait(run, fill):
 def test_show_belief(run, fill, monkeypatch):
   disk = fill(0)
   drawn = types.SimpleNamespace(picture=np.zeros((90, 90, 3), np.uint8), errors=[0.1])
-  monkeypatch.setattr(
-    "nerf2real.evaluation.report.belief_pictures.draw_episode", lambda *_, **__: drawn
-  )
+  place = "nerf2real.evaluation.report.belief_pictures.draw_episode"
+  monkeypatch.setattr(place, lambda *_, **__: drawn)
   _expect(run("show_belief", "policy", "--out", disk / "belief.png"), disk)
 
 
