@@ -32,6 +32,8 @@ class Setting:
   """"navigation", "ball" or "gain"."""
   perturbation: str
   """"none", or what was disturbed."""
+  control: str = "none"
+  """Or what of the observations was falsified, one of `controls.CONTROLS`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

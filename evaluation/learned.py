@@ -15,6 +15,8 @@ from nerf2real.evaluation.policies import Belief
 class LearnedPolicy:
   """An exported policy in an evaluation."""
 
+  control = "none"
+
   def __init__(self, folder: Path, *, seed: int, stochastic: bool):
     """Loads the policy.
 

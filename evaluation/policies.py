@@ -34,6 +34,7 @@ class EvaluatedPolicy(Protocol):
   name: str
   policy_id: str  # digest of what it is made of
   image_size: tuple[int, int] | None  # of the pictures that it needs
+  control: str  # one of `controls.CONTROLS`; "none": its observations are the plant's
   trained_on: str  # name of its environment; empty for a policy that was not trained
 
   def reset(self, sight: Sight) -> None:
@@ -60,6 +61,7 @@ class GaitPolicy:
 
   name = "gait"
   image_size: tuple[int, int] | None = None
+  control = "none"
   trained_on = ""
   belief: Belief | None = None
 

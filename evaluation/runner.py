@@ -29,6 +29,7 @@ def setting_of(plant: Plant, policy: EvaluatedPolicy) -> Setting:
     plant_id=plant.plant_id,
     protocol=plant.protocol,
     perturbation=plant.perturbation,
+    control=policy.control,
   )
 
 

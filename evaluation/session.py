@@ -18,9 +18,11 @@ from nerf2real.agents.environments.loading import camera_settings
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.evaluation import episodes, runner
+from nerf2real.evaluation.controls import under_control
 from nerf2real.evaluation.driving import density
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants import swaps
 from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
 from nerf2real.evaluation.policy_names import WALKERS, policy_folder
@@ -33,11 +35,33 @@ _FILMED = (60, 80)  # pixels of the robot's picture in a film, if its policy loo
 
 
 def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
-  """Returns the policy that the settings name."""
+  """Returns the policy that the settings name, with its observations falsified if they say so."""
+  policy: EvaluatedPolicy
   if settings.policy in WALKERS:
-    return GaitPolicy(scene, settings.protocol)
-  folder = policy_folder(settings.policy, task=plants.TASKS[settings.protocol])
-  return LearnedPolicy(folder, seed=settings.seed, stochastic=settings.stochastic)
+    policy = GaitPolicy(scene, settings.protocol)
+  else:
+    folder = policy_folder(settings.policy, task=plants.TASKS[settings.protocol])
+    policy = LearnedPolicy(folder, seed=settings.seed, stochastic=settings.stochastic)
+  return under_control(policy, settings.control, scene=scene, protocol=settings.protocol)
+
+
+def each_plant(settings: EvaluationSettings) -> list[EvaluationSettings]:
+  """Returns the settings of every single plant that is evaluated on.
+
+  Raises:
+    ValueError: There is no virtual robot where one is wanted.
+  """
+  robots = [
+    dataclasses.replace(settings, plant="virtual", robot_seed=(s,))
+    for s in dict.fromkeys(settings.robot_seed)
+  ]
+  if settings.plant in ("virtual", "both") and not robots:
+    raise ValueError("--robot-seed names no virtual robot: expected one or more seeds.")
+  if settings.plant == "virtual":
+    return robots
+  if settings.plant == "both":
+    return [dataclasses.replace(settings, plant="sim"), *robots]
+  return [settings]
 
 
 def make_plant(
@@ -47,7 +71,7 @@ def make_plant(
   *,
   trained_on: str = "",
 ) -> Plant:
-  """Returns the plant that the settings name.
+  """Returns the plant that the settings of one name; see `each_plant`.
 
   Args:
     settings: The evaluation.
@@ -56,6 +80,7 @@ def make_plant(
     trained_on: Name of the policy's environment: a simulated camera has its rate, lens and
       response. Robots have cameras of their own.
   """
+  swaps.check(settings.swap, plant=settings.plant, built_in=settings.scene is None)
   record = None
   if settings.record and settings.plant != "sim":
     record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
@@ -71,6 +96,7 @@ def make_plant(
       effects=settings.effects,
       seed=settings.seed,
       time_limit=settings.time_limit,
+      swap=settings.swap,
     )
   if settings.plant == "virtual":
     from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
@@ -80,8 +106,9 @@ def make_plant(
       settings.protocol,
       settings.perturb,
       image_size=image_size,
-      robot_seed=settings.robot_seed,
+      robot_seed=settings.robot_seed[0],
       time_limit=settings.time_limit,
+      swap=settings.swap,
       record=record,
     )
   from nerf2real.evaluation.plants.operated import OperatedPlant
@@ -224,13 +251,15 @@ def _run_trials(
   policy = load_policy(settings, scene)
   size = policy.image_size or settings.camera_size
   size = _FILMED if settings.video and size is None else size
-  plant = make_plant(settings, scene, size, trained_on=policy.trained_on)
   chosen = choose(plants.trials(settings.protocol), count)
-  try:
-    with _filming(settings, plant) as watch:
-      runner.run_all(
-        plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)), watch=watch
-      )
-  finally:
-    plant.close()
-  plant.check_recording()
+  for single in each_plant(settings):
+    plant = make_plant(single, scene, size, trained_on=policy.trained_on)
+    say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
+    try:
+      with _filming(settings, plant) as watch:
+        runner.run_all(
+          plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)), watch=watch
+        )
+    finally:
+      plant.close()
+    plant.check_recording()

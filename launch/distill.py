@@ -33,8 +33,8 @@ class Arguments(training.TrainingSettings):
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   preset: str | None = None
-  """Settings of the distillation: nerf_nav, or tiny to try the machinery; "nerf_nav" if not
-  given."""
+  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push, or tiny to try the
+  machinery; "nerf_nav" if not given."""
 
 
 def run(arguments: Arguments, forwarded: list[str]) -> None:

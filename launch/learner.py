@@ -59,6 +59,13 @@ class Arguments:
   init_from: Path | None = None
   """Folder of an exported policy to begin with, with fresh optimisers and critic; random weights if
   not given."""
+  prior_data: Path | None = None
+  """Folder of an earlier run whose replay, or a distillation whose episodes, are mixed into the
+  batches; none if not given."""
+  prior_share: float = 0.5
+  """Share of the prior data in every batch."""
+  prior_steps: int = 200_000
+  """Environment steps of the prior data to read: the last ones [steps]."""
   threads: int = max(1, _CORES // 2)
   """Processor threads of the updates: half of the cores, the rest is for actors."""
   resume: bool = False

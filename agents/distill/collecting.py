@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from nerf2real.agents.distill.episodes import EpisodeRunner
-from nerf2real.agents.distill.schedule import mixture_at, push_level, pushed
+from nerf2real.agents.distill.schedule import may_collect, mixture_at, push_level, pushed
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import make_teacher
 from nerf2real.agents.dmpo.policy.acting import task_of
@@ -90,7 +90,10 @@ class Collector:
         if answer is not None:
           self._policy = student_policy(answer[1], self._settings)
           self._begun = grant["steps"] if self._begun is None else self._begun
-      return int(grant["steps"])
+      if may_collect(self._settings, int(grant["steps"]), begun=self._begun):
+        return int(grant["steps"])
+      self._link.flush()
+      self._stop.wait(AWAY_POLL)
     return None
 
   def _episode(self, frames: int) -> None:
@@ -101,7 +104,7 @@ class Collector:
     mixture = mixture_at(self._settings.mixture, frames, begun=self._begun)
     arrays, figures = self._runner.run(self._policy, mixture)
     # The link counts a trajectory's transitions by its rewards: one less than observations.
-    self._link.send(arrays | {"reward": np.zeros(len(arrays["state"]) + 1, np.float32)})
+    self._link.send(arrays | {"reward": np.append(arrays["reward"], np.float32(0))})
     steps = len(arrays["state"])
     rates = {"steps_per_second": steps / (time.perf_counter() - begin), "push_force": level[1]}
     about = {"teacher_share": mixture.teacher, "belief_share": mixture.belief}

@@ -71,8 +71,10 @@ class Evaluator:
       grant = self._link.request(0)
       if grant is not None and grant["stop"]:
         return
-      if grant is not None and grant["version"] > 0 and time.monotonic() >= due:
-        # Without a first student the period does not begin.
+      # Version 0: no student yet; that of the last evaluation: none since, as while the encoder
+      # learns again.
+      fresh = grant is not None and grant["version"] not in (0, self._link.version)
+      if fresh and time.monotonic() >= due:
         due = time.monotonic() + self._settings.evaluation_period
         answer = self._link.parameters()
         if answer is not None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from nerf2real.agents.distill import settings as stages
 from nerf2real.agents.distill import student
-from nerf2real.agents.distill.dataset import UNROLL_FIELDS, Dataset, Streams
+from nerf2real.agents.distill.dataset import Dataset, Streams
 from nerf2real.agents.distill.features import FeatureCache
 from nerf2real.agents.distill.learning import make_updates, standardised
 from nerf2real.agents.distill.schedule import cosine
@@ -94,10 +94,10 @@ class Trainer:
   def _update_encoder(self, within: float) -> Metrics:
     with self._times.stage("sampling"):
       chosen = self._rng.choice(self._training_frames(), self._settings.encoder_batch)
-      image, pose = (self._data.arrays[name][chosen] for name in ("image", "pose"))
+      batch = {"image": self._data.arrays["image"][chosen], **self._data.take(chosen)}
     with self._times.stage("update"):
       rate = self._settings.learning_rate * cosine(within)
-      self.state, metrics = self._updates.encoder(self.state, image, pose, rate)
+      self.state, metrics = self._updates.encoder(self.state, batch, rate)
       jax.block_until_ready(metrics)
     return metrics
 
@@ -111,7 +111,7 @@ class Trainer:
       limit = self._cache.frames if cached else self._data.frames
       spans = [s for s in self._data.spans(held_out=False) if s.end <= limit]
       unroll = self._streams.next(spans)
-      batch = {name: self._data.arrays[name][unroll.frames] for name in UNROLL_FIELDS}
+      batch = self._data.take(unroll.frames)
       batch["begins"] = unroll.begins
       if cached:
         batch["features"] = self._cache.take(unroll.frames, self._rng)

@@ -11,7 +11,7 @@ import optax
 from nerf2real.agents.dmpo import belief, losses, networks, scaling
 from nerf2real.agents.dmpo.config import DmpoConfig
 from nerf2real.agents.dmpo.networks import Params
-from nerf2real.agents.dmpo.objective import Metrics, total_loss
+from nerf2real.agents.dmpo.objective import Metrics, critic_objective, total_loss
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.dmpo.training_state import TrainingState
 
@@ -21,6 +21,7 @@ class Learning(NamedTuple):
 
   init: Callable[[jax.Array], TrainingState]
   update: Callable[[TrainingState, Mapping[str, Any]], tuple[TrainingState, Metrics]]
+  update_critic: Callable[[TrainingState, Mapping[str, Any]], tuple[TrainingState, Metrics]]
 
 
 def has_belief(layout: Layout) -> bool:
@@ -39,7 +40,8 @@ def make_learning(
     first_action: what the policy's mean is about at the start [A]; zero if None.
 
   `update(state, batch)` takes a batch as `Replay.sample` gives it and is jitted; it gives the new
-  state and metrics with fixed names. The state passed in must not be used again (donated).
+  state and metrics with fixed names. `update_critic` does so for the critic alone. The state passed
+  in must not be used again (donated).
   """
   optimisers = _make_optimisers(config)
 
@@ -76,7 +78,32 @@ def make_learning(
       else {},
       steps=jnp.zeros((), jnp.int32),
       key=key,
+      student=jax.tree.map(jnp.copy, policy) if config.student_kl else {},
     )
+
+  def update_critic(
+    state: TrainingState, batch: Mapping[str, Any]
+  ) -> tuple[TrainingState, Metrics]:
+    key, loss_key = jax.random.split(state.key)
+    gradients, metrics = jax.grad(critic_objective, has_aux=True)(
+      state.critic,
+      state.target_policy,
+      state.target_critic,
+      batch=batch,
+      key=loss_key,
+      config=config,
+      scales=state.scaling,
+    )
+    changes, optimiser_state = optimisers["critic"].update(gradients, state.critic_optimiser)
+    critic, steps = optax.apply_updates(state.critic, changes), state.steps + 1
+    metrics["gradient_critic"] = optax.global_norm(gradients)
+    return state._replace(
+      critic=critic,
+      target_critic=_copy_every(config.target_critic_period, steps, critic, state.target_critic),
+      critic_optimiser=optimiser_state,
+      steps=steps,
+      key=key,
+    ), metrics
 
   def update(state: TrainingState, batch: Mapping[str, Any]) -> tuple[TrainingState, Metrics]:
     key, loss_key = jax.random.split(state.key)
@@ -90,6 +117,7 @@ def make_learning(
       config=config,
       layout=layout,
       scales=state.scaling,
+      student=state.student,
     )
     new, optimiser_states = [], []
     states = (
@@ -108,7 +136,7 @@ def make_learning(
         metrics[f"gradient_{name}"] = optax.global_norm(grads)
     policy, critic, duals, beliefs = new
     steps = state.steps + 1
-    return TrainingState(
+    return state._replace(
       policy=policy,
       target_policy=_copy_every(config.target_actor_period, steps, policy, state.target_policy),
       critic=critic,
@@ -119,12 +147,31 @@ def make_learning(
       critic_optimiser=optimiser_states[1],
       dual_optimiser=optimiser_states[2],
       belief_optimiser=optimiser_states[3],
-      scaling=state.scaling,
       steps=steps,
       key=key,
     ), metrics
 
-  return Learning(init, jax.jit(update, donate_argnums=0))
+  return Learning(init, jax.jit(update, donate_argnums=0), jax.jit(update_critic, donate_argnums=0))
+
+
+def student_weight(config: DmpoConfig, updates: int, mean_return: float | None) -> float:
+  """Weight of the KL from the policy that a run began with.
+
+  w = student_kl * (1 - share of the updates) * (1 - share of the way between the returns).
+
+  Args:
+    config: the agent's settings.
+    updates: done so far.
+    mean_return: of the last acting episodes; None while there are none.
+  """
+  weight = config.student_kl
+  if config.student_kl_updates:
+    done = max(0, updates - config.critic_warmup) / config.student_kl_updates
+    weight *= max(0.0, 1.0 - done)
+  if config.student_kl_returns is not None and mean_return is not None:
+    low, high = config.student_kl_returns
+    weight *= float(np.clip((high - mean_return) / (high - low), 0.0, 1.0))
+  return weight
 
 
 def _copy_every(period: int, steps: jax.Array, online: Params, target: Params) -> Params:

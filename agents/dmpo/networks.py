@@ -186,14 +186,28 @@ def lstm_step(params: Params, state: LstmState, x: jax.Array) -> LstmState:
   return LstmState(jax.nn.sigmoid(o) * jnp.tanh(cell), cell)
 
 
-def unroll_lstm(params: Params, initial: LstmState, features: jax.Array) -> jax.Array:
-  """Runs the LSTM over features [B, T, F] from a stored state; returns its outputs [B, T, U]."""
+def unroll_lstm(
+  params: Params, initial: LstmState, features: jax.Array, burn_in: jax.Array | None = None
+) -> jax.Array:
+  """Runs the LSTM over features [B, T, F] from a stored state; returns its outputs [B, T, U].
 
-  def step(state: LstmState, x: jax.Array) -> tuple[LstmState, jax.Array]:
+  Args:
+    params: of the LSTM.
+    initial: the stored state.
+    features: its inputs.
+    burn_in: steps of each trajectory [B] beyond which no gradient flows back.
+  """
+
+  def step(state: LstmState, inputs: tuple[jax.Array, jax.Array]) -> tuple[LstmState, jax.Array]:
+    x, time = inputs
+    if burn_in is not None:
+      cut = (time == burn_in)[:, None]
+      state = jax.tree.map(lambda s: jnp.where(cut, jax.lax.stop_gradient(s), s), state)
     state = lstm_step(params, state, x)
     return state, state.hidden
 
-  _, outputs = jax.lax.scan(step, initial, features.swapaxes(0, 1))
+  times = jnp.arange(features.shape[1])
+  _, outputs = jax.lax.scan(step, initial, (features.swapaxes(0, 1), times))
   return outputs.swapaxes(0, 1)
 
 
@@ -217,6 +231,8 @@ def unroll_policy(
   state: jax.Array,
   images: jax.Array | None,
   initial: LstmState | None,
+  features: jax.Array | None = None,
+  burn_in: jax.Array | None = None,
 ) -> PolicyOutput:
   """Applies the policy to trajectories.
 
@@ -226,17 +242,20 @@ def unroll_policy(
     state: proprioception [B, T, S].
     images: pictures in [0, 1] [B, T, H, W, 3], or None.
     initial: the LSTM's state before the first step, as the actor stored it; None without an LSTM.
+    features: of the pictures [B, T, F], in place of them; None where they are to be computed.
+    burn_in: steps of each trajectory [B] that only unroll the LSTM; None for none.
   """
   batch, time = state.shape[:2]
-  if images is None:
-    embedding = jnp.zeros((batch, time, 0))
-  else:
+  embedding = features
+  if embedding is None and images is not None:
     flat = images.reshape(batch * time, *images.shape[2:])
     embedding = resnet(params["resnet"], flat, config).reshape(batch, time, -1)
-    if "lstm" in params:
-      if initial is None:
-        raise ValueError("A recurrent policy needs the stored LSTM state, found None.")
-      embedding = unroll_lstm(params["lstm"], initial, embedding)
+  if embedding is None:
+    embedding = jnp.zeros((batch, time, 0))
+  elif "lstm" in params:
+    if initial is None:
+      raise ValueError("A recurrent policy needs the stored LSTM state, found None.")
+    embedding = unroll_lstm(params["lstm"], initial, embedding, burn_in)
   return PolicyOutput(policy_head(params, embedding, state, config), embedding)
 
 

@@ -219,6 +219,22 @@ class Replay:
         array.flush()
 
 
+def open_stored(folder: Path) -> dict[str, np.ndarray] | None:
+  """Opens the arrays of a folder's replay for reading, `origin` among them; None without one.
+
+  The entries that are whole have a number above 0 in `origin[:, 2]`, which rises as they came.
+  """
+  if not (folder / _INDEX_FILE).exists():
+    return None
+  index = json.loads((folder / _INDEX_FILE).read_text())
+  return {
+    name: np.zeros(shape, dtype)
+    if 0 in shape
+    else np.memmap(folder / f"{name}.raw", dtype, "r", shape=tuple(shape))
+    for name, (shape, dtype) in index.items()
+  }
+
+
 def _check_index(folder: Path, shapes: Mapping[str, tuple]) -> bool:
   """Returns whether the folder holds a replay; raises ValueError if it is another one."""
   folder.mkdir(parents=True, exist_ok=True)

@@ -29,6 +29,7 @@ class TrainingState(NamedTuple):
   scaling: Params  # of the observations; empty without scaling
   steps: jax.Array  # [] int32, updates done
   key: jax.Array  # random key
+  student: Params  # policy that the run began with; empty where nothing is drawn to it
 
 
 def served_parameters(state: TrainingState) -> dict[str, np.ndarray]:
@@ -75,6 +76,7 @@ def with_policy(state: TrainingState, parameters: Mapping[str, np.ndarray]) -> T
       )
   arrays = jax.tree.map(jnp.array, {"policy": policy, "belief": beliefs or state.belief})
   return state._replace(
+    student=jax.tree.map(jnp.copy, arrays["policy"]) if state.student else {},
     policy=arrays["policy"],
     target_policy=jax.tree.map(jnp.copy, arrays["policy"]),
     belief=arrays["belief"],
@@ -88,16 +90,17 @@ def with_scaling(state: TrainingState, scales: Params, *, keep_policy: bool) -> 
   Args:
     state: the state.
     scales: from `scaling.measure`.
-    keep_policy: rewrites the policies' first layers so that they act as before; a policy with
-      random weights is better left with them, for inputs of one size.
+    keep_policy: rewrites the policies' and the student's first layers so that they act as before; a
+      policy with random weights is better left with them, for inputs of one size.
   """
   state = state._replace(scaling=jax.tree.map(jnp.array, scales))
   if not keep_policy:
     return state
-  policy, target = (
-    jax.tree.map(jnp.array, scaling.unfold(p, scales)) for p in (state.policy, state.target_policy)
+  policy, target, student = (
+    jax.tree.map(jnp.array, scaling.unfold(p, scales)) if p else p
+    for p in (state.policy, state.target_policy, state.student)
   )
-  return state._replace(policy=policy, target_policy=target)
+  return state._replace(policy=policy, target_policy=target, student=student)
 
 
 def flatten_params(params: Params, prefix: str = "") -> dict[str, np.ndarray]:

@@ -55,6 +55,18 @@ def with_exported_policy(folder: Path, state: TrainingState, layout: Layout) -> 
   return training_state.with_policy(state, arrays)
 
 
+def check_beginning(config: configs.DmpoConfig, init_from: str) -> None:
+  """Raises ValueError where settings need a policy to begin with and there is none.
+
+  Args:
+    config: the agent's settings.
+    init_from: the policy that the run began with; empty for random weights.
+  """
+  for name in ("student_kl", "frozen_encoder"):
+    if getattr(config, name) and not init_from:
+      raise ValueError(f"{name} needs a policy to begin with: add --init-from, or set it to 0.")
+
+
 def open_replay(
   settings: RunSettings, config: configs.DmpoConfig, *, fields: Any, resume: bool
 ) -> Replay:

@@ -16,7 +16,6 @@ import numpy as np
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.dmpo import learning, scaling, training_state
 from nerf2real.agents.dmpo.policy import export
-from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments.loading import evaluation_name, make_environment
 from nerf2real.agents.link import sessions
@@ -25,6 +24,7 @@ from nerf2real.agents.link.server import LearnerLink
 from nerf2real.agents.processes import beginning
 from nerf2real.agents.processes.best_policy import BestPolicy
 from nerf2real.agents.processes.checkpoints import BEST, CheckpointError, Checkpoints
+from nerf2real.agents.processes.experience import Experience
 from nerf2real.agents.processes.logs import MetricsLog
 from nerf2real.agents.processes.settings import RunSettings
 from nerf2real.agents.processes.timings import Periods, Rates, StageTimes
@@ -86,9 +86,11 @@ class Learner:
     self._best = BestPolicy(info)
     # Remembered: reading it from the state would wait for the update that the device works on.
     self._scaled = scaling.is_measured(self._state.scaling)
-    lstm = self._state.policy["lstm"]["b"].shape[0] // 4 if "lstm" in self._state.policy else 0
-    self._fields = trajectory_fields(self.layout, lstm_size=lstm)
-    self.replay = beginning.open_replay(settings, config, fields=self._fields, resume=resume)
+    beginning.check_beginning(config, self._init_from)
+    self._experience = Experience(
+      settings, config, layout=self.layout, policy=self._state.policy, resume=resume
+    )
+    self.replay = self._experience.replay
     limiter = beginning.make_limiter(
       settings, config, replay=self.replay, info=info, updates=int(self._state.steps)
     )
@@ -107,7 +109,7 @@ class Learner:
       self._session,
       link,
       limiter=limiter,
-      insert=self._insert,
+      insert=self._experience.insert,
       known=self.replay.origins(),
       description={
         "environment": settings.environment,
@@ -124,11 +126,6 @@ class Learner:
     self._publish()
     if not resume:  # so that a learner that dies early has something to go on from
       self.save()
-
-  def _insert(self, trajectory: Any, actor: int, number: int) -> int:
-    steps = check_trajectory(trajectory, self._fields, length=self._config.trajectory_length)
-    self.replay.insert(trajectory, actor=actor, number=number)
-    return steps - 1
 
   def stop(self) -> None:
     """Ends `run` after the present update; safe in a signal handler."""
@@ -155,7 +152,7 @@ class Learner:
     try:
       while not self._stop.is_set():
         with self.link.lock:
-          due, finished = self.limiter.update_due, self.limiter.finished
+          due, finished = self._update_due, self.limiter.finished
         if finished or self._time_is_up():
           break
         if self.link.failure:
@@ -184,17 +181,31 @@ class Learner:
     minutes = self._settings.minutes
     return minutes is not None and self._seconds >= 60 * minutes
 
+  @property
+  def _warms_up(self) -> bool:
+    """Whether the critic learns alone."""
+    return self.limiter.updates < self._config.critic_warmup
+
+  @property
+  def _update_due(self) -> bool:
+    return self.limiter.filled if self._warms_up else self.limiter.update_due
+
   def _update(self, previous: dict[str, Any]) -> dict[str, Any]:
     if not self._scaled:
       self._measure_scaling()
+    warms_up = self._warms_up
     with self._times.stage("sampling"):
-      batch = self.replay.sample(self._random, self._config.batch_size)
+      batch = self._experience.sample(self._random)
+      if self._config.student_kl:
+        weight = learning.student_weight(self._config, self.limiter.updates, self._mean("return"))
+        batch["student_weight"] = np.float32(weight)
     with self._times.stage("update"):
       if previous:  # at most one update waits behind the one that the device works on
         jax.block_until_ready(previous["loss"])
-      self._state, metrics = self._learning.update(self._state, batch)
+      update = self._learning.update_critic if warms_up else self._learning.update
+      self._state, metrics = update(self._state, batch)
     with self.link.lock:
-      self.limiter.updated()
+      self.limiter.updated(paid=not warms_up)
       updates = self.limiter.updates
     if updates % self._config.target_actor_period == 0:
       self._publish()
@@ -300,9 +311,13 @@ class Learner:
       "seconds": self._seconds,
     }
     for name in ("return", "success", "localisation_error"):
-      seen = [e[name] for e in self._recent if isinstance(e.get(name), int | float)]
-      status[name] = float(np.mean(seen)) if seen else None
+      status[name] = self._mean(name)
     return status | self._rates.measure(steps, updates)
+
+  def _mean(self, name: str) -> float | None:
+    """Mean of a figure over the last acting episodes."""
+    seen = [e[name] for e in self._recent if isinstance(e.get(name), int | float)]
+    return float(np.mean(seen)) if seen else None
 
   def _write_own(self, metrics: dict[str, Any]) -> None:
     """Writes the learner's row; its times are means over the updates since the last one."""

@@ -27,6 +27,13 @@ class RunSettings:
   """Time of the run [min], over all its parts where it is resumed; None: until it is stopped."""
   init_from: Path | None = None
   """Folder of an exported policy to begin with, optimisers and critic being fresh; None: random."""
+  prior_data: Path | None = None
+  """Folder of a run whose replay (`replay/`) or episodes (a distillation's `data/`) are mixed into
+  the batches; None: none."""
+  prior_share: float = 0.5
+  """Their share of every batch. Source: Tirumala et al. 2024 mix data of earlier runs evenly."""
+  prior_steps: int = 200_000
+  """Environment steps of them to read into memory: the last ones [steps]."""
   evaluation_period: int = 10_000
   """Environment steps between evaluations [steps]."""
   evaluation_episodes: int | None = None

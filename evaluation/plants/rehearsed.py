@@ -8,10 +8,11 @@ import dm_env
 import numpy as np
 
 from nerf2real import real
-from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.plants import perturbations, swaps
 from nerf2real.evaluation.plants.plant import BALL, TASKS, Sight, Trial, make_intruder
 from nerf2real.evaluation.plants.robot_plant import RobotPlant
 from nerf2real.real.virtual.camera import VirtualCamera
+from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
@@ -51,6 +52,7 @@ class RehearsedPlant(RobotPlant):
     world: str = "room",
     time_limit: float | None = None,
     record: Path | None = None,
+    swap: str = swaps.NONE,
   ):
     """Builds the robot and connects to it.
 
@@ -63,13 +65,17 @@ class RehearsedPlant(RobotPlant):
       world: "room" or "floor", see `VirtualRobot`.
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
+      swap: `swaps.PHYSICS`: nothing is hidden in the robot.
     """
     super().__init__(scene, protocol, perturbation, record=record)
     self.plant_id = "data sheet" if robot_seed is None else f"robot {robot_seed}"
+    known = swap == swaps.PHYSICS
+    self.plant_id += ", data sheet's physics" if known else ""
     self._intruder = make_intruder(self, self._starts)
     self.robot = VirtualRobot(
       world=world,
       seed=robot_seed,
+      hidden=Hidden.none() if known else None,
       stepped=True,
       camera=None if image_size is None else VirtualCamera(),
       ball=protocol == BALL,

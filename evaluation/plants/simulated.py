@@ -7,7 +7,7 @@ import dm_env
 import numpy as np
 
 from nerf2real import suite
-from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.plants import perturbations, swaps
 from nerf2real.evaluation.plants.plant import TASKS, Plant, Sight, Trial, make_intruder
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
@@ -32,6 +32,7 @@ class SimulatedPlant(Plant):
     effects: Any = None,
     seed: int = 0,
     time_limit: float | None = None,
+    swap: str = swaps.NONE,
   ):
     """Builds the environment.
 
@@ -44,9 +45,12 @@ class SimulatedPlant(Plant):
       effects: An effects.json, or effects.
       seed: Of what differs between episodes, with the trial's own.
       time_limit: Length of an episode [s]; the task's own if None.
+      swap: What is taken from the virtual robot: `swaps.PICTURE` or `swaps.DELAY`.
     """
     super().__init__(scene, protocol, perturbation)
     self.plant_id = f"seed {seed}" + ("" if effects is None else ", effects")
+    self.plant_id += "" if swap == swaps.NONE else f", the robot's {swap}"
+    self._room = swaps.TrueRoom(scene) if swap == swaps.PICTURE and image_size else None
     self._seed = seed
     self._intruder = make_intruder(self, protocols.scene_starts(scene))
     self._environment = suite.load(
@@ -54,7 +58,8 @@ class SimulatedPlant(Plant):
       scene=scene,
       effects=effects,
       image_size=image_size,
-      camera=camera,
+      camera=swaps.camera_of_the_robot(camera) if swap == swaps.DELAY else camera,
+      renderer=self._room,
       random=seed,
       randomisation=dataclasses.replace(RandomisationSettings(), pushes=False),
       time_limit=time_limit,
@@ -113,3 +118,5 @@ class SimulatedPlant(Plant):
 
   def close(self) -> None:
     self._environment.close()
+    if self._room is not None:
+      self._room.close()

@@ -82,10 +82,9 @@ def _table(table: tables.Table, text: str = "") -> Section:
 
 def _title(episode: Episode) -> str:
   setting = episode.setting
-  disturbed = "" if setting.perturbation == "none" else f", {setting.perturbation}"
   return (
     f"{setting.policy}, {setting.resolution}, {tables.PLANTS[setting.plant]} "
-    f"({setting.plant_id}), {setting.protocol}{disturbed}"
+    f"({setting.plant_id}), {setting.protocol}{tables.changes(setting)}"
   )
 
 

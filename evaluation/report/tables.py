@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerf2real.agents.environments.trials import clopper_pearson
 from nerf2real.evaluation import episodes as kept
 from nerf2real.evaluation.episodes import Episode, select
 from nerf2real.suite import protocols
@@ -188,55 +189,52 @@ def gain_table(found: Sequence[Episode]) -> Table:
   return Table("Table V: camera gain", tuple(header), tuple(rows))
 
 
+def changes(setting: kept.Setting) -> str:
+  """Says what was disturbed or falsified, after a comma; empty if nothing was."""
+  control = "" if setting.control == "none" else f"control {setting.control}"
+  disturbed = "" if setting.perturbation == "none" else setting.perturbation
+  return "".join(f", {change}" for change in (disturbed, control) if change)
+
+
+def exact_rate(successes: int, count: int) -> str:
+  """Says a rate with its exact 95 % interval (Clopper and Pearson 1934), such as
+  "7/9, 40 to 97 %"."""
+  low, high = clopper_pearson(successes, count)
+  return f"{successes}/{count}, {100 * low:.0f} to {100 * high:.0f} %"
+
+
 def outcome_table(found: Sequence[Episode]) -> Table:
   """Returns how the episodes of each setting ended."""
   header = (
-    "Policy, plant, protocol, perturbation",
+    "Policy, plant, protocol, perturbation, control",
     "episodes",
     *kept.OUTCOMES,
+    "success, exact 95 % interval",
     "localisation error when successful",
     "and when failed",
   )
   rows = []
-  keys = dict.fromkeys(
-    (
-      e.setting.policy,
-      e.setting.policy_id,
-      e.setting.resolution,
-      e.setting.plant,
-      e.setting.plant_id,
-      e.setting.protocol,
-      e.setting.perturbation,
-    )
-    for e in found
-  )
-  for policy, digest, size, plant, plant_id, protocol, perturbation in keys:
-    chosen = select(
-      found,
-      policy_id=digest,
-      resolution=size,
-      plant=plant,
-      plant_id=plant_id,
-      protocol=protocol,
-      perturbation=perturbation,
-    )
+  for setting in dict.fromkeys(episode.setting for episode in found):
+    chosen = [episode for episode in found if episode.setting == setting]
     counts = Counter(episode.outcome for episode in chosen)
-    good = [e for e in chosen if e.success]
-    bad = [e for e in chosen if not e.success]
     cells = (
       str(len(chosen)),
       *(str(counts[name]) for name in kept.OUTCOMES),
-      _number(localisation_error(good), 2, "m"),
-      _number(localisation_error(bad), 2, "m"),
+      exact_rate(counts[kept.SUCCESS], len(chosen)),
+      _number(localisation_error([e for e in chosen if e.success]), 2, "m"),
+      _number(localisation_error([e for e in chosen if not e.success]), 2, "m"),
     )
-    name = f"{_label((policy, digest, size), found)}, {PLANTS[plant]} ({plant_id}), {protocol}"
-    rows.append(Row(name + ("" if perturbation == "none" else f", {perturbation}"), cells))
+    policy = (setting.policy, setting.policy_id, setting.resolution)
+    name = (
+      f"{_label(policy, found)}, {PLANTS[setting.plant]} ({setting.plant_id}), {setting.protocol}"
+    )
+    rows.append(Row(name + changes(setting), cells))
   return Table("How the episodes ended", header, tuple(rows))
 
 
 def paper_tables(found: Sequence[Episode]) -> list[Table]:
   """Returns the paper's tables for which there are undisturbed episodes."""
-  plain = select(found, perturbation="none")
+  plain = select(found, perturbation="none", control="none")
   makers = {"navigation": navigation_table, "ball": ball_table, "gain": gain_table}
   return [
     make(select(plain, protocol=protocol))
