@@ -88,6 +88,8 @@ def owner_of(folder: str | Path, *, name: str = FILE) -> dict[str, Any]:
 def _create(folder: Path) -> list[Path]:
   """Creates a folder with its parents; returns those that were missing, the innermost first."""
   missing = _missing(folder)
+  if not missing and not folder.is_dir():
+    raise NotADirectoryError(f"{folder} is a file, expected a folder to write: name another one.")
   with files.explain_disk_full(folder):
     folder.mkdir(parents=True, exist_ok=True)
   return missing

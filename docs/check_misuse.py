@@ -13,6 +13,7 @@ import importlib
 import io
 import os
 import pathlib
+import re
 import shlex
 import signal
 import sys
@@ -78,6 +79,7 @@ def run(command: str) -> Found:
         signal.signal(number, handler)
     said = err.getvalue().replace(f"{folder}/", "")
     left = tuple(sorted(_listed(folder) - before))
+  said = re.sub("[─-]{3,}", "", said)
   lines = [line.strip(" │") for line in said.splitlines() if line.strip(" │╭╮╰╯─")]
   words = " ".join(lines) if status == _PARSER else (lines[-1] if lines else "")
   return Found(status, words, "Traceback" in said, left, time.monotonic() - begin)

@@ -125,7 +125,7 @@ def test_without_flock_the_owner_decides(tmp_path, monkeypatch, owner, free):
 
 def test_folder_that_cannot_be_made_is_said(tmp_path):
   (tmp_path / "file").write_text("")
-  with pytest.raises(OSError, match="file"), lock_folder(tmp_path / "file"):
+  with pytest.raises(OSError, match="is a file, expected a folder"), lock_folder(tmp_path / "file"):
     pass
 
 
