@@ -136,8 +136,8 @@ class Film:
       environment: From `suite.load`, with pictures.
       sink: Takes the frames.
     """
-    self._task, self._sink = environment.task, sink
-    self._third = ThirdPerson(self._task, environment.physics, height=HEIGHT, width=WIDTH)
+    self._environment, self._task, self._sink = environment, environment.task, sink
+    self._third: ThirdPerson | None = None  # made with the first episode, where the robot is
     self._map = TopDown(self._task, HEIGHT)
     self._step = 0
 
@@ -147,7 +147,10 @@ class Film:
     return self._map.extent
 
   def restart(self) -> None:
-    """Begins an episode."""
+    """Begins an episode; to be called before the first frame."""
+    if self._third is None:
+      physics = self._environment.physics
+      self._third = ThirdPerson(self._task, physics, height=HEIGHT, width=WIDTH)
     self._third.restart()
     self._map.restart()
 
@@ -166,7 +169,7 @@ class Film:
       density: Where a policy expects to be on the map, `Driver.density`.
     """
     self._step += 1
-    if self._step % FRAME_STEPS:
+    if self._step % FRAME_STEPS or self._third is None:
       return
     own = cv2.resize(observation["camera"], (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
     self._sink.add(compose([self._third.draw(), own, self._map.draw(density)], text))
