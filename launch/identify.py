@@ -22,7 +22,7 @@ class Arguments:
   model: Path | None = None
   """Declared MuJoCo model (.xml)."""
   logs: tuple[Path, ...] = ()
-  """Logs to identify from (.mcap)."""
+  """Logs to identify from (.mcap, .csv, BAM's .json)."""
   held: tuple[Path, ...] = ()
   """Logs on which only errors are reported."""
   reference: tuple[Path, ...] = ()
