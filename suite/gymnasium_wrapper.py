@@ -57,7 +57,8 @@ class GymnasiumEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
       for name, spec in environment.observation_spec().items()
       if privileged or not name.startswith(PREFIX)
     }
-    self.observation_space = spaces.Dict({n: space_of(s) for n, s in self._specs.items()})
+    space: Any = spaces.Dict({n: space_of(s) for n, s in self._specs.items()})
+    self.observation_space = space
     self.action_space = space_of(environment.action_spec())
     self._view: ThirdPerson | None = None
 

@@ -20,7 +20,10 @@ FRAME_STEPS = 2  # control steps between frames: 20 frames/s
 HEIGHT, WIDTH = 360, 480  # pixels of the third person's picture and of the enlarged robot's view
 _INK, _PAPER = (29, 35, 48), (255, 255, 255)
 _STRIP = 44  # pixels of text under the pictures
-_ANIMATED = {".webp": {"quality": 60, "method": 4}, ".gif": {}}  # Pillow's options
+_ANIMATED: dict[str, dict[str, Any]] = {
+  ".webp": {"quality": 60, "method": 4},
+  ".gif": {},
+}  # Pillow's options
 _SHARE = 2  # of an animation's pictures every so many-th is kept, and reduced by it
 
 
