@@ -1,5 +1,10 @@
+<<<<<<< HEAD
 # make see: a walking robot in the browser; make demo: the main job on the built-in room; make test:
 # all tests. All install first.
+=======
+# make demo: the main job on the built-in room; make loop: the closed loop with the shipped policy; make
+# test: all tests. All install first.
+>>>>>>> main
 SHELL := /bin/bash
 # the first interpreter that runs, is new enough and can make environments
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -7,13 +12,23 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
   && { echo $$p; break; }; done)
 BIN := .venv/bin
 
+<<<<<<< HEAD
 .PHONY: see demo test lint install clean
 see: install
 	$(BIN)/python launch/view.py --task nerf_nav --policy walker
 
+=======
+.PHONY: demo loop test lint install clean
+>>>>>>> main
 demo: install
 	$(BIN)/python launch/make_scene.py --capture builtin --preset demo --out out/demo
 	@echo "open out/demo/report.html"
+
+# the closed loop, first case, at reduced size: 6 trials, 5 minutes of training
+loop: install
+	$(BIN)/python launch/close_loop.py --robot virtual --hidden command_delay:0.045 --policy shipped \
+	  --trials 6 --seconds 6 --minutes 5 --out out/loop
+	@echo "open out/loop/loop.html"
 
 test: install lint
 	$(BIN)/python -m pytest
