@@ -1,10 +1,5 @@
-<<<<<<< HEAD
-# make see: a walking robot in the browser; make demo: the main job on the built-in room; make test:
-# all tests. All install first.
-=======
-# make demo: the main job on the built-in room; make loop: the closed loop with the shipped policy; make
-# test: all tests. All install first.
->>>>>>> main
+# make see: a walking robot in the browser; make demo: the main job on the built-in room; make loop: the
+# closed loop with the shipped policy; make test: all tests. All install first.
 SHELL := /bin/bash
 # the first interpreter that runs, is new enough and can make environments
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -12,14 +7,10 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
   && { echo $$p; break; }; done)
 BIN := .venv/bin
 
-<<<<<<< HEAD
-.PHONY: see demo test lint install clean
+.PHONY: see demo loop test lint install clean
 see: install
 	$(BIN)/python launch/view.py --task nerf_nav --policy walker
 
-=======
-.PHONY: demo loop test lint install clean
->>>>>>> main
 demo: install
 	$(BIN)/python launch/make_scene.py --capture builtin --preset demo --out out/demo
 	@echo "open out/demo/report.html"

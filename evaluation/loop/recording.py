@@ -56,21 +56,6 @@ def record_stand(
   """
   for name in (*TRAIN, *HELD):
     path = out / f"{name}.mcap"
-<<<<<<< HEAD
-    try:
-      with Recorder(path) as recorder:
-        _play(connection, motion(name, count), robot, recorder=Gate(recorder), held=True)
-    except BaseException:  # a motion that was cut off is nothing to identify from
-      path.unlink(missing_ok=True)
-      raise
-    if recorder.dropped:
-      raise RuntimeError(
-        f"Found {recorder.dropped} messages missing in {name}.mcap, expected none: the recorder did"
-        " not keep up; run again on a machine with less load."
-      )
-  actions = motion(STANDING, count)
-  return {"actions": actions, "positions": _play(connection, actions, robot, held=False)}
-=======
     filmed = lens if name == FILMED else None
 
     def play(gate: Gate, name: str = name, filmed: Any = filmed) -> None:
@@ -78,7 +63,6 @@ def record_stand(
       play_actions(connection, actions, robot, recorder=gate, held=True, lens=filmed)
 
     record(path, play)
->>>>>>> main
 
 
 def record(path: Path, play: Any) -> None:

@@ -40,7 +40,7 @@ from tests.launch.test_identify import _log
     ("evaluate", ("--dry-run", "--out", "{out}"), 1, "expected --plant robot"),
     ("identify", ("--model", "none.xml", "--logs", "{log}", "--out", "{out}"), 1, "none.xml"),
     ("rollout", ("--scene", "none", "--video", "{out}/x.mp4"), 1, "none"),
-    ("close_loop", ("--reuse", "--out", "{out}"), 1, "{out}"),
+    ("close_loop", ("--policy", "none", "--out", "{out}"), 1, "none"),
   ],
 )
 def test_refused_at_once(run, tmp_path, script, arguments, status, words):

@@ -10,8 +10,11 @@ from tests.sysid.synthetic import PENDULUM
 
 _HOLD = """
 import sys, time
+from contextlib import ExitStack
 from nerf2real.core.folder_lock import lock_folder
-with lock_folder(sys.argv[1]), lock_folder(sys.argv[1], name=".learner.lock"):
+with ExitStack() as stack:
+  for name in (".lock", ".learner.lock", ".loop.lock"):
+    stack.enter_context(lock_folder(sys.argv[1], name=name))
   print("held", flush=True)
   time.sleep(600)
 """
