@@ -29,7 +29,7 @@ def _floor(rng, height=0.0):
 def _outlook(tmp_path, points, **changes) -> Made:
   return geometry_stages.outlook(
     Stages(tmp_path / ".stages", show_progress=False),
-    None,
+    types.SimpleNamespace(value=types.SimpleNamespace(known=None)),
     _poses(points),
     world_frame.AlignSettings(**changes),
     voxel=0.02,
