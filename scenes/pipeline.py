@@ -76,7 +76,7 @@ def _run_stages(
 
   capture = image_stages.keyframes(cache, film, settings.capture)
   poses = image_stages.poses(cache, capture, settings.localise)
-  if fixed.floor_points is None:
+  if override.floor_points is None:
     surroundings.require_room(poses.value.world_from_camera, poses.value.points)
   marker = geometry_stages.outlook(
     cache,
