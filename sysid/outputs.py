@@ -125,7 +125,9 @@ def identify(
     ]
   if found.verdict == "partly":
     joints = ", ".join(item.joint for item in found.unexplained)
-    text = f"More remains than the reference leaves, at {joints}: what is named is certain, not all."
+    text = (
+      f"More remains than the reference leaves, at {joints}: what is named is certain, not all."
+    )
     content["notes"] = [*content["notes"], text]
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))

@@ -63,10 +63,11 @@ class Settings:
   """Blocks that must be so: one may be a knock."""
   alike: float = 0.5
   """Of the residual's scale: hypotheses whose predictions differ by less are not told apart."""
-  more: float = 1.5
-  """Times what the reference leaves: more than that remains to be explained."""
+  more: float = 2.0
+  """Times what the machine leaves anyway: more than that remains to be explained (as a blind set's
+  effect counts as seen from twice the healthy machine's error on)."""
   most: float = 0.75
-  """Share of a squared residual that a name must explain where more remains: it halves the error."""
+  """Share of a squared residual that names must explain where more remains: half the error."""
   level: float = 0.05
   """Family-wise significance of all names together."""
 

@@ -40,7 +40,9 @@ class JointLikelihood:
     elif all(log.effort is not None for log in logs) and plant.holds:
       self.effort = [log.effort for log in logs]  # type: ignore[misc]
     self.channels = ["course"] + (["effort"] if self.effort is not None else [])
-    self.floor = np.array([self.position_noise] + ([effort_noise(self.effort)] if self.effort else []))
+    self.floor = np.array(
+      [self.position_noise] + ([effort_noise(self.effort)] if self.effort else [])
+    )
     self.mask = np.concatenate([log.valid for log in logs]).astype(float)
     self.speed = np.concatenate([log.velocity for log in logs])
     self.speed_matters = not self.is_duty
@@ -137,8 +139,8 @@ class JointLikelihood:
     scale = self._factor(soft * measured, soft * torque)
     left = soft * (measured - scale * torque)
     if not self.is_duty:  # a current's torque lacks what the back-EMF takes
-        speed = soft * self.speed
-        left = left - float(left @ speed) / (float(speed @ speed) + 1e-12) * speed
+      speed = soft * self.speed
+      left = left - float(left @ speed) / (float(speed @ speed) + 1e-12) * speed
     return left
 
   def _factor(self, measured: Array, torque: Array) -> float:
@@ -176,7 +178,9 @@ class JointLikelihood:
     squares = self.squares(residuals)
     self.scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
     for c, row in enumerate(residuals):
-      self.independent[c] = 1.0 / _correlation_time(row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts)
+      self.independent[c] = 1.0 / _correlation_time(
+        row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts
+      )
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

@@ -21,7 +21,13 @@ Array = np.ndarray
 
 CONSTANTS = "calibration"
 CLOCKS = ("latency", "skew", "delay")
-_DAMPINGS = ((1e-4, 1.0, True), (1e-4, 1.0, False), (1e-2, 0.3, True), (1e-2, 0.3, False), (3.0, 1.0, True))
+_DAMPINGS = (
+  (1e-4, 1.0, True),
+  (1e-4, 1.0, False),
+  (1e-2, 0.3, True),
+  (1e-2, 0.3, False),
+  (3.0, 1.0, True),
+)
 """Damping and share of the steps that are tried, and whether latencies move: held commands make
 stairs of them, whose derivatives mislead."""
 _WIDTH, _FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
@@ -98,7 +104,9 @@ class Fitter:
   def costs(self, xs: Array, *, without: int | None = None) -> Array:
     """Returns C of sets of values [X, n], of all but one fold."""
     total = self.prior(xs)
-    for joint, terms, index in zip(self.joints, self.layout.of_joint, self.layout.index, strict=True):
+    for joint, terms, index in zip(
+      self.joints, self.layout.of_joint, self.layout.index, strict=True
+    ):
       nats = joint.loglik(joint.squares(joint.residuals(terms, xs[:, index])))
       keep = np.ones(nats.shape[1]) if without is None else (joint.fold != without)
       total = total - nats @ keep

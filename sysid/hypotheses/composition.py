@@ -24,7 +24,6 @@ def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> tuple[Array, 
       loads.append(Load(str(term.target), moments))
     elif term.kind == "gravity_tilt":
       loads.append(plant.tilt_load(values["x"], values["y"]))
-    elif term.kind == "calibration":
-      if "mass" in values:
-        loads.append(Load("mass", np.array([values["mass"]])))
+    elif term.kind == "calibration" and "mass" in values:
+      loads.append(Load("mass", np.array([values["mass"]])))
   return p, loads

@@ -26,7 +26,10 @@ def constants(plant: JointModel, settings: Settings = SETTINGS) -> Term:
   }
   names = tuple(n for n, there in present.items() if there)
   sigma = tuple(tolerance[n] for n in names)
-  limit = tuple(min(5.0 * s, 0.9) if n not in ("zero", "skew", "latency") else 5.0 * s for n, s in zip(names, sigma, strict=True))
+  limit = tuple(
+    min(5.0 * s, 0.9) if n not in ("zero", "skew", "latency") else 5.0 * s
+    for n, s in zip(names, sigma, strict=True)
+  )
   low = tuple(0.0 if n == "latency" else -b for n, b in zip(names, limit, strict=True))
   zeros = (0.0,) * len(names)
   scale = tuple(0.005 if n in ("skew", "latency") else t for n, t in zip(names, sigma, strict=True))

@@ -76,7 +76,9 @@ class JointModel(JointPlant):
     result = []
     for index, parts in enumerate(logs):
       grid, time = self._grids[index], self.logs[index].time
-      rows = [[np.interp(grid, time, f) for f in (p.inertia, p.here, p.across, p.bias)] for p in parts]
+      rows = [
+        [np.interp(grid, time, f) for f in (p.inertia, p.here, p.across, p.bias)] for p in parts
+      ]
       result.append(np.array(rows))
     return result
 

@@ -1,9 +1,6 @@
 """What reference logs show: constants and effects that a machine has without the fault."""
 
 import dataclasses
-from collections.abc import Sequence
-
-import numpy as np
 
 from nerf2real.sysid.fit.posterior import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import Term
@@ -21,7 +18,8 @@ def known_terms(found: Scored, settings: Settings = SETTINGS) -> tuple[Term, ...
       sigma = tuple(repeat[n] for n in term.names)
     else:
       sigma = tuple(
-        settings.repeat_effect * max(abs(v), 0.3 * s) for v, s in zip(values, term.scale, strict=True)
+        settings.repeat_effect * max(abs(v), 0.3 * s)
+        for v, s in zip(values, term.scale, strict=True)
       )
     known = term.kind != CONSTANTS
     result.append(

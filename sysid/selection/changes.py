@@ -13,12 +13,11 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.fitting import Fit as OldFit
 from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import CONSTANTS, Fitter, Layout
+from nerf2real.sysid.fit.posterior import Fitter, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import Term
@@ -80,9 +79,13 @@ def find(
     tried: joints that are looked at, over which the level of significance is shared.
     settings: tolerances and effort.
   """
-  healthy = JointModel(model, joint, reference, reductions=reductions[1], window_s=settings.window_s)
+  healthy = JointModel(
+    model, joint, reference, reductions=reductions[1], window_s=settings.window_s
+  )
   before = JointLikelihood(healthy, settings=settings)
-  first = Explainer(before, constants(healthy, settings), _library(healthy, before), settings=settings)
+  first = Explainer(
+    before, constants(healthy, settings), _library(healthy, before), settings=settings
+  )
   kinds = {t.kind for t in first.library}
   beyond = threshold(len(kinds) * tried, settings)
   plant = JointModel(model, joint, logs, reductions=reductions[0], window_s=settings.window_s)
@@ -93,12 +96,11 @@ def find(
   explainer = Explainer(now, known[0], _library(plant, now), settings=settings, known=known[1:])
   ranked = explainer.explain()
   found = conclude(now, ranked, beyond)
-  named = tuple(
-    k for k in found.named if paired or _is_new(before, usual, found.best, k, beyond)
-  )
+  named = tuple(k for k in found.named if paired or _is_new(before, usual, found.best, k, beyond))
   own = np.median(usual.fit.held[0][0]) if not paired else 2.0 * now.position_noise**2
   remains = _remains(now, found.best, before, usual, paired, beyond, settings)
-  verdict = _verdict(found, named, remains, settings)
+  over = float(np.sqrt(np.median(found.left) / max(own, 1e-300)))
+  verdict = _verdict(found, named, remains, over, settings)
   return Changed(
     joint,
     now,
@@ -120,9 +122,7 @@ def _library(plant: JointModel, likelihood: JointLikelihood) -> list[Term]:
   return [*candidates.library(plant), candidates.cogging(plant, waves)]
 
 
-def _is_new(
-  before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float
-) -> bool:
+def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:
   """Tells whether the reference is clearly worse with an effect of these values than without."""
   term = next(t for t in best.terms if t.kind == kind)
   held = term.held_at(np.array(list(best.fit.values(term).values())))
@@ -171,12 +171,19 @@ def _together(joint: JointLikelihood, residual: Array) -> tuple[Array, Array]:
 
 
 def _verdict(
-  found: Explanation, named: Sequence[str], remains: bool, settings: Settings
+  found: Explanation, named: Sequence[str], remains: bool, over: float, settings: Settings
 ) -> str:
-  """Returns the graded verdict of a joint."""
+  """Returns the graded verdict of a joint.
+
+  Args:
+    found: the best hypothesis.
+    named: kinds that are certain.
+    remains: whether more remains than the machine leaves anyway.
+    over: what the median block leaves, over what the machine leaves anyway.
+    settings: limits.
+  """
   if not named:
     return "unexplained" if remains or found.best.names else "none"
-  if not remains:
+  if over <= settings.more:
     return "effects"
-  share = min(n.share_low for n in found.names if n.kind in named)
-  return "partly" if share > settings.most else "unexplained"
+  return "partly" if found.share_low > settings.most else "unexplained"

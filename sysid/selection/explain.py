@@ -152,7 +152,9 @@ class Explainer:
     for position, term in enumerate(parent.terms):  # an effect that references show may be larger
       count = len(term.names)
       if term.known:
-        free = next((t for t in self.library if t.kind == term.kind and t.fixed == term.fixed), None)
+        free = next(
+          (t for t in self.library if t.kind == term.kind and t.fixed == term.fixed), None
+        )
         if free is not None:
           terms = (*parent.terms[:position], free, *parent.terms[position + 1 :])
           starts = [x]
@@ -200,7 +202,9 @@ class Explainer:
           self.null = self.refit(self.null)
         for item in sorted(grown, key=lambda g: -g.evidence)[: s.kept]:
           self.refit(item, 3)
-      grown = sorted((g for g in self.scored.values() if len(g.names) == depth + 1), key=lambda g: -g.evidence)
+      grown = sorted(
+        (g for g in self.scored.values() if len(g.names) == depth + 1), key=lambda g: -g.evidence
+      )
       if clear(grown[0], best) < s.worth:
         break
       best, parents = grown[0], grown[: s.parents]

@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log, read_log
-from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.model.simulation import Clocks
@@ -30,8 +29,8 @@ from nerf2real.sysid.selection import (
 )
 from nerf2real.sysid.selection.common import WHOLE
 from nerf2real.sysid.selection.decision import Thresholds
-from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.explanation import Effort, Ladder, even_out
+from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.joint import (
   Found,
   decide,

@@ -30,10 +30,6 @@ class Name:
   """Whether that is beyond the threshold."""
   confounded: tuple[Scored, ...]
   """Hypotheses without it that predict the same."""
-  share: float
-  """Of the squared residual without it that it explains, on left-out blocks."""
-  share_low: float
-  """Lower end of that share's 95 % interval."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +40,10 @@ class Explanation:
   names: tuple[Name, ...]
   left: Array
   """[B] mean squared position residual of left-out blocks."""
+  share: float
+  """Of the squared residual without effects that the names explain, on left-out blocks."""
+  share_low: float
+  """Lower end of that share's 95 % interval."""
 
   @property
   def named(self) -> tuple[str, ...]:
@@ -56,9 +56,7 @@ def threshold(tried: int, settings: Settings = SETTINGS) -> float:
   return float(norm.isf(settings.level / max(tried, 1)))
 
 
-def conclude(
-  joint: JointLikelihood, ranked: Sequence[Scored], beyond: float
-) -> Explanation:
+def conclude(joint: JointLikelihood, ranked: Sequence[Scored], beyond: float) -> Explanation:
   """Returns the best hypothesis and what of it is certain.
 
   Args:
@@ -74,7 +72,9 @@ def conclude(
       if clear(top, best) > beyond:
         best = top
   names = tuple(_name(joint, best, kind, ranked, beyond) for kind in sorted(best.names))
-  return Explanation(best, names, best.fit.held[0][0])
+  bare = next(s for s in ranked if not s.names)
+  left = best.fit.held[0][0]
+  return Explanation(best, names, left, *_share(left, bare.fit.held[0][0]))
 
 
 def _name(
@@ -86,9 +86,7 @@ def _name(
   alike = tuple(s for s in near if _same(joint, best, s))
   told = [z for z, s in behind if not any(s is a for a in alike)]
   least = min(told, default=float("inf"))
-  without = max(rivals, key=lambda s: s.evidence)
-  share, low = _share(best.fit.held[0][0], without.fit.held[0][0])
-  return Name(kind, least, least >= beyond, alike, share, low)
+  return Name(kind, least, least >= beyond, alike)
 
 
 def _same(joint: JointLikelihood, one: Scored, other: Scored) -> bool:

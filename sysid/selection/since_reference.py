@@ -147,8 +147,8 @@ def _evidence(item: Changed, name: Any) -> dict[str, Any]:
   return {
     "clear_by_standard_errors": round(min(name.clear, 999.0), 2),
     "clear_of_the_baseline": round(clear(item.found.best, item.null), 2),
-    "share_explained": round(name.share, 4),
-    "share_explained_low": round(name.share_low, 4),
+    "share_explained": round(item.found.share, 4),
+    "share_explained_low": round(item.found.share_low, 4),
     "left_over_reference": round(item.left / max(item.reference_left, 1e-12), 3),
     "held_out_gain_nats": round(item.found.best.evidence - item.null.evidence, 2),
   }

@@ -32,7 +32,9 @@ def test_nats_of_a_block_are_those_of_the_formula(viscous):
   residuals[0, chosen] = 3.0 * joint.scale[0]
   squares = joint.squares(residuals)
   nats = joint.loglik(squares)
-  expected = -joint.independent[0] * joint.counts[0, 2] * np.log1p(squares[0, 2] / joint.scale[0] ** 2)
+  expected = (
+    -joint.independent[0] * joint.counts[0, 2] * np.log1p(squares[0, 2] / joint.scale[0] ** 2)
+  )
   assert nats[2] == pytest.approx(expected)
   assert np.all(np.delete(nats, 2) == 0.0)
 

@@ -1,4 +1,4 @@
-"""Names of what has changed since a reference: one rule, and a machine that had something before."""
+"""Names of what changed since a reference: one rule, and a machine that had something before."""
 
 import mujoco
 import numpy as np
