@@ -60,7 +60,7 @@ class Layout:
     self.sigma = join(lambda t: t.prior or (np.inf,) * len(t.names))
     self.centre = join(lambda t: t.centre or (0.0,) * len(t.names))
     self.is_clock = np.array([n in CLOCKS for t in self.terms for n in t.names], bool)
-    self.is_effect = join(lambda t: (t.kind != CONSTANTS,) * len(t.names)).astype(bool)
+    self.is_effect = join(lambda t: (t.freed or t.kind != CONSTANTS,) * len(t.names)).astype(bool)
 
 
 @dataclasses.dataclass

@@ -38,6 +38,16 @@ class Term:
   fixed: tuple[tuple[str, float], ...] = ()
   known: bool = False
   """Whether reference logs show it, too."""
+  freed: bool = False
+  """Whether constants may differ from those that reference logs show."""
+
+  @property
+  def name(self) -> str | None:
+    """What is claimed with this term: a kind of effect; None for constants and known effects."""
+    if self.kind == "calibration":
+      return "parameter_error" if self.freed else None
+    return None if self.known else self.kind
+
   """Parameters that are a choice between models and not fitted."""
 
   def apply(self, plant: JointPlant, p: Array, x: Array) -> None:

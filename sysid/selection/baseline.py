@@ -26,3 +26,15 @@ def known_terms(found: Scored, settings: Settings = SETTINGS) -> tuple[Term, ...
       dataclasses.replace(term, prior=sigma, centre=values, starts=(values,), known=known)
     )
   return tuple(result)
+
+
+_MAY_CHANGE = ("damping", "armature", "friction")
+
+
+def freed_constants(known: Term, settings: Settings = SETTINGS) -> Term:
+  """Returns a reference's constants, of which those that no effect stands for may have changed."""
+  tolerance = dict(settings.tolerances)
+  sigma = tuple(
+    tolerance[n] if n in _MAY_CHANGE else s for n, s in zip(known.names, known.prior, strict=True)
+  )
+  return dataclasses.replace(known, prior=sigma, freed=True)

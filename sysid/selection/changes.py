@@ -23,7 +23,7 @@ from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection.baseline import known_terms
+from nerf2real.sysid.selection.baseline import freed_constants, known_terms
 from nerf2real.sysid.selection.explain import Explainer, Scored, clear
 from nerf2real.sysid.selection.naming import Explanation, conclude, threshold
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -93,7 +93,14 @@ def find(
   usual = conclude(before, first.explain(settings.reference_depth), beyond).best
   paired = now.expect(before, usual.fit.residuals[0])
   known = known_terms(usual, settings)
-  explainer = Explainer(now, known[0], _library(plant, now), settings=settings, known=known[1:])
+  explainer = Explainer(
+    now,
+    known[0],
+    _library(plant, now),
+    settings=settings,
+    known=known[1:],
+    freed=freed_constants(known[0], settings),
+  )
   ranked = explainer.explain()
   found = conclude(now, ranked, beyond)
   named = tuple(k for k in found.named if paired or _is_new(before, usual, found.best, k, beyond))
@@ -124,7 +131,9 @@ def _library(plant: JointModel, likelihood: JointLikelihood) -> list[Term]:
 
 def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:
   """Tells whether the reference is clearly worse with an effect of these values than without."""
-  term = next(t for t in best.terms if t.kind == kind)
+  term = next(t for t in best.terms if t.name == kind)
+  if term.freed:
+    return True
   held = term.held_at(np.array(list(best.fit.values(term).values())))
   kept = [(t, usual.fit.values(t)) for t in usual.terms if t.kind != kind]
   terms = (*[t for t, _ in kept], held)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import CONSTANTS, Fit, Fitter, Layout
+from nerf2real.sysid.fit.posterior import Fit, Fitter, Layout
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -35,8 +35,8 @@ class Scored:
 
 
 def named(terms: Sequence[Term]) -> frozenset[str]:
-  """Returns the kinds of effects that are not constants and not in the reference, too."""
-  return frozenset(t.kind for t in terms if t.kind != CONSTANTS and not t.known)
+  """Returns the kinds of effects that are not the machine's anyway."""
+  return frozenset(t.name for t in terms if t.name is not None)
 
 
 def clear(better: Scored, other: Scored) -> float:
@@ -69,6 +69,7 @@ class Explainer:
     settings: Settings = SETTINGS,
     start: Array | None = None,
     known: Sequence[Term] = (),
+    freed: Term | None = None,
   ):
     """Fits the constants, setting the residual's scale as they improve.
 
@@ -79,9 +80,10 @@ class Explainer:
       settings: effort.
       start: of the constants.
       known: effects that every hypothesis has.
+      freed: constants that may differ from those of a reference.
     """
     self.joint, self.constants, self.settings = joint, constants, settings
-    self.library = list(library)
+    self.library, self.freed = list(library), freed
     self.scored: dict[tuple[Term, ...], Scored] = {}
     base = (constants, *known)
     x = np.concatenate([t.starts[0] for t in base]) if start is None else start
@@ -128,7 +130,7 @@ class Explainer:
       fitter = Fitter([self.joint], Layout([terms]))
       costs = fitter.costs(starts)
       best = None
-      for k in np.argsort(costs)[: self.settings.starts]:
+      for k in np.argsort(costs)[: 1 if parent.names else self.settings.starts]:
         fit = fitter.fit(starts[k], iterations=2, known=stale, fresh=fresh, quick=True)
         if best is None or fit.cost < best.cost:
           best = fit
@@ -165,6 +167,10 @@ class Explainer:
           fresh[at : at + count] = True
           yield terms, np.array(starts), [known], fresh
       at += count
+    if self.freed is not None and not parent.terms[0].freed:
+      fresh = np.zeros(len(x), bool)
+      fresh[: len(self.freed.names)] = True
+      yield (self.freed, *parent.terms[1:]), x[None], [known], fresh
     for term in self.library:
       if term.kind in old:
         continue
@@ -207,7 +213,8 @@ class Explainer:
       )
       if clear(grown[0], best) < s.worth:
         break
-      best, parents = grown[0], grown[: s.parents]
+      best = grown[0]
+      parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
     return self.ranked()
 
   def ranked(self) -> list[Scored]:

@@ -99,7 +99,7 @@ def analyse(
 ) -> Identified:
   """Finds what a model lacks."""
   settings = settings or Settings()
-  if reference:
+  if reference and len(logs[0].commands.joints) == 1:
     return since_reference.analyse(model, logs, reference)
   screened = screening.screen(model, logs, reference=reference, window_s=settings.window_s)
   if not screened:

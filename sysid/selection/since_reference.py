@@ -109,7 +109,7 @@ def entry(problem: Problem, scored: Scored) -> race.Entry:
 
 
 def _changed(terms: Sequence[Term]) -> list[Term]:
-  return [t for t in terms if t.kind != CONSTANTS and not t.known]
+  return [t for t in terms if t.name is not None]
 
 
 def _write_down(result: Identified, item: Changed, found: Found) -> None:
@@ -124,6 +124,10 @@ def _write_down(result: Identified, item: Changed, found: Found) -> None:
       effect = term.effect(np.array(list(values.values())))
       result.calibration.append(dataclasses.replace(effect, target=item.joint))
       offset += values.get("zero", 0.0)
+      if term.freed:
+        row = claims.constants(found.screened, chosen)
+        row["evidence"] |= _evidence(item, names["parameter_error"])
+        _list(result, item, "parameter_error", row)
       continue
     effect, row = claims.effect(found, chosen, term, 0.0)
     if term.kind == "encoder_offset":
@@ -134,13 +138,16 @@ def _write_down(result: Identified, item: Changed, found: Found) -> None:
       result.in_reference.append(row)
       continue
     row["evidence"] |= _evidence(item, names[term.kind])
-    if term.kind in item.named and item.verdict in ("effects", "partly"):
-      result.effects.append(row)
-    else:
-      result.nearest.append(row)
+    _list(result, item, term.kind, row)
   if offset:
     result.objects.append(Effect("encoder_offset", item.joint, {"offset": offset}))
   result.objects[:] = _once(result.objects)
+
+
+def _list(result: Identified, item: Changed, kind: str, row: dict[str, Any]) -> None:
+  """Adds an entry to what is claimed, or to what is only in the extended model."""
+  stands = kind in item.named and item.verdict in ("effects", "partly")
+  (result.effects if stands else result.nearest).append(row)
 
 
 def _evidence(item: Changed, name: Any) -> dict[str, Any]:
