@@ -59,8 +59,6 @@ class Settings:
   """Effects of a joint at most that are looked for in reference logs."""
   structured: float = 0.5
   """Of the readings' noise: a residual beside a reference that goes together is that large."""
-  structured_blocks: int = 2
-  """Blocks that must be so: one may be a knock."""
   alike: float = 0.5
   """Of the residual's scale: hypotheses whose predictions differ by less are not told apart."""
   more: float = 2.0

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from scipy.stats import norm
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.fit import signatures
@@ -101,8 +102,9 @@ def find(
     known=known[1:],
     freed=freed_constants(known[0], settings),
   )
+  as_it_was = now.residuals(known, np.concatenate([t.centre for t in known])[None])[0]
   ranked = explainer.explain()
-  found = conclude(now, ranked, beyond)
+  found = conclude(now, ranked, beyond, now.squares(as_it_was)[0])
   named = tuple(k for k in found.named if paired or _is_new(before, usual, found.best, k, beyond))
   own = np.median(usual.fit.held[0][0]) if not paired else 2.0 * now.position_noise**2
   remains = _remains(now, found.best, before, usual, paired, beyond, settings)
@@ -155,13 +157,14 @@ def _remains(
   """Tells whether more remains than the machine leaves anyway.
 
   Beside a reference with the same commands only noise may remain: neighbouring readings' residuals
-  must not go together. Else blocks are compared with the reference's, on a logarithmic scale.
+  must not go together, but in one block (which may hold a knock). Else blocks are compared with the reference's, on a logarithmic scale.
   """
   if paired:
     certain, size = _together(now, best.fit.residuals[0][0])
-    beyond = threshold(len(certain), settings)
+    # Two of B blocks exceed z by chance with a probability of (B p)^2 / 2 at most.
+    rare = float(norm.isf(np.sqrt(2.0 * settings.level) / len(certain)))
     large = size > (settings.structured * now.position_noise) ** 2
-    return int(np.sum((certain > beyond) & large)) >= settings.structured_blocks
+    return int(np.sum((certain > rare) & large)) >= 2
   mine, usually = (0.5 * np.log(s.fit.held[0][0] + 1e-30) for s in (best, usual))
   error = np.sqrt(np.var(mine) / len(mine) + np.var(usually) / len(usually))
   ratio = float(mine.mean() - usually.mean())

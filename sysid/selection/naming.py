@@ -56,13 +56,19 @@ def threshold(tried: int, settings: Settings = SETTINGS) -> float:
   return float(norm.isf(settings.level / max(tried, 1)))
 
 
-def conclude(joint: JointLikelihood, ranked: Sequence[Scored], beyond: float) -> Explanation:
+def conclude(
+  joint: JointLikelihood,
+  ranked: Sequence[Scored],
+  beyond: float,
+  without: Array | None = None,
+) -> Explanation:
   """Returns the best hypothesis and what of it is certain.
 
   Args:
     joint: the logs.
     ranked: tried hypotheses, the one without effects among them.
     beyond: standard errors that count as clear.
+    without: mean squares [B] that the baseline leaves as it was; those of the fitted one for None.
   """
   best = next(s for s in ranked if not s.names)
   for size in range(1, max(len(s.names) for s in ranked) + 1):
@@ -72,9 +78,10 @@ def conclude(joint: JointLikelihood, ranked: Sequence[Scored], beyond: float) ->
       if clear(top, best) > beyond:
         best = top
   names = tuple(_name(joint, best, kind, ranked, beyond) for kind in sorted(best.names))
-  bare = next(s for s in ranked if not s.names)
   left = best.fit.held[0][0]
-  return Explanation(best, names, left, *_share(left, bare.fit.held[0][0]))
+  bare = next(s for s in ranked if not s.names)
+  share = _share(left, bare.fit.held[0][0] if without is None else without)
+  return Explanation(best, names, left, *share)
 
 
 def _name(
