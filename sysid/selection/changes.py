@@ -21,6 +21,7 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
@@ -128,7 +129,8 @@ def find(
 def _library(plant: JointModel, likelihood: JointLikelihood) -> list[Term]:
   """Returns the effects to try; where torque repeats with position is read off the residual."""
   waves = signatures.waves(Problem(plant), OldFit((), np.zeros(0), 0.0, 1.0, 0))
-  return [*candidates.library(plant), candidates.cogging(plant, waves)]
+  terms = [*candidates.library(plant), candidates.cogging(plant, waves)]
+  return [plausible(term) for term in terms] if plant.hinge else terms
 
 
 def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:
@@ -157,7 +159,8 @@ def _remains(
   """Tells whether more remains than the machine leaves anyway.
 
   Beside a reference with the same commands only noise may remain: neighbouring readings' residuals
-  must not go together, but in one block (which may hold a knock). Else blocks are compared with the reference's, on a logarithmic scale.
+  must not go together, but in one block (which may hold a knock). Else blocks are compared with
+  the reference's, on a logarithmic scale.
   """
   if paired:
     certain, size = _together(now, best.fit.residuals[0][0])

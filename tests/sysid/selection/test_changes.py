@@ -7,8 +7,9 @@ import pytest
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.posterior import Fit, Layout
 from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.selection import changes, naming, since_reference
-from nerf2real.sysid.selection.explain import Scored, clear, standardised
+from nerf2real.sysid.selection.explain import Scored, standardised
 from tests.sysid.synthetic import PENDULUM, log_of
 
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
@@ -109,7 +110,24 @@ def test_what_changed_is_named_with_its_size(found):
   assert row["evidence"]["clear_by_standard_errors"] > naming.threshold(len(KINDS))
 
 
-def test_evidence_is_paired(found):
-  item = found["late"].found[0]
-  assert item.finding.chosen.score < item.ladder.null.score
-  assert clear is not None
+def test_the_report_lists_what_was_there_before(found):
+  # Dry friction of 0.15 N m is in both: it is in the extended model, and no change.
+  result = found["late"]
+  kinds = {row["kind"] for row in result.in_reference}
+  assert kinds <= {"coulomb_friction", "viscous_friction", "payload"}
+  assert {e.kind for e in result.objects} >= {"command_delay", *kinds}
+
+
+def test_values_stay_within_what_is_plausible():
+  waves = candidates.Term(
+    "cogging",
+    "joint",
+    ("amplitude", "periods", "phase"),
+    (0.0, 3.0, -10.0),
+    (5.0, 300.0, 10.0),
+    (0.1, 0.05, 0.3),
+    ((0.1, 216.0, 0.0), (0.1, 40.0, 0.0)),
+  )
+  term = plausible(waves)
+  assert term.high == (0.625, 125.0, 10.0)
+  assert term.starts == ((0.1, 125.0, 0.0), (0.1, 40.0, 0.0))
