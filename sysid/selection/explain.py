@@ -175,9 +175,9 @@ class Explainer:
       if term.kind in old:
         continue
       blank = np.zeros((len(term.names), *known.shape[1:]))
-      starts = np.array([np.concatenate([x, s]) for s in term.starts])
-      fresh = np.arange(starts.shape[1]) >= len(x)
-      yield (*parent.terms, term), starts, [np.concatenate([known, blank])], fresh
+      begin = np.array([np.concatenate([x, s]) for s in term.starts])
+      fresh = np.arange(begin.shape[1]) >= len(x)
+      yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
   def adopt(self, best: Scored) -> None:
     """Sets the scale by the best hypothesis; all are scored anew."""
