@@ -2,7 +2,7 @@
 
 The built-in room at its true poses: what is compared is the field, not the localisation. Both
 runs get the same pictures, time and seed. A field without the augmentation has never seen a
-coarser pixel than the training camera's; it is scored twice, told the robot's true pixel and told
+coarser pixel than the training camera's; it is scored twice, given the robot's true pixel and given
 the training pixel, and the better of the two is what the augmentation is compared with.
 
   python benchmarks/blur_ablation.py                # twice 4 minutes on 2 cores
@@ -103,7 +103,7 @@ def picture(renderer: Renderer, camera: Camera, pose: np.ndarray, *, told_angle:
 
 
 def score(renderer: Renderer, views: Views, *, told_angle: float) -> dict[str, harness.Value]:
-  """Mean PSNR [dB] and SSIM over views; the field is told that pixels span `told_angle` [rad]."""
+  """Mean PSNR [dB] and SSIM over views; the field is given pixels that span `told_angle` [rad]."""
   pairs = [
     (picture(renderer, views.camera, pose, told_angle=told_angle), truth)
     for pose, truth in zip(views.world_from_camera, views.images, strict=True)

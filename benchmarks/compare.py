@@ -27,7 +27,7 @@ import tyro
 from benchmarks.ledger.records import ROOT
 from benchmarks.turns import percentile
 
-# Words of the path to a number that say nothing about what it is.
+# Words of the path to a number that do not describe it.
 _CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs"}
 _MOST_ALONE = 6  # names that only one checkout has and that are listed
 # Words that older files had for the same.
@@ -77,7 +77,7 @@ def key(path: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def last_error(done: subprocess.CompletedProcess[str]) -> str:
-  """Returns the line in which a program that failed says why."""
+  """Returns the line of a failed program's output that holds the reason."""
   lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
   errors = [line for line in lines if re.match(r"(\w+\.)*\w*(Error|Exception|error)\b", line)]
   return (errors or lines)[-1]

@@ -52,7 +52,7 @@ class Settings(harness.Options):
 
 
 def layout(checkout: Path) -> dict[str, str]:
-  """Returns the worker's arguments that say where a checkout keeps its trainer.
+  """Returns the worker's arguments for where a checkout keeps its trainer.
 
   Raises:
     ValueError: The checkout has none of the known layouts.

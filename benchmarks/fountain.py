@@ -34,8 +34,10 @@ class Settings(harness.Options):
 class PoseErrors:
   """Errors of poses [N] after the best similarity and one constant rotation in the camera frame."""
 
-  position: np.ndarray  # [N], unit of the truth
-  rotation: np.ndarray  # [N] [degree]
+  position: np.ndarray
+  """[N], unit of the truth."""
+  rotation: np.ndarray
+  """[N] [degree]."""
 
   @property
   def position_rmse(self) -> float:

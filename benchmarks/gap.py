@@ -40,7 +40,6 @@ _LEG_SWAY, _ARM_SWAY = 0.05, 0.2  # rad
 _NOMINAL = RandomisationSettings(
   pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
 )
-MOTIONS = ("sway", "walk")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,13 +62,20 @@ class Settings(harness.Options):
 class Trace:
   """What was observed, T control steps."""
 
-  joints: np.ndarray  # [T, 20] rad
-  gyroscope: np.ndarray  # [T, 3] rad/s
-  accelerometer: np.ndarray  # [T, 3] m/s^2
-  gravity: np.ndarray  # [T, 3]
-  place: np.ndarray  # [T, 2] of the torso, by an observer [m]
-  pictures: dict[int, np.ndarray]  # by step, uint8 [30, 40, 3]
-  same_pose: dict[int, np.ndarray]  # the simulation's, from the virtual camera's pose
+  joints: np.ndarray
+  """[T, 20] rad."""
+  gyroscope: np.ndarray
+  """[T, 3] rad/s."""
+  accelerometer: np.ndarray
+  """[T, 3] m/s^2."""
+  gravity: np.ndarray
+  """[T, 3]."""
+  place: np.ndarray
+  """[T, 2] of the torso, by an observer [m]."""
+  pictures: dict[int, np.ndarray]
+  """By step, uint8 [30, 40, 3]."""
+  same_pose: dict[int, np.ndarray]
+  """The simulation's, from the virtual camera's pose."""
   fell: bool = False
 
 

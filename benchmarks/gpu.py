@@ -6,7 +6,7 @@
 
 Each check is a process of its own with a time limit: one that fails or hangs loses no other's
 figures. They are printed as they come; `--write` keeps them as records with the GPU's name. Exit
-status: 0 if all went well or there is no GPU (one line says so), 1 if a check failed.
+status: 0 if all went well or there is no GPU (one line is printed), 1 if a check failed.
 
   python benchmarks/gpu.py --write
   python benchmarks/gpu.py --device cpu --tiny      # a rehearsal of all checks without a GPU

@@ -98,7 +98,7 @@ def one_thread() -> None:
 
 
 def one_core(core: int | None = None) -> None:
-  """Keeps this process on one core, the first that it may use if not told."""
+  """Keeps this process on one core, by default the first that it may use."""
   if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0)) if core is None else core})
 
@@ -155,7 +155,7 @@ def command_line() -> str:
 
 
 def versions() -> dict[str, str]:
-  """Returns the versions of Python and of the packages that decide speed."""
+  """Returns the versions of Python and of the packages on which speed depends."""
   found = {"python": platform.python_version()}
   for name in _PACKAGES:
     try:
@@ -166,7 +166,7 @@ def versions() -> dict[str, str]:
 
 
 def provenance(seed: int | str | None = None) -> dict[str, Any]:
-  """Returns what a record says of where its figures come from."""
+  """Returns a record's fields on where its figures come from."""
   git = ("git", "-C", str(ROOT))
   return {
     "command": command_line(),
@@ -209,7 +209,7 @@ def finish(
   details: Any = None,
   words: str = "",
 ) -> None:
-  """Prints figures and does with them what the options say.
+  """Prints figures, and writes them as the options require.
 
   Args:
     topic: Name of the file of records.

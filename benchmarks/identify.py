@@ -15,7 +15,7 @@ import resource
 import subprocess
 import sys
 import time
-from typing import Any
+from typing import Any, Literal
 
 from benchmarks import harness
 from benchmarks.blind_sets import scoring
@@ -26,7 +26,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-  """What to judge."""
+  """Arguments of the benchmark."""
 
   sets: pathlib.Path = pathlib.Path("out/blind")
   """Folder of sets with answers.json."""
@@ -36,6 +36,10 @@ class Settings:
   """Seed of the sets where they must be made."""
   count: int = 72
   """Number of sets where they must be made."""
+  generator: Literal["blind_sets", "independent_sets"] = "blind_sets"
+  """Which package makes them."""
+  references: bool = True
+  """Give the analyser the reference logs that a set has."""
   only: tuple[str, ...] = ()
   """Names of sets; empty: all."""
   processes: int = 2
@@ -61,7 +65,7 @@ def main(settings: Settings) -> None:
       [
         *(sys.executable, str(ROOT / "benchmarks/make_blind_sets.py")),
         *("--out", str(settings.sets), "--seed", str(settings.seed)),
-        *("--count", str(settings.count)),
+        *("--count", str(settings.count), "--generator", settings.generator),
       ]
     )
   answers = json.loads((settings.sets / "answers.json").read_text())
@@ -128,6 +132,8 @@ def _analyse(settings: Settings, name: str) -> tuple[dict[str, Any], dict[str, f
   out.mkdir(parents=True, exist_ok=True)
   command = [sys.executable, str(ROOT / "launch/identify.py"), "--model", str(folder / "model.xml")]
   for option, pattern in (("logs", "train"), ("held", "held"), ("reference", "reference")):
+    if option == "reference" and not settings.references:
+      continue
     paths = sorted(str(path) for path in folder.glob(f"{pattern}_*.mcap"))
     command += [f"--{option}", *paths] if paths else []
   before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
@@ -207,7 +213,7 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any]) -> str:
 
 
 def _right(score: scoring.Score) -> bool | None:
-  """Returns whether a set was answered as its mix asks."""
+  """Returns whether a set was answered as its mix requires."""
   if score.below_floor:
     return None
   if score.mix == "healthy":

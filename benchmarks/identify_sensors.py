@@ -89,14 +89,14 @@ def motion(seed: int, count: int) -> np.ndarray:
 
 
 class Arrival:
-  """A camera whose driver takes pictures for as old as their arrival says."""
+  """A camera whose driver takes pictures for as old as their arrival."""
 
   def __init__(self, camera: Any, late: float):
     """Takes the camera and how long its pictures travel [s]."""
     self._camera, self._late = camera, late
 
   def read(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture and the age that is believed [s]."""
+    """Returns the newest picture and its supposed age [s]."""
     picture, age = self._camera.read()
     return picture, max(age - self._late, 0.0)
 

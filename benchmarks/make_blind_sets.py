@@ -1,8 +1,9 @@
 """Makes blind sets: `python benchmarks/make_blind_sets.py --out out/blind --seed 0 --count 20`.
 
 Each set is a folder with the declared `model.xml`, three logs to identify from and two held out;
-`answers.json` beside them says what each machine has that its model lacks. The plant is
-`blind_sets`, which shares no code with the analyser. The same seed gives the same logs.
+`answers.json` beside them holds what each machine has that its model lacks. Two generators that
+share no code with each other or with the analyser: `blind_sets` and `independent_sets`, which has
+one log held out and always three of the healthy machine. The same seed gives the same logs.
 """
 
 import contextlib
@@ -11,11 +12,17 @@ import json
 import multiprocessing
 import pathlib
 import time
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Callable, Iterable
+from typing import Any, Literal
 
 from benchmarks import harness
 from benchmarks.blind_sets import sets
+from benchmarks.independent_sets import sets as independent_sets
+
+GENERATORS: dict[str, Callable[..., Any]] = {
+  "blind_sets": sets.make_set,
+  "independent_sets": independent_sets.make_set,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,14 +37,16 @@ class Settings:
   """Number of sets."""
   first: int = 0
   """Index of the first set; a set depends on seed and index alone."""
+  generator: Literal["blind_sets", "independent_sets"] = "blind_sets"
+  """Which package makes them."""
   mix: Literal["single", "pair", "outside", "healthy", "all"] = "all"
   """What the machines have: one effect, two, one that no library has, none, or all of these."""
   plants: tuple[str, ...] = ()
-  """Kinds of apparatus, of pendulum, arm, op3; empty: all."""
+  """Kinds of apparatus, of pendulum, arm, op3, or of slider, arm, wheel; empty: all."""
   kinds: tuple[str, ...] = ()
   """Kinds of effect to draw from; empty: all."""
   reference: bool = False
-  """Also write reference_*.mcap: the same machine without the effects."""
+  """Also write reference_*.mcap: the same machine without the effects; `independent_sets` does."""
   processes: int = 1
   """Sets made at the same time."""
 
@@ -60,7 +69,7 @@ def main(settings: Settings) -> None:
       kinds = ", ".join(f"{e['kind']}@{e['joint']}" for e in answer["effects"]) or "none"
       print(
         f"{name}: {answer['plant']}, {kinds}; "
-        f"held-out error {1e3 * answer['held_error']:.1f} mrad, "
+        f"held-out error {1e3 * answer['held_error']:.1f} mrad or mm, "
         f"{answer['error_ratio']:.1f} times the floor; {seconds:.1f} s",
         flush=True,
       )
@@ -73,14 +82,14 @@ def _name(settings: Settings, index: int) -> str:
 def _make(job: tuple[Settings, int]) -> tuple[str, dict, float]:
   settings, index = job
   start = time.perf_counter()
-  truth = sets.make_set(
+  truth = GENERATORS[settings.generator](
     settings.out / _name(settings, index),
     seed=settings.seed,
     index=index,
     mix=settings.mix,
     plants=settings.plants or None,
     kinds=settings.kinds or None,
-    reference=settings.reference,
+    reference=settings.reference or settings.generator == "independent_sets",
   )
   return _name(settings, index), truth.answer, time.perf_counter() - start
 

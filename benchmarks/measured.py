@@ -2,7 +2,7 @@
 
 Runs `sysid.identify` on the real logs in ../shared/data/measured (Dynamixel XL330 at three gains,
 and the EMPS positioning benchmark) and keeps the figures in benchmarks/results/measured.json.
-There are no answers: what was named, how sure it is and what it lowers is told in measured.md.
+There are no answers: what was named, how sure it is and what it lowers stands in measured.md.
 """
 
 import dataclasses

@@ -17,7 +17,7 @@ harness.one_thread()
 
 import numpy as np
 
-from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.core.serialization import to_plain
 
 TARGETS = {(30, 40): 10.0, (60, 80): 25.0}  # ms
@@ -43,9 +43,9 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
   import jax
 
   from nerf2real.agents.dmpo import config, networks
-  from nerf2real.agents.dmpo.export import export_policy
-  from nerf2real.agents.dmpo.learning import flatten_params
+  from nerf2real.agents.dmpo.policy.export import export_policy
   from nerf2real.agents.dmpo.specs import Layout
+  from nerf2real.agents.dmpo.training_state import flatten_params
 
   settings = config.preset("paper")
   layout = Layout("camera", (*size, 3), ("s",), (PROPRIOCEPTION,), (), (), ACTIONS)

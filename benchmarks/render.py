@@ -53,7 +53,7 @@ class Settings(harness.Options):
   field: Path | None = None
   """A field file instead of a bundle."""
   room_from_unit: Path | None = None
-  """With a field: the similarity (JSON) that maps its frame to the room's; the bundle knows its."""
+  """With a field: the similarity (JSON) of its frame to the room's; a bundle holds its own."""
   views: int = 40
   """Views that are drawn."""
   repeats: int = 3

@@ -1,6 +1,6 @@
 """Does the scripted walker walk? A metre straight ahead, then five goals, on every plant.
 
-Straight ahead only the gait acts, without being told where it is. The goals are reached one after
+Straight ahead only the gait acts, without a pose. The goals are reached one after
 another, steered by the true pose. Simulation: episodes as in training, without pushes. Virtual
 robots: what is hidden in each is drawn from its seed; "data sheet" has nothing hidden.
 

@@ -23,16 +23,26 @@ class Camera:
   Source: OpenCV documentation, calib3d, equations of the distortion model; COLMAP's model OPENCV.
   """
 
-  width: int  # picture width [pixel]
-  height: int  # picture height [pixel]
-  fx: float  # focal length along x [pixel]
-  fy: float  # focal length along y [pixel]
-  cx: float  # principal point, x [pixel]
-  cy: float  # principal point, y [pixel]
-  k1: float = 0.0  # radial distortion, second order
-  k2: float = 0.0  # radial distortion, fourth order
-  p1: float = 0.0  # tangential distortion
-  p2: float = 0.0  # tangential distortion
+  width: int
+  """Picture width [pixel]."""
+  height: int
+  """Picture height [pixel]."""
+  fx: float
+  """Focal length along x [pixel]."""
+  fy: float
+  """Focal length along y [pixel]."""
+  cx: float
+  """Principal point, x [pixel]."""
+  cy: float
+  """Principal point, y [pixel]."""
+  k1: float = 0.0
+  """Radial distortion, second order."""
+  k2: float = 0.0
+  """Radial distortion, fourth order."""
+  p1: float = 0.0
+  """Tangential distortion."""
+  p2: float = 0.0
+  """Tangential distortion."""
 
   def __post_init__(self):
     if self.width < 1 or self.height < 1:

@@ -25,7 +25,7 @@ class DiskFullError(OSError):
 
 
 def is_disk_full(error: BaseException) -> bool:
-  """Returns whether an error says that the disk or the quota is exhausted."""
+  """Returns whether an error means that the disk or the quota is exhausted."""
   return isinstance(error, OSError) and error.errno in _FULL
 
 

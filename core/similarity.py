@@ -10,8 +10,10 @@ class Similarity:
   """A rotation, a uniform scale and a translation."""
 
   scale: float = 1.0
-  rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))  # [3, 3]
-  translation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))  # [3]
+  rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+  """[3, 3]."""
+  translation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+  """[3]."""
 
   def apply(self, points: np.ndarray) -> np.ndarray:
     """Maps points [..., 3]."""

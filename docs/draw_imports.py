@@ -1,10 +1,10 @@
 """Draws the imports between packages and folders into docs/architecture.md.
 
   python docs/draw_imports.py            # rewrites the drawn parts
-  python docs/draw_imports.py --check    # says what is out of date or against the rules
+  python docs/draw_imports.py --check    # lists what is out of date or against the rules
 
-The rules: imports run one way through the layers, packages of one layer do not know each other, and
-no two folders of a package import each other, directly or on the way round.
+The rules: imports run one way through the layers, packages of one layer do not import each other,
+and no two folders of a package import each other, directly or on the way round.
 """
 
 import argparse

@@ -18,25 +18,40 @@ FILE = "episodes.jsonl"
 class Setting:
   """What an episode belongs to; episodes of one setting are counted together."""
 
-  policy: str  # its name
-  policy_id: str  # digest of its parameters
-  resolution: str  # of its pictures, such as "30 x 40"; "no camera"
-  plant: str  # "sim", "virtual" or "robot"
-  plant_id: str  # which robot: the virtual one's seed, the robot's name
-  protocol: str  # "navigation", "ball" or "gain"
-  perturbation: str  # "none", or what was disturbed
+  policy: str
+  """Its name."""
+  policy_id: str
+  """Digest of its parameters."""
+  resolution: str
+  """Of its pictures, such as "30 x 40"; "no camera"."""
+  plant: str
+  """"sim", "virtual" or "robot"."""
+  plant_id: str
+  """Which robot: the virtual one's seed, the robot's name."""
+  protocol: str
+  """"navigation", "ball" or "gain"."""
+  perturbation: str
+  """"none", or what was disturbed."""
+  control: str = "none"
+  """Or what of the observations was falsified, one of `controls.CONTROLS`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Moment:
-  """What a policy believed at a moment."""
+  """A policy's belief at one step."""
 
-  time: float  # s
-  position: tuple[float, float] | None  # true x, y [m]
-  logits: list[float]  # [M]
-  means: list[list[float]]  # [M, 3] m, m, rad
-  stddevs: list[list[float]]  # [M, 3]
-  picture: str = ""  # what it saw, PNG in base64
+  time: float
+  """s."""
+  position: tuple[float, float] | None
+  """True x, y [m]."""
+  logits: list[float]
+  """[M]."""
+  means: list[list[float]]
+  """[M, 3] m, m, rad."""
+  stddevs: list[list[float]]
+  """[M, 3]."""
+  picture: str = ""
+  """What it saw, PNG in base64."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,16 +59,26 @@ class Episode:
   """One episode."""
 
   setting: Setting
-  group: str  # within a protocol: "navigation", "center", "wall", "gain 50"
-  index: int  # of the trial in the protocol
-  goal: tuple[float, float]  # m
-  outcome: str  # one of OUTCOMES
-  detail: str = ""  # more about why it ended
-  time: float | None = None  # s until the goal was reached
-  duration: float = 0.0  # s
-  localisation_error: float | None = None  # m, mean over the episode
-  path: list[list[float]] = dataclasses.field(default_factory=list)  # [t, x, y, yaw] every 0.2 s
-  ball_path: list[list[float]] = dataclasses.field(default_factory=list)  # [t, x, y]
+  group: str
+  """Within a protocol: "navigation", "center", "wall", "gain 50"."""
+  index: int
+  """Of the trial in the protocol."""
+  goal: tuple[float, float]
+  """m."""
+  outcome: str
+  """One of OUTCOMES."""
+  detail: str = ""
+  """More about why it ended."""
+  time: float | None = None
+  """s until the goal was reached."""
+  duration: float = 0.0
+  """s."""
+  localisation_error: float | None = None
+  """m, mean over the episode."""
+  path: list[list[float]] = dataclasses.field(default_factory=list)
+  """[t, x, y, yaw] every 0.2 s."""
+  ball_path: list[list[float]] = dataclasses.field(default_factory=list)
+  """[t, x, y]."""
   moments: list[Moment] = dataclasses.field(default_factory=list)
 
   @property
@@ -63,7 +88,7 @@ class Episode:
 
   @property
   def key(self) -> tuple[Any, ...]:
-    """What tells episodes apart: an evaluation runs each once."""
+    """The identity of an episode: an evaluation runs each once."""
     return (*dataclasses.astuple(self.setting), self.index)
 
 

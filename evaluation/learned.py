@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.agents.dmpo import export
-from nerf2real.evaluation.plants import Sight
+from nerf2real.agents.dmpo.policy import export
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
 
 
 class LearnedPolicy:
   """An exported policy in an evaluation."""
+
+  control = "none"
 
   def __init__(self, folder: Path, *, seed: int, stochastic: bool):
     """Loads the policy.
@@ -42,6 +44,7 @@ class LearnedPolicy:
     self.policy_id = str(_digest(folder))
     shape = self._layout.image_shape
     self.image_size = None if shape is None else (shape[0], shape[1])
+    self.trained_on = self._loaded.environment
     self._seed, self._stochastic = seed, stochastic
     self.belief: Belief | None = None
 

@@ -1,4 +1,4 @@
-"""What an evaluation asks of a policy, and the scripted walker as one."""
+"""The protocol of policies in an evaluation, and the scripted walker as one."""
 
 import hashlib
 import json
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation.plants import BALL, Sight
+from nerf2real.evaluation.plants.plant import BALL, Sight
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import Walker
 from nerf2real.suite.op3 import constants
@@ -34,6 +34,8 @@ class EvaluatedPolicy(Protocol):
   name: str
   policy_id: str  # digest of what it is made of
   image_size: tuple[int, int] | None  # of the pictures that it needs
+  control: str  # one of `controls.CONTROLS`; "none": its observations are the plant's
+  trained_on: str  # name of its environment; empty for a policy that was not trained
 
   def reset(self, sight: Sight) -> None:
     """Begins an episode."""
@@ -45,7 +47,7 @@ class EvaluatedPolicy(Protocol):
 
   @property
   def belief(self) -> Belief | None:
-    """Where it believes to be since the last action; None if it says nothing."""
+    """The believed position since the last action; None for a policy without a belief."""
 
 
 def resolution(policy: EvaluatedPolicy) -> str:
@@ -55,10 +57,12 @@ def resolution(policy: EvaluatedPolicy) -> str:
 
 
 class GaitPolicy:
-  """The scripted walker; it is told where it is, or reckons where nobody sees it."""
+  """The scripted walker, with the observed pose or by dead reckoning without one."""
 
   name = "gait"
   image_size: tuple[int, int] | None = None
+  control = "none"
+  trained_on = ""
   belief: Belief | None = None
 
   def __init__(self, scene: Any, protocol: str, *, settings: GaitSettings | None = None):

@@ -1,4 +1,4 @@
-"""Runs trials on a plant and says how each went: success, collision, fall, or lost."""
+"""Runs trials on a plant and classifies each: success, collision, fall, or lost."""
 
 import base64
 from collections.abc import Callable, Iterable
@@ -9,8 +9,8 @@ import numpy as np
 
 from nerf2real.evaluation import episodes
 from nerf2real.evaluation.episodes import Episode, Moment, Setting
-from nerf2real.evaluation.operated import RepeatError
-from nerf2real.evaluation.plants import Plant, Sight, Trial
+from nerf2real.evaluation.plants.operated import RepeatError
+from nerf2real.evaluation.plants.plant import Plant, Sight, Trial
 from nerf2real.evaluation.policies import EvaluatedPolicy, resolution
 from nerf2real.suite.op3 import constants
 
@@ -29,6 +29,7 @@ def setting_of(plant: Plant, policy: EvaluatedPolicy) -> Setting:
     plant_id=plant.plant_id,
     protocol=plant.protocol,
     perturbation=plant.perturbation,
+    control=policy.control,
   )
 
 

@@ -12,53 +12,99 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.evaluation import episodes, plants, report, runner, tables
+from nerf2real.agents.environments.loading import camera_settings
+from nerf2real.evaluation import episodes, runner
+from nerf2real.evaluation.controls import under_control
 from nerf2real.evaluation.learned import LearnedPolicy
-from nerf2real.evaluation.plants import Plant
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants import swaps
+from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
+from nerf2real.evaluation.report import page as report
+from nerf2real.evaluation.report import tables
 from nerf2real.evaluation.settings import GAIT, EvaluationSettings
 from nerf2real.suite import loading
 
 
 def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
-  """Returns the policy that the settings name."""
+  """Returns the policy that the settings name, with its observations falsified if they say so."""
+  policy: EvaluatedPolicy
   if settings.policy == GAIT:
-    return GaitPolicy(scene, settings.protocol)
-  return LearnedPolicy(Path(settings.policy), seed=settings.seed, stochastic=settings.stochastic)
+    policy = GaitPolicy(scene, settings.protocol)
+  else:
+    policy = LearnedPolicy(
+      Path(settings.policy), seed=settings.seed, stochastic=settings.stochastic
+    )
+  return under_control(policy, settings.control, scene=scene, protocol=settings.protocol)
+
+
+def each_plant(settings: EvaluationSettings) -> list[EvaluationSettings]:
+  """Returns the settings of every single plant that is evaluated on.
+
+  Raises:
+    ValueError: There is no virtual robot where one is wanted.
+  """
+  robots = [
+    dataclasses.replace(settings, plant="virtual", robot_seed=(s,))
+    for s in dict.fromkeys(settings.robot_seed)
+  ]
+  if settings.plant in ("virtual", "both") and not robots:
+    raise ValueError("--robot-seed names no virtual robot: expected one or more seeds.")
+  if settings.plant == "virtual":
+    return robots
+  if settings.plant == "both":
+    return [dataclasses.replace(settings, plant="sim"), *robots]
+  return [settings]
 
 
 def make_plant(
-  settings: EvaluationSettings, scene: Any, image_size: tuple[int, int] | None
+  settings: EvaluationSettings,
+  scene: Any,
+  image_size: tuple[int, int] | None,
+  *,
+  trained_on: str = "",
 ) -> Plant:
-  """Returns the plant that the settings name."""
+  """Returns the plant that the settings of one name; see `each_plant`.
+
+  Args:
+    settings: The evaluation.
+    scene: An opened bundle.
+    image_size: Height and width of the policy's picture; None for no camera.
+    trained_on: Name of the policy's environment: a simulated camera has its rate, lens and
+      response. Robots have cameras of their own.
+  """
+  swaps.check(settings.swap, plant=settings.plant, built_in=settings.scene is None)
   record = None
   if settings.record and settings.plant != "sim":
     record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
   if settings.plant == "sim":
-    from nerf2real.evaluation.simulated import SimulatedPlant
+    from nerf2real.evaluation.plants.simulated import SimulatedPlant
 
     return SimulatedPlant(
       scene,
       settings.protocol,
       settings.perturb,
       image_size=image_size,
+      camera=camera_settings(trained_on),
       effects=settings.effects,
       seed=settings.seed,
       time_limit=settings.time_limit,
+      swap=settings.swap,
     )
   if settings.plant == "virtual":
-    from nerf2real.evaluation.rehearsed import RehearsedPlant
+    from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 
     return RehearsedPlant(
       scene,
       settings.protocol,
       settings.perturb,
       image_size=image_size,
-      robot_seed=settings.robot_seed,
+      robot_seed=settings.robot_seed[0],
       time_limit=settings.time_limit,
+      swap=settings.swap,
       record=record,
     )
-  from nerf2real.evaluation.operated import OperatedPlant
+  from nerf2real.evaluation.plants.operated import OperatedPlant
 
   camera: Any = int(settings.camera) if settings.camera.isdigit() else settings.camera
   return OperatedPlant(
@@ -158,9 +204,12 @@ def _run_trials(
   say: Callable[[str], None],
 ) -> None:
   policy = load_policy(settings, scene)
-  plant = make_plant(settings, scene, policy.image_size or settings.camera_size)
+  size = policy.image_size or settings.camera_size
   chosen = choose(plants.trials(settings.protocol), count)
-  try:
-    runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
-  finally:
-    plant.close()
+  for single in each_plant(settings):
+    plant = make_plant(single, scene, size, trained_on=policy.trained_on)
+    say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
+    try:
+      runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
+    finally:
+      plant.close()

@@ -13,12 +13,19 @@ class EvaluationSettings:
 
   policy: str = GAIT
   """Folder of an exported policy, or "gait" for the scripted walker."""
-  plant: Literal["sim", "virtual", "robot"] = "sim"
-  """Where: the training simulation, a virtual robot in the true room, or a robot."""
+  plant: Literal["sim", "virtual", "both", "robot"] = "sim"
+  """Where: the training simulation, virtual robots in the true room, both after one another, or a
+  robot."""
   protocol: Literal["navigation", "ball", "gain"] = "navigation"
   """Which of the paper's evaluations: tables I, II and V."""
   perturb: Literal["none", "blocked_camera", "moved_object", "person"] = "none"
   """What is disturbed."""
+  control: Literal["none", "black", "other_goal"] = "none"
+  """What of the observations is falsified, for a control experiment: the pictures are black, or the
+  goal is another one than the trial's."""
+  swap: Literal["none", "picture", "delay", "physics"] = "none"
+  """What of the gap between simulation and virtual robot is closed: in the simulation the true
+  room's pictures, or the robot's camera delay; on the virtual robot its hidden physics."""
   out: Path = Path("out/evaluation")
   """Folder of the episodes and the report."""
   scene: Path | None = None
@@ -29,8 +36,8 @@ class EvaluationSettings:
   """Runs only the first trials of the protocol, spread over it; all if not given."""
   seed: int = 0
   """Seed of the simulation's episodes and of drawn actions."""
-  robot_seed: int = 1
-  """Which virtual robot: the seed of what is hidden in it."""
+  robot_seed: tuple[int, ...] = (1,)
+  """Which virtual robots: the seeds of what is hidden in them."""
   stochastic: bool = False
   """Draws actions instead of taking the policy's mean."""
   camera_size: tuple[int, int] | None = None
@@ -50,4 +57,5 @@ class EvaluationSettings:
   markdown: Path | None = None
   """Writes the tables of everything in the folder to a Markdown file, too."""
   dry_run: bool = False
-  """Robot only: reads and asks everything, moves and keeps nothing; one trial without --trials."""
+  """Robot only: reads everything and puts all questions, moves and keeps nothing; one trial without
+  --trials."""

@@ -13,15 +13,10 @@ the learner (`launch/learner.py --help`). Needs the extra `cluster`.
 
 import dataclasses
 import sys
-from pathlib import Path
 
-from nerf2real.agents.processes import cluster, training
+from nerf2real.agents.supervision import cluster
 from nerf2real.launch import command
-
-SCRIPTS = training.Scripts(
-  learner=Path(__file__).resolve().parent / "learner.py",
-  actor=Path(__file__).resolve().parent / "actor.py",
-)
+from nerf2real.launch.local_distributed import SCRIPTS, supervised
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,12 +30,9 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
   Raises:
     CommandError: The run cannot start, or it failed.
   """
-  try:
-    failure = cluster.train(arguments, SCRIPTS, forwarded=forwarded, command=command.command_line())
-  except training.RunRefusedError as error:
-    raise command.CommandError(error, status=command.WRONG_ARGUMENTS) from error
-  if failure:
-    raise command.CommandError(failure)
+  supervised(
+    lambda: cluster.train(arguments, SCRIPTS, forwarded=forwarded, command=command.command_line())
+  )
 
 
 def main() -> int:

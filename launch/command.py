@@ -89,7 +89,7 @@ def main(
 
 
 def _say(text: str) -> None:
-  """Prints to stderr; where that is a file on a full disk, the exit status still tells."""
+  """Prints to stderr; where that is a file on a full disk, the exit status remains."""
   with contextlib.suppress(OSError):
     print(text, file=sys.stderr, flush=True)
 

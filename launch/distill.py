@@ -12,8 +12,9 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from nerf2real.agents.processes import training
+from nerf2real.agents.supervision import training
 from nerf2real.launch import command
+from nerf2real.launch.local_distributed import supervised
 
 _HERE = Path(__file__).resolve().parent
 SCRIPTS = training.Scripts(
@@ -32,8 +33,8 @@ class Arguments(training.TrainingSettings):
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   preset: str | None = None
-  """Settings of the distillation: nerf_nav, or tiny to try the machinery; "nerf_nav" if not
-  given."""
+  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push, or tiny to try the
+  machinery; "nerf_nav" if not given."""
 
 
 def run(arguments: Arguments, forwarded: list[str]) -> None:
@@ -42,14 +43,9 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
   Raises:
     CommandError: The run cannot start, or it failed.
   """
-  try:
-    failure = training.train(
-      arguments, SCRIPTS, forwarded=forwarded, command=command.command_line()
-    )
-  except training.RunRefusedError as error:
-    raise command.CommandError(error, status=command.WRONG_ARGUMENTS) from error
-  if failure:
-    raise command.CommandError(failure)
+  supervised(
+    lambda: training.train(arguments, SCRIPTS, forwarded=forwarded, command=command.command_line())
+  )
 
 
 def main() -> int:

@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.statuses import REFUSED
+from nerf2real.agents.supervision.statuses import REFUSED
 from nerf2real.core.serialization import read_json
 from nerf2real.launch import command
 from nerf2real.launch.learner import DEFAULT_ENDPOINT, set_threads
@@ -33,11 +33,12 @@ class Arguments:
   listen: str = DEFAULT_ENDPOINT
   """Where to listen, such as tcp/0.0.0.0:7447."""
   preset: str = "nerf_nav"
-  """Settings to start from: nerf_nav, or tiny to try the machinery."""
+  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push, or tiny to try the
+  machinery."""
   env: str | None = None
   """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
   teacher: str | None = None
-  """quick, steady, or the folder of an exported policy; the preset's if not given."""
+  """quick, steady, ball, or the folder of an exported policy; the preset's if not given."""
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   minutes: float = 60.0

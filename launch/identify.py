@@ -22,12 +22,12 @@ class Arguments:
   model: Path | None = None
   """Declared MuJoCo model (.xml)."""
   logs: tuple[Path, ...] = ()
-  """Logs to identify from (.mcap)."""
+  """Logs to identify from (.mcap, .csv, BAM's .json)."""
   held: tuple[Path, ...] = ()
   """Logs on which only errors are reported."""
   reference: tuple[Path, ...] = ()
   """Logs of the same apparatus without the effect: they calibrate the declared constants first, and
-  say how bright the place is."""
+  are how bright the place is."""
   out: Path | None = None
   """Folder to write."""
   evaluate: Path | None = None

@@ -20,7 +20,7 @@ import tyro
 
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link import sessions
-from nerf2real.agents.processes.statuses import NOT_SAVED, REFUSED
+from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
 from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 
@@ -59,6 +59,13 @@ class Arguments:
   init_from: Path | None = None
   """Folder of an exported policy to begin with, with fresh optimisers and critic; random weights if
   not given."""
+  prior_data: Path | None = None
+  """Folder of an earlier run whose replay, or a distillation whose episodes, are mixed into the
+  batches; none if not given."""
+  prior_share: float = 0.5
+  """Share of the prior data in every batch."""
+  prior_steps: int = 200_000
+  """Environment steps of the prior data to read: the last ones [steps]."""
   threads: int = max(1, _CORES // 2)
   """Processor threads of the updates: half of the cores, the rest is for actors."""
   resume: bool = False
@@ -134,7 +141,8 @@ def run(arguments: Arguments) -> None:
       what was learned was not saved.
   """
   from nerf2real.agents.processes.checkpoints import CheckpointError
-  from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+  from nerf2real.agents.processes.learner import Learner, LearnerError
+  from nerf2real.agents.processes.settings import RunSettings
 
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
   set_threads(arguments.threads)

@@ -10,9 +10,10 @@ checkpoint; --resume goes on. Arguments that are not listed here go to the learn
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
-from nerf2real.agents.processes import training
+from nerf2real.agents.supervision import training
 from nerf2real.launch import command
 
 SCRIPTS = training.Scripts(
@@ -35,14 +36,25 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
   Raises:
     CommandError: The run cannot start, or it failed.
   """
-  try:
-    failure = training.train(
+  supervised(
+    lambda: training.train(
       arguments,
       SCRIPTS,
       port=arguments.port,
       forwarded=forwarded,
       command=command.command_line(),
     )
+  )
+
+
+def supervised(train: Callable[[], str]) -> None:
+  """Calls a function that runs a training and returns why it failed, empty if it did not.
+
+  Raises:
+    CommandError: The run cannot start, or it failed.
+  """
+  try:
+    failure = train()
   except training.RunRefusedError as error:
     raise command.CommandError(error, status=command.WRONG_ARGUMENTS) from error
   if failure:

@@ -41,7 +41,7 @@ def run(arguments: Arguments) -> None:
   import cv2
   import numpy as np
 
-  from nerf2real.evaluation.belief_pictures import draw_episode
+  from nerf2real.evaluation.report.belief_pictures import draw_episode
 
   drawn = draw_episode(
     arguments.policy,

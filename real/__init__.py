@@ -13,7 +13,7 @@ __all__ = ["Connection", "load"]
 
 
 def __getattr__(name: str) -> Any:
-  # Loaded when asked for: the recorder's process needs no environment.
+  # Loaded on first use: the recorder's process needs no environment.
   if name in __all__:
     from nerf2real.real import loading
 

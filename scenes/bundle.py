@@ -33,7 +33,8 @@ class Bundle:
   """A scene bundle on disk; the world frame is metric, z up, with the floor at z = 0."""
 
   folder: Path
-  scene: Mapping[str, Any]  # the content of scene.json
+  scene: Mapping[str, Any]
+  """The content of scene.json."""
 
   @classmethod
   def load(cls, folder: Path | str | None = None) -> "Bundle":

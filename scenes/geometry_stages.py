@@ -44,7 +44,7 @@ def world(
     settings: Of the alignment.
     marker_side: Side of the black square of a marker in the room [m], or None.
     override: What a person fixed.
-    override_key: Hash of the file that says so.
+    override_key: Hash of the file of overrides.
   """
   found = poses.value
 

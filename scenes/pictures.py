@@ -19,8 +19,10 @@ class PosedPictures:
 
   capture: Made[Capture]
   poses: Made[Localisation]
-  width: int  # wider pictures are reduced to it [pixel]
-  held_out_every: int  # every so many are kept from training
+  width: int
+  """Wider pictures are reduced to it [pixel]."""
+  held_out_every: int
+  """Every so many are kept from training."""
 
   def views(self) -> Views:
     """Reads all pictures.

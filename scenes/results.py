@@ -45,7 +45,8 @@ class TrainedField:
 class Contact:
   """Figures of the convex parts and of the free floor; their files lie beside them."""
 
-  goals: np.ndarray  # [G, 2] m
+  goals: np.ndarray
+  """[G, 2] m."""
   free_area_m2: float
   collision_parts: int
   collision_error_m: float

@@ -34,11 +34,16 @@ class StageError(ValueError):
 class StageResult:
   """A finished stage."""
 
-  folder: Path  # what the stage wrote
-  key: str  # hash of its name, settings and inputs
-  made: str  # drawn when it was made: two runs of equal settings may differ, as training does
-  seconds: float  # how long it took, summed over interrupted runs
-  cached: bool  # True where an earlier run had done it
+  folder: Path
+  """What the stage wrote."""
+  key: str
+  """Hash of its name, settings and inputs."""
+  made: str
+  """Drawn when it was made: two runs of equal settings may differ, as training does."""
+  seconds: float
+  """How long it took, summed over interrupted runs."""
+  cached: bool
+  """True where an earlier run had done it."""
 
 
 class Made(NamedTuple, Generic[T]):

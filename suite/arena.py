@@ -8,7 +8,7 @@ from dm_control import composer
 
 from nerf2real.suite.op3 import op3
 
-FLOOR_FRICTION = (1.0, 0.005, 0.0001)  # sliding, torsional, rolling: ours (MuJoCo's defaults)
+FLOOR_FRICTION = (1.0, 0.005, 0.0001)  # sliding, torsional, rolling: MuJoCo's defaults
 _FLOOR_COLOR = (0.55, 0.52, 0.48, 1.0)
 _MARGIN = 1.0  # m of floor around the scene's extent
 

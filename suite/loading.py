@@ -59,7 +59,7 @@ def load(
     The environment, a `composer.Environment`.
 
   Raises:
-    ValueError: If an argument is none of what is expected; the message says what would be.
+    ValueError: If an argument is none of what is expected; the message lists what is.
   """
   if task not in _TASKS:
     raise ValueError(errors.unknown_name("task", task, ALL_TASKS))

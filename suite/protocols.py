@@ -1,7 +1,7 @@
 """Evaluation protocols of the paper, as data: which episodes are run, in which order.
 
 Paper, sections "Navigation and obstacle avoidance results" and "Ball pushing results", and the
-appendix table on the camera's gain. A protocol is a tuple of trials; a trial says where everything
+appendix table on the camera's gain. A protocol is a tuple of trials; a trial holds where everything
 starts. The paper gives the numbers of positions and orientations but not the positions themselves:
 navigation trials name them by index, and `scene_starts` draws positions of a scene from its free
 space with a fixed seed, so that they are the same for every policy.
@@ -20,12 +20,14 @@ WORKSPACE_SIZE = 3.0  # m, ball pushing, paper
 CELL_SIZE = 1.0  # m, the target square; the workspace is 3 x 3 cells
 TARGET_CELL = (1, 1)  # the corner, in cells from the centre cell: +x, +y
 BALL_TIME_LIMIT = 60.0  # s, paper
-WALL_SPREAD = 0.1  # m, ours: the paper says "near the center" of the cell
-START_SEED = 20221010  # ours
+WALL_SPREAD = 0.1  # m; chosen for the paper's "near the center" of the cell
+START_SEED = 20221010  # chosen: fixed, so that every evaluation has the same starts
 START_ROOM = 0.15  # m around a start beyond what the robot needs to stand: as at the scene's goals
-MIN_GOAL_DISTANCE = 1.0  # m between a start and every goal, where the scene has such places: ours
-_START_GRID = 0.1  # m between the places among which starts are chosen: ours
-_START_ROOM_STEP = 0.05  # m by which less room is taken where the scene has no better: ours
+MIN_GOAL_DISTANCE = 1.0  # m between a start and every goal, where the scene has places; chosen
+_START_GRID = 0.1  # m between the candidates of starts; chosen: finer than the robot is wide
+_START_ROOM_STEP = (
+  0.05  # m by which the room is reduced where the scene has too few; chosen: a cell
+)
 
 
 class NavigationTrial(NamedTuple):
@@ -133,7 +135,7 @@ def navigation_starts(
     free_xy: positions [N, 2] at which the robot may stand, m.
     goals: goal positions [G, 2], m.
     count: how many positions.
-    min_goal_distance: wanted distance from every goal, m; less where the scene has no such place.
+    min_goal_distance: distance from every goal, m; less where the scene has no such place.
     seed: of the first position.
 
   Returns:

@@ -19,11 +19,13 @@ STATE = Path("checkpoints") / "newest-student.npz"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Counters:
-  """What a saved state says besides arrays."""
+  """What a saved state holds besides arrays."""
 
   updates: int = 0
-  elapsed: float = 0.0  # s of training, over all parts of the run
-  begun: int | None = None  # frames at which the first student was published
+  elapsed: float = 0.0
+  """s of training, over all parts of the run."""
+  begun: int | None = None
+  """Frames at which the first student was published."""
 
 
 def save_state(path: Path, state: TrainingState, counters: Counters) -> None:

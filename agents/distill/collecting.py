@@ -1,31 +1,28 @@
 """The collector: runs labelled episodes for a learner until the run is over.
 
-A process of its own; the learner says over the link what to run, and gives the newest student. An
+A process of its own; what to run and the newest student come from the learner over the link. An
 episode is sent whole when it ends, and kept until the learner has acknowledged it.
 """
 
 import logging
 import threading
 import time
-from typing import Any
 
 import numpy as np
 
 from nerf2real.agents.distill.episodes import EpisodeRunner
-from nerf2real.agents.distill.schedule import mixture_at, push_level, pushed
+from nerf2real.agents.distill.schedule import may_collect, mixture_at, push_level, pushed
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import make_teacher
-from nerf2real.agents.dmpo.acting import task_of
-from nerf2real.agents.dmpo.inference import Policy
+from nerf2real.agents.dmpo.policy.acting import task_of
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.processes.joining import AWAY_POLL, Failures, make_known_environment, wait_for
 from nerf2real.core.serialization import from_plain
 
 _log = logging.getLogger(__name__)
-_AWAY_POLL = 0.5  # s between questions while the learner does not answer
 _DRAIN = 5.0  # s to deliver what was made, at the end
-_MAX_FAILURES = 5  # episodes in a row
 _MAX_UNDELIVERED = 8  # episodes in the outbox, from which the collector waits for the learner
 
 
@@ -43,7 +40,7 @@ class Collector:
     """
     self._link = link
     self._stop = threading.Event()
-    answer = wait_for_description(link, self._stop)
+    answer = wait_for(link.status, self._stop)
     description = answer["description"]
     self._settings = from_plain(description["settings"], DistillSettings)
     self._layout = from_plain(description["layout"], Layout)
@@ -62,9 +59,9 @@ class Collector:
     """Collects until the run is over or `stop` is called.
 
     Raises:
-      RuntimeError: several episodes in a row ended in an exception.
+      EpisodesFailed: several episodes in a row ended in an exception.
     """
-    failures = 0
+    failures = Failures(self._link)
     try:
       while not self._stop.is_set():
         frames = self._ask()
@@ -72,12 +69,9 @@ class Collector:
           break
         try:
           self._episode(frames)
-          failures = 0
+          failures.reset()
         except Exception as error:
-          failures += 1
-          _log.error("An episode failed (%d in a row).", failures, exc_info=error)
-          if failures >= _MAX_FAILURES:
-            raise RuntimeError(f"{failures} episodes in a row failed: {error}") from error
+          failures.add(error)
     finally:
       self._link.drain(timeout=_DRAIN)
 
@@ -87,7 +81,7 @@ class Collector:
       grant = self._link.request(0)
       if grant is None or self._link.outbox.size > _MAX_UNDELIVERED:
         self._link.flush()
-        self._stop.wait(_AWAY_POLL)
+        self._stop.wait(AWAY_POLL)
         continue
       if grant["stop"]:
         return None
@@ -96,7 +90,10 @@ class Collector:
         if answer is not None:
           self._policy = student_policy(answer[1], self._settings)
           self._begun = grant["steps"] if self._begun is None else self._begun
-      return int(grant["steps"])
+      if may_collect(self._settings, int(grant["steps"]), begun=self._begun):
+        return int(grant["steps"])
+      self._link.flush()
+      self._stop.wait(AWAY_POLL)
     return None
 
   def _episode(self, frames: int) -> None:
@@ -107,7 +104,7 @@ class Collector:
     mixture = mixture_at(self._settings.mixture, frames, begun=self._begun)
     arrays, figures = self._runner.run(self._policy, mixture)
     # The link counts a trajectory's transitions by its rewards: one less than observations.
-    self._link.send(arrays | {"reward": np.zeros(len(arrays["state"]) + 1, np.float32)})
+    self._link.send(arrays | {"reward": np.append(arrays["reward"], np.float32(0))})
     steps = len(arrays["state"])
     rates = {"steps_per_second": steps / (time.perf_counter() - begin), "push_force": level[1]}
     about = {"teacher_share": mixture.teacher, "belief_share": mixture.belief}
@@ -115,13 +112,9 @@ class Collector:
 
   def _make_runner(self, level: tuple[float, float]) -> EpisodeRunner:
     environment_seed, mixture_seed = (int(s) for s in self._seeds.spawn(1)[0].generate_state(2))
-    environment = make_environment(pushed(self._settings.environment, level), seed=environment_seed)
-    found = Layout.of(environment)
-    if found != self._layout:
-      raise ValueError(
-        f"{self._settings.environment} is not the learner's here: expected {self._layout}, found "
-        f"{found}. Install the same release and scene."
-      )
+    environment = make_known_environment(
+      pushed(self._settings.environment, level), self._layout, seed=environment_seed
+    )
     return EpisodeRunner(
       environment,
       self._layout,
@@ -129,16 +122,6 @@ class Collector:
       settings=self._settings.mixture,
       rng=np.random.default_rng(mixture_seed),
     )
-
-
-def wait_for_description(link: ActorLink, stop: threading.Event) -> dict[str, Any]:
-  """Returns the learner's answer to "status" as soon as there is one."""
-  while not stop.is_set():
-    answer = link.status()
-    if answer is not None:
-      return answer
-    stop.wait(_AWAY_POLL)
-  raise InterruptedError("Stopped while waiting for the learner.")
 
 
 def student_policy(parameters: dict[str, np.ndarray], settings: DistillSettings) -> Policy:

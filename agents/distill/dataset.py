@@ -11,16 +11,18 @@ import threading
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
-from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.prior import write_layout
+from nerf2real.agents.dmpo.specs import BALL, Layout
 from nerf2real.core import files
 
 POSE_SIZE = 3  # x [m], y [m], yaw [rad]
-UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance")  # besides the pictures
+BALL_SIZE = 3  # x ahead [m], y to the left [m] of the robot, pan of its head [rad]
+_UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance", "ball")
 
 
 class Span(NamedTuple):
@@ -33,12 +35,12 @@ class Span(NamedTuple):
 def fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
   """Arrays of an episode by name: shape of a frame and dtype.
 
-  `label` and `command` are the teacher's, `pose` the truth, `goal_distance` [m] says how far the
+  `label` and `command` are the teacher's, `pose` the truth, `goal_distance` [m] is how far the
   goal is, `driver` who drove: 0 the teacher, 1 the student, 2 a detour.
   """
   if layout.image_shape is None:
     raise ValueError("A distillation needs pictures: give the environment an image_size.")
-  return {
+  kept: dict[str, tuple[tuple[int, ...], type]] = {
     "image": (layout.image_shape, np.uint8),
     "state": ((layout.state_size,), np.float32),
     "label": ((layout.action_size,), np.float32),
@@ -46,6 +48,20 @@ def fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
     "pose": ((POSE_SIZE,), np.float32),
     "goal_distance": ((), np.float32),
     "driver": ((), np.uint8),
+  }
+  if layout.privileged_column(BALL) is not None:
+    kept["ball"] = ((BALL_SIZE,), np.float32)
+  return kept
+
+
+def transition_fields(layout: Layout) -> dict[str, tuple[tuple[int, ...], type]]:
+  """Further arrays of an episode, of which the files alone make use: they are a later DMPO run's
+  prior data. `action` was applied at a step, `reward` and `discount` followed it."""
+  return {
+    "action": ((layout.action_size,), np.float32),
+    "reward": ((), np.float32),
+    "discount": ((), np.float32),
+    "privileged": ((layout.privileged_size,), np.float32),
   }
 
 
@@ -66,6 +82,7 @@ class Dataset:
     """
     self._folder = folder
     self._fields = fields(layout)
+    self._written = self._fields | transition_fields(layout)
     self._holdout = holdout
     self._capacity = capacity
     self._lock = threading.Lock()
@@ -75,6 +92,7 @@ class Dataset:
     self._spans: list[Span] = []
     self._origins: list[tuple[int, int]] = []
     folder.mkdir(parents=True, exist_ok=True)
+    write_layout(folder, layout)
     for path in sorted(folder.glob("[0-9]*.npz")):
       self._read(path)
 
@@ -90,6 +108,10 @@ class Dataset:
     with self._lock:
       return list(self._origins)
 
+  def take(self, frames: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns what an unroll needs besides pictures, at frames of any shape."""
+    return {name: self.arrays[name][frames] for name in _UNROLL_FIELDS if name in self.arrays}
+
   def spans(self, *, held_out: bool) -> list[Span]:
     """Returns the episodes to train on, or those held out."""
     with self._lock:
@@ -99,7 +121,7 @@ class Dataset:
     """Writes and keeps an episode; returns its frames.
 
     Args:
-      episode: arrays of `fields`, of one length.
+      episode: arrays of `fields` and `transition_fields`, of one length.
       key: of the actor that made it.
       number: the episode's, among that actor's.
 
@@ -107,19 +129,21 @@ class Dataset:
       ValueError: arrays are missing or of another shape, or the capacity is reached.
       OSError: it cannot be written.
     """
-    frames = self._check(episode)
+    if {"state", "reward"} <= set(episode):  # the link has counted transitions by one reward more
+      episode = {**episode, "reward": episode["reward"][: len(episode["state"])]}
+    frames = self._check(episode, self._written)
     name = f"{len(self._spans):06d}_{key:016x}_{number}.npz"
     with files.atomic_path(self._folder / name) as path:
-      np.savez(path, **{name: episode[name] for name in self._fields})  # type: ignore[arg-type]
+      np.savez(path, **{name: episode[name] for name in self._written})  # type: ignore[arg-type]
     self._append(episode, frames, (key, number))
     return frames
 
-  def _check(self, episode: Mapping[str, np.ndarray]) -> int:
-    missing = sorted(set(self._fields) - set(episode))
+  def _check(self, episode: Mapping[str, np.ndarray], wanted: Mapping[str, Any]) -> int:
+    missing = sorted(set(wanted) - set(episode))
     if missing:
       raise ValueError(f"An episode lacks {missing}.")
     frames = len(episode["state"])
-    for name, (shape, dtype) in self._fields.items():
+    for name, (shape, dtype) in wanted.items():
       array = episode[name]
       if array.shape != (frames, *shape) or array.dtype != dtype:
         raise ValueError(
@@ -141,8 +165,8 @@ class Dataset:
   def _read(self, path: Path) -> None:
     try:
       with np.load(path, allow_pickle=False) as stored:
-        episode = {name: stored[name] for name in stored.files}
-      frames = self._check(episode)
+        episode = {name: stored[name] for name in stored.files if name in self._fields}
+      frames = self._check(episode, self._fields)
     except (zipfile.BadZipFile, ValueError) as error:
       raise ValueError(f"{path} is no episode of this run: {error}") from error
     _, key, number = path.stem.split("_")

@@ -2,21 +2,24 @@
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import dm_env
 import numpy as np
 
-from nerf2real.agents.distill.dataset import fields
+from nerf2real.agents.distill.dataset import fields, transition_fields
 from nerf2real.agents.distill.schedule import Mixture
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Teacher
-from nerf2real.agents.dmpo.acting import episode_success, task_of
-from nerf2real.agents.dmpo.inference import Policy, PolicyState
-from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
+from nerf2real.agents.dmpo.policy.acting import episode_success, task_of
+from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState
+from nerf2real.agents.dmpo.specs import BALL, FlatObservation, Layout, planar_pose
 from nerf2real.agents.processes.timings import StageTimes
 from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.op3 import constants
 
+_HEAD_PAN = constants.JOINT_NAMES.index("head_pan")
 TEACHER, STUDENT, DETOUR = 0, 1, 2  # drivers, as `dataset.fields` counts them
 
 
@@ -25,6 +28,23 @@ def pose_of(layout: Layout, observation: FlatObservation) -> Pose:
   if layout.pose_columns is None:
     raise ValueError("A teacher needs the true pose: the environment gives no privileged state.")
   return Pose(*(float(v) for v in planar_pose(observation.privileged, layout.pose_columns)))
+
+
+def ball_of(layout: Layout, observation: FlatObservation) -> np.ndarray | None:
+  """Returns where the ball is [2] [m]; None without one."""
+  column = layout.privileged_column(BALL)
+  return None if column is None else observation.privileged[column : column + 2]
+
+
+def relative_ball(
+  observation: Mapping[str, Any], pose: Pose, ball: np.ndarray | None
+) -> np.ndarray | None:
+  """Returns a ball [2] [m] from the robot: x ahead, y to the left [m], and the head's pan [rad]."""
+  if ball is None:
+    return None
+  offset, cosine, sine = ball - pose.xy, np.cos(pose.yaw), np.sin(pose.yaw)
+  ahead, left = cosine * offset[0] + sine * offset[1], cosine * offset[1] - sine * offset[0]
+  return np.array([ahead, left, observation["joint_positions"][-1][_HEAD_PAN]])
 
 
 def likeliest_pose(policy: Policy, embedding: np.ndarray) -> Pose:
@@ -40,8 +60,10 @@ class _Segment:
   driver: int = TEACHER
   left: int = 0
   noise: float = 0.0
-  place: np.ndarray | None = None  # of a detour [2] [m]
-  guide: Teacher | None = None  # drives the detour
+  place: np.ndarray | None = None
+  """Of a detour [2] [m]."""
+  guide: Teacher | None = None
+  """Drives the detour."""
 
 
 class EpisodeRunner:
@@ -73,13 +95,14 @@ class EpisodeRunner:
   def run(
     self, policy: Policy | None, mixture: Mixture
   ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Runs an episode; returns its arrays (`dataset.fields`) and its figures.
+    """Runs an episode; returns its arrays (`dataset.fields`, `transition_fields`) and figures.
 
     Args:
       policy: the student; None while there is none.
       mixture: who drives how often.
     """
-    rows: dict[str, list[Any]] = {name: [] for name in fields(self._layout)}
+    kept = fields(self._layout) | transition_fields(self._layout)
+    rows: dict[str, list[Any]] = {name: [] for name in kept}
     with self.times.stage("env"):
       timestep = self._environment.reset()
     segment, state = _Segment(), policy.initial_state() if policy else None
@@ -91,6 +114,7 @@ class EpisodeRunner:
       observation = timestep.observation
       goal = np.asarray(observation["goal"], np.float64)
       truth = pose = pose_of(self._layout, flat)
+      ball = ball_of(self._layout, flat)
       student: np.ndarray | None = None
       if policy is not None:
         with self.times.stage("student"):
@@ -100,25 +124,30 @@ class EpisodeRunner:
         if segment.left <= 0:
           segment = self._draw_segment(policy is not None, mixture)
         segment.left -= 1
-        label = self._teacher.label(observation, goal=goal, pose=pose)
+        label = self._teacher.label(observation, goal=goal, pose=pose, ball=ball)
         action = self._choose(segment, label.action, student, observation, pose)
-      values = (
-        flat.image,
-        flat.state,
-        label.action,
-        label.command,
-        np.array(truth),
-        float(np.linalg.norm(goal - truth.xy)),
-        segment.driver,
-      )
-      for row, value in zip(rows.values(), values, strict=True):
-        row.append(value)
       with self.times.stage("env"):
         timestep = self._environment.step(action)
+      values = {
+        "image": flat.image,
+        "state": flat.state,
+        "label": label.action,
+        "command": label.command,
+        "pose": np.array(truth),
+        "goal_distance": float(np.linalg.norm(goal - truth.xy)),
+        "driver": segment.driver,
+        "ball": relative_ball(observation, truth, ball),
+        "action": action,
+        "reward": float(timestep.reward or 0.0),
+        "discount": 1.0 if timestep.discount is None else float(timestep.discount),
+        "privileged": flat.privileged,
+      }
+      for name, row in rows.items():
+        row.append(values[name])
       flat = self._layout.flatten(timestep.observation)
       since_success += bool(episode_success(self._environment))
     arrays: dict[str, np.ndarray] = {
-      name: np.asarray(rows[name], dtype) for name, (_, dtype) in fields(self._layout).items()
+      name: np.asarray(rows[name], dtype) for name, (_, dtype) in kept.items()
     }
     ending = getattr(task_of(self._environment), "ending", None)
     figures = {

@@ -10,17 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.distill.collecting import student_policy, wait_for_description
+from nerf2real.agents.distill.collecting import student_policy
 from nerf2real.agents.distill.settings import DistillSettings
-from nerf2real.agents.dmpo.acting import Agent, run_episode, task_of
+from nerf2real.agents.dmpo.policy.acting import Agent, run_episode, task_of
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.processes.environments import (
+from nerf2real.agents.environments.loading import (
   evaluation_name,
   make_environment,
   trials_of,
 )
-from nerf2real.agents.processes.trials import clopper_pearson
+from nerf2real.agents.environments.trials import clopper_pearson
+from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.processes.joining import wait_for
 from nerf2real.core.serialization import from_plain
 
 _POLL = 1.0  # s
@@ -49,7 +50,7 @@ class Evaluator:
     """
     self._link, self._seed = link, seed
     self._stop = threading.Event()
-    description = wait_for_description(link, self._stop)["description"]
+    description = wait_for(link.status, self._stop)["description"]
     self._settings = from_plain(description["settings"], DistillSettings)
     self._layout = from_plain(description["layout"], Layout)
     self._environment = make_environment(evaluation_name(self._settings.environment), seed=seed)
@@ -70,8 +71,10 @@ class Evaluator:
       grant = self._link.request(0)
       if grant is not None and grant["stop"]:
         return
-      if grant is not None and grant["version"] > 0 and time.monotonic() >= due:
-        # Without a first student the period does not begin.
+      # Version 0: no student yet; that of the last evaluation: none since, as while the encoder
+      # learns again.
+      fresh = grant is not None and grant["version"] not in (0, self._link.version)
+      if fresh and time.monotonic() >= due:
         due = time.monotonic() + self._settings.evaluation_period
         answer = self._link.parameters()
         if answer is not None:

@@ -1,4 +1,4 @@
-"""The learner of a distillation: takes labelled episodes in, trains the student stage by stage.
+"""The learner of a distillation: takes labelled episodes in, trains and serves the student.
 
 What a run leaves in its folder: `data/` (episodes), `checkpoints/` (the learner's state),
 `settings.json`, `policy/newest` (the exported student) and `metrics.jsonl`. Files are written
@@ -17,22 +17,19 @@ import jax
 import numpy as np
 
 from nerf2real.agents.distill import settings as stages
-from nerf2real.agents.distill import student
 from nerf2real.agents.distill.checkpoint import STATE, Counters, load_state, save_state
-from nerf2real.agents.distill.dataset import UNROLL_FIELDS, Dataset, Streams, Unroll
-from nerf2real.agents.distill.features import FeatureCache
-from nerf2real.agents.distill.learning import make_updates, standardised
-from nerf2real.agents.distill.schedule import cosine, stage_at
+from nerf2real.agents.distill.dataset import Dataset
+from nerf2real.agents.distill.schedule import stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
-from nerf2real.agents.distill.validation import validate
-from nerf2real.agents.dmpo.export import export_policy, load_arrays
+from nerf2real.agents.distill.training import Trainer
+from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink
-from nerf2real.agents.processes.environments import make_environment
 from nerf2real.agents.processes.logs import MetricsLog
-from nerf2real.agents.processes.timings import StageTimes
+from nerf2real.agents.processes.timings import Periods, Rates, StageTimes
 from nerf2real.core.serialization import to_plain, write_json
 
 _log = logging.getLogger(__name__)
@@ -87,17 +84,13 @@ class Learner:
       capacity=settings.max_frames + _SLACK,
       holdout=settings.holdout,
     )
-    self._updates = make_updates(settings, self._layout)
-    self._state = self._updates.init(jax.random.PRNGKey(seed))
+    self._times = StageTimes()
+    self._trainer = Trainer(settings, self._layout, self._data, seed=seed, times=self._times)
     self._counters = Counters()
     if resume:
-      self._state, self._counters = load_state(run / STATE, like=self._state)
+      self._trainer.state, self._counters = load_state(run / STATE, like=self._trainer.state)
     write_json(run / SETTINGS, settings)
-    save_state(run / STATE, self._state, self._counters)
-    self._rng = np.random.default_rng((seed, self._data.frames))
-    self._cache = FeatureCache(
-      self._updates.features, self._data, copies=settings.copies, width=self._width, seed=seed
-    )
+    save_state(run / STATE, self._trainer.state, self._counters)
     limiter = RateLimiter(
       LimiterSettings(
         steps_per_update=1.0,
@@ -108,14 +101,13 @@ class Learner:
       steps=self._data.frames,
     )
     self._log = MetricsLog(run, tensorboard=False)
-    self._times = StageTimes()
     self._stop = threading.Event()
-    self._last: dict[str, float] = {}  # times of the last periodical work
+    self._periods = Periods()
     self._evaluation: dict[str, Any] = {}  # the last one
     self._is_fit = False  # whether encoder and policy belong together now
     self._compiled: set[str] = set()  # kinds of stages whose update was called
     self._recent: list[dict[str, jax.Array]] = []
-    self._last_figures = (time.monotonic(), self._data.frames, self._counters.updates)
+    self._rates = Rates(self._data.frames, self._counters.updates)
     self._session = sessions.listen(endpoint, link)
     self._link = LearnerLink(
       self._session,
@@ -135,10 +127,6 @@ class Learner:
       self._link.publish_parameters(
         load_arrays(run / POLICY), version=max(1, self._counters.updates)
       )
-
-  @property
-  def _width(self) -> int:
-    return self._settings.agent.network.image_features
 
   @property
   def _progress(self) -> float:
@@ -178,14 +166,7 @@ class Learner:
       self._stop.wait(_WAIT)
     if self._counters.updates or self._stop.is_set():
       return
-    frames = self._training_frames()
-    self._state = standardised(
-      self._state,
-      state_rows=self._data.arrays["state"][frames],
-      labels=self._data.arrays["label"][frames],
-      layout=self._layout,
-      min_spread=self._settings.min_action_spread,
-    )
+    self._trainer.standardise()
     _log.info("Training begins with %d frames.", self._data.frames)
 
   # ---- stages ----
@@ -196,21 +177,12 @@ class Learner:
     begin = time.monotonic()
     self._recent.clear()
     done = 0
-    if kind == stages.POLICY:
-      self._cache.clear()
-    count = (
-      self._settings.end_to_end_streams if kind == stages.END_TO_END else self._settings.streams
-    )
-    streams = Streams(count, self._settings.unroll, rng=self._rng)
-    carried = student.initial_state(count, self._settings.agent.network)
+    self._trainer.begin_stage(kind)
     while not self._stop.is_set() and self._progress < 1.0:
       current, within = stage_at(self._settings, self._progress)
       if current != index:
         break
-      if kind == stages.ENCODER:
-        metrics = self._update_encoder(within)
-      else:
-        carried, metrics = self._update_unrolls(kind, streams, carried, within)
+      metrics = self._trainer.update(within)
       now = time.monotonic()
       # An update that was compiled for minutes is no minute of training.
       counted = now - begin if kind in self._compiled else 0.0
@@ -222,7 +194,7 @@ class Learner:
       )
       self._recent.append(metrics)
       done += 1
-      # While the encoder learns, and until the policy knows its new features, the two do not fit.
+      # They do not fit while the encoder learns, nor until the policy has learned its features.
       self._is_fit = kind == stages.END_TO_END or (
         kind == stages.POLICY and done >= self._settings.settling
       )
@@ -232,67 +204,16 @@ class Learner:
       self._housekeeping(kind)
     self._save()
 
-  def _update_encoder(self, within: float) -> dict[str, jax.Array]:
-    with self._times.stage("sampling"):
-      frames = self._training_frames()
-      chosen = self._rng.choice(frames, self._settings.encoder_batch)
-      image, pose = (self._data.arrays[name][chosen] for name in ("image", "pose"))
-    with self._times.stage("update"):
-      rate = self._settings.learning_rate * cosine(within)
-      self._state, metrics = self._updates.encoder(self._state, image, pose, rate)
-      jax.block_until_ready(metrics)
-    return metrics
-
-  def _update_unrolls(
-    self, kind: str, streams: Streams, carried: Any, within: float
-  ) -> tuple[Any, dict[str, jax.Array]]:
-    cached = kind == stages.POLICY
-    if cached:
-      with self._times.stage("features"):
-        self._cache.extend(self._state.student["encoder"])
-    with self._times.stage("sampling"):
-      limit = self._cache.frames if cached else self._data.frames
-      spans = [s for s in self._data.spans(held_out=False) if s.end <= limit]
-      unroll = streams.next(spans)
-      batch = self._batch(unroll)
-      if cached:
-        batch["features"] = self._cache.take(unroll.frames, self._rng)
-      else:
-        batch["image"] = self._data.arrays["image"][unroll.frames]
-    with self._times.stage("update"):
-      update = self._updates.policy if cached else self._updates.end_to_end
-      settings = self._settings
-      rate = settings.learning_rate if cached else settings.end_to_end_learning_rate
-      self._state, carried, metrics = update(self._state, batch, carried, rate * cosine(within))
-      jax.block_until_ready(metrics)
-    return carried, metrics
-
-  def _batch(self, unroll: Unroll) -> dict[str, np.ndarray]:
-    batch = {name: self._data.arrays[name][unroll.frames] for name in UNROLL_FIELDS}
-    return batch | {"begins": unroll.begins}
-
-  def _training_frames(self) -> np.ndarray:
-    """Indices of the frames that are not held out."""
-    spans = self._data.spans(held_out=False)
-    return np.concatenate([np.arange(span.begin, span.end) for span in spans])
-
   # ---- periodical work ----
-
-  def _due(self, name: str, period: float) -> bool:
-    now = time.monotonic()
-    if now - self._last.setdefault(name, now) < period:
-      return False
-    self._last[name] = now
-    return True
 
   def _housekeeping(self, kind: str) -> None:
     settings = self._settings
-    if self._is_fit and self._due("publish", settings.publish_period):
+    if self._is_fit and self._periods.due("publish", settings.publish_period):
       self._publish()
-    if self._due("save", settings.save_period):
+    if self._periods.due("save", settings.save_period):
       with self._times.stage("saving"):
         self._save()
-    if self._due("log", settings.log_period):
+    if self._periods.due("log", settings.log_period):
       self._check_link()
       self._drain_metrics()
       values = {name: float(np.mean([m[name] for m in self._recent])) for name in self._recent[0]}
@@ -300,9 +221,9 @@ class Learner:
       self._write("learner", values | figures | self._times.take(len(self._recent)))
       self._set_status()
       self._recent.clear()
-    if self._due("validate", _VALIDATION_PERIOD):
+    if self._periods.due("validate", _VALIDATION_PERIOD):
       with self._times.stage("validation"):
-        found = validate(self._state, self._updates, data=self._data, cache=self._cache)
+        found = self._trainer.validate()
       self._write("validation", found)
 
   def _check_link(self) -> None:
@@ -316,46 +237,37 @@ class Learner:
       _log.info("%d frames, %s: %s", self._data.frames, source, shown)
 
   def _drain_metrics(self) -> None:
-    while not self._link.metrics.empty():
-      who, values = self._link.metrics.get()
+    for who, values in self._link.take_metrics():
       if who.startswith("evaluator"):
         self._evaluation = values
       self._write(who.partition("-")[0], values)
 
   def _set_status(self) -> None:
     """Offers the figures that `agents.processes.status_view` shows."""
-    now, frames, updates = time.monotonic(), self._data.frames, self._counters.updates
-    then, frames_then, updates_then = self._last_figures
-    self._last_figures = (now, frames, updates)
-    period = max(now - then, 1e-3)
+    frames, updates = self._data.frames, self._counters.updates
     status = {
       "steps": frames,
-      "steps_per_second": (frames - frames_then) / period,
       "updates": updates,
-      "updates_per_second": (updates - updates_then) / period,
       "filled": frames >= self._settings.first_frames,
-      "return": None,
-      "evaluation": None,
-      "best": None,
       "success": self._evaluation.get("success"),
       "localisation_error": self._evaluation.get("localisation_error"),
       "replay_steps": frames,
     }
-    self._link.set_status(status)
+    self._link.set_status(status | self._rates.measure(frames, updates))
 
   def _publish(self) -> None:
-    arrays = student.served_parameters(self._state.student, self._state.scales)
     # Version 0 stands for no student in the link.
+    arrays = self._trainer.served_parameters()
     self._link.publish_parameters(arrays, version=max(1, self._counters.updates))
 
   def _save(self) -> None:
-    save_state(self._run / STATE, self._state, self._counters)
+    save_state(self._run / STATE, self._trainer.state, self._counters)
     if not self._is_fit:
       return
     self._publish()
     export_policy(
       self._run / POLICY,
-      student.served_parameters(self._state.student, self._state.scales),
+      self._trainer.served_parameters(),
       layout=self._layout,
       environment=self._settings.environment,
       settings=to_plain(self._settings.agent),

@@ -54,7 +54,8 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
     settings: of the distillation.
     layout: the environment's layout.
 
-  `encoder(state, image, pose, rate)` takes single frames; `policy(state, batch, carried, rate)` and
+  `encoder(state, batch, rate)` takes single frames of `image`, `pose` and, where there is a ball,
+  `ball`; `policy(state, batch, carried, rate)` and
   `end_to_end(...)` take unrolls of `state`, `label`, `command`, `pose`, `goal_distance`, `begins`
   and of `features` or `image`, and the LSTM's state before them. Training states are donated.
   """
@@ -82,21 +83,31 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
     return optax.apply_updates(params, changes), optimiser_state
 
   def encoder(
-    state: TrainingState, image: jax.Array, pose: jax.Array, rate: jax.Array
+    state: TrainingState, batch: Mapping[str, jax.Array], rate: jax.Array
   ) -> tuple[TrainingState, Metrics]:
     key, augment_key = jax.random.split(state.key)
 
-    def loss(params: Params) -> jax.Array:
-      images = augmentation.augment(augment_key, _scaled(image)[:, None], config.augmentation)
+    def loss(params: Params) -> tuple[jax.Array, Metrics]:
+      images = augmentation.augment(
+        augment_key, _scaled(batch["image"])[:, None], config.augmentation
+      )
       features = student.encode(params, images[:, 0], config.network)
-      return losses.pose_loss(student.predict_pose(params, features), pose)
+      value = losses.pose_loss(student.predict_pose(params, features), batch["pose"])
+      metrics = {"loss_encoder": value}
+      if "ball" in batch:
+        target, seen = losses.ball_target_of_picture(batch["ball"])
+        metrics["loss_ball"] = losses.ball_loss(
+          student.predict_ball(params, features), target, seen
+        )
+        value = value + metrics["loss_ball"]
+      return value, metrics
 
     params = state.student["encoder"]
-    value, gradients = jax.value_and_grad(loss)(params)
+    gradients, metrics = jax.grad(loss, has_aux=True)(params)
     params, optimiser_state = step(params, gradients, state.encoder_optimiser, rate)
     return state._replace(
       student=state.student | {"encoder": params}, encoder_optimiser=optimiser_state, key=key
-    ), {"loss_encoder": value}
+    ), metrics
 
   def policy(
     state: TrainingState, batch: Mapping[str, jax.Array], carried: LstmState, rate: jax.Array
@@ -244,6 +255,11 @@ def unroll_loss(
     + settings.command_weight * metrics["loss_command"]
     + settings.belief_weight * metrics["loss_belief"]
   )
+  if found.ball is not None:
+    metrics["loss_ball"] = losses.ball_loss(
+      found.ball, losses.ball_target(batch["ball"]), jnp.ones_like(batch["goal_distance"])
+    )
+    loss = loss + settings.ball_weight * metrics["loss_ball"]
   return loss, (found.state, metrics)
 
 

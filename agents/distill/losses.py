@@ -6,6 +6,9 @@ Shape letters: A action; leading axes are any.
 import jax
 import jax.numpy as jnp
 
+# Half the picture's width over its distance: 4/3 of the tangent of half of the suite's camera's
+# 43.3 degrees.
+VIEW_SLOPE = 0.53
 POSITION = 2.0  # m that a unit of the pose target stands for: rooms of some metres
 
 
@@ -31,8 +34,28 @@ def pose_errors(predicted: jax.Array, pose: jax.Array) -> tuple[jax.Array, jax.A
 
 def pose_loss(predicted: jax.Array, pose: jax.Array) -> jax.Array:
   """Mean absolute error of predicted pose targets [..., 4] at poses [..., 3]: robust to the few
-  pictures that show nothing to tell the place from."""
+  pictures that do not determine the place."""
   return jnp.mean(jnp.abs(predicted - pose_target(pose)))
+
+
+def ball_target(ball: jax.Array) -> jax.Array:
+  """Maps balls [..., 3] (`dataset.BALL_SIZE`) to targets ahead / 2 m, left / 2 m [..., 2]."""
+  return ball[..., :2] / POSITION
+
+
+def ball_target_of_picture(ball: jax.Array) -> tuple[jax.Array, jax.Array]:
+  """Maps balls [..., 3] to what a picture shows: targets [..., 2] seen from the head's pan, and
+  weights [...]: 1 where the ball is in view."""
+  cosine, sine = jnp.cos(ball[..., 2]), jnp.sin(ball[..., 2])
+  ahead = cosine * ball[..., 0] + sine * ball[..., 1]
+  left = cosine * ball[..., 1] - sine * ball[..., 0]
+  seen = (ahead > 0) & (jnp.abs(left) < VIEW_SLOPE * ahead)
+  return jnp.stack([ahead, left], axis=-1) / POSITION, seen.astype(jnp.float32)
+
+
+def ball_loss(predicted: jax.Array, target: jax.Array, weights: jax.Array) -> jax.Array:
+  """Mean absolute error of predicted ball targets [..., 2] with weights [...]."""
+  return weighted_mean(jnp.mean(jnp.abs(predicted - target), axis=-1), weights)
 
 
 def action_loss(

@@ -48,6 +48,18 @@ def mixture_at(settings: MixtureSettings, frames: int, *, begun: int | None) -> 
   return Mixture(teacher, progress * settings.belief_share)
 
 
+def may_collect(settings: DistillSettings, frames: int, *, begun: int | None) -> bool:
+  """Whether a further episode is wanted: the data set has room, and room is left for the students.
+
+  Args:
+    settings: of the distillation.
+    frames: of the run so far.
+    begun: frames at which the first student was there; None before it.
+  """
+  limit = settings.max_frames
+  return frames < (min(limit, settings.teacher_frames) if begun is None else limit)
+
+
 def push_level(settings: DistillSettings, frames: int) -> tuple[float, float]:
   """Returns the range of pushes' forces [N] after a number of frames."""
   return [(low, high) for first, low, high in settings.push_forces if frames >= first][-1]

@@ -2,7 +2,8 @@
 
 Data flow: pictures -> ResNet -> LSTM -> embedding; embedding and proprioception -> MLP -> action.
 On the way three heads are supervised: the pose from one picture's features (encoder stage), the
-pose from the embedding, and the teacher's command from the MLP's last layer. The belief is the
+pose from the embedding, and the teacher's command from the MLP's last layer; where there is a ball,
+two more: its place from one picture, and from the MLP's last layer. The belief is the
 agent's own and is exported.
 
 Shape letters: B streams, T steps, N pictures, F features, U embedding, S proprioception.
@@ -15,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
-from nerf2real.agents.dmpo import belief, learning, networks, scaling
+from nerf2real.agents.dmpo import belief, networks, scaling, training_state
 from nerf2real.agents.dmpo.config import NetworkConfig
 from nerf2real.agents.dmpo.networks import LstmState, Params
-from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.specs import BALL, Layout
 
 _POSE_TARGETS = 4  # see losses.pose_target
+_BALL_TARGETS = 2  # see losses.ball_target
 _HEAD_SCALE = 0.1  # variance scale of the first weights; chosen
 
 
@@ -30,6 +32,7 @@ class StudentOutput(NamedTuple):
   action: jax.Array  # mean [B, T, A]
   pose: jax.Array  # target of the pose [B, T, 4]
   command: jax.Array  # [B, T, 2]
+  ball: jax.Array | None  # target of the ball [B, T, 2], where there is one
   embedding: jax.Array  # [B, T, U]
   state: LstmState  # after the last step [B, U]
 
@@ -37,12 +40,13 @@ class StudentOutput(NamedTuple):
 def init_student(key: jax.Array, config: NetworkConfig, layout: Layout) -> dict[str, Params]:
   """Returns {"encoder", "policy", "belief"}: "encoder" is the ResNet with its pose head."""
   keys = jax.random.split(key, 5)
+  has_ball = layout.privileged_column(BALL) is not None
   policy = networks.init_policy(keys[0], config, layout)
   if "lstm" not in policy:
     raise ValueError("A student needs pictures and an LSTM: network.recurrent must be true.")
 
   def head(key: jax.Array, inputs: int, outputs: int) -> Params:
-    return networks._init_linear(key, inputs, outputs, _HEAD_SCALE)
+    return networks.init_linear(key, inputs, outputs, _HEAD_SCALE)
 
   encoder = {
     "resnet": policy.pop("resnet"),
@@ -53,6 +57,9 @@ def init_student(key: jax.Array, config: NetworkConfig, layout: Layout) -> dict[
     "pose": head(keys[3], config.lstm_size, _POSE_TARGETS),
     "command": head(keys[4], config.policy_layers[-1], COMMAND_SIZE),
   }
+  if has_ball:
+    encoder["ball"] = head(jax.random.fold_in(key, 1), config.image_features, _BALL_TARGETS)
+    heads["ball"] = head(jax.random.fold_in(key, 2), config.policy_layers[-1], _BALL_TARGETS)
   beliefs = belief.init_belief(keys[3], config, config.lstm_size)
   return {"encoder": encoder, "policy": policy | {"heads": heads}, "belief": beliefs}
 
@@ -64,7 +71,12 @@ def encode(encoder: Params, images: jax.Array, config: NetworkConfig) -> jax.Arr
 
 def predict_pose(encoder: Params, features: jax.Array) -> jax.Array:
   """Maps features [..., F] to pose targets [..., 4]."""
-  return networks._linear(encoder["pose"], features)
+  return networks.linear(encoder["pose"], features)
+
+
+def predict_ball(encoder: Params, features: jax.Array) -> jax.Array:
+  """Maps features [..., F] to the ball's targets as seen from the head [..., 2]."""
+  return networks.linear(encoder["ball"], features)
 
 
 def unroll(
@@ -96,9 +108,10 @@ def unroll(
   embedding = outputs.swapaxes(0, 1)
   hidden = networks.mlp(policy["mlp"], jnp.concatenate([embedding, state], axis=-1))
   return StudentOutput(
-    action=networks._linear(policy["mean"], hidden),
-    pose=networks._linear(policy["heads"]["pose"], embedding),
-    command=networks._linear(policy["heads"]["command"], hidden),
+    action=networks.linear(policy["mean"], hidden),
+    pose=networks.linear(policy["heads"]["pose"], embedding),
+    command=networks.linear(policy["heads"]["command"], hidden),
+    ball=networks.linear(policy["heads"]["ball"], hidden) if "ball" in policy["heads"] else None,
     embedding=embedding,
     state=last,
   )
@@ -122,5 +135,5 @@ def served_parameters(student: dict[str, Params], scales: Params) -> dict[str, n
   policy["resnet"] = student["encoder"]["resnet"]
   policy["stddev"] = jax.tree.map(np.zeros_like, jax.device_get(policy["stddev"]))
   policy = scaling.fold(jax.device_get(policy), scales)
-  flat = learning.flatten_params({"policy": policy, "belief": student["belief"]})
+  flat = training_state.flatten_params({"policy": policy, "belief": student["belief"]})
   return {name: np.asarray(array, np.float32) for name, array in flat.items()}

@@ -1,6 +1,6 @@
 """Teachers: policies that may read privileged state and label every state that is visited.
 
-DAgger (Ross, Gordon and Bagnell 2011, https://arxiv.org/abs/1011.0686) wants the expert's action at
+DAgger (Ross, Gordon and Bagnell 2011, https://arxiv.org/abs/1011.0686) needs the expert's action at
 the states that the student reaches. A teacher with a hidden state, such as a gait's phase, must
 therefore follow what the robot really did, or its labels contradict what the student sees.
 """
@@ -12,9 +12,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from nerf2real.agents.dmpo.export import ExportedPolicy, load_policy
+from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import Pose, SteeringSettings, Walker
+from nerf2real.suite.op3 import constants
 
 COMMAND_SIZE = 2  # forward, turn
 # rad, the upper end of the paper's range: at the reference -0.47 the camera sees little but floor.
@@ -34,13 +35,21 @@ class Teacher(Protocol):
   def reset(self, pose: Pose) -> None:
     """Begins an episode at a pose."""
 
-  def label(self, observation: Mapping[str, Any], *, goal: np.ndarray, pose: Pose) -> Label:
+  def label(
+    self,
+    observation: Mapping[str, Any],
+    *,
+    goal: np.ndarray,
+    pose: Pose,
+    ball: np.ndarray | None = None,
+  ) -> Label:
     """Returns what the teacher would do.
 
     Args:
-      observation: the environment's; `previous_control` says what was applied before.
-      goal: where to go [2] [m].
+      observation: the environment's; `previous_control` is what was applied before.
+      goal: where to go, or where to push the ball [2] [m].
       pose: where the robot is, the truth or a student's belief.
+      ball: where the ball is [2] [m]; None: there is none, or it does not matter.
     """
 
 
@@ -52,6 +61,8 @@ class WalkerSettings:
   """Parameters of the gait."""
   steering: SteeringSettings
   """And of its steering."""
+  head_pan_limit: float | None = None
+  """As the task's robot has it [rad]; None: the paper's table."""
 
 
 def _steady() -> WalkerSettings:
@@ -86,7 +97,15 @@ def _quick() -> WalkerSettings:
   return WalkerSettings(gait=gait, steering=steering)
 
 
-TEACHERS = {"steady": _steady, "quick": _quick}
+def _ball() -> WalkerSettings:
+  """The steady walker, pushing the ball; its head looks for the ball and follows it."""
+  steering = SteeringSettings(head_tilt=_HEAD_TILT, watches_ball=True)
+  return WalkerSettings(
+    gait=GaitSettings(), steering=steering, head_pan_limit=constants.BALL_PUSHING_HEAD_PAN
+  )
+
+
+TEACHERS = {"steady": _steady, "quick": _quick, "ball": _ball}
 
 
 class WalkerTeacher:
@@ -99,18 +118,30 @@ class WalkerTeacher:
       scene: the bundle, for its free space.
       settings: of gait and steering.
     """
-    self._walker = Walker(scene, gait=settings.gait, steering=settings.steering)
+    self._walker = Walker(
+      scene,
+      gait=settings.gait,
+      steering=settings.steering,
+      head_pan_limit=settings.head_pan_limit,
+    )
     self._begun = False
 
   def reset(self, pose: Pose) -> None:
     self._walker.reset(pose)
     self._begun = False
 
-  def label(self, observation: Mapping[str, Any], *, goal: np.ndarray, pose: Pose) -> Label:
+  def label(
+    self,
+    observation: Mapping[str, Any],
+    *,
+    goal: np.ndarray,
+    pose: Pose,
+    ball: np.ndarray | None = None,
+  ) -> Label:
     if self._begun:
       self._walker.follow(observation["previous_control"][-1])
     self._begun = True
-    action = self._walker.act(observation, goal=goal, pose=pose)
+    action = self._walker.act(observation, goal=goal, pose=pose, ball=ball)
     command = self._walker.command
     return Label(action, np.array([command.forward, command.turn], np.float32))
 
@@ -125,7 +156,14 @@ class PolicyTeacher:
   def reset(self, pose: Pose) -> None:
     self._state = self._policy.initial_state()
 
-  def label(self, observation: Mapping[str, Any], *, goal: np.ndarray, pose: Pose) -> Label:
+  def label(
+    self,
+    observation: Mapping[str, Any],
+    *,
+    goal: np.ndarray,
+    pose: Pose,
+    ball: np.ndarray | None = None,
+  ) -> Label:
     flat = self._layout.flatten(observation)
     step = self._policy.step(flat.image, flat.state, self._state)
     self._state = step.state

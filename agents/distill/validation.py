@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from nerf2real.agents.distill.dataset import UNROLL_FIELDS, Dataset, Span
+from nerf2real.agents.distill.dataset import Dataset, Span
 from nerf2real.agents.distill.features import FeatureCache
 from nerf2real.agents.distill.learning import TrainingState, Updates
 
@@ -28,7 +28,7 @@ def validate(
   lengths = np.array([span.end - span.begin for span in spans])
   padded = -(-int(lengths.max()) // _ROUND) * _ROUND
   frames = np.stack([_padded(span, padded) for span in spans])
-  batch: dict[str, Any] = {name: data.arrays[name][frames] for name in UNROLL_FIELDS}
+  batch: dict[str, Any] = data.take(frames)
   batch["begins"] = np.zeros(frames.shape, np.float32)
   batch["begins"][:, 0] = 1.0
   features = cache.clean(state.student["encoder"], frames.ravel())

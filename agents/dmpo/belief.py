@@ -1,10 +1,11 @@
-"""Where the policy believes the robot is: a mixture of Gaussians over x, y and yaw.
+"""The belief head: localisation as a mixture of Gaussians over x, y and yaw.
 
 An MLP on the policy's recurrent image embedding, for analysis only: no gradient reaches the policy.
 Source: Byravan et al. 2022 (NeRF2Real), "Navigation and obstacle avoidance results" (a mixture of
 five Gaussians; the localisation error is the distance between its mean and the true position) and
-the figure "Localization performance of the agent". Components are diagonal, and yaw differences are
-wrapped to (-pi, pi]; both ours, the paper does not say.
+the figure "Localization performance of the agent". Where the paper is silent: components are
+diagonal (chosen: the fewest outputs that still hold several places), and yaw differences are
+wrapped to (-pi, pi], so that two headings are never further apart than half a turn.
 
 Shape letters: B states, U embedding, M components.
 """
@@ -19,7 +20,9 @@ from nerf2real.agents.dmpo.config import NetworkConfig
 from nerf2real.agents.dmpo.shapes import check_shapes
 
 POSE_SIZE = 3  # x [m], y [m], yaw [rad]
-_MIN_STDDEV = 0.01  # m and rad: keeps a component from collapsing onto one state; ours
+_MIN_STDDEV = (
+  0.01  # m and rad: chosen: far below the error, so that no component collapses onto a state
+)
 
 
 class Belief(NamedTuple):
@@ -35,8 +38,8 @@ def init_belief(key: jax.Array, config: NetworkConfig, embedding_size: int) -> n
   body, head = jax.random.split(key)
   outputs = config.belief_components * (1 + 2 * POSE_SIZE)
   return {
-    "mlp": networks._init_mlp(body, embedding_size, config.belief_layers),
-    "head": networks._init_linear(head, config.belief_layers[-1], outputs, 1.0),
+    "mlp": networks.init_mlp(body, embedding_size, config.belief_layers),
+    "head": networks.init_linear(head, config.belief_layers[-1], outputs, 1.0),
   }
 
 
@@ -44,7 +47,7 @@ def predict(params: networks.Params, embedding: jax.Array) -> Belief:
   """Maps embeddings [B, U] to beliefs; no gradient flows into the embedding."""
   check_shapes(embedding=(embedding, 2))
   hidden = networks.mlp(params["mlp"], jax.lax.stop_gradient(embedding))
-  raw = networks._linear(params["head"], hidden).reshape(embedding.shape[0], -1, 1 + 2 * POSE_SIZE)
+  raw = networks.linear(params["head"], hidden).reshape(embedding.shape[0], -1, 1 + 2 * POSE_SIZE)
   means, spread = raw[..., 1 : 1 + POSE_SIZE], raw[..., 1 + POSE_SIZE :]
   return Belief(raw[..., 0], means, jax.nn.softplus(spread) + _MIN_STDDEV)
 

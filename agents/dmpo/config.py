@@ -134,6 +134,27 @@ class DmpoConfig:
   first_action: str = ZERO
   """What the policy's mean is about at the start: "zero", the middle of the actions' range, or
   "standing", the task's `standing_action`. Source: reference (zero)."""
+  critic_warmup: int = 0
+  """Updates at the start in which the critic alone learns; no environment steps pay for them
+  [updates]. Source: chosen; the paper starts from scratch."""
+  burn_in: int = 12
+  """Steps of a trajectory of prior data that only unroll the LSTM, whose state there is unknown
+  [steps]. Source: chosen, 8 to 16; R2D2 (Kapturowski et al. 2019) takes 20 and 40 of 80."""
+  student_kl: float = 0.0
+  """Weight of KL(policy || policy that the run began with), summed over action dimensions. Source:
+  Haarnoja et al. 2023 and Tirumala et al. 2024 regularise to teachers so; the size is chosen."""
+  student_kl_updates: int = 0
+  """Updates after the critic's warm-up over which that weight falls to 0 along a line; 0: it does
+  not [updates]."""
+  student_kl_returns: tuple[float, float] | None = None
+  """Mean returns of acting episodes between which the weight falls to 0; None: returns do not
+  matter [reward]."""
+  frozen_encoder: bool = False
+  """Whether the image encoder stays what the run began with: the replay then holds its features in
+  place of pictures."""
+  feature_copies: int = 2
+  """Features of a frozen encoder for each picture: of the picture as it is, and of augmented ones.
+  Source: chosen."""
   history: int = 1
   """Observations stacked by the agent [steps]. The suite's arrive with the paper's 5."""
 
@@ -152,6 +173,9 @@ class DmpoConfig:
       raise ValueError(
         f"vmin must lie below vmax, found {self.network.vmin} and {self.network.vmax}."
       )
+    returns = self.student_kl_returns
+    if returns is not None and not returns[0] < returns[1]:
+      raise ValueError(f"student_kl_returns must rise, found {returns}.")
     if self.replay_steps < self.min_replay_steps:
       raise ValueError(
         f"replay_steps ({self.replay_steps}) must hold min_replay_steps ({self.min_replay_steps})."
@@ -172,9 +196,9 @@ def state() -> DmpoConfig:
   - 32 trajectories of 9 observations instead of 16 of 17: less alike transitions in a batch.
   - Networks half as wide: 2.4 times the updates a second, no worse.
   - Values in [-100, 100]: such rewards sum to 100 at most with a discount of 0.99, and a symmetric
-    support makes the first critic say 0. One that began at 50 took 10,000 steps to forget it.
+    support makes the first critic's value 0. One that began at 50 took 10,000 steps to unlearn it.
   - A hundred times the bound on the out-of-bounds objective: with the paper's, the mean drifts
-    beyond 2, where every sample is clipped alike and the critic can no longer tell them apart.
+    beyond 2, where every sample is clipped alike and the critic no longer separates them.
   - First temperatures and multipliers near 1: from 10, the first 1,000 updates weigh all samples
     alike.
   - Learning rates of 1e-3: all else equal, 3e-4 reached 252 at 30,000 steps, 1e-3 498 at 15,000.
@@ -245,6 +269,11 @@ def op3_small() -> DmpoConfig:
     joints' positions 4 %.
   - Multipliers, temperatures, the penalty's bound and the range of values as in `state`.
   - Networks and batches of about a tenth of the paper's time.
+  - The critic learns alone first. The E-step weighs the samples with a KL of `epsilon` whatever
+    makes their values differ, so that noise of 0.1 under a critic that does not know actions yet is
+    a random walk of a policy that stood (on `dm_control:cartpole:balance` returns fell). A critic's
+    values reach n_step * updates / target_critic_period steps ahead: after 1,000 updates, with
+    copies every 50, the 100 steps that a discount of 0.99 looks ahead.
   """
   return DmpoConfig(
     network=NetworkConfig(
@@ -269,8 +298,40 @@ def op3_small() -> DmpoConfig:
     batch_size=16,
     min_replay_steps=5_000,
     replay_steps=200_000,
+    target_critic_period=50,
     scale_observations=True,
     first_action=STANDING,
+    critic_warmup=1_000,
+  )
+
+
+def nerf_nav_finetune() -> DmpoConfig:
+  """Settings for `suite:nerf_nav` from a student of `launch/distill.py` (--init-from).
+
+  - Networks of the student; its noise begins at 0.1, which leaves a walking robot on its feet, and
+    may shrink as in `op3_small`.
+  - The critic, which begins at random, learns alone first: a policy that follows it is undone.
+  - The policy is drawn to the student while that is still of use.
+  - The encoder is frozen: an update without convolutions takes a tenth of the time.
+  - Rates of the paper for the policy; multipliers, temperatures and the penalty's bound as in
+    `op3_small`, batches of a third of the paper's frames.
+  """
+  return DmpoConfig(
+    network=NetworkConfig(critic_layers=(256, 256, 256), init_stddev=0.1),
+    critic_learning_rate=3e-4,
+    epsilon_stddev=1e-5,
+    epsilon_action_penalty=0.1,
+    init_log_temperature=0.0,
+    init_log_alpha_stddev=10.0,
+    trajectory_length=32,
+    batch_size=16,
+    min_replay_steps=5_000,
+    replay_steps=200_000,
+    scale_observations=True,
+    critic_warmup=5_000,
+    student_kl=0.1,
+    student_kl_updates=30_000,
+    frozen_encoder=True,
   )
 
 
@@ -279,6 +340,7 @@ PRESETS: Mapping[str, Callable[[], DmpoConfig]] = {
   "state": state,
   "vision_small": vision_small,
   "op3_small": op3_small,
+  "nerf_nav_finetune": nerf_nav_finetune,
 }
 
 

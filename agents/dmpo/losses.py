@@ -5,7 +5,7 @@ Regularized Policy Iteration" (https://arxiv.org/abs/1812.02256); Abdolmaleki et
 Distributional View on Multi-Objective Policy Optimization" (the action penalty); Hoffman et al.
 2020, "Acme" (the reference implementation).
 
-Shape letters: N sampled actions, B states, D action dimensions. Weights [B] say how much a state
+Shape letters: N sampled actions, B states, D action dimensions. Weights [B] are how much a state
 counts: 1, or 0 for padding.
 """
 

@@ -45,8 +45,12 @@ def _variance_scaled(key: jax.Array, shape: tuple[int, ...], scale: float, fan: 
   return jax.random.uniform(key, shape, jnp.float32, -limit, limit)
 
 
-def _init_linear(key: jax.Array, inputs: int, outputs: int, scale: float | None = None) -> Params:
-  """Reference: uniform with variance 1/3 of 1/outputs; heads scale * 1/inputs."""
+def init_linear(key: jax.Array, inputs: int, outputs: int, scale: float | None = None) -> Params:
+  """Returns a linear layer's parameters.
+
+  Weights are uniform with variance 1/3 of 1/outputs, a head's (`scale`) with scale * 1/inputs.
+  Source: the reference implementation.
+  """
   fan, scale = (outputs, 1.0 / 3.0) if scale is None else (inputs, scale)
   return {"w": _variance_scaled(key, (inputs, outputs), scale, fan), "b": jnp.zeros(outputs)}
 
@@ -56,10 +60,11 @@ def _init_conv(key: jax.Array, inputs: int, outputs: int) -> Params:
   return {"w": weights, "b": jnp.zeros(outputs)}
 
 
-def _init_mlp(key: jax.Array, inputs: int, widths: tuple[int, ...]) -> Params:
+def init_mlp(key: jax.Array, inputs: int, widths: tuple[int, ...]) -> Params:
+  """Returns the parameters of `mlp` for inputs of a size and layers of the widths."""
   keys = jax.random.split(key, len(widths))
   sizes = (inputs, *widths)
-  layers = {f"layer{i}": _init_linear(keys[i], sizes[i], sizes[i + 1]) for i in range(len(widths))}
+  layers = {f"layer{i}": init_linear(keys[i], sizes[i], sizes[i + 1]) for i in range(len(widths))}
   return layers | {"norm_scale": jnp.ones(widths[0]), "norm_bias": jnp.zeros(widths[0])}
 
 
@@ -74,7 +79,7 @@ def _init_resnet(key: jax.Array, config: NetworkConfig, image_shape: tuple[int, 
       section[f"block{b}_conv1"] = _init_conv(keys[2 + 2 * b], outputs, outputs)
     params[f"section{s}"] = section
     height, width, channels = -(-height // 2), -(-width // 2), outputs
-  params["linear"] = _init_linear(key, height * width * channels, config.image_features)
+  params["linear"] = init_linear(key, height * width * channels, config.image_features)
   return params
 
 
@@ -99,10 +104,10 @@ def init_policy(key: jax.Array, config: NetworkConfig, layout: Layout) -> Params
     if config.recurrent:
       params["lstm"] = _init_lstm(keys[1], config.image_features, config.lstm_size)
   inputs = embedding_size(config, layout) + layout.state_size
-  params["mlp"] = _init_mlp(keys[2], inputs, config.policy_layers)
+  params["mlp"] = init_mlp(keys[2], inputs, config.policy_layers)
   last = config.policy_layers[-1]
-  params["mean"] = _init_linear(keys[3], last, layout.action_size, config.policy_head_scale)
-  params["stddev"] = _init_linear(keys[4], last, layout.action_size, config.policy_head_scale)
+  params["mean"] = init_linear(keys[3], last, layout.action_size, config.policy_head_scale)
+  params["stddev"] = init_linear(keys[4], last, layout.action_size, config.policy_head_scale)
   return params
 
 
@@ -110,20 +115,21 @@ def init_critic(key: jax.Array, config: NetworkConfig, layout: Layout) -> Params
   """Returns the critic's parameters."""
   keys = jax.random.split(key, 2)
   inputs = layout.state_size + layout.privileged_size + layout.action_size
-  head = _init_linear(keys[1], config.critic_layers[-1], config.num_atoms, config.critic_head_scale)
-  return {"mlp": _init_mlp(keys[0], inputs, config.critic_layers), "head": head}
+  head = init_linear(keys[1], config.critic_layers[-1], config.num_atoms, config.critic_head_scale)
+  return {"mlp": init_mlp(keys[0], inputs, config.critic_layers), "head": head}
 
 
 # ---------------------------------------------------------------- application
 
 
-def _linear(params: Params, x: jax.Array) -> jax.Array:
+def linear(params: Params, x: jax.Array) -> jax.Array:
+  """x W + b: x [..., I] -> [..., O]."""
   return x @ params["w"] + params["b"]
 
 
 def mlp(params: Params, x: jax.Array) -> jax.Array:
   """Linear, layer norm, tanh, then linear and ELU for every further layer."""
-  return _after_first_layer(params, _linear(params["layer0"], x))
+  return _after_first_layer(params, linear(params["layer0"], x))
 
 
 def _after_first_layer(params: Params, x: jax.Array) -> jax.Array:
@@ -131,7 +137,7 @@ def _after_first_layer(params: Params, x: jax.Array) -> jax.Array:
   x = x * jax.lax.rsqrt(jnp.mean(x**2, -1, keepdims=True) + _LAYER_NORM_EPSILON)
   x = jnp.tanh(x * params["norm_scale"] + params["norm_bias"])
   for i in range(1, sum(name.startswith("layer") for name in params)):
-    x = jax.nn.elu(_linear(params[f"layer{i}"], x))
+    x = jax.nn.elu(linear(params[f"layer{i}"], x))
   return x
 
 
@@ -169,7 +175,7 @@ def resnet(params: Params, images: jax.Array, config: NetworkConfig) -> jax.Arra
       y = _conv(section[f"block{b}_conv0"], jax.nn.relu(x))
       x = x + _conv(section[f"block{b}_conv1"], jax.nn.relu(y))
   x = jax.nn.relu(x).reshape(x.shape[0], -1)
-  return jax.nn.relu(_linear(params["linear"], x))
+  return jax.nn.relu(linear(params["linear"], x))
 
 
 def lstm_step(params: Params, state: LstmState, x: jax.Array) -> LstmState:
@@ -180,14 +186,28 @@ def lstm_step(params: Params, state: LstmState, x: jax.Array) -> LstmState:
   return LstmState(jax.nn.sigmoid(o) * jnp.tanh(cell), cell)
 
 
-def unroll_lstm(params: Params, initial: LstmState, features: jax.Array) -> jax.Array:
-  """Runs the LSTM over features [B, T, F] from a stored state; returns its outputs [B, T, U]."""
+def unroll_lstm(
+  params: Params, initial: LstmState, features: jax.Array, burn_in: jax.Array | None = None
+) -> jax.Array:
+  """Runs the LSTM over features [B, T, F] from a stored state; returns its outputs [B, T, U].
 
-  def step(state: LstmState, x: jax.Array) -> tuple[LstmState, jax.Array]:
+  Args:
+    params: of the LSTM.
+    initial: the stored state.
+    features: its inputs.
+    burn_in: steps of each trajectory [B] beyond which no gradient flows back.
+  """
+
+  def step(state: LstmState, inputs: tuple[jax.Array, jax.Array]) -> tuple[LstmState, jax.Array]:
+    x, time = inputs
+    if burn_in is not None:
+      cut = (time == burn_in)[:, None]
+      state = jax.tree.map(lambda s: jnp.where(cut, jax.lax.stop_gradient(s), s), state)
     state = lstm_step(params, state, x)
     return state, state.hidden
 
-  _, outputs = jax.lax.scan(step, initial, features.swapaxes(0, 1))
+  times = jnp.arange(features.shape[1])
+  _, outputs = jax.lax.scan(step, initial, (features.swapaxes(0, 1), times))
   return outputs.swapaxes(0, 1)
 
 
@@ -200,8 +220,8 @@ def policy_head(
   """
   hidden = mlp(params["mlp"], jnp.concatenate([embedding, state], axis=-1))
   scale = config.init_stddev / jax.nn.softplus(0.0)
-  stddev = jax.nn.softplus(_linear(params["stddev"], hidden)) * scale + config.min_stddev
-  return Gaussian(_linear(params["mean"], hidden), stddev)
+  stddev = jax.nn.softplus(linear(params["stddev"], hidden)) * scale + config.min_stddev
+  return Gaussian(linear(params["mean"], hidden), stddev)
 
 
 def unroll_policy(
@@ -211,6 +231,8 @@ def unroll_policy(
   state: jax.Array,
   images: jax.Array | None,
   initial: LstmState | None,
+  features: jax.Array | None = None,
+  burn_in: jax.Array | None = None,
 ) -> PolicyOutput:
   """Applies the policy to trajectories.
 
@@ -220,17 +242,20 @@ def unroll_policy(
     state: proprioception [B, T, S].
     images: pictures in [0, 1] [B, T, H, W, 3], or None.
     initial: the LSTM's state before the first step, as the actor stored it; None without an LSTM.
+    features: of the pictures [B, T, F], in place of them; None where they are to be computed.
+    burn_in: steps of each trajectory [B] that only unroll the LSTM; None for none.
   """
   batch, time = state.shape[:2]
-  if images is None:
-    embedding = jnp.zeros((batch, time, 0))
-  else:
+  embedding = features
+  if embedding is None and images is not None:
     flat = images.reshape(batch * time, *images.shape[2:])
     embedding = resnet(params["resnet"], flat, config).reshape(batch, time, -1)
-    if "lstm" in params:
-      if initial is None:
-        raise ValueError("A recurrent policy needs the stored LSTM state, found None.")
-      embedding = unroll_lstm(params["lstm"], initial, embedding)
+  if embedding is None:
+    embedding = jnp.zeros((batch, time, 0))
+  elif "lstm" in params:
+    if initial is None:
+      raise ValueError("A recurrent policy needs the stored LSTM state, found None.")
+    embedding = unroll_lstm(params["lstm"], initial, embedding, burn_in)
   return PolicyOutput(policy_head(params, embedding, state, config), embedding)
 
 
@@ -243,7 +268,7 @@ def critic_logits(params: Params, inputs: jax.Array, actions: jax.Array) -> jax.
   first, count = params["mlp"]["layer0"], inputs.shape[-1]
   of_inputs = inputs @ first["w"][:count] + first["b"]
   of_actions = jnp.clip(actions, -1.0, 1.0) @ first["w"][count:]
-  return _linear(params["head"], _after_first_layer(params["mlp"], of_inputs + of_actions))
+  return linear(params["head"], _after_first_layer(params["mlp"], of_inputs + of_actions))
 
 
 def atoms(config: NetworkConfig) -> jax.Array:

@@ -2,7 +2,7 @@
 
 Trajectories shorter than T are padded with zeros; `last` is the index of a trajectory's last
 observation, so that it holds `last` transitions (environment steps). Stored on disk, the arrays are
-memory maps: what was inserted survives the death of the process, and every entry knows the actor
+memory maps: what was inserted survives the death of the process, and every entry holds the actor
 and the number that it came with, so that nothing is inserted twice after a restart. The files are
 sparse and grow with what is inserted; an entry's space is reserved before it is written, so that a
 full disk is an OSError and not the signal SIGBUS.
@@ -216,6 +216,22 @@ class Replay:
     for array in self._arrays.values():
       if isinstance(array, np.memmap):
         array.flush()
+
+
+def open_stored(folder: Path) -> dict[str, np.ndarray] | None:
+  """Opens the arrays of a folder's replay for reading, `origin` among them; None without one.
+
+  The entries that are whole have a number above 0 in `origin[:, 2]`, which rises as they came.
+  """
+  if not (folder / _INDEX_FILE).exists():
+    return None
+  index = json.loads((folder / _INDEX_FILE).read_text())
+  return {
+    name: np.zeros(shape, dtype)
+    if 0 in shape
+    else np.memmap(folder / f"{name}.raw", dtype, "r", shape=tuple(shape))
+    for name, (shape, dtype) in index.items()
+  }
 
 
 def _check_index(folder: Path, shapes: Mapping[str, tuple]) -> bool:

@@ -1,4 +1,4 @@
-"""What the agent needs to know of an environment: which observation goes where, and how large.
+"""The layout of an environment's observations and actions: what goes where, and how large.
 
 Pictures (uint8 [H, W, 3]) go to the policy's image encoder; observations named `privileged/...` to
 the critic alone; all others, flattened, to both. `Layout.flatten` turns a dm_env observation into
@@ -15,6 +15,7 @@ PRIVILEGED = "privileged/"
 # Where the suite puts the robot's position [m] and rotation matrix: what the belief predicts.
 POSITION = "privileged/robot_position"
 ROTATION = "privileged/robot_rotation"
+BALL = "privileged/ball_position"
 
 
 class FlatObservation(NamedTuple):
@@ -47,15 +48,17 @@ class Layout:
     """Numbers in the flattened privileged observations, P."""
     return sum(self.privileged_sizes)
 
+  def privileged_column(self, name: str) -> int | None:
+    """Where an observation begins in the privileged vector; None if it is not there."""
+    if name not in self.privileged_names:
+      return None
+    return sum(self.privileged_sizes[: self.privileged_names.index(name)])
+
   @property
   def pose_columns(self) -> tuple[int, int] | None:
     """Where position and rotation begin in the privileged vector; None if they are not there."""
-    if POSITION not in self.privileged_names or ROTATION not in self.privileged_names:
-      return None
-    starts = dict(
-      zip(self.privileged_names, np.cumsum([0, *self.privileged_sizes[:-1]]), strict=True)
-    )
-    return int(starts[POSITION]), int(starts[ROTATION])
+    position, rotation = self.privileged_column(POSITION), self.privileged_column(ROTATION)
+    return None if position is None or rotation is None else (position, rotation)
 
   @classmethod
   def of(cls, environment: Any) -> "Layout":

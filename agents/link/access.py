@@ -26,7 +26,7 @@ def read_users(path: Path) -> dict[str, str]:
 
 
 def access_control(users: list[str], prefix: str, *, learner: str | None) -> dict[str, Any]:
-  """The router's rules: actors send trajectories and metrics, ask, and say that they are alive.
+  """The router's rules: actors put trajectories and metrics, query, and declare their liveliness.
 
   No actor can answer queries in the learner's place or publish on its keys.
 

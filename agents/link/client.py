@@ -1,7 +1,7 @@
-"""The actor's end of the link: asks for credits, sends trajectories until they are acknowledged.
+"""The actor's end of the link: requests credits, sends trajectories until they are acknowledged.
 
 Every call has a deadline. When no answer comes, the learner is away (killed, frozen, compiling its
-machine's last core away): the actor waits and asks again, and keeps what it made.
+machine's last core away): the actor waits and queries again, and keeps what it made.
 """
 
 import time
@@ -66,7 +66,7 @@ class ActorLink:
   @property
   def learner_is_there(self) -> bool:
     """Whether something receives this actor's trajectories now."""
-    status: Any = self._publisher.matching_status  # zenoh's type stub says bool
+    status: Any = self._publisher.matching_status  # bool in zenoh's type stub
     return bool(status.matching)
 
   def ask(
@@ -139,7 +139,7 @@ class ActorLink:
     """Fetches the present parameters and their version; None if the learner has none or is away.
 
     Args:
-      hold: asks the learner to keep them, so that it can save them if they turn out to be the best.
+      hold: whether the learner keeps them, to save them if they turn out to be the best.
     """
     question = schema.encode("ask", {"hold": hold})
     message = self.ask("parameters", question, kind="parameters", timeout=_PARAMETERS_TIMEOUT)

@@ -1,6 +1,6 @@
 """Every trajectory arrives once: numbering and resending on one side, acknowledgement on the other.
 
-zenoh's put does not tell whether data arrived: it vanishes while no learner is there, and after a
+zenoh's put does not report whether data arrived: it vanishes while no learner is there, and after a
 transport was closed. So an actor numbers its trajectories from 1 and keeps each until it is
 acknowledged; what stays unacknowledged is sent again. The learner drops what it has already. Pure
 accounting: no network, no threads; time is passed in.

@@ -1,6 +1,6 @@
 """The rate limiter: how many environment steps may be taken, and when an update is due.
 
-Credits are environment steps. An actor asks for some before it takes them; what it was granted and
+Credits are environment steps. An actor requests some before it takes them; what it was granted and
 has not delivered yet is outstanding, and returns to the pool when the actor is gone. Steps that
 fill the replay pay for no update, as in Reverb's SampleToInsertRatio with Acme's offset:
 updates = floor((steps - unpaid) / steps_per_update), so that training begins at the ratio and not
@@ -36,7 +36,7 @@ class RateLimiter:
     steps: int = 0,
     updates: int = 0,
     refill_until: int | None = None,
-    unpaid: int | None = None,
+    unpaid: float | None = None,
   ):
     """Starts a run, or continues one.
 
@@ -45,13 +45,14 @@ class RateLimiter:
       steps: environment steps that reached the replay.
       updates: updates done.
       refill_until: number of steps at which the replay was, or will be, filled; None for a new run.
-      unpaid: steps that pay for no update; None for a new run.
+      unpaid: steps that pay for no update, less those of updates without payment; None for a new
+        run.
     """
     self.settings = settings
     self.steps = steps
     self.updates = updates
     self.refill_until = settings.min_replay_steps if refill_until is None else refill_until
-    self.unpaid = settings.min_replay_steps if unpaid is None else unpaid
+    self.unpaid: float = settings.min_replay_steps if unpaid is None else unpaid
     self._outstanding: dict[str, int] = {}
 
   @property
@@ -104,7 +105,7 @@ class RateLimiter:
     self.refill_until = max(self.refill_until, until)
 
   def request(self, actor: str, wanted: int, *, held: int) -> int:
-    """Grants up to `wanted` steps to an actor that says it holds `held` unspent or undelivered."""
+    """Grants up to `wanted` steps to an actor that holds `held` unspent or undelivered."""
     # The actor's own count is the truth: a reply may have been lost on the way.
     self._outstanding[actor] = held
     room = self.limit - self.steps - self.outstanding
@@ -123,9 +124,11 @@ class RateLimiter:
     if actor in self._outstanding:
       self._outstanding[actor] = max(0, self._outstanding[actor] - steps)
 
-  def updated(self) -> None:
-    """Counts an update."""
+  def updated(self, *, paid: bool = True) -> None:
+    """Counts an update; one that is not paid for neither asks for steps nor gives credits."""
     self.updates += 1
+    if not paid:
+      self.unpaid -= self.settings.steps_per_update
 
   def forget(self, actor: str) -> None:
     """Returns an actor's credits to the pool: it is gone."""

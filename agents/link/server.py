@@ -36,12 +36,14 @@ Insert = Callable[[Mapping[str, np.ndarray], int, int], int]
 
 @dataclasses.dataclass
 class ActorRecord:
-  """What the learner knows of an actor."""
+  """The learner's record of an actor."""
 
-  heard: float  # monotonic time of its last message [s]
+  heard: float
+  """Monotonic time of its last message [s]."""
   alive: bool = True
   parameters_version: int = 0
-  refused: int = 0  # trajectories that did not fit the replay
+  refused: int = 0
+  """Trajectories that did not fit the replay."""
 
 
 @dataclasses.dataclass
@@ -81,7 +83,7 @@ class LearnerLink:
       limiter: the run's rate limiter; use it under `lock` only.
       insert: puts (trajectory, actor's key, number) into the replay and returns its environment
         steps; raises ValueError for one that does not fit.
-      description: what actors must know of the run: environment, settings.
+      description: of the run, for its actors: environment, settings.
       known: (actor's key, number) of trajectories that the replay holds already.
     """
     self.lock = threading.Lock()
@@ -126,7 +128,7 @@ class LearnerLink:
   # ------------------------------------------------------------ what the learner calls
 
   def publish_parameters(self, arrays: Mapping[str, np.ndarray], *, version: int) -> None:
-    """Offers parameters to all who ask; `version` grows (updates done)."""
+    """Serves parameters to all processes; `version` grows (updates done)."""
     data = schema.encode("parameters", {"version": version}, arrays)
     with self.lock:
       self._parameters, self._version, self._published = data, version, time.monotonic()
@@ -142,8 +144,12 @@ class LearnerLink:
     with self.lock:
       self._status = dict(status)
 
+  def take_metrics(self) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the figures that came in since the last call, with their senders' names."""
+    return [self.metrics.get() for _ in range(self.metrics.qsize())]
+
   def stop_actors(self) -> None:
-    """Tells actors, when they ask next, that the run is over."""
+    """Ends the run for the actors: `stop` in all grants from now on."""
     with self.lock:
       self._stopping = True
 
@@ -221,7 +227,7 @@ class LearnerLink:
         self._refuse(str(error))
         query.reply_err(str(error).encode())
       except zenoh.ZError:
-        pass  # the one who asked is gone; it asks again if it comes back
+        pass  # the querying process is gone; it queries again if it comes back
       finally:
         query.drop()  # otherwise the asker waits for further answers until its deadline
 
@@ -238,7 +244,7 @@ class LearnerLink:
     with self.lock:
       self._ledger.confirm(actor_key(actor), oldest=oldest)
       granted = 0
-      # The evaluator never asks for anything: only what has been reached.
+      # The evaluator requests no steps: only what has been reached.
       acts = wanted + held > 0 or actor in self._actors
       if acts:
         self._record(actor).parameters_version = version

@@ -9,6 +9,7 @@ import json
 import logging
 import re
 import shutil
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
-from nerf2real.agents.dmpo.learning import TrainingState
+from nerf2real.agents.dmpo.training_state import TrainingState
 
 NEWEST, BEST = "newest", "best"
 _KEEP = {NEWEST: 2, BEST: 1}
+_SWEEPS, _SWEEP_PAUSE = 20, 0.05  # s; chosen: writes that are under way end within a second
 _NAME = re.compile(r"(newest|best)-\d{10}-\d{12}")  # kind, updates, environment steps
 
 
@@ -39,10 +41,18 @@ class Checkpoints:
     self._sweep()
 
   def _sweep(self) -> None:
-    """Removes what an interrupted save has left."""
-    for path in self._folder.iterdir():
-      if path.is_dir() and not _NAME.fullmatch(path.name):
+    """Removes what an interrupted save has left.
+
+    A failed save raises its first error while writes of other arrays go on in threads; a folder
+    that gets a file while it is removed stays, and is removed again.
+    """
+    for _ in range(_SWEEPS):
+      left = [p for p in self._folder.iterdir() if p.is_dir() and not _NAME.fullmatch(p.name)]
+      if not left:
+        return
+      for path in left:
         shutil.rmtree(path, ignore_errors=True)
+      time.sleep(_SWEEP_PAUSE)
 
   def list(self, kind: str = NEWEST) -> list[Path]:
     """The whole checkpoints of a kind, oldest first."""

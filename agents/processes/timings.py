@@ -1,4 +1,4 @@
-"""Where the time of a loop goes: seconds by stage, given out as milliseconds for each turn."""
+"""Times of a process: seconds by stage of its loop, rates of its counters, periodical work."""
 
 import collections
 import contextlib
@@ -31,3 +31,41 @@ class StageTimes:
     found = {f"{name}_ms": 1e3 * s / max(turns, 1) for name, s in self._seconds.items()}
     self._seconds.clear()
     return found
+
+
+class Rates:
+  """Steps and updates a second, over the last 60 measurements."""
+
+  def __init__(self, steps: int, updates: int):
+    """Begins with the counters' present values."""
+    self._points = collections.deque([(time.monotonic(), steps, updates)], maxlen=60)
+
+  def measure(self, steps: int, updates: int) -> dict[str, float]:
+    """Returns `steps_per_second` and `updates_per_second` up to the counters' present values."""
+    now = time.monotonic()
+    self._points.append((now, steps, updates))
+    begin, first_steps, first_updates = self._points[0]
+    span = max(now - begin, 1e-3)
+    return {
+      "steps_per_second": (steps - first_steps) / span,
+      "updates_per_second": (updates - first_updates) / span,
+    }
+
+
+class Periods:
+  """When periodical work of a loop is due, by name."""
+
+  def __init__(self) -> None:
+    self._last: dict[str, float] = {}
+
+  def due(self, name: str, period: float) -> bool:
+    """Returns whether the period [s] is over since it last was; it begins with the first call."""
+    now = time.monotonic()
+    if now - self._last.setdefault(name, now) < period:
+      return False
+    self._last[name] = now
+    return True
+
+  def restart(self, name: str) -> None:
+    """Begins a period anew, such as after work that was done early."""
+    self._last[name] = time.monotonic()

@@ -270,7 +270,7 @@ LIBRARY: dict[str, Maker] = {
     ("amplitude",),
     _sets(cogging_amplitude="amplitude", cogging_periods="periods", cogging_phase="phase"),
   ),
-  # One joint alone cannot tell tilted gravity from an offset encoder: not drawn for the pendulum.
+  # On one joint alone tilted gravity equals an offset encoder: not drawn for the pendulum.
   "gravity_tilt": Maker(
     {"x": Range(0.04, 0.2, signed=True), "y": Range(0.04, 0.2, signed=True)},
     ("x", "y"),
@@ -369,7 +369,7 @@ _ALIKE = (
 
 
 def may_pair(first: str, second: str) -> bool:
-  """Returns whether two kinds can be told apart when both are there."""
+  """Returns whether two kinds are distinguishable when both are there."""
   return first != second and not any({first, second} <= group for group in _ALIKE)
 
 

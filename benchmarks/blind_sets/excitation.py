@@ -1,4 +1,4 @@
-"""What the joints are told to do: sweeps, slow ramps, steps and multisines. T times, J joints."""
+"""Commands of the joints: sweeps, slow ramps, steps and multisines. T times, J joints."""
 
 import numpy as np
 

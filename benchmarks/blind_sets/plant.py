@@ -3,7 +3,7 @@
 A servo is two masses: the motor (with the gear train, seen from the output) and the output stage
 on the link, joined by a stiff gear with play. Friction is LuGre (Canudas de Wit et al. 1995) with a
 bristle that yields after `presliding`. Every millisecond the firmware counts the encoder and sets
-the duty in whole counts of the PWM; it knows nothing of what `Servo` holds but its own constants.
+the duty in whole counts of the PWM; it uses nothing of `Servo` but its own constants.
 Semi-implicit Euler with the speed-dependent terms implicit; bristles in closed form. J joints.
 """
 

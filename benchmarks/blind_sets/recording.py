@@ -28,17 +28,28 @@ _PERIODIC = 0.1  # s between messages of supply and temperature
 class Recording:
   """A log's content; times in s from the log's zero."""
 
-  command_time: np.ndarray  # [C]
-  command: np.ndarray  # [C, J] rad
-  stamp: np.ndarray  # [T]
-  log_time: np.ndarray  # [T]
-  position: np.ndarray  # [T, J] rad
-  velocity: np.ndarray  # [T, J] rad/s
-  effort: np.ndarray  # [T, J] N m
-  duty: np.ndarray  # [T, J]
-  slow_time: np.ndarray  # [B]
-  volts: np.ndarray  # [B]
-  celsius: np.ndarray  # [B, J]
+  command_time: np.ndarray
+  """[C]."""
+  command: np.ndarray
+  """[C, J] rad."""
+  stamp: np.ndarray
+  """[T]."""
+  log_time: np.ndarray
+  """[T]."""
+  position: np.ndarray
+  """[T, J] rad."""
+  velocity: np.ndarray
+  """[T, J] rad/s."""
+  effort: np.ndarray
+  """[T, J] N m."""
+  duty: np.ndarray
+  """[T, J]."""
+  slow_time: np.ndarray
+  """[B]."""
+  volts: np.ndarray
+  """[B]."""
+  celsius: np.ndarray
+  """[B, J]."""
 
 
 def record(

@@ -128,7 +128,7 @@ def _words(effects: list[Entry]) -> str:
 
 
 def _places(effect: Entry) -> set[str]:
-  """Returns the names of joint and body that an effect is said to be at."""
+  """Returns the names of joint and body of an effect's target."""
   return {str(effect[key]) for key in ("joint", "body", "target") if effect.get(key)}
 
 
@@ -193,7 +193,7 @@ class Row:
 
   question: str
   value: float | None
-  """Share or figure; None where nothing was asked."""
+  """Share or figure; None without a question."""
   of: int
   """How many sets or parameters it is of."""
   target: str

@@ -20,7 +20,7 @@ PLANT_SHARES = {"pendulum": 0.6, "arm": 0.2, "op3": 0.2}
 DECLARED_ERRORS = (0.0, 0.0, 0.0, 0.03, 0.1)
 """Shares by which declared constants are off, drawn once a set."""
 DETECTABLE = 2.0
-"""A held-out error this many times the healthy machine's can be seen; ours. Both are of a machine
+"""A held-out error this many times the healthy machine's can be seen; chosen. Both are of a machine
 whose declared constants are right: wrong ones can be calibrated, and hide nothing for good."""
 
 

@@ -1,4 +1,4 @@
-"""Finds figures in the prose of a README, and says which of them have no record.
+"""Finds figures in the prose of a README that have no record.
 
 A figure is a number with a unit, or "N of M". It is recorded if it stands in a block that
 `benchmarks/tables.py` generates, or in a paragraph with `<!-- record: id, id -->` and equals a

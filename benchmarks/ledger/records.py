@@ -70,7 +70,7 @@ class Record:
   found: str
   """How the values are printed: a format string over their names."""
   asked: str = ""
-  """What was asked for; empty: nothing."""
+  """The requirement; empty: none."""
   command: str
   """Command line from the root."""
   commit: str
@@ -90,7 +90,7 @@ class Record:
   load: float | None = None
   """Load average of the machine; None: not noted."""
   caveats: tuple[str, ...] = ()
-  """What a reader must know beside the figure."""
+  """Caveats."""
   evidence: tuple[str, ...] = ()
   """Files with more, from the root."""
   measured_again: bool = False

@@ -1,6 +1,6 @@
 """HTML reports: stand-alone pages from jinja2 templates, with plotly charts and embedded pictures.
 
-A report says what it shows; the kit lays it out, one look for all. `page.Page` holds title, lead
+A report lists its contents; the kit lays them out, one look for all. `page.Page` holds title, lead
 sentence, warnings and sections of blocks (`blocks`: pictures, grids, tables, figures with unit and
 meaning, charts, folded text), `page.write` writes it whole. `charts` makes the plots,
 `pictures` colours errors and depths; floors from above are drawn by `core.floor_map`.

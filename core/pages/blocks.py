@@ -95,12 +95,13 @@ class Figure:
   value: Any
   unit: str = ""
   meaning: str = ""
-  good: str = ""  # which values are good, such as "higher" or "below 1"
+  good: str = ""
+  """Which values are good, such as "higher" or "below 1"."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Figures(Block):
-  """A table of figures with unit and meaning, and with what is good where that is said of any."""
+  """A table of figures with unit and meaning, and with what is good where any row has that."""
 
   kind = "figures"
   figures: Sequence[Figure]
@@ -125,7 +126,7 @@ class Times(Block):
 
 @dataclasses.dataclass(frozen=True)
 class Legend(Block):
-  """Names of colours, any that CSS knows."""
+  """Names of colours in CSS."""
 
   kind = "legend"
   colors: Mapping[str, str]
@@ -137,7 +138,8 @@ class Chart(Block):
 
   kind = "chart"
   figure: go.Figure
-  tools: bool = False  # shows plotly's buttons
+  tools: bool = False
+  """Shows plotly's buttons."""
 
   @property
   def content(self) -> dict[str, Any]:

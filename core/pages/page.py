@@ -104,7 +104,7 @@ def _environment(folder: Path) -> jinja2.Environment:
 
 
 def _plain(value: Any) -> Any:
-  """Returns what JSON knows for arrays and for dataclasses, whose fields that are None it omits."""
+  """Converts arrays and dataclasses to JSON values; fields that are None are omitted."""
   if isinstance(value, np.ndarray | np.generic):
     return value.tolist()
   if dataclasses.is_dataclass(value):

@@ -138,7 +138,7 @@ def imu(
   frame: str = IMU_FRAME,
 ) -> Message:
   """Returns turning rates [3] [rad/s] and specific force [3] [m/s^2]; there is no orientation."""
-  unknown = [-1.0] + 8 * [0.0]  # sensor_msgs: -1 first says that there is none
+  unknown = [-1.0] + 8 * [0.0]  # sensor_msgs: -1 first stands for none
   fields = {
     "header": header(time_ns, frame),
     "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},

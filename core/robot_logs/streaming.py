@@ -101,7 +101,7 @@ def _readings(
 ) -> Iterator[Reading]:
   factory = DecoderFactory()
   types: dict[int, Schema] = {}
-  decoders: dict[int, tuple[str, str, Callable[[bytes], Any]]] = {}  # of the channels wanted
+  decoders: dict[int, tuple[str, str, Callable[[bytes], Any]]] = {}  # of the selected channels
   for record in StreamReader(stream, validate_crcs=True).records:
     if isinstance(record, Message):
       if record.channel_id not in decoders:

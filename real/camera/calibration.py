@@ -188,7 +188,7 @@ def _check(views: list[View]) -> None:
 
 def _fit(views: list[View], board: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
   """Returns the values [8] and each view's RMS error [N] [pixel]."""
-  fit: Any = cv2.calibrateCameraExtended  # its stubs do not know that the first guess may be None
+  fit: Any = cv2.calibrateCameraExtended  # in its stubs the first guess may not be None
   fitted = fit(
     [board] * len(views), [v.corners for v in views], views[0].size, None, None, flags=_FLAGS
   )

@@ -51,7 +51,7 @@ class Controls:
 
 @dataclasses.dataclass(frozen=True)
 class Readback:
-  """What a control was set to and what the driver says that it is."""
+  """A control's requested value and the driver's."""
 
   asked: float
   found: float | None
@@ -59,7 +59,7 @@ class Readback:
 
   @property
   def holds(self) -> bool:
-    """Whether the driver did as it was told."""
+    """Whether the driver took the value."""
     return self.found is not None and abs(self.found - self.asked) <= _TOLERANCE * max(
       1.0, abs(self.asked)
     )
@@ -70,7 +70,7 @@ class CaptureSettings:
   """How a source is opened and what is held fixed."""
 
   capture_size: tuple[int, int] | None = None
-  """Height and width that a device is asked for; None: its own."""
+  """Height and width requested of a device; None: its own."""
   controls: Controls = Controls()
   """What the camera shall hold fixed."""
   latency: float = 0.0
@@ -159,7 +159,7 @@ class Camera:
   def read(self) -> tuple[np.ndarray, float]:
     """Returns the newest picture as it came, RGB uint8 [H, W, 3], and its age [s].
 
-    The age grows while no picture comes: the reader decides how old is too old.
+    The age grows while no picture comes: the limit is the reader's.
     """
     with self._lock:
       picture, taken = self._picture, self._taken
@@ -170,7 +170,7 @@ class Camera:
   def set_controls(self, controls: Controls) -> dict[str, Readback]:
     """Changes what is held fixed from now on; returns what the driver made of it.
 
-    A device is reopened by its thread; a network camera is asked at once.
+    A device is reopened by its thread; a network camera at once.
     """
     self._asked = controls
     if _is_http(self.source):

@@ -1,7 +1,7 @@
 """The bus's own clock: every 8 ms the IMU and all joints are read, judged and recorded.
 
 It runs in a thread of its own, so the robot is watched whatever the control loop does. When the
-monitor says stop, torque goes off here, and goes on being switched off until all servos confirm.
+monitor demands a stop, torque goes off here, again and again until all servos confirm.
 """
 
 import logging
@@ -162,7 +162,7 @@ class Cycle:
       self.halt(stop)
 
   def _insist(self) -> None:
-    """Goes on switching the torque off until every servo says that it is."""
+    """Goes on switching the torque off until every servo confirms."""
     with self._commands:
       self._bus.drop_torque()
       states = self._servos.torque_states()

@@ -135,7 +135,7 @@ class RobotEnvironment(dm_env.Environment):
     """Has the robot held, moves it slowly to its pose, lets it stand, and starts an episode.
 
     Raises:
-      SafetyError: The robot must not or does not get there; the message says why.
+      SafetyError: The robot must not or does not get there; the message holds the reason.
     """
     self._check_open()
     self._running = False

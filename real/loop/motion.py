@@ -43,7 +43,7 @@ class Motion:
     """Has the robot held, moves it slowly to its pose and lets it stand.
 
     Raises:
-      SafetyError: It must not or does not get there; the message says why.
+      SafetyError: It must not or does not get there; the message holds the reason.
     """
     self._clear_stop()
     self._wait_for_readings()
@@ -114,7 +114,7 @@ class Motion:
     self._limiter.reset(pose)
 
   def _level(self) -> None:
-    """Lets the accelerometer say which way is up: the robot rests, and the filter is slow."""
+    """Sets the gravity estimate from the accelerometer: the robot rests, and the filter is slow."""
     self._cycle.sensing.level()
     self._pause(_LEVEL_TIME)
 

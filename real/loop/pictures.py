@@ -45,7 +45,7 @@ class Pictures:
   def read(self, *, watched: bool) -> tuple[np.ndarray, Stop | None]:
     """Returns the newest picture, uint8 [height, width, 3], and why to stop, if there is a reason.
 
-    A picture that cannot be read is black; how long that may go on is the monitor's to say.
+    A picture that cannot be read is black; how long that may go on is the monitor's limit.
 
     Args:
       watched: Whether the monitor judges; it does during an episode.

@@ -1,4 +1,4 @@
-"""From the bus's readings to what a policy is told: Madgwick, action filter's input, histories.
+"""From the bus's readings to a policy's observations: Madgwick, action filter's input, histories.
 
 The same filters as in simulation (`suite.sensors.filters`, `suite.sensors.madgwick`), the same
 names and shapes (`suite.specs`). The low-pass is in the IMU chip, as OP3's firmware sets it; a
@@ -21,7 +21,7 @@ from nerf2real.suite.sensors.madgwick import Madgwick
 
 _LONG_GAP = 1.5  # periods after which a sample was missed
 _STILL = 0.03  # rad/s, standard deviation of the turning rate of a robot that stands still: chosen
-_MAX_ZERO = 0.1  # rad/s: a mean above it is a turn and no zero, whatever the deviation says: chosen
+_MAX_ZERO = 0.1  # rad/s: a mean above it is a turn and no zero, whatever the deviation: chosen
 _MIN_READINGS = 20  # of which a zero is the mean: chosen
 
 

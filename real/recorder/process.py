@@ -1,6 +1,6 @@
 """The recorder's own process: reads messages to build from standard input, writes the MCAP file.
 
-Started by `real.recorder.recorder.Recorder`; says "open" once the file is there.
+Started by `real.recorder.recorder.Recorder`; sends "open" once the file is there.
 """
 
 import pickle
@@ -63,7 +63,7 @@ def receive(pipe: BinaryIO) -> Iterator[Call]:
 
 def main() -> None:
   """Writes until the pipe ends."""
-  signal.signal(signal.SIGINT, signal.SIG_IGN)  # the pipe's end says when
+  signal.signal(signal.SIGINT, signal.SIG_IGN)  # until the pipe's end
   try:
     stream = open(sys.argv[1], "wb")  # noqa: SIM115  (closed below)
   except OSError as error:

@@ -33,9 +33,12 @@ class Series:
   """Numbers over time."""
 
   unit: str
-  names: tuple[str, ...]  # of the columns
-  times: np.ndarray  # [N] s from the log's start
-  values: np.ndarray  # [N, J]
+  names: tuple[str, ...]
+  """Of the columns."""
+  times: np.ndarray
+  """[N] s from the log's start."""
+  values: np.ndarray
+  """[N, J]."""
 
 
 @dataclasses.dataclass
@@ -43,11 +46,15 @@ class Replay:
   """What a log holds, ready to be shown."""
 
   name: str
-  complete: bool  # the recorder closed it properly
-  start: float  # s since 1970
-  duration: float  # s
+  complete: bool
+  """The recorder closed it properly."""
+  start: float
+  """s since 1970."""
+  duration: float
+  """s."""
   series: dict[str, Series]
-  frames: list[tuple[float, bytes]]  # time [s from the start] and JPEG
+  frames: list[tuple[float, bytes]]
+  """Time [s from the start] and JPEG."""
 
 
 def load(path: Path | str) -> Replay:
@@ -133,16 +140,20 @@ class Plot:
   """Numbers over time, as the page's script takes them."""
 
   unit: str
-  names: tuple[str, ...]  # of the lines
-  t: list[float]  # s
-  y: list[list[float]]  # of each line
+  names: tuple[str, ...]
+  """Of the lines."""
+  t: list[float]
+  """s."""
+  y: list[list[float]]
+  """Of each line."""
 
 
 @dataclasses.dataclass
 class Line:
   """A number over time."""
 
-  t: list[float]  # s
+  t: list[float]
+  """s."""
   y: list[float]
 
 
@@ -151,12 +162,17 @@ class PageData:
   """What the page's script shows."""
 
   joints: list[str]
-  moving: str  # the joint that is shown first
-  duration: float  # s
+  moving: str
+  """The joint that is shown first."""
+  duration: float
+  """s."""
   series: dict[str, Plot]
-  temperatures: dict[str, Line]  # by joint [degrees C]
-  frames: list[float]  # times of the pictures [s]
-  pictures: list[str] | None  # JPEG in base64; None where a server gives them
+  temperatures: dict[str, Line]
+  """By joint [degrees C]."""
+  frames: list[float]
+  """Times of the pictures [s]."""
+  pictures: list[str] | None
+  """JPEG in base64; None where a server gives them."""
 
 
 def _page_data(replay: Replay, *, embed: bool) -> PageData:

@@ -1,7 +1,7 @@
 """Limits, and the reasons to switch the torque off, in one place.
 
 `Limiter` is the last thing that a goal passes before it goes to the servos. `Monitor` sees every
-reading and says when to stop; whoever runs the bus then switches the torque off. J joints.
+reading and demands a stop; whoever runs the bus then switches the torque off. J joints.
 """
 
 import dataclasses
@@ -39,12 +39,12 @@ class Stop(NamedTuple):
 
 
 class SafetyError(RuntimeError):
-  """The robot must not move; the message says why and what to do."""
+  """The robot must not move; the message holds the reason and what to do."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SafetySettings:
-  """Limits. Where no source is said they are chosen with room to ordinary walking."""
+  """Limits. Those without a source are chosen with room to ordinary walking."""
 
   min_upright: float = constants.MIN_UPRIGHT
   """Cosine of the tilt below which the robot falls, as in `suite`."""

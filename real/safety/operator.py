@@ -1,4 +1,4 @@
-"""The operator: a key that stops the robot, and being asked to hold it."""
+"""The operator: a key that stops the robot, and questions such as to hold it."""
 
 import contextlib
 import os
@@ -29,10 +29,10 @@ class Operator(Protocol):
 
 
 class Terminal:
-  """A person at a terminal: any key stops the robot, Enter confirms what is asked.
+  """A person at a terminal: any key stops the robot, Enter confirms.
 
-  The bus's thread looks for keys all the time, also while a question waits. So whoever asks at this
-  terminal must ask with `ask`: `input` would compete for the keys, and an answer would be a stop.
+  The bus's thread looks for keys all the time, also while a question waits. So questions at this
+  terminal go through `ask`: `input` would compete for the keys, and an answer would be a stop.
   """
 
   def __init__(self, descriptor: int | None = None):

@@ -37,7 +37,7 @@ _FLOOR_HEIGHT = 0.02  # m
 
 
 class Truth(NamedTuple):
-  """What an observer in the room knows."""
+  """Measurements of an observer in the room."""
 
   time: float  # s
   position: np.ndarray  # torso [3] in the world [m]
@@ -210,7 +210,7 @@ class Body:
       self._touches[1] |= bool(floor.any())
 
   def truth(self) -> Truth:
-    """Returns what an observer in the room knows."""
+    """Returns the measurements of an observer in the room."""
     with self.lock:
       data = self.data
       return Truth(

@@ -1,4 +1,4 @@
-"""What the virtual robot is made of that nobody is told: drawn from a seed, or put in by a test."""
+"""Hidden parameters of the virtual robot: drawn from a seed, or set by a test."""
 
 import dataclasses
 

@@ -29,7 +29,7 @@ _P_DIVISOR = 128.0
 # Chosen: a small metal gear motor warms by 8 K for each watt, with a time constant of ten minutes.
 _HEATING, _WARMING_TIME, _AMBIENT = 8.0, 600.0, 25.0  # K/W, s, degrees C
 _COMPUTER_CURRENT = 1.5  # A that everything but the servos draws: chosen
-_DIP_TIME = 0.1  # s, time constant with which servos judge the supply: chosen
+_DIP_TIME = 0.1  # s, time constant of the servos' supply voltage: chosen
 _BROWN_OUT = 6.0  # V below which a servo's controller resets: chosen
 
 
@@ -70,7 +70,7 @@ class Motors:
     """Starts with torque off, at ambient temperature."""
     count = len(parameters.strength)
     self.parameters = parameters
-    # What the registers say.
+    # Contents of the registers.
     self.goal = np.full(count, CENTER, np.float64)  # counts
     self.enabled = np.zeros(count, bool)
     self.p_gain = np.full(count, 800.0)
@@ -82,7 +82,7 @@ class Motors:
     self.current = np.zeros(count)  # A
     self.temperature = np.full(count, _AMBIENT)
     self.supply = parameters.battery_voltage  # V
-    self.slow_supply = self.supply  # V, as the servos judge it: without short dips
+    self.slow_supply = self.supply  # V, as the servos measure it: without short dips
     self.stuck, self.is_stuck = np.zeros(count, bool), False
     self.forced_voltage: float | None = None
     self._late_goals: list[tuple[float, np.ndarray]] = []

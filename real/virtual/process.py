@@ -27,7 +27,7 @@ class VirtualRobotProcess:
       **arguments: Those of `VirtualRobot`, except `stepped` and `furnish`.
 
     Raises:
-      RuntimeError: It did not start; the message says why.
+      RuntimeError: It did not start; the message holds the reason.
     """
     context = multiprocessing.get_context("spawn")
     self._pipe, theirs = context.Pipe()
@@ -45,7 +45,7 @@ class VirtualRobotProcess:
     self.operator = Hand(self.hold)
 
   def connection(self) -> Connection:
-    """Returns what `real.load` needs, with this robot's person holding it when asked."""
+    """Returns what `real.load` needs, with this robot's person holding it on demand."""
     return Connection(port=self.port, camera=self.camera_url, operator=self.operator)
 
   def place(self, x: float, y: float, yaw: float) -> None:
@@ -104,7 +104,7 @@ class VirtualRobotProcess:
 
 
 def _serve(pipe: Pipe, arguments: dict[str, Any]) -> None:
-  """Runs the robot and does what it is asked until the pipe ends."""
+  """Runs the robot and answers requests until the pipe ends."""
   from nerf2real.real.virtual.robot import VirtualRobot
 
   try:

@@ -85,7 +85,7 @@ class VirtualRobot:
     return self._wire.port
 
   def connection(self) -> Connection:
-    """Returns what `real.load` needs, with this robot's person holding it when asked."""
+    """Returns what `real.load` needs, with this robot's person holding it on demand."""
     source = self.stream.url if self.stream is not None else self.camera
     clock = self.clock if isinstance(self.clock, SteppedClock) else None
     return Connection(port=self.port, camera=source, operator=self.operator, clock=clock)

@@ -105,7 +105,7 @@ class CameraStream:
       if not self._frozen:
         try:
           picture = self._render()
-        except Exception as error:  # whatever a renderer raises: the stream ends and says why
+        except Exception as error:  # whatever a renderer raises: the stream ends with the reason
           self.error = error
           return
         if self._blocked:

@@ -42,7 +42,7 @@ _ATTEMPTS, _PINGS = 5, 4  # of a transaction outside the cycle, of a ping
 
 
 class BusError(OSError):
-  """A device does not do what it should; the message says which and what."""
+  """A device failed; the message names device and fault."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -106,7 +106,7 @@ def read_offsets(path: Path | str) -> Wiring:
   """Reads a robot's offsets from a file of ROBOTIS's offset tuner (`offset: {joint: rad}`).
 
   Raises:
-    ValueError: The file holds something else; the message says what.
+    ValueError: The file holds something else; the message names it.
   """
   import yaml
 

@@ -29,7 +29,7 @@ class ImuReading(NamedTuple):
 
 
 def decode(stamp: float, data: bytes) -> ImuReading:
-  """Returns what the 13 bytes from address 31 on say, taken at a time [s]."""
+  """Decodes the 13 bytes from address 31 on, taken at a time [s]."""
   volts, *counts = _LAYOUT.unpack(data)
   values = np.array(counts, np.float64).reshape(2, 3) * _BODY_FROM_CHIP
   return ImuReading(

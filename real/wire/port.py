@@ -20,7 +20,7 @@ _LATENCY_LIMIT = 1  # ms; the adapter's own default of 16 ms is a hidden delay
 
 
 class PortError(OSError):
-  """The serial port cannot be used; the message says what to do."""
+  """The serial port cannot be used; the message holds what to do."""
 
 
 class Port(dynamixel_sdk.PortHandler):
@@ -30,7 +30,7 @@ class Port(dynamixel_sdk.PortHandler):
     """Opens the port.
 
     Args:
-      path: Such as /dev/ttyUSB0, or a URL that pyserial knows.
+      path: Such as /dev/ttyUSB0, or a URL of pyserial.
       baud: Bit/s.
       clock: Time for time-outs.
 
@@ -54,7 +54,7 @@ class Port(dynamixel_sdk.PortHandler):
     _check_latency(path)
 
   def setupPort(self, cflag_baud: int) -> bool:
-    # The SDK's own knows paths alone; pyserial's function opens URLs, too.
+    # The SDK's own takes paths alone; pyserial's function opens URLs, too.
     self.ser = serial.serial_for_url(self.port_name, baudrate=self.baudrate, timeout=0)
     self.is_open = True
     self.ser.reset_input_buffer()
@@ -65,7 +65,7 @@ class Port(dynamixel_sdk.PortHandler):
     return 1000 * self._clock.now()
 
   def setPacketTimeout(self, packet_length: int) -> None:
-    # The SDK asks with a rough upper bound of the length; `expect` sets the true one.
+    # The SDK gives a rough upper bound of the length; `expect` sets the true one.
     self.setPacketTimeoutMillis(1000 * (packet_length * self.byte_time + _PATIENCE))
 
   def expect(self, size: int, *, delay: float, margin: float) -> None:
@@ -115,7 +115,7 @@ class Port(dynamixel_sdk.PortHandler):
 
 
 def _check_latency(path: str) -> None:
-  """Makes a USB adapter deliver bytes at once, or says how to."""
+  """Makes a USB adapter deliver bytes at once, or raises with the command for it."""
   timer = Path("/sys/bus/usb-serial/devices") / Path(path).name / "latency_timer"
   if not timer.exists():
     return

@@ -23,12 +23,18 @@ _PEEL = 2.5  # tolerances taken off with a plane, or its noise would be the next
 class FloorSettings:
   """Settings of the search for the floor; lengths relative to the median distance of the points."""
 
-  max_tilt_deg: float = 20.0  # between the floor's normal and the cameras' mean up direction
-  tolerance: float = 0.012  # a point this near belongs to a plane: about 2.5 cm in a room
-  cell: float = 0.05  # ground is covered in cells of this size
-  min_cover: float = 0.25  # of the largest plane's cover; smaller planes are furniture
-  hypotheses: int = 600  # random triples of points a plane; 5 % of points in it: 1 - 5e-2 miss
-  max_points: int = 40_000  # subsample for speed
+  max_tilt_deg: float = 20.0
+  """Between the floor's normal and the cameras' mean up direction."""
+  tolerance: float = 0.012
+  """a point this near belongs to a plane: about 2.5 cm in a room."""
+  cell: float = 0.05
+  """Ground is covered in cells of this size."""
+  min_cover: float = 0.25
+  """Of the largest plane's cover; smaller planes are furniture."""
+  hypotheses: int = 600
+  """Random triples of points a plane; 5 % of points in it: 1 - 5e-2 miss."""
+  max_points: int = 40_000
+  """Subsample for speed."""
 
 
 class Floor(NamedTuple):
@@ -199,7 +205,7 @@ def refine_floor(floor: Floor, points: np.ndarray, *, tolerance: float) -> Floor
 
 
 class FoundFloor(NamedTuple):
-  """The floor plane, and whether the dense points agree with the sparse ones."""
+  """The floor plane, and whether dense and sparse points give the same."""
 
   floor: Floor
   dense_trusted: bool  # False where the dense points show a floor well above the sparse ones'

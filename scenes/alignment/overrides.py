@@ -16,17 +16,28 @@ import yaml
 class Overrides:
   """Values given by hand; None leaves the choice to the program."""
 
-  floor_points: np.ndarray | None = None  # [K >= 3, 3] points on the floor, unit frame
-  up: np.ndarray | None = None  # [3] up direction, unit frame; the floor is then searched across it
-  scale: float | None = None  # metres per unit
-  scale_points: np.ndarray | None = None  # [2, 3] two points, unit frame, with scale_distance
-  scale_distance: float | None = None  # their distance [m]
-  camera_height: float | None = None  # median height of the camera above the floor [m]
-  yaw_deg: float | None = None  # the world's x axis against the unit frame's, about up
-  origin: np.ndarray | None = None  # [2] or [3] point, unit frame, that becomes x = y = 0
-  extent_lower: np.ndarray | None = None  # [3] world frame [m]
-  extent_upper: np.ndarray | None = None  # [3] world frame [m]
-  floor_threshold: float | None = None  # matter below this height counts as floor [m]
+  floor_points: np.ndarray | None = None
+  """[K >= 3, 3] points on the floor, unit frame."""
+  up: np.ndarray | None = None
+  """[3] up direction, unit frame; the floor is then searched across it."""
+  scale: float | None = None
+  """Metres per unit."""
+  scale_points: np.ndarray | None = None
+  """[2, 3] two points, unit frame, with scale_distance."""
+  scale_distance: float | None = None
+  """Their distance [m]."""
+  camera_height: float | None = None
+  """Median height of the camera above the floor [m]."""
+  yaw_deg: float | None = None
+  """The world's x axis against the unit frame's, about up."""
+  origin: np.ndarray | None = None
+  """[2] or [3] point, unit frame, that becomes x = y = 0."""
+  extent_lower: np.ndarray | None = None
+  """[3] world frame [m]."""
+  extent_upper: np.ndarray | None = None
+  """[3] world frame [m]."""
+  floor_threshold: float | None = None
+  """Matter below this height counts as floor [m]."""
 
 
 _SHAPES = {
@@ -107,7 +118,7 @@ def read(path: pathlib.Path) -> Overrides:
   """Reads an override file, YAML or JSON.
 
   Raises:
-    ValueError: one line that says what is wrong with it.
+    ValueError: it is wrong; one line with the fault.
   """
   if not path.is_file():
     raise ValueError(f"The override file {path} does not exist.")

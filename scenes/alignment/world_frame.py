@@ -31,17 +31,27 @@ _MAX_TILT_DEG = 15.0  # of the floor against the cameras' mean up direction, wit
 class AlignSettings:
   """Settings of the alignment; lengths in metres unless said otherwise."""
 
-  guessed_camera_height: float = 1.4  # of a phone held by a standing adult, if nothing gives scale
-  camera_height: float | None = None  # known median height of the camera above the floor
-  max_marker_spread: float = 0.03  # a marker whose scale is less certain (relative) is not used
-  margin: float = 0.15  # added around the extent, so that walls are inside
-  camera_margin: float = 0.4  # the extent holds every camera with this much room around it
-  max_height: float = 2.6  # top of the extent; a ceiling seldom touches a robot
-  outliers: float = 0.01  # share of surface cells outside the extent, on each side
+  guessed_camera_height: float = 1.4
+  """Of a phone held by a standing adult, if nothing gives scale."""
+  camera_height: float | None = None
+  """Known median height of the camera above the floor."""
+  max_marker_spread: float = 0.03
+  """a marker whose scale is less certain (relative) is not used."""
+  margin: float = 0.15
+  """Added around the extent, so that walls are inside."""
+  camera_margin: float = 0.4
+  """The extent holds every camera with this much room around it."""
+  max_height: float = 2.6
+  """Top of the extent; a ceiling seldom touches a robot."""
+  outliers: float = 0.01
+  """Share of surface cells outside the extent, on each side."""
   floor: FloorSettings = dataclasses.field(default_factory=FloorSettings)
-  floor_threshold: float = 0.04  # matter below this height counts as floor
-  max_floor_gap: float = 0.1  # dense above sparse floor, share of the cameras' height: a bad field
-  refine_tolerance: float = 0.04  # of dense points about the floor
+  floor_threshold: float = 0.04
+  """Matter below this height counts as floor."""
+  max_floor_gap: float = 0.1
+  """Dense above sparse floor, share of the cameras' height: a bad field."""
+  refine_tolerance: float = 0.04
+  """Of dense points about the floor."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,17 +59,28 @@ class Alignment:
   """The world frame and the sources of its parts."""
 
   world_from_unit: similarity.Similarity
-  extent_lower: np.ndarray  # [3] m, world frame; z is the floor, 0
-  extent_upper: np.ndarray  # [3] m, world frame
-  scale_source: str  # "marker", "points", "camera_height", "manual" or "unknown"
-  scale_spread: float | None  # relative standard deviation, where it is known
-  floor_source: str  # "plane", "manual_points" or "manual_up"
-  floor_residual: float  # root mean square distance of the floor's points [m]
-  floor_points: int  # points that carry the floor
-  floor_tilt_from_cameras_deg: float  # floor's normal against the cameras' mean up direction
-  floor_threshold: float  # m
-  yaw_source: str  # "walls", "points" or "manual"
-  camera_height: float  # median height of the cameras above the floor [m]
+  extent_lower: np.ndarray
+  """[3] m, world frame; z is the floor, 0."""
+  extent_upper: np.ndarray
+  """[3] m, world frame."""
+  scale_source: str
+  """"marker", "points", "camera_height", "manual" or "unknown"."""
+  scale_spread: float | None
+  """Relative standard deviation, where it is known."""
+  floor_source: str
+  """"plane", "manual_points" or "manual_up"."""
+  floor_residual: float
+  """Root mean square distance of the floor's points [m]."""
+  floor_points: int
+  """Points that carry the floor."""
+  floor_tilt_from_cameras_deg: float
+  """floor's normal against the cameras' mean up direction."""
+  floor_threshold: float
+  """m."""
+  yaw_source: str
+  """"walls", "points" or "manual"."""
+  camera_height: float
+  """Median height of the cameras above the floor [m]."""
   warnings: tuple[str, ...] = ()
 
   def tilt_deg(self, true_up: np.ndarray) -> float:

@@ -18,7 +18,7 @@ _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 
 
 def _context_class():
-  """EGL unless the environment names another way; whoever imported mujoco first decides nothing."""
+  """EGL unless the environment names another way, whoever imported mujoco first."""
   if os.environ.get("MUJOCO_GL", "egl").lower() != "egl":
     return mujoco.GLContext
   from mujoco.egl import GLContext  # here: where EGL is missing, this import itself fails
@@ -36,10 +36,13 @@ class _Lens:
 
   width: int
   height: int
-  tan_x: float  # half the pinhole picture's extent at z = 1
+  tan_x: float
+  """Half the pinhole picture's extent at z = 1."""
   tan_y: float
-  maps: tuple[np.ndarray, np.ndarray]  # for cv2.remap, one sample a sub-pixel
-  depth_maps: tuple[np.ndarray, np.ndarray]  # one sample a pixel
+  maps: tuple[np.ndarray, np.ndarray]
+  """For cv2.remap, one sample a sub-pixel."""
+  depth_maps: tuple[np.ndarray, np.ndarray]
+  """One sample a pixel."""
 
 
 def _sampling(camera: Camera, lens_size, factor: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,17 +16,28 @@ _BISECTIONS = 40  # halvings of the bracket of the ellipsoid's nearest point: be
 class Solid:
   """A placed solid and the look of its surface."""
 
-  name: str  # unique
-  kind: str  # "box" (half sizes), "cone" (bottom radius, top radius, half height) or "ellipsoid"
-  size: tuple[float, float, float]  # see kind [m]
-  position: np.ndarray  # of the centre in the world [3]
-  rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))  # world from solid
-  rounding: float = 0.0  # radius of a box's edges; the half sizes include it [m]
-  material: str  # name of the texture
-  tint: tuple[float, float, float] = (1.0, 1.0, 1.0)  # multiplies the texture
-  tiles: float | None = 1.0  # textures per metre; None: one texture fits the local +z face
-  window: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)  # u, v from, to, when it fits
-  offset: tuple[float, float] = (0.0, 0.0)  # shift of the texture
+  name: str
+  """Unique."""
+  kind: str
+  """"box" (half sizes), "cone" (bottom radius, top radius, half height) or "ellipsoid"."""
+  size: tuple[float, float, float]
+  """See kind [m]."""
+  position: np.ndarray
+  """Of the centre in the world [3]."""
+  rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+  """World from solid."""
+  rounding: float = 0.0
+  """Radius of a box's edges; the half sizes include it [m]."""
+  material: str
+  """Name of the texture."""
+  tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+  """Multiplies the texture."""
+  tiles: float | None = 1.0
+  """Textures per metre; None: one texture fits the local +z face."""
+  window: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+  """U, v from, to, when it fits."""
+  offset: tuple[float, float] = (0.0, 0.0)
+  """Shift of the texture."""
 
   def to_local(self, points: np.ndarray) -> np.ndarray:
     """Maps world points [P, 3] into the solid's frame."""
@@ -107,10 +118,14 @@ def distance(solids: Iterable[Solid], points: np.ndarray, *, limit: float = np.i
 class Mesh:
   """A triangle mesh in the solid's frame, with one normal and texture coordinate a vertex."""
 
-  vertices: np.ndarray  # [V, 3]
-  normals: np.ndarray  # [V, 3]
-  texcoords: np.ndarray  # [V, 2]
-  faces: np.ndarray  # [F, 3], counter-clockwise from outside
+  vertices: np.ndarray
+  """[V, 3]."""
+  normals: np.ndarray
+  """[V, 3]."""
+  texcoords: np.ndarray
+  """[V, 2]."""
+  faces: np.ndarray
+  """[F, 3], counter-clockwise from outside."""
 
 
 def tessellate(solid: Solid) -> Mesh:

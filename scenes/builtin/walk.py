@@ -23,15 +23,24 @@ _CENTRE = np.array([0.32, -0.17])  # of the open floor [m]
 class Round:
   """One closed round: an ellipse about the middle of the open floor."""
 
-  share: float  # of the film's time
-  radii: tuple[float, float]  # along x and y [m]
-  heights: tuple[float, float]  # at its beginning and end [m]
-  start: float  # angle on the ellipse at the beginning [rad]
-  turns: float  # rounds; negative is clockwise
-  outwards: bool  # look away from the middle, else across the room
-  sway: float  # amplitude of looking left and right [rad]
-  pitch: float  # mean inclination; positive looks down [rad]
-  nod: float  # amplitude of looking up and down [rad]
+  share: float
+  """Of the film's time."""
+  radii: tuple[float, float]
+  """Along x and y [m]."""
+  heights: tuple[float, float]
+  """At its beginning and end [m]."""
+  start: float
+  """Angle on the ellipse at the beginning [rad]."""
+  turns: float
+  """Rounds; negative is clockwise."""
+  outwards: bool
+  """Look away from the middle, else across the room."""
+  sway: float
+  """Amplitude of looking left and right [rad]."""
+  pitch: float
+  """Mean inclination; positive looks down [rad]."""
+  nod: float
+  """Amplitude of looking up and down [rad]."""
 
 
 ROUNDS = (

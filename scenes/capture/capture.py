@@ -37,32 +37,51 @@ MIN_IMAGES = 8  # fewer pictures do not cover a room
 class CaptureSettings:
   """Settings of the keyframes and of the warnings."""
 
-  num_keyframes: int = 150  # parts of the capture; the sharpest frame of each is kept
-  max_size: int = 1920  # long side of a keyframe; larger pictures are reduced [pixel]
-  jpeg_quality: int = 95  # of written keyframes
-  min_images: int = MIN_IMAGES  # fewer pictures are an error
-  warn_duration: float = 15.0  # a shorter walk does not see a room from enough places [s]
-  warn_short_side: int = 480  # a smaller picture has too few features [pixel]
-  warn_sharpness: float = 30.0  # variance of the Laplacian below which a picture is blurred;
+  num_keyframes: int = 150
+  """Parts of the capture; the sharpest frame of each is kept."""
+  max_size: int = 1920
+  """Long side of a keyframe; larger pictures are reduced [pixel]."""
+  jpeg_quality: int = 95
+  """Of written keyframes."""
+  min_images: int = MIN_IMAGES
+  """Fewer pictures are an error."""
+  warn_duration: float = 15.0
+  """a shorter walk does not see a room from enough places [s]."""
+  warn_short_side: int = 480
+  """a smaller picture has too few features [pixel]."""
+  warn_sharpness: float = 30.0
+  """Variance of the Laplacian below which a picture is blurred;."""
   # sharp indoor phone pictures have 100 to 1000, motion-blurred ones under 30
-  warn_blurred_fraction: float = 0.3  # of the keyframes that may be blurred without a warning
-  warn_brightness_range: float = 3.0  # 95th to 5th percentile of the keyframes' mean brightness
+  warn_blurred_fraction: float = 0.3
+  """Of the keyframes that may be blurred without a warning."""
+  warn_brightness_range: float = 3.0
+  """95th to 5th percentile of the keyframes' mean brightness."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Capture:
   """Keyframes on disk and what is known about them. Shape: N keyframes."""
 
-  kind: str  # "video", "images", "colmap" or "transforms"
-  folder: Path  # where the keyframes lie
-  images: list[Path]  # keyframes, sorted by name
-  width: int  # of every keyframe [pixel]
-  height: int  # of every keyframe [pixel]
-  sharpness: np.ndarray  # variance of the Laplacian at the standard size [N]
-  brightness: np.ndarray  # mean grey level [N], 0 to 255
-  times: np.ndarray | None  # in the video [N] [s]; None for pictures
-  warnings: list[str]  # what may ruin the reconstruction, one line each
-  known: KnownPoses | None = None  # cameras that came with the pictures
+  kind: str
+  """"video", "images", "colmap" or "transforms"."""
+  folder: Path
+  """Where the keyframes lie."""
+  images: list[Path]
+  """Keyframes, sorted by name."""
+  width: int
+  """Of every keyframe [pixel]."""
+  height: int
+  """Of every keyframe [pixel]."""
+  sharpness: np.ndarray
+  """Variance of the Laplacian at the standard size [N]."""
+  brightness: np.ndarray
+  """Mean grey level [N], 0 to 255."""
+  times: np.ndarray | None
+  """In the video [N] [s]; None for pictures."""
+  warnings: list[str]
+  """What may ruin the reconstruction, one line each."""
+  known: KnownPoses | None = None
+  """Cameras that came with the pictures."""
 
 
 def source_kind(source: Path) -> str:

@@ -27,13 +27,20 @@ ROTATION_TOLERANCE = 1e-2  # of a pose's 3x3 part to a rotation
 class KnownPoses:
   """Cameras and points that came with the pictures."""
 
-  kind: str  # "colmap" or "transforms"
-  camera: Camera  # of the original pictures
-  files: tuple[Path, ...]  # picture of each pose
-  world_from_camera: np.ndarray  # [N, 4, 4], OpenCV camera axes, the source's frame
-  points: np.ndarray  # [P, 3], the source's frame; empty where the source has none
-  point_colors: NDArray[np.uint8]  # [P, 3]
-  point_errors: np.ndarray  # mean reprojection error [P] [pixel]
+  kind: str
+  """"colmap" or "transforms"."""
+  camera: Camera
+  """Of the original pictures."""
+  files: tuple[Path, ...]
+  """Picture of each pose."""
+  world_from_camera: np.ndarray
+  """[N, 4, 4], OpenCV camera axes, the source's frame."""
+  points: np.ndarray
+  """[P, 3], the source's frame; empty where the source has none."""
+  point_colors: NDArray[np.uint8]
+  """[P, 3]."""
+  point_errors: np.ndarray
+  """Mean reprojection error [P] [pixel]."""
 
   def __post_init__(self):
     # JSON does not keep the columns of an array without rows.

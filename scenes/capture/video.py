@@ -15,8 +15,8 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 
-STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; ours, so that
-# pictures of different resolution are comparable; pictures are never enlarged
+STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; chosen: less than any
+# phone's video, so that resolutions are comparable; pictures are never enlarged
 DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged
 
 
@@ -28,20 +28,28 @@ class CaptureError(ValueError):
 class Frame:
   """A picture chosen from a video."""
 
-  index: int  # number of the frame in the video
-  time: float  # presentation time [s]
-  sharpness: float  # variance of the Laplacian at the standard size [grey level^2]
-  image: np.ndarray  # upright BGR picture uint8 [H, W, 3]
+  index: int
+  """Number of the frame in the video."""
+  time: float
+  """Presentation time [s]."""
+  sharpness: float
+  """Variance of the Laplacian at the standard size [grey level^2]."""
+  image: np.ndarray
+  """Upright BGR picture uint8 [H, W, 3]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoInfo:
   """Facts of a video's header and packets, without decoding."""
 
-  num_frames: int  # packets of the video stream
-  declared_frames: int  # what the header promises; 0 where it does not say
-  frames_per_second: float  # mean rate [1/s]; 0 where unknown
-  codec: str  # name of the codec
+  num_frames: int
+  """Packets of the video stream."""
+  declared_frames: int
+  """What the header promises; 0 where it has none."""
+  frames_per_second: float
+  """Mean rate [1/s]; 0 where unknown."""
+  codec: str
+  """Name of the codec."""
 
   @property
   def duration(self) -> float:
@@ -77,7 +85,7 @@ def inspect_video(path: Path) -> VideoInfo:
       try:
         count = sum(1 for packet in container.demux(stream) if packet.size)
       except av.error.FFmpegError:
-        count = max(count, 1)  # decoding says where it breaks
+        count = max(count, 1)  # decoding shows where it breaks
       return VideoInfo(
         num_frames=count,
         declared_frames=stream.frames,

@@ -1,4 +1,4 @@
-"""What localised points tell of the geometry: distances along pixels' rays, and empty space.
+"""Depth supervision from localised points: distances along pixels' rays, and empty space.
 
 Source of the first idea: Deng et al. 2022, "Depth-supervised NeRF"; the second is space carving.
 Shapes: N pictures, A anchors.
@@ -17,12 +17,13 @@ from nerf2real.core.cameras import Camera
 if TYPE_CHECKING:
   from nerf2real.scenes.field.views import Views
 
-_MOST_ERROR = 2.0  # ours: points with a larger reprojection error are left out [pixel]
-_FEWEST_VIEWS = 3  # ours: so are points that fewer pictures see
-EMPTY_CELLS = 80  # ours: cells along the unit cube, 6 cm in a room of 5 m
-_CROSSINGS = 4  # ours: a cell is empty when so many sight lines cross it; fewer may be mistakes
-_CLEARANCE = 0.4  # ours: nor is there matter this near a camera, of the nearest points' distance
-_MARGIN = 0.04  # ours: a sight line counts up to this distance before its point [unit]
+# Chosen, not tuned, for points that may be wrong:
+_MOST_ERROR = 2.0  # points with a larger reprojection error are left out [pixel]
+_FEWEST_VIEWS = 3  # so are points in fewer pictures: the third one checks the first two
+EMPTY_CELLS = 80  # cells along the unit cube: 6 cm in a room of 5 m, finer than furniture
+_CROSSINGS = 4  # sight lines that cross an empty cell; fewer may all end at wrong points
+_CLEARANCE = 0.4  # no matter this near a camera, as a share of the nearest points' distance
+_MARGIN = 0.04  # a sight line ends this far before its point [unit]: 10 cm in a room of 5 m
 
 
 def known_points(

@@ -12,7 +12,7 @@ import numpy as np
 
 HASH_PRIMES = (1, 2654435761, 805459861)  # Mueller et al. 2022, equation 4
 HARMONICS = 9  # numbers that `spherical_harmonics` gives
-_VARIANCE_FLOOR = 1e-10  # ours: a standard deviation of 1e-5 units, far below a pixel's
+_VARIANCE_FLOOR = 1e-10  # chosen: a standard deviation of 1e-5 units, far below a pixel's
 
 
 def grid_resolutions(base: int, growth: float, levels: int) -> tuple[int, ...]:

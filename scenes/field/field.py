@@ -29,9 +29,11 @@ class FieldSettings:
   """The field's shape. It is stored with the parameters."""
 
   levels: int = 8
-  """Levels of the hash grid, L. Ours for two CPU cores; the paper's table: 12."""
+  """Levels of the hash grid, L. Chosen: what two CPU cores train in
+  five minutes; the paper's table: 12."""
   log2_table_size: int = 18
-  """Binary logarithm of the entries a level, T. Ours; the paper's table: 20."""
+  """Binary logarithm of the entries a level, T. Chosen for two CPU cores, as
+  `levels`; the paper's table: 20."""
   features: int = 2
   """Features an entry, F. Mueller et al. 2022, table 1."""
   base_resolution: int = 16
@@ -41,22 +43,24 @@ class FieldSettings:
   width: int = 64
   """Width of the base network, W. Paper, NeRF table."""
   bottleneck: int = 12
-  """Numbers that the base network hands to the view network, B. Ours: 1 + 3 + 12 is one vector."""
+  """Numbers that the base network hands to the view network, B. Chosen: with density and colour,
+  1 + 3 + 12 outputs fill one vector of 16."""
   view_width: int = 32
   """Width of the view network, V. Paper, NeRF table."""
   table_init: float = 1e-2
-  """The table's first values are uniform within this. Ours: the layer norm's constant must not hide
-  the first steps; Mueller et al. 2022: 1e-4."""
+  """The table's first values are uniform within this. Chosen: large against the layer norm's
+  constant, which would hide the first steps; Mueller et al. 2022: 1e-4."""
   density_bias: float = -5.0
   """Added before squareplus. Paper, NeRF table."""
   density_gain: float = 40.0
-  """Factor on the network's output before the bias; 1 is the paper's. Ours: squareplus falls off as
-  1/x only, so free space stays a fog for thousands of steps with 1 (measured after 60 s of training
-  at half size: 22.1 dB with 1, 23.1 with 10, 24.6 with 40; with 120 training fails)."""
+  """Factor on the network's output before the bias; 1 is the paper's. Chosen: squareplus falls off
+  as 1/x only, so free space stays a fog for thousands of steps with 1 (after 60 s of
+  training at half size: 22.1 dB with 1, 23.1 with 10, 24.6 with 40; with 120 training fails)."""
   density_scale: float = 1.0
-  """Density [1/unit] per unit of squareplus. Ours: with 10 the tail of squareplus leaves fog."""
+  """Density [1/unit] per unit of squareplus. Chosen: with 10 its tail leaves fog."""
   specular_bias: float = -3.0
-  """Added before the specular colour's sigmoid, so that colour starts diffuse. Ours."""
+  """Added before the specular colour's sigmoid. Chosen: sigmoid(-3) = 0.05, so that
+  colour starts diffuse."""
   march_step: float = 0.008
   """Interval [unit] between samples inside the unit cube that the field was trained with."""
 
@@ -181,7 +185,8 @@ class Field:
 
   settings: FieldSettings
   params: dict[str, Any]
-  training_pixel_angle: float  # angle that a pixel of the training pictures spans [rad]
+  training_pixel_angle: float
+  """Angle that a pixel of the training pictures spans [rad]."""
 
   def save(self, path: str | Path) -> None:
     """Writes a safetensors file; the table and nothing else is rounded to float16."""

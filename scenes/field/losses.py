@@ -53,7 +53,8 @@ def anchor(weights: jax.Array, edges: jax.Array, goals: jax.Array, known: jax.Ar
     goals: Normalised distance of the point on each ray [R].
     known: Which rays have a goal, bool [R].
 
-  Source: ours, after the depth supervision of Deng et al. 2022, DS-NeRF.
+  Source: a mean absolute error in place of the likelihood of Deng et al. 2022, DS-NeRF. Chosen: it
+  needs no width of the distribution about a point.
   """
   middles = 0.5 * (edges[..., 1:] + edges[..., :-1])
   off = jnp.sum(weights * jnp.abs(middles - goals[:, None]), axis=-1)

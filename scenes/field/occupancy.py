@@ -20,19 +20,19 @@ _MAX_DISTANCE = 255  # cells; a byte
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OccupancySettings:
-  """How finely and how carefully matter is looked for."""
+  """Settings of the search for matter."""
 
   cells: int = 128
-  """Cells along an axis, divisible by 4: 8 cm in a room of 5 m. Ours: 256 renders as fast, but
+  """Cells along an axis, divisible by 4: 8 cm in a room of 5 m. Chosen: 256 renders as fast, but
   takes eight times as long to fill."""
   density: float = 2.0
-  """Density [1/unit] from which a cell counts as matter. Ours: a cell of it hides 3 %."""
+  """Density [1/unit] from which a cell counts as matter. Chosen: a cell of it hides 3 %."""
   coarse_density: float = 0.5
   """The same for the coarser grids of the search; lower, because they are sampled more sparsely."""
   fine_deviation: float = 0.002
-  """Standard deviation [unit] of the smallest sample looked at (a pixel near the camera). Ours."""
+  """Standard deviation [unit] of the smallest sample evaluated. Chosen: a pixel near the camera."""
   coarse_deviation: float = 0.012
-  """Standard deviation [unit] of the largest one (a pixel of 30x40 pictures in the room). Ours."""
+  """Standard deviation [unit] of the largest one. Chosen: a pixel of 30x40 pictures in the room."""
 
   def __post_init__(self):
     if self.cells % 4 or self.cells < 16:
@@ -43,7 +43,8 @@ class OccupancySettings:
 class Occupancy:
   """Distance to the nearest cell with matter in cells (maximum norm), 0 in matter."""
 
-  distance: np.ndarray  # uint8 [G, G, G], axes z, y, x
+  distance: np.ndarray
+  """uint8 [G, G, G], axes z, y, x."""
 
   @property
   def cells(self) -> int:

@@ -11,13 +11,15 @@ import numpy as np
 import pycolmap
 import scipy.sparse
 
-_SMOOTHING = 2.0  # ours: a colour is the mean over a Gaussian of this deviation [pixel]
-_DARKEST, _BRIGHTEST = 12.0, 243.0  # ours: outside, a value is noise or clipped
-_ROUNDS = 12  # ours: of reweighting; the gains move by less than 1e-3 after 8
-_CORE = 0.03  # ours: log residuals below this count quadratically
-_PRIOR = 0.1  # ours: a gain is pulled to 1 as by a tenth of an observation
-_NOTICEABLE = 0.02  # ours: below this spread of the log gains the exposure counts as fixed
-_CLIPPING = (235.0, 255.0)  # ours: from here on a value stays bright, however its gain
+_SMOOTHING = (
+  2.0  # deviation of a colour's Gaussian [pixel]; chosen: hides a pixel's reprojection error
+)
+_DARKEST, _BRIGHTEST = 12.0, 243.0  # chosen: 5 % off the ends, where a value is noise or clipped
+_ROUNDS = 12  # of reweighting; chosen: the gains move by less than 1e-3 after 8
+_CORE = 0.03  # log residuals below this count quadratically; chosen: 7 levels of noise at 243
+_PRIOR = 0.1  # a gain is pulled to 1 as by so many observations; chosen: matters without any only
+_NOTICEABLE = 0.02  # spread of the log gains of a fixed exposure; chosen: less than can be seen
+_CLIPPING = (235.0, 255.0)  # a value stays bright from here on; chosen: beyond the fit's range
 
 
 def point_colors(

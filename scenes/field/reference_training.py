@@ -18,7 +18,7 @@ from nerf2real.scenes.field.field import Field, init_params, layer_norm, query, 
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.field.views import BlurPyramid, Views
 
-FAR = 16.0  # ours: rays end here [unit]; the squashed space is all but used up
+FAR = 16.0  # rays end here [unit]; chosen: 15/16 of the squashed space is used up
 _PROPOSAL_BASE = 16  # cells along an axis of the proposal grid's coarsest level
 
 Params = dict[str, jax.Array]

@@ -1,4 +1,4 @@
-"""How a field is trained: every number with its source, and the two presets."""
+"""Settings of the field's training: every number with its source, and the two presets."""
 
 import dataclasses
 
@@ -23,12 +23,13 @@ class TrainSettings:
   learning_rate: float = 1e-2
   """Learning rate after the warm-up. Mueller et al. 2022, section 4; the paper's table: 2e-3."""
   final_learning_rate: float = 3e-4
-  """Learning rate at the end; the decay is exponential. Ours."""
+  """Learning rate at the end; the decay is exponential. Chosen, not tuned: 3 % of the first."""
   variance_rate: float = 0.1
-  """Factor on the rate of the weights that see the variance. Ours: it gives away the direction and
-  the distance of the camera, and a field that learns those first finds no geometry."""
+  """Factor on the rate of the weights that see the variance. Chosen: it gives away direction and
+  distance of the camera, and a field that learns those first finds no geometry."""
   warmup_steps: int = 64
-  """Steps over which the learning rate rises from a hundredth. Ours; the paper's table: 2048."""
+  """Steps over which the learning rate rises from a hundredth. Chosen: 1 % of the steps;
+  the paper's table: 2048, 5 % of its own."""
   weight_decay: float = 5e-5
   """Decoupled weight decay (AdamW). Paper, NeRF table."""
   adam_beta1: float = 0.9
@@ -42,61 +43,67 @@ class TrainSettings:
   distortion_weight: float = 1e-2
   """Weight of the distortion loss. Paper, NeRF table."""
   distortion_start: int = 1000
-  """Step at which the distortion loss sets in; it has its weight at twice this step. Ours: from the
-  start it favours fog before the camera. The paper's table has no such value."""
+  """Step at which the distortion loss sets in; it has its weight at twice this step. Chosen: from
+  the start it favours fog before the camera. The paper's table has no such value."""
   blur_max: float = 12.0
   """Largest blur of a training ray [training pixel]; 0 turns the augmentation off. Paper."""
   blur_sharp_fraction: float = 0.5
-  """Fraction of the rays without blur. Ours: keeps the detail at full resolution."""
+  """Fraction of the rays without blur. Chosen: keeps the detail at full resolution."""
   blur_power: float = 1.5
-  """Blurred rays draw blur_max * uniform^power. Ours: most robot cameras lie below half of it."""
+  """Blurred rays draw blur_max * uniform^power. Chosen: most robot cameras lie below half of it."""
   near: float = 0.03
-  """Distance where a ray's first sample may lie [unit]. Ours: no matter within 8 cm of a phone."""
+  """Distance where a ray's first sample may lie [unit]. Chosen: no matter within 8 cm of a
+  phone."""
   random_background: bool = True
   """Composite over a random colour, so that dark surfaces cannot be empty. Mueller et al. 2022."""
 
   known_steps: int = 1200
-  """Steps after which localised points take no part: fog forms early, and later their errors of a
-  pixel cost 1 dB and more. Ours."""
+  """Steps after which localised points take no part. Chosen: fog forms early, and later their
+  errors of a pixel cost 1 dB and more."""
   known_steps_uneven: int = 30_000
-  """The same for pictures of changing exposure, which alone never clear the fog: a living room's
-  held-out views lost 2 dB when its points went after 1,200 steps. Ours."""
+  """The same for pictures of changing exposure, which alone never clear the fog. Chosen: a living
+  room's held-out views lost 2 dB when its points went after 1,200 steps."""
   anchor_fraction: float = 0.15
-  """Fraction of the rays that go to a localised point, where there are any. Ours."""
+  """Fraction of the rays that go to a localised point, where there are any. Chosen, not tuned."""
   anchor_weight: float = 0.3
   """Weight of those rays' distance to their point [normalised distance]: Deng et al. 2022 (depth
   supervision from the sparse points), as a mean absolute error."""
 
   # Engine "fused".
   empty_samples: int = 1024
-  """Points a step in cells that sight lines to localised points cross; at most 768 a thread. Ours:
-  walls without texture are explained as well by fog before the cameras."""
+  """Points a step in cells that sight lines to localised points cross; at most 768 a thread.
+  Chosen: walls without texture are explained as well by fog before the cameras."""
   empty_weight: float = 0.01
-  """Weight of the mean of log(1 + density) there. Ours."""
+  """Weight of the mean of log(1 + density) there. Chosen, not tuned."""
   batch_samples: int = 1 << 15
-  """Samples a step that are evaluated; the number of rays follows. Ours."""
+  """Samples a step that are evaluated; the number of rays follows. Chosen for two CPU cores;
+  Mueller et al. 2022: 2^18."""
   ray_samples: int = 256
-  """Most samples of a ray. Ours."""
+  """Most samples of a ray. Chosen: the finest step then reaches across the unit cube."""
   transmittance_threshold: float = 1e-3
-  """Samples behind this much light take no part. Ours; Mueller et al. 2022: 1e-4."""
+  """Samples behind this much light take no part. Chosen: a quarter of one of 255 levels; Mueller et
+  al. 2022: 1e-4."""
   depth_limit: float = 10.0
-  """A march ends where the occupancy grid's optical depth passes this. Ours."""
+  """A march ends where the occupancy grid's optical depth passes this. Chosen: exp(-10) is below
+  the threshold above, so that a grid that is too dense ends no ray early."""
   refine_samples: float = 24.0
-  """The march starts coarse and its step is halved when a ray has fewer samples than this. Ours."""
+  """The march starts coarse and its step is halved when a ray has fewer samples than this. Chosen,
+  not tuned."""
   inner_cells: int = 128
   """Occupancy cells along the unit cube: 4 cm in a room of 5 m. Mueller et al. 2022."""
   outer_cells: int = 64
-  """Occupancy cells along the squashed space. Ours."""
+  """Occupancy cells along the squashed space. Chosen: what lies there is far, and seen coarsely."""
   occupancy_interval: int = 16
   """Steps between updates of the occupancy. Mueller et al. 2022, appendix C."""
   occupancy_start: int = 192
   """Step of the first update; until then nothing counts as empty. Mueller et al. 2022."""
   occupancy_sweep_steps: int = 448
-  """Until this step every second update looks at all cells. Ours."""
+  """Until this step every second update looks at all cells. Chosen: 16 updates."""
   occupancy_samples: int = 1 << 17
-  """Cells looked at in an update after that. Ours."""
+  """Cells looked at in an update after that. Chosen: a twentieth of the grid."""
   occupancy_decay: float = 0.8
-  """Factor on a cell's density when it is looked at again. Ours."""
+  """Factor on a cell's density when it is looked at again. Chosen: with a twentieth of the
+  grid in an update, fog must go in few looks; Mueller et al. 2022: 0.95."""
   occupancy_threshold: float = 0.01
   """A cell is occupied when a step through it absorbs this fraction. Mueller et al. 2022."""
 
@@ -108,11 +115,11 @@ class TrainSettings:
   final_samples: int = 64
   """Samples of the field a ray. Paper, NeRF table: 64 x 64."""
   proposal_levels: int = 5
-  """Levels of the proposal network's hash grid. Ours; nerfstudio's nerfacto."""
+  """Levels of the proposal network's hash grid. As in nerfstudio's nerfacto."""
   proposal_log2_table_size: int = 17
-  """Binary logarithm of its entries a level. Ours; nerfstudio's nerfacto."""
+  """Binary logarithm of its entries a level. As in nerfstudio's nerfacto."""
   proposal_finest_resolution: int = 256
-  """Cells along an axis of its finest level. Ours; nerfstudio's nerfacto."""
+  """Cells along an axis of its finest level. As in nerfstudio's nerfacto."""
   proposal_width: int = 64
   """Width of the proposal network. Paper, NeRF table."""
   proposal_depth: int = 2

@@ -43,16 +43,22 @@ class TrainError(ValueError):
 class TrainReport:
   """What a training run did. Curves have one entry for every point in `curve_seconds`."""
 
-  steps: int  # steps made, interrupted runs included
-  seconds: float  # time spent, interrupted runs included, compilation not
-  rays: int  # rays seen
-  samples: int  # samples of the field evaluated
+  steps: int
+  """Steps made, interrupted runs included."""
+  seconds: float
+  """Time spent, interrupted runs included, compilation not."""
+  rays: int
+  """Rays seen."""
+  samples: int
+  """Samples of the field evaluated."""
   samples_per_second: float
   engine: str
   curve_seconds: list[float]
-  curve_psnr_db: list[float]  # of training rays, blurred ones included
+  curve_psnr_db: list[float]
+  """Of training rays, blurred ones included."""
   curve_samples_per_ray: list[float]
-  resumed_at_step: int | None  # step of the checkpoint that the run continued, or None
+  resumed_at_step: int | None
+  """Step of the checkpoint that the run continued, or None."""
 
 
 class Trainer(Protocol):

@@ -12,8 +12,10 @@ import numpy as np
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.field import photometry
 
-BLUR_LEVELS = (0.0, 0.7, 1.4, 2.8, 5.6, 12.0)  # ours: about an octave apart, up to the paper's 12
-_SAMPLES_PER_BLUR = 1.4  # ours: a level is stored smaller while its blur stays this many pixels
+BLUR_LEVELS = (0.0, 0.7, 1.4, 2.8, 5.6, 12.0)  # chosen: an octave apart, up to the paper's 12
+_SAMPLES_PER_BLUR = (
+  1.4  # pixels of a smaller level in its blur, at least; chosen: above Nyquist's 1
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,11 +23,15 @@ class Views:
   """Pictures of one camera with their poses in the unit frame."""
 
   camera: Camera
-  images: np.ndarray  # uint8 [N, H, W, 3]
-  world_from_camera: np.ndarray  # float64 [N, 4, 4], OpenCV camera axes
+  images: np.ndarray
+  """uint8 [N, H, W, 3]."""
+  world_from_camera: np.ndarray
+  """float64 [N, 4, 4], OpenCV camera axes."""
   names: tuple[str, ...]
-  gains: np.ndarray | None = None  # float64 [N, 3]: exposure of each picture; None: all 1
-  uneven: bool = False  # whether the exposure changed, also where it was evened out since
+  gains: np.ndarray | None = None
+  """float64 [N, 3]: exposure of each picture; None: all 1."""
+  uneven: bool = False
+  """Whether the exposure changed, also where it was evened out since."""
   anchors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.float32))
   """Known points [A, 4]: picture, pixel x and y, distance along the pixel's ray [unit]."""
 
@@ -106,9 +112,12 @@ class BlurPyramid:
   A blur between two levels is mixed from them so that the variance is right.
   """
 
-  levels: tuple[np.ndarray, ...]  # uint8 [N, h, w, 3] each
-  blurs: tuple[float, ...]  # standard deviation [pixel of the full size]
-  factors: tuple[int, ...]  # full size / stored size
+  levels: tuple[np.ndarray, ...]
+  """uint8 [N, h, w, 3] each."""
+  blurs: tuple[float, ...]
+  """Standard deviation [pixel of the full size]."""
+  factors: tuple[int, ...]
+  """Full size / stored size."""
 
   @classmethod
   def build(cls, views: Views, *, blur_max: float) -> "BlurPyramid":

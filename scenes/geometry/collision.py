@@ -21,16 +21,22 @@ from nerf2real.scenes.geometry import mesh as meshes
 class CollisionSettings:
   """Settings of the contact geometry; lengths in metres."""
 
-  voxel: float = 0.03  # edge of a voxel; a finer one costs time and finds noise
-  truncation: float = 0.08  # matter is at least this thick behind a seen surface
-  top: float = 1.5  # nothing above is needed: three times the height of the robot
-  floor_threshold: float = 0.04  # matter below counts as floor
-  smoothing: float = 1.3  # standard deviation of the blur over voxels that takes off depth noise
-  min_component: float = 0.15  # smaller floating pieces are dropped, diagonal of their box
+  voxel: float = 0.03
+  """Edge of a voxel; a finer one costs time and finds noise."""
+  truncation: float = 0.08
+  """Matter is at least this thick behind a seen surface."""
+  top: float = 1.5
+  """Nothing above is needed: three times the height of the robot."""
+  floor_threshold: float = 0.04
+  """Matter below counts as floor."""
+  smoothing: float = 1.3
+  """Standard deviation of the blur over voxels that takes off depth noise."""
+  min_component: float = 0.15
+  """Smaller floating pieces are dropped, diagonal of their box."""
   parts: convex.ConvexSettings = dataclasses.field(default_factory=convex.ConvexSettings)
 
 
-_CORE = -0.2  # value, in truncations, below which a voxel is matter whatever its neighbours say
+_CORE = -0.2  # value, in truncations, below which a voxel is matter whatever its neighbours are
 
 
 def remove_floor(grid: fusion.Grid, *, threshold: float) -> fusion.Grid:

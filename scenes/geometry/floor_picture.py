@@ -11,7 +11,7 @@ _CELL = 0.04  # m; where a free space has no cells of its own
 def draw(
   space: FreeSpace, extent: tuple[np.ndarray, np.ndarray], *, height: int, margin: float = 0.0
 ) -> FloorMap:
-  """Draws the reachable floor, and matter and unseen places where the space knows them.
+  """Draws the reachable floor, and matter and unseen places where the space holds them.
 
   Args:
     space: The free space.

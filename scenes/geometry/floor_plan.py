@@ -18,12 +18,18 @@ from nerf2real.scenes.geometry.free_space import FREE, OCCUPIED, UNKNOWN, FreeSp
 class FreeSpaceSettings:
   """The robot and the map; lengths in metres."""
 
-  resolution: float = 0.04  # edge of a cell
-  radius: float = 0.18  # of the robot: OP3's shoulders are 0.3 m apart, plus its sway
-  low: float = 0.02  # lower matter is stepped over or is floor
-  high: float = 0.6  # matter above passes over the robot's head: OP3 is 0.51 m tall
-  goals: int = 3  # paper, section "Robot navigation": three targets
-  goal_clearance: float = 0.15  # more room at a goal than a robot needs to stand
+  resolution: float = 0.04
+  """Edge of a cell."""
+  radius: float = 0.18
+  """Of the robot: OP3's shoulders are 0.3 m apart, plus its sway."""
+  low: float = 0.02
+  """Lower matter is stepped over or is floor."""
+  high: float = 0.6
+  """Matter above passes over the robot's head: OP3 is 0.51 m tall."""
+  goals: int = 3
+  """Paper, section "Robot navigation": three targets."""
+  goal_clearance: float = 0.15
+  """More room at a goal than a robot needs to stand."""
 
 
 def _shadow(part: convex.Part, low: float, high: float) -> np.ndarray | None:

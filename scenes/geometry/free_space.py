@@ -29,10 +29,14 @@ def _cells_to_blocked(free: np.ndarray) -> np.ndarray:
 class FloorGrid:
   """The reachable floor, sampled at the centres of square cells."""
 
-  free: np.ndarray  # bool [X, Y]
-  centres: np.ndarray  # [X, Y, 2] world x, y [m]
-  lower: np.ndarray  # [2] lower corner of cell (0, 0) [m]
-  cell: float  # edge of a cell [m]
+  free: np.ndarray
+  """bool [X, Y]."""
+  centres: np.ndarray
+  """[X, Y, 2] world x, y [m]."""
+  lower: np.ndarray
+  """[2] lower corner of cell (0, 0) [m]."""
+  cell: float
+  """Edge of a cell [m]."""
 
   @functools.cached_property
   def clearance(self) -> np.ndarray:
@@ -103,10 +107,14 @@ class FreeSpace(abc.ABC):
 class FreeSpaceMap(FreeSpace):
   """An occupancy map of the ground."""
 
-  cells: np.ndarray  # uint8 [H, W], FREE, OCCUPIED or UNKNOWN; row 0 is the smallest y
-  resolution: float  # m
-  origin: np.ndarray  # [2] world x, y of the map's lower left corner [m]
-  radius: float  # of the robot [m]
+  cells: np.ndarray
+  """uint8 [H, W], FREE, OCCUPIED or UNKNOWN; row 0 is the smallest y."""
+  resolution: float
+  """m."""
+  origin: np.ndarray
+  """[2] world x, y of the map's lower left corner [m]."""
+  radius: float
+  """Of the robot [m]."""
 
   @functools.cached_property
   def clearance(self) -> np.ndarray:

@@ -24,10 +24,14 @@ _MAX_VOXELS = 60_000_000  # 0.5 GB of values and weights
 class DepthViews:
   """Depth pictures with their poses, all in one frame and one unit of length."""
 
-  camera: cameras.Camera  # of the depth pictures; its size is theirs
-  frame_from_camera: np.ndarray  # float64 [N, 4, 4], OpenCV camera axes
-  depth: np.ndarray  # float32 [N, H, W], z-depth; inf or nan: nothing was hit
-  color: np.ndarray | None = None  # uint8 [N, H, W, 3]
+  camera: cameras.Camera
+  """Of the depth pictures; its size is theirs."""
+  frame_from_camera: np.ndarray
+  """float64 [N, 4, 4], OpenCV camera axes."""
+  depth: np.ndarray
+  """float32 [N, H, W], z-depth; inf or nan: nothing was hit."""
+  color: np.ndarray | None = None
+  """uint8 [N, H, W, 3]."""
 
   def __post_init__(self):
     expected = (len(self.frame_from_camera), self.camera.height, self.camera.width)
@@ -80,7 +84,7 @@ class Grid(NamedTuple):
   """A signed distance grid: negative inside matter, +1 far in front, in units of the truncation."""
 
   values: np.ndarray  # float32 [X, Y, Z] in [-1, 1]; +1 where unknown
-  weights: np.ndarray  # float32 [X, Y, Z]; 0: no ray says anything
+  weights: np.ndarray  # float32 [X, Y, Z]; 0: seen by no ray
   lower: np.ndarray  # [3] centre of voxel (0, 0, 0)
   voxel: float  # edge of a voxel
   truncation: float  # distance that the value 1 stands for

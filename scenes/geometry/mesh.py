@@ -26,10 +26,14 @@ _SAME_DEPTH = 0.04  # relative; a vertex this far behind the seen depth is hidde
 class MeshSettings:
   """Settings of the surface and of the mesh shown to people."""
 
-  voxel: float = 0.025  # edge of a voxel [m]; half of what the collision may be wrong by
-  truncation: float = 0.075  # band in which views are averaged [m]; 3 voxels
-  min_component: float = 0.3  # smaller floating pieces are dropped [m], diagonal of their box
-  visual_faces: int = 60_000  # faces of visual.glb after decimation
+  voxel: float = 0.025
+  """Edge of a voxel [m]; half of what the collision may be wrong by."""
+  truncation: float = 0.075
+  """Band in which views are averaged [m]; 3 voxels."""
+  min_component: float = 0.3
+  """Smaller floating pieces are dropped [m], diagonal of their box."""
+  visual_faces: int = 60_000
+  """Faces of visual.glb after decimation."""
 
 
 class Mesh(NamedTuple):

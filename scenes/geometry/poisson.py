@@ -30,7 +30,7 @@ _NEAR = 1e-3  # corners nearer than this to the image plane are not drawn [unit]
 def estimate_normals(points: np.ndarray, camera_positions: np.ndarray) -> np.ndarray:
   """Unit normals [P, 3] of points [P, 3]: least variance of the neighbours, towards the cameras.
 
-  Which cameras saw a point is not asked: it is turned to the nearest one.
+  Which cameras saw a point is not used: it is turned to the nearest one.
   """
   _, index = spatial.cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
   patches = points[index] - points[index].mean(1, keepdims=True)

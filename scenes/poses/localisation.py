@@ -22,25 +22,37 @@ _FIGURES = "localisation.json"
 
 
 class LocalisationError(ValueError):
-  """The keyframes do not connect; the message says how many did, why, and what to film."""
+  """The keyframes do not connect; the message holds how many did, why, and what to film."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Localisation:
   """Where the keyframes were taken, in the unit frame."""
 
-  camera: Camera  # the one camera of all keyframes
-  names: tuple[str, ...]  # registered keyframes, sorted
-  world_from_camera: np.ndarray  # float64 [N, 4, 4], unit frame, OpenCV camera axes
-  points: np.ndarray  # float64 [P, 3], unit frame
-  point_colors: np.ndarray  # uint8 [P, 3]
-  point_errors: np.ndarray  # mean reprojection error of each point [P] [pixel]
-  reprojection_error_px: float  # mean over the observations [pixel]; NaN where none are known
-  registered_fraction: float  # registered keyframes of all given
-  strategy: str  # which pairs were matched and which mapper was used
-  unit_from_source: Similarity  # from the source's frame (COLMAP's, or that of the known poses)
-  warnings: tuple[str, ...] = ()  # what may ruin the reconstruction
-  seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # wall time of each step
+  camera: Camera
+  """The one camera of all keyframes."""
+  names: tuple[str, ...]
+  """Registered keyframes, sorted."""
+  world_from_camera: np.ndarray
+  """float64 [N, 4, 4], unit frame, OpenCV camera axes."""
+  points: np.ndarray
+  """float64 [P, 3], unit frame."""
+  point_colors: np.ndarray
+  """uint8 [P, 3]."""
+  point_errors: np.ndarray
+  """Mean reprojection error of each point [P] [pixel]."""
+  reprojection_error_px: float
+  """Mean over the observations [pixel]; NaN where none are known."""
+  registered_fraction: float
+  """Registered keyframes of all given."""
+  strategy: str
+  """Which pairs were matched and which mapper was used."""
+  unit_from_source: Similarity
+  """From the source's frame (COLMAP's, or that of the known poses)."""
+  warnings: tuple[str, ...] = ()
+  """What may ruin the reconstruction."""
+  seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+  """Wall time of each step."""
 
 
 def reprojection_error(model: pycolmap.Reconstruction) -> float:

@@ -50,12 +50,18 @@ class LocaliseSettings:
     "auto"  # "global", "incremental", or "auto": incremental for stills (few keyframes),
   )
   # else global; the other one where the first leaves too many keyframes out
-  few_keyframes: int = 40  # up to this many are mapped incrementally
-  repair_below: float = 0.95  # fraction of registered keyframes under which more pairs are matched
-  min_fraction: float = 0.5  # fewer registered keyframes are an error
-  min_registered: int = 10  # fewer are an error, unless there are fewer keyframes
-  min_parallax: float = 0.08  # share of matches off a homography below which a warning is given
-  seed: int = 0  # of RANSAC and of the mappers
+  few_keyframes: int = 40
+  """Up to this many are mapped incrementally."""
+  repair_below: float = 0.95
+  """Fraction of registered keyframes under which more pairs are matched."""
+  min_fraction: float = 0.5
+  """Fewer registered keyframes are an error."""
+  min_registered: int = 10
+  """Fewer are an error, unless there are fewer keyframes."""
+  min_parallax: float = 0.08
+  """Share of matches off a homography below which a warning is given."""
+  seed: int = 0
+  """Of RANSAC and of the mappers."""
 
 
 def localise(
@@ -103,7 +109,8 @@ def localise(
 
 @dataclasses.dataclass(frozen=True)
 class _Mapped:
-  model: pycolmap.Reconstruction  # in the source's frame
+  model: pycolmap.Reconstruction
+  """In the source's frame."""
   strategy: str
   warnings: tuple[str, ...]
 

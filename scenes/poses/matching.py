@@ -26,13 +26,20 @@ _FATAL_ONLY = 3  # glog level
 class FeatureSettings:
   """Features and their matching."""
 
-  max_num_features: int = 1536  # of a picture, the largest first; time grows with the square
-  few_num_features: int = 4096  # the same for captures of few pictures
-  few_pictures: int = 40  # so many are few
-  max_image_size: int = 1600  # long side at which features are sought [pixel]
-  affine_shape: bool = True  # paper, appendix A
-  guided_matching: bool = True  # paper, appendix A
-  focal_factor: float = 1.2  # first guess of the focal length, times the long side; COLMAP
+  max_num_features: int = 1536
+  """Of a picture, the largest first; time grows with the square."""
+  few_num_features: int = 4096
+  """The same for captures of few pictures."""
+  few_pictures: int = 40
+  """So many are few."""
+  max_image_size: int = 1600
+  """Long side at which features are sought [pixel]."""
+  affine_shape: bool = True
+  """Paper, appendix A."""
+  guided_matching: bool = True
+  """Paper, appendix A."""
+  focal_factor: float = 1.2
+  """First guess of the focal length, times the long side; COLMAP."""
 
 
 @contextlib.contextmanager

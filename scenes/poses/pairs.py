@@ -26,14 +26,21 @@ Pair = tuple[int, int]  # indices of two keyframes, the smaller first
 class PairSettings:
   """Settings of the pair selection."""
 
-  exhaustive_cost: float = 1.6e10  # products of feature counts that may be compared exhaustively:
+  exhaustive_cost: float = 1.6e10
+  """Products of feature counts that may be compared exhaustively:."""
   # measured 5.2e-9 CPU s each on a 2-core machine, so 80 CPU s; 11,325 pairs of 1,090 features fit
-  overlap: int = 8  # following keyframes that each one is matched with (COLMAP: 10)
-  loop_keyframes: int = 300  # at most this many keyframes are scored for loop closures
-  loop_closures: int = 12  # partners that each scored keyframe is matched with
-  score_features: int = 256  # largest features of a keyframe that take part in scoring
-  score_ratio: float = 0.85  # nearest to second-nearest descriptor distance in scoring
-  min_score: int = 5  # mutual matches of a pair worth matching: of the living room's verified pairs
+  overlap: int = 8
+  """Following keyframes that each one is matched with (COLMAP: 10)."""
+  loop_keyframes: int = 300
+  """At most this many keyframes are scored for loop closures."""
+  loop_closures: int = 12
+  """Partners that each scored keyframe is matched with."""
+  score_features: int = 256
+  """Largest features of a keyframe that take part in scoring."""
+  score_ratio: float = 0.85
+  """Nearest to second-nearest descriptor distance in scoring."""
+  min_score: int = 5
+  """Mutual matches of a pair worth matching: of the living room's verified pairs."""
   # further than 10 keyframes apart 97 % have them, of all others a quarter has not
 
 

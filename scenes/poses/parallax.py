@@ -25,7 +25,7 @@ def parallax_share(database: Path, *, width: int, seed: int = 0) -> float | None
     seed: Of the choice of pairs.
 
   Returns:
-    The share, or None if there are not enough pairs to judge.
+    The share, or None if there are too few pairs.
   """
   with contextlib.closing(sqlite3.connect(database)) as db:
     rows = db.execute(

@@ -26,9 +26,12 @@ class ViewScore:
   """One held-out view, rendered and compared."""
 
   name: str
-  truth: np.ndarray  # uint8 [H, W, 3]
-  image: np.ndarray  # uint8 [H, W, 3]
-  depth: np.ndarray  # float32 [H, W]
+  truth: np.ndarray
+  """uint8 [H, W, 3]."""
+  image: np.ndarray
+  """uint8 [H, W, 3]."""
+  depth: np.ndarray
+  """float32 [H, W]."""
   psnr_db: float
   ssim: float
 

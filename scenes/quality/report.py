@@ -34,7 +34,7 @@ _VIEW_WIDTH = 480
 
 
 class Meaning(NamedTuple):
-  """What a figure of scene.json says."""
+  """The meaning of a figure of scene.json."""
 
   unit: str
   text: str
@@ -113,15 +113,22 @@ class ReportData:
   warnings: Sequence[str]
   settings: Mapping[str, Any]
   keyframes: Sequence[Path]
-  strategy: str  # how the keyframes were matched
-  camera_path: np.ndarray  # [N, 3]
-  views: Sequence[ViewScore]  # held-out views at full size
-  robot_views: Sequence[ViewScore]  # at robot resolution
-  baseline: Mapping[str, np.ndarray]  # name of a held-out view -> baseline's picture; may be empty
+  strategy: str
+  """How the keyframes were matched."""
+  camera_path: np.ndarray
+  """[N, 3]."""
+  views: Sequence[ViewScore]
+  """held-out views at full size."""
+  robot_views: Sequence[ViewScore]
+  """At robot resolution."""
+  baseline: Mapping[str, np.ndarray]
+  """Name of a held-out view -> baseline's picture; may be empty."""
   visual: trimesh.Trimesh
   collision: Sequence[trimesh.Trimesh]
-  floor: FloorMap  # without goals and camera path
-  goals: np.ndarray  # [G, 2]
+  floor: FloorMap
+  """Without goals and camera path."""
+  goals: np.ndarray
+  """[G, 2]."""
 
 
 def write(path: Path, data: ReportData) -> None:

@@ -25,7 +25,7 @@ _HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")
 _PHASE_CORRECTION = 0.12
 _ROVING = 8  # further phases that `follow` tries in turn
 _JUMP_SHARE = 0.5  # of the present mismatch below which it takes one of them; chosen
-_LOCKABLE = 0.5  # amplitude from which a phase can be told from the legs; chosen
+_LOCKABLE = 0.5  # amplitude from which the legs determine the phase; chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class GaitSettings:
   """Parameters of the gait; all but the first three were found by search."""
 
   stop_time: float = 0.4
-  """s over which steps grow from nothing and shrink again; ours."""
+  """s over which steps grow from nothing and shrink again; chosen: about a period."""
   max_turn: float = 0.25
   """rad of hip yaw in a turning step; the joints' limit is 0.3."""
   period: float = 0.4241
@@ -74,10 +74,14 @@ class GaitSettings:
 class Command:
   """What the walker shall do."""
 
-  forward: float = 0.0  # -1 to 1: share of the full stride
-  turn: float = 0.0  # -1 to 1: share of the full turning step, positive to the left
-  step: bool = True  # False: come to a stand
-  head: tuple[float, float] | None = None  # pan, tilt [rad]; None: as in the reference pose
+  forward: float = 0.0
+  """-1 to 1: share of the full stride."""
+  turn: float = 0.0
+  """-1 to 1: share of the full turning step, positive to the left."""
+  step: bool = True
+  """False: come to a stand."""
+  head: tuple[float, float] | None = None
+  """Pan, tilt [rad]; None: as in the reference pose."""
 
 
 class Gait:

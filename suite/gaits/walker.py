@@ -1,6 +1,6 @@
 """The scripted walker: the gait, steered to a goal over a path, or pushing a ball.
 
-It is a baseline that needs no training: it knows where it is, from a pose that is given to it
+It is a baseline that needs no training: its pose is given to it
 (privileged in simulation, an observer's on the virtual robot) or else by dead reckoning: its own
 turning rate and the steps that it has commanded.
 """
@@ -11,11 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nerf2real.suite.gaits.gaze import Gaze, view_of
 from nerf2real.suite.gaits.planner import Planner
 from nerf2real.suite.gaits.walk import Command, Gait, GaitSettings
 from nerf2real.suite.op3 import constants
 
 _TIMESTEP = constants.CONTROL_TIMESTEP
+_HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")]
 
 
 class Pose(NamedTuple):
@@ -33,7 +35,7 @@ class Pose(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SteeringSettings:
-  """How the walker steers; ours."""
+  """Steering of the walker; chosen: it reached the goals in simulation."""
 
   speed: float = 0.22
   """m/s at full stride, for dead reckoning."""
@@ -55,6 +57,8 @@ class SteeringSettings:
   """m from the ball's centre at which it walks around it."""
   head_tilt: float | None = None
   """rad of the head's tilt; None: as in the reference pose, which sees the floor ahead."""
+  watches_ball: bool = False
+  """Whether the head follows the ball, and looks for it first."""
 
 
 class Walker:
@@ -79,12 +83,14 @@ class Walker:
     self._planner = Planner(scene)
     self._gait = Gait(gait, head_pan_limit=head_pan_limit)
     self.steering = steering or SteeringSettings()
+    self._gaze = Gaze()
     self.reset(Pose(0.0, 0.0, 0.0))
 
   def reset(self, start: Pose) -> None:
     """Begins an episode, standing at a place."""
     self._gait.reset()
-    self.pose = start  # where it believes to be
+    self._gaze.reset()
+    self.pose = start  # the estimated pose
     self._command = Command(step=False)
     self._path: np.ndarray | None = None
     self._planned = -np.inf
@@ -111,7 +117,7 @@ class Walker:
     """Returns the next action [20], normalised.
 
     Args:
-      observation: With `gyroscope` and `gravity` as a policy has them.
+      observation: With `gyroscope`, `gravity` and `joint_positions` as a policy has them.
       goal: Where to walk, or where to push the ball [2] [m].
       pose: Where the robot is; None: by dead reckoning.
       ball: Where the ball is [2] [m]; None: there is none.
@@ -123,7 +129,11 @@ class Walker:
       self._command = self._walk_to(goal)
     else:
       self._command = self._push(np.asarray(ball, np.float64)[:2], goal)
-    if self.steering.head_tilt is not None:
+    if ball is not None and self.steering.watches_ball:
+      pan, tilt = observation["joint_positions"][-1][_HEAD]
+      view = view_of(self.pose, ball)
+      self._command = self._gaze.apply(self._command, view, pan=float(pan), tilt=float(tilt))
+    elif self.steering.head_tilt is not None:
       self._command = dataclasses.replace(self._command, head=(0.0, self.steering.head_tilt))
     self._time += _TIMESTEP
     return self._gait.act(self._command, gyroscope=gyroscope, gravity=gravity)

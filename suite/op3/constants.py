@@ -6,7 +6,7 @@ known when these numbers are used:
 - Table "Joint reference poses and limits": the reference of the hip pitch (-0.5553 left, 0.5553
   right) lies outside its own range (-0.45..1.57 and -1.57..0.45), and so does the reference of the
   hip roll (-0.0383 in -0.4..-0.1 and mirrored). `REFERENCE_POSE` keeps the printed values, which
-  the pose reward measures against; what the servos are told (`standing_targets`) is clipped to the
+  the pose reward measures against; the servos' targets (`standing_targets`) are clipped to the
   ranges.
 - Equation of r_pose: printed without a minus sign, although the text calls the term a
   regularisation towards the pose. `suite/tasks/rewards.py` implements a penalty (negative).
@@ -77,7 +77,7 @@ TORSO_LINK = "body_link"
 # A robot has fallen below either; chosen: 60 degrees, little more than half the standing height.
 MIN_UPRIGHT = 0.5  # cosine of the torso's tilt
 MIN_HEIGHT = 0.14  # m of the torso's origin above the floor (standing: 0.246)
-IMU_POSITION = (-0.01, 0.0, 0.05)  # m in the torso: ours, near where the OpenCR board sits
+IMU_POSITION = (-0.01, 0.0, 0.05)  # m in the torso; chosen: near the OpenCR board
 EXCLUDED_CONTACTS = (("l_hip_yaw_link", "l_hip_pitch_link"), ("r_hip_yaw_link", "r_hip_pitch_link"))
 FOOT_LINKS = ("l_ank_roll_link", "r_ank_roll_link")
 
@@ -87,14 +87,22 @@ class Link:
   """One rigid link; its frame is given in the parent link at zero joint angle (SI units)."""
 
   name: str
-  parent: str  # "world" for the torso
-  position: np.ndarray  # [3] m
-  joint: str  # "free" for the torso
-  axis: np.ndarray  # [3] unit vector in the link's frame
-  mass: float  # kg
-  center: np.ndarray  # centre of mass [3] m
-  inertia_quat: np.ndarray  # [4] w x y z of the principal axes
-  inertia: np.ndarray  # principal moments [3] kg m^2
+  parent: str
+  """"world" for the torso."""
+  position: np.ndarray
+  """[3] m."""
+  joint: str
+  """"free" for the torso."""
+  axis: np.ndarray
+  """[3] unit vector in the link's frame."""
+  mass: float
+  """kg."""
+  center: np.ndarray
+  """Centre of mass [3] m."""
+  inertia_quat: np.ndarray
+  """[4] w x y z of the principal axes."""
+  inertia: np.ndarray
+  """Principal moments [3] kg m^2."""
 
 
 def read_links() -> tuple[Link, ...]:

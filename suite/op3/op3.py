@@ -24,7 +24,7 @@ _LIGHT = (0.62, 0.64, 0.66, 1.0)  # aluminium frames
 _SHELL = (0.22, 0.24, 0.28, 1.0)  # torso and head covers
 
 # Link (without l_ or r_): list of (type, half sizes, position, colour) in the link's frame [m], for
-# the left side; positions change the sign of y on the right. Ours: plausible OP3 proportions.
+# the left side; positions change the sign of y on the right. Chosen: plausible OP3 proportions.
 _GEOMS: dict[str, list[tuple[str, tuple[float, ...], tuple[float, float, float], tuple]]] = {
   "body_link": [
     ("box", (0.040, 0.048, 0.058), (-0.012, 0.0, 0.066), _SHELL),

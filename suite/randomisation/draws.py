@@ -43,13 +43,13 @@ class RandomisationSettings:
   delay_range: tuple[float, float] = (filters.MIN_DELAY, filters.MAX_DELAY)
   """s, paper."""
   jitter_half_width: float = filters.JITTER
-  """s; uniform within plus and minus this. The paper says "5 ms jitter"; the law is ours."""
+  """s; uniform within plus and minus this. The paper: "5 ms jitter"; its law is chosen."""
   max_torso_mass: float = 0.5
   """kg, paper; uniform from 0."""
   torso_box_center: tuple[float, float, float] = (-0.01, 0.0, 0.06)
-  """m, body frame of the torso; ours: near the torso's centre of mass."""
+  """m, body frame of the torso; chosen: near the torso's centre of mass."""
   torso_box_half_size: tuple[float, float, float] = (0.05, 0.06, 0.07)
-  """m; ours: about the torso's shell."""
+  """m; chosen: about the torso's shell."""
   max_imu_shift: float = 0.005
   """m, paper; uniform in the ball of this radius."""
   max_imu_tilt: float = float(np.deg2rad(2.0))
@@ -59,11 +59,11 @@ class RandomisationSettings:
   ball_radius_range: tuple[float, float] = (0.115, 0.125)
   """m, paper."""
   push_interval: tuple[float, float] = (2.0, 5.0)
-  """s between the starts of pushes; the paper gives no figures for pushes, these are ours."""
+  """s between the starts of pushes; no figures in the paper. Chosen: several an episode."""
   push_duration: tuple[float, float] = (0.05, 0.15)
-  """s; ours."""
+  """s; chosen: shorter than a step of the gait, an impulse."""
   push_force: tuple[float, float] = (5.0, 15.0)
-  """N, horizontal; ours: 0.08 to 0.7 m/s for the 3.2 kg robot if nothing held it."""
+  """N, horizontal; chosen: 0.08 to 0.7 m/s for the 3.2 kg robot if nothing held it."""
 
 
 class Pushes(NamedTuple):
@@ -122,7 +122,7 @@ def draw_episode(
 ) -> EpisodeDraws:
   """Draws one episode.
 
-  The same numbers are taken from the generator whatever the switches say, so that turning one
+  The same numbers are taken from the generator whatever the switches, so that turning one
   variation off leaves the others as they were for the same seed.
   """
   delays = rng.uniform(*settings.delay_range, size=3) * settings.delays

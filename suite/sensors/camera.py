@@ -20,8 +20,10 @@ from nerf2real.suite.op3 import constants, op3
 
 DEPTH, OVERLAY = "depth", "overlay"
 _DISPLAY_GAMMA = 2.2  # of the pictures: light = value ** 2.2
-_LIGHT_DIRECTION = np.array([0.3, 0.2, 0.933])  # towards the light, in the world; ours
-_AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; ours
+_LIGHT_DIRECTION = np.array(
+  [0.3, 0.2, 0.933]
+)  # towards the light, in the world; chosen: a lamp above
+_AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; chosen
 _CULLING_SLACK = 1e-3  # rad added to the cone around a geom
 
 
@@ -36,14 +38,22 @@ class FieldRenderer(Protocol):
 class CameraSettings:
   """Settings of the robot's camera; the defaults are neutral."""
 
-  lens: Camera | None = None  # a calibrated camera; None: no distortion, 43.3 degrees vertically
-  compositing: str = DEPTH  # "depth", or "overlay": moving objects always in front, as the paper
-  gain: float = 1.0  # factor on the light; the paper's gains are ratios of its default of 50
-  exposure: float = 1.0  # another factor on the light
-  white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors on red, green, blue light
-  noise: float = 0.0  # standard deviation of the noise at gain 1 [8-bit levels]
-  latency: float = 0.0  # s, in addition to the delay that an episode draws
-  rate: float = 1 / constants.CONTROL_TIMESTEP  # pictures a second [Hz]; between two the last stays
+  lens: Camera | None = None
+  """a calibrated camera; None: no distortion, 43.3 degrees vertically."""
+  compositing: str = DEPTH
+  """"depth", or "overlay": moving objects always in front, as the paper."""
+  gain: float = 1.0
+  """Factor on the light; the paper's gains are ratios of its default of 50."""
+  exposure: float = 1.0
+  """Another factor on the light."""
+  white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+  """Factors on red, green, blue light."""
+  noise: float = 0.0
+  """Standard deviation of the noise at gain 1 [8-bit levels]."""
+  latency: float = 0.0
+  """s, in addition to the delay that an episode draws."""
+  rate: float = 1 / constants.CONTROL_TIMESTEP
+  """Pictures a second [Hz]; between two the last stays."""
 
   def __post_init__(self):
     if self.compositing not in (DEPTH, OVERLAY):

@@ -2,7 +2,7 @@
 
 `History` keeps samples with their times and gives the newest up to a time, or interpolates;
 `DelayLine` is one whose samples arrive late, with jitter; `StepRing` keeps an array that changes
-once a fixed step. They know nothing of the simulator.
+once a fixed step. They use nothing of the simulator.
 """
 
 import math

@@ -1,6 +1,6 @@
 """Filters of the sensor and action path: low-pass, range of the IMU chip, action smoothing.
 
-They hold state, work on float arrays of a fixed shape and know nothing of the simulator: the same
+They hold state, work on float arrays of a fixed shape and use nothing of the simulator: the same
 objects run on the robot. Each has `reset()` and one call a sample.
 
 The low-pass of the IMU chip: OP3's OpenCR board carries an MPU-9250 (later boards an ICM-20648).

@@ -1,4 +1,4 @@
-"""The path from the robot's true motion to what its policy is told about it.
+"""The path from the robot's true motion to its policy's observations.
 
 Gyroscope and accelerometer pass the IMU chip's low-pass, end at its range, are sampled with the
 encoders at 125 Hz, feed Madgwick's filter, and reach the policy late (a delay drawn for each

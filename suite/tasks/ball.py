@@ -7,8 +7,8 @@ from dm_control import composer, mjcf
 from nerf2real.suite.op3 import op3
 from nerf2real.suite.randomisation.draws import BALL_MASS, BALL_RADIUS
 
-COLOR = (0.86, 0.42, 0.10, 1.0)  # "a simple orange ball" (paper, "Tasks"); the shade is ours
-# Sliding, torsional, rolling [m] friction. Ours: rubber on a floor; rolling over radius is 0.8 %.
+COLOR = (0.86, 0.42, 0.10, 1.0)  # "a simple orange ball" (paper, "Tasks")
+# Sliding, torsional, rolling [m] friction. Chosen: rubber on a floor; rolling over radius is 0.8 %.
 FRICTION = (0.8, 0.005, 0.001)
 _ROLLING = 6  # MuJoCo contact dimension with torsional and rolling friction
 

@@ -25,7 +25,7 @@ NAME = catalogue.BALL_PUSH
 TIME_LIMIT = catalogue.TIME_LIMITS[NAME]  # s
 FALL = "fall"
 BALL_IN_FRONT = 0.5  # share of episodes with the ball just in front of the robot (paper)
-# m ahead of and beside the robot's torso, when it starts in front: ours.
+# m ahead of and beside the robot's torso, when it starts in front; chosen: a few steps away.
 _AHEAD, _ASIDE = (0.25, 0.45), 0.08
 _MAX_ATTEMPTS = 100
 

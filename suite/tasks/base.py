@@ -43,7 +43,7 @@ def _single(read: Callable[[], np.ndarray]) -> np.ndarray:
 
 
 class RobotTask(composer.Task):
-  """The OP3 in a room. A task says where it starts, what is rewarded and when it has succeeded."""
+  """The OP3 in a room. A task defines start, reward and success."""
 
   weights: Mapping[str, float]  # of the reward terms
 

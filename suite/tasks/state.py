@@ -106,7 +106,7 @@ class RobotIndices:
 def standing_posture() -> np.ndarray:
   """Returns qpos [27] of the robot standing at rest at the origin on a flat floor, facing +x.
 
-  The servos are soft: under its weight the robot settles a little away from what they are told.
+  The servos are soft: under its weight the robot settles a little away from their targets.
   """
   arena = composer.Arena()
   robot = op3.OP3()

@@ -10,14 +10,15 @@ from nerf2real.suite import protocols
 
 _STEP = 0.1  # m between the places that are tried, and between the points that are counted
 _PLACE_GRID = 0.05  # m between the places that a start blocked by furniture may move to
-_MIN_FREE = 0.25  # share of the workspace that a robot must be able to stand on: ours
+_MIN_FREE = 0.25  # least share of the workspace that is free; chosen
 
 
 @dataclasses.dataclass(frozen=True)
 class Workspace:
   """A square along the world's axes, of 3 x 3 cells; the target is one of its corner cells."""
 
-  center: np.ndarray  # [2] m
+  center: np.ndarray
+  """[2] m."""
 
   @property
   def lower(self) -> np.ndarray:

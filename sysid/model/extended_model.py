@@ -1,8 +1,10 @@
 """model_extended.xml: the declared model with what MuJoCo itself can express put in.
 
 Constants are corrected; friction, drag, springs, gains, limits, offsets, payloads and tilts are
-written as attributes, a sloping floor is turned. Delays, Stribeck and load friction, play, cogging,
-learned forces and what is wrong with sensors have no MJCF: those stay in effects.json.
+written as attributes, a sloping floor is turned; delays, Stribeck friction, cogging, friction that
+differs by direction and play are native elements (`native_effects`). The file needs MuJoCo 3.7 or
+later and nothing of this project. What MJCF cannot hold (load friction, heat, supply, learned
+forces, sensors' errors) is listed in a comment of the file, and stays in effects.json.
 """
 
 from collections.abc import Sequence
@@ -12,7 +14,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.files import write_atomically
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.model import native_effects
 
 _POINT = 1e-4  # m, radius of a payload: no inertia of its own
 
@@ -21,7 +25,7 @@ EXPRESSED = (
   *("torque_limit", "encoder_offset", "payload", "spring", "gravity_tilt"),
   "floor_slope",
 )
-"""Kinds that MJCF can hold."""
+"""Kinds that are constants of a model."""
 
 
 def write(source: Path, target: Path, effects: Sequence[Effect]) -> list[Effect]:
@@ -36,16 +40,43 @@ def write(source: Path, target: Path, effects: Sequence[Effect]) -> list[Effect]
     The effects that MJCF cannot hold.
   """
   spec = mujoco.MjSpec.from_file(str(source))
-  left = []
-  for effect in effects:
-    if effect.kind not in EXPRESSED:
+  # Constants first: friction and play take over what a joint has by then.
+  order = [*EXPRESSED, *native_effects.KINDS]
+  left, written = [], []
+  for effect in sorted(effects, key=lambda e: order.index(e.kind) if e.kind in order else 0):
+    if effect.kind in EXPRESSED:
+      _put(spec, effect)
+    elif native_effects.holds(spec, effect):
+      native_effects.put(spec, effect)
+    else:
       left.append(effect)
       continue
-    _put(spec, effect)
+    written.append(effect)
   spec.compile()
   _absolute(spec, source.resolve().parent)
-  target.write_text(spec.to_xml())
+  head, body = spec.to_xml().split("\n", 1)
+  write_atomically(target, f"{head}\n{_comment(written, left)}{body}")
   return left
+
+
+def _comment(written: Sequence[Effect], left: Sequence[Effect]) -> str:
+  """Returns what a reader of the file must know, as an XML comment."""
+  lines = [
+    f"{len(written)} corrections and effects are in this model; plain MuJoCo simulates them."
+  ]
+  notes = {
+    "command_delay": "Before the first command arrives, actuators act on commands of zero.",
+    "measurement_delay": "Positions and velocities are read late by the sensors named *_late.",
+    "backlash": "A link is at the sum of its joint and the joint named *_play behind it.",
+    "encoder_offset": "Positions read are the joint's plus the offset, which is in the servo only.",
+  }
+  lines += [note for kind, note in notes.items() if any(e.kind == kind for e in written)]
+  for effect in left:
+    values = ", ".join(f"{name} {value}" for name, value in effect.parameters.items())
+    lines.append(f"Not in this model: {effect.kind} on {effect.target or 'all'} ({values}).")
+  # A comment may not hold two hyphens in a row.
+  text = "\n".join(f"    {line.replace('--', '- -')}" for line in lines)
+  return f"  <!--\n{text}\n  -->\n"
 
 
 def _absolute(spec: mujoco.MjSpec, folder: Path) -> None:

@@ -12,9 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import Log, read_log
+from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.data.compatibility import check_against_model
+from nerf2real.sysid.data.opening import named, read_log
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import (
   chain,
@@ -84,7 +85,7 @@ def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:
   """Reads logs and checks them against the model."""
   logs = []
   for path in paths:
-    log = read_log(path)
+    log = named(read_log(path), model)
     check_against_model(log, model)
     logs.append(log)
   return logs

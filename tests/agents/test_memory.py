@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import acting
-from nerf2real.agents.dmpo.export import load_policy
-from nerf2real.agents.processes import cue_task, environments
+from nerf2real.agents.dmpo.policy import acting
+from nerf2real.agents.dmpo.policy.export import load_policy
+from nerf2real.agents.environments import cue_task, loading
 from tests.agents.processes.test_runs import finish, rows, start
 
 MINUTES = 15
@@ -35,7 +35,7 @@ def test_recurrent_policy_remembers_the_cue(tmp_path):
   finish(process, timeout=MINUTES * 60, run=run)
   exported = load_policy(run / "policy" / "best")
   agent = acting.Agent(exported.policy, exported.layout, seed=0, deterministic=True)
-  environment = environments.make_environment(exported.environment, seed=123)
+  environment = loading.make_environment(exported.environment, seed=123)
   returns = [acting.run_episode(agent, environment)["return"] for _ in range(EPISODES)]
   curve = [(r["steps"], round(r["return"], 1)) for r in rows(run, "evaluator")]
   assert np.mean(returns) > MEMORYLESS_BOUND, curve

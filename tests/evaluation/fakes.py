@@ -3,9 +3,9 @@
 import dm_env
 import numpy as np
 
-from nerf2real.evaluation import plants
 from nerf2real.evaluation.episodes import Episode, Setting
-from nerf2real.evaluation.plants import Plant, Sight
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import Plant, Sight
 from nerf2real.suite import specs
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walker import Pose
@@ -69,7 +69,8 @@ class ScriptedPlant(Plant):
 class StillPolicy:
   """Stands; says that it believes to be where it is told."""
 
-  name, policy_id, image_size = "still", "0123", None
+  name, policy_id, image_size, control = "still", "0123", None, "none"
+  trained_on = ""
 
   def __init__(self, belief=None):
     self.belief = belief
@@ -93,6 +94,7 @@ def episode(outcome="success", *, index=0, group="navigation", **changes):
     "plant_id": "a",
     "protocol": "navigation",
     "perturbation": "none",
+    "control": "none",
   }
   fields = {"time": 10.0 if outcome == "success" else None, "duration": 12.0}
   for name, value in changes.items():

@@ -1,14 +1,19 @@
 """Simulation, virtual robot and robot as plants of an evaluation, and what disturbs them."""
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.evaluation import operated, perturbations, plants, runner
+from nerf2real.evaluation import runner, session
+from nerf2real.evaluation.plants import operated, perturbations
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
+from nerf2real.evaluation.plants.simulated import SimulatedPlant
 from nerf2real.evaluation.policies import GaitPolicy
-from nerf2real.evaluation.rehearsed import RehearsedPlant
-from nerf2real.evaluation.simulated import SimulatedPlant
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite import loading, protocols
 from nerf2real.suite.tasks.workspace import find_workspace
@@ -59,6 +64,18 @@ def test_the_gait_reaches_a_goal_in_simulation(scene, simulated):
   assert distance < 0.35  # a point every 0.2 s
   again = runner.run_trial(simulated, policy, trial, group=group, index=NEAREST)
   assert again == found  # the same trial is the same episode
+
+
+@pytest.mark.parametrize("trained_on, pictures", [("", 8), ("suite:nerf_nav?camera_rate=10", 2)])
+def test_the_simulated_camera_has_the_rate_of_the_policys_training(scene, trained_on, pictures):
+  settings = EvaluationSettings(policy="a/folder", plant="sim")
+  plant = session.make_plant(settings, scene, (6, 8), trained_on=trained_on)
+  try:
+    plant.start(protocols.navigation()[0])
+    seen = [plant.step(np.zeros(20)).observation["camera"].copy() for _ in range(9)]
+  finally:
+    plant.close()
+  assert sum((a != b).any() for a, b in itertools.pairwise(seen)) == pictures
 
 
 def test_the_gait_reaches_a_goal_on_the_virtual_robot(scene):

@@ -4,13 +4,17 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import belief, config, export, learning, networks
+from nerf2real.agents.dmpo import belief, config, networks, training_state
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation import episodes, operated, plants, report, runner, session
+from nerf2real.evaluation import episodes, runner, session
 from nerf2real.evaluation.learned import LearnedPolicy
-from nerf2real.evaluation.plants import Sight
+from nerf2real.evaluation.plants import operated
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
+from nerf2real.evaluation.report import page as report
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walker import Pose
 from tests.evaluation.fakes import FAR, TRIAL, ScriptedPlant, StillPolicy
@@ -129,7 +133,7 @@ def exported(tmp_path_factory):
   folder = tmp_path_factory.mktemp("run") / "policy"
   export.export_policy(
     folder,
-    learning.flatten_params(parameters),
+    training_state.flatten_params(parameters),
     layout=layout,
     environment="suite:nerf_nav",
     settings=to_plain(preset),

@@ -6,7 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from nerf2real.evaluation import episodes, report, tables
+from nerf2real.evaluation import episodes
+from nerf2real.evaluation.report import page as report
+from nerf2real.evaluation.report import tables
 from nerf2real.suite.gaits.floor import EmptyFloor
 from tests.evaluation.fakes import episode
 

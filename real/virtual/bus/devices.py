@@ -24,7 +24,7 @@ _FAST_HEAD = 8  # bytes of a fast answer before its first part
 _PROTECT_PERIOD = 0.010  # s between a servo's checks of temperature and voltage: chosen
 
 # Ids by joint: ROBOTIS OP3, odd right, even left. The virtual robot's own copy: what the host
-# believes (real.wire.op3) is tested against it.
+# expects (real.wire.op3) is tested against it.
 IDS = {
   "r_sho_pitch": 1,
   "l_sho_pitch": 2,
@@ -185,7 +185,7 @@ class Devices:
     spoken = 0
     for device_id, address, length in wanted:
       device = self._reachable(device_id, time)
-      # The board's firmware knows no fast reads.
+      # The board's firmware has no fast reads.
       if spoken < len(parts) or not isinstance(device, Servo):
         parts.append((device_id, 0, bytes(length)))  # its place in the packet stays silent
         continue

@@ -21,7 +21,7 @@ _POLYNOMIAL = 0x8005  # CRC-16 with initial value 0, most significant bit first
 
 
 class Instruction(enum.IntEnum):
-  """What a packet asks for."""
+  """A packet's instruction."""
 
   PING = 0x01
   READ = 0x02

@@ -146,7 +146,7 @@ class Table:
     self.memory[register.address : register.address + register.size] = raw
 
   def reset(self, *, eeprom: bool = False) -> None:
-    """Writes the defaults to the RAM area, and to the EEPROM area if asked."""
+    """Writes the defaults to the RAM area, and optionally to the EEPROM area."""
     for name, register in self.registers.items():
       if eeprom or not register.eeprom:
         self[name] = register.default

@@ -17,7 +17,7 @@ from nerf2real.real.virtual.bus.line import Line
 
 _CHUNK = 4096
 _MAX_LAG = 0.2  # s that the body may be behind the clock
-_IDLE = 0.001  # s after which the body is brought up to date when nothing is asked
+_IDLE = 0.001  # s after which the body is brought up to date without packets
 
 
 class Wire:

@@ -25,7 +25,7 @@ from nerf2real.scenes.field.engine.layout import (
   Workers,
 )
 from nerf2real.scenes.field.engine.losses import squareplus
-from nerf2real.scenes.field.engine.native import PADDING
+from nerf2real.scenes.field.engine.native.vectors import PADDING
 from nerf2real.scenes.field.engine.rays import draw_ray, largest, squash
 
 

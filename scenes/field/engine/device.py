@@ -13,13 +13,13 @@ import numpy as np
 import warp as wp
 
 _LINE_BYTES = 64  # of a cache line: vector loads of work arrays shall not cross two
-# Warp compiles on the machine itself with -march=native; fused multiply-adds must be asked for.
+# Warp compiles on the machine itself with -march=native; fused multiply-adds need a flag.
 OPTIONS = {
   "fast_math": True,
   "optimization_level": 3,
   "cpu_compiler_flags": "-march=native -ffp-contract=fast",
 }
-# Loops written for vectors of samples (`native.CPU_LANES`) also want registers of 512 bits; clang
+# Loops written for vectors of samples (`vectors.CPU_LANES`) also need registers of 512 bits; clang
 # takes narrower ones where a CPU has no AVX-512. The renderer's loops lose 15 % with them.
 _WIDE = " -mprefer-vector-width=512" if platform.machine() in ("x86_64", "AMD64") else ""
 WIDE_OPTIONS = OPTIONS | {"cpu_compiler_flags": f"{OPTIONS['cpu_compiler_flags']}{_WIDE}"}

@@ -1,6 +1,6 @@
 """The trainer's functions of samples and rays in Warp, for one shape of field.
 
-The arithmetic on samples is C++ (`native_grid`, `native_network`), a vector at a time. `chunks` and
+The arithmetic on samples is C++ (`native/`), a vector at a time. `chunks` and
 `phases` build kernels of these functions.
 """
 # mypy: ignore-errors
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from nerf2real.scenes.field.engine import losses, native_grid, native_network
+from nerf2real.scenes.field.engine import losses
 from nerf2real.scenes.field.engine.layout import (
   CHUNK_SAMPLES,
   AdamW,
@@ -23,7 +23,9 @@ from nerf2real.scenes.field.engine.layout import (
   Shape,
   Worker,
 )
-from nerf2real.scenes.field.engine.native import snippet
+from nerf2real.scenes.field.engine.native import grid as native_grid
+from nerf2real.scenes.field.engine.native import network as native_network
+from nerf2real.scenes.field.engine.native.vectors import snippet
 from nerf2real.scenes.field.engine.rays import march, uniform
 
 

@@ -13,7 +13,7 @@ CHUNK_RAYS = 128  # of a chunk at most
 CHUNK_SAMPLES = 768  # chosen: a thread's activations stay in a second-level cache of 1 MB
 Floats = wp.array(dtype=wp.float32)
 Ints = wp.array(dtype=wp.int32)
-MULTIPLE = 8  # of the widths: a tile of the matrix products, see `native`
+MULTIPLE = 8  # of the widths: a tile of the matrix products, see `native/vectors.py`
 # An odd number of cache lines, as rows a power of two apart would share a cache's sets.
 STRIDE = CHUNK_SAMPLES + 48
 
@@ -145,7 +145,7 @@ class Settings:
   specular_bias: wp.float32
   pixel_angle: wp.float32
   step: wp.float32
-  variance_step: wp.float32  # interval that the variance tells of, inside the unit cube
+  variance_step: wp.float32  # interval of the variance, inside the unit cube
   near: wp.float32
   depth_limit: wp.float32  # a ray's march ends where the grid's optical depth passes this
   ray_samples: wp.int32  # most samples of a ray

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from nerf2real.scenes.field.engine import native, native_grid
 from nerf2real.scenes.field.engine.layout import Floats, Pictures, Settings, Shape, Worker
+from nerf2real.scenes.field.engine.native import grid as native_grid
+from nerf2real.scenes.field.engine.native import vectors as native
 from nerf2real.scenes.field.engine.rays import squash, uniform
 
 _EMPTY_SLOPE = 0.1 * math.log2(10.0)  # of a variance input by the deviation's decimal logarithm

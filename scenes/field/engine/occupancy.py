@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from nerf2real.scenes.field.engine import layout, native_grid
+from nerf2real.scenes.field.engine import layout
 from nerf2real.scenes.field.engine.device import OPTIONS, Device
 from nerf2real.scenes.field.engine.engine import Engine
+from nerf2real.scenes.field.engine.native import grid as native_grid
 from nerf2real.scenes.field.settings import TrainSettings
 
 DISTANCE_CELLS = 12  # chosen: empty space is skipped in strides of at most this many cells

@@ -23,7 +23,7 @@ from nerf2real.scenes.field.engine.layout import (
   Worker,
   Workers,
 )
-from nerf2real.scenes.field.engine.native import PADDING
+from nerf2real.scenes.field.engine.native.vectors import PADDING
 from nerf2real.scenes.field.engine.rays import draw_ray
 
 

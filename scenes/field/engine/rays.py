@@ -8,8 +8,9 @@ the cube samples are `step` apart, outside `OUTER_STEP * step * |x|_max`.
 
 import warp as wp
 
-from nerf2real.scenes.field.engine import native, native_grid
 from nerf2real.scenes.field.engine.layout import Floats, Occupancy, Pictures, Settings
+from nerf2real.scenes.field.engine.native import grid as native_grid
+from nerf2real.scenes.field.engine.native import vectors as native
 
 FAR = 16.0  # chosen: rays end here [unit]; squashed to 1.94 of 2
 OUTER_STEP = 2.0  # chosen: outside, intervals are this many steps times |x|_max

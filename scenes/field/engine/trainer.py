@@ -9,7 +9,7 @@ from nerf2real.scenes.field.anchors import EMPTY_CELLS
 from nerf2real.scenes.field.engine import layout, parameters, pictures
 from nerf2real.scenes.field.engine.device import Device
 from nerf2real.scenes.field.engine.engine import Engine
-from nerf2real.scenes.field.engine.native import PADDING
+from nerf2real.scenes.field.engine.native.vectors import PADDING
 from nerf2real.scenes.field.engine.occupancy import OccupancyGrids, distance_along
 from nerf2real.scenes.field.field import Field, init_params
 from nerf2real.scenes.field.settings import TrainSettings
@@ -18,7 +18,7 @@ from nerf2real.scenes.field.views import Views
 _COARSEST = 8  # chosen: the first marches take steps of 16 cm in a room of 5 m
 _COARSEN_RATIO = 5  # chosen: above 2, so that the march does not go back and forth
 # Chosen, for a step in phases:
-_ROOM = 1.25  # room for so many samples of those wanted; rays beyond it get none
+_ROOM = 1.25  # room for so many times the settings' samples; rays beyond it get none
 _FEWEST_SAMPLES = 4  # samples a ray on which the room for rays is reckoned
 _FIRST_SAMPLES = 64  # samples a ray expected of the first step
 _STRETCH = 512  # samples that one thread sums a tile of the networks' gradient over

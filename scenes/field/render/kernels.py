@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from nerf2real.scenes.field.engine.device import OPTIONS, Device
-from nerf2real.scenes.field.engine.native import snippet
+from nerf2real.scenes.field.engine.native.vectors import snippet
 from nerf2real.scenes.field.engine.rays import largest, squash
 from nerf2real.scenes.field.render import native
 from nerf2real.scenes.field.render.weights import Layout, Packed

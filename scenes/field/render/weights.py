@@ -23,7 +23,8 @@ class Layout:
 
   padded_levels: int
   width: int
-  outputs: int  # 1 density, 3 diffuse, bottleneck, padding
+  outputs: int
+  """1 density, 3 diffuse, bottleneck, padding."""
   bottleneck: int
   view_width: int
   density_scale: float
@@ -59,7 +60,7 @@ def pack(settings: Any, params: Any) -> Packed:
     params: Its parameters by name.
 
   Raises:
-    ValueError: Where the field has a shape that the kernels do not know.
+    ValueError: Where the kernels do not support the field's shape.
   """
   if settings.features != 2 or settings.width % 4:
     raise ValueError(

@@ -1,14 +1,16 @@
 """The collector: the mixture over a run, pushes in steps, and labelled episodes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from nerf2real.agents.distill import episodes, evaluating, schedule, settings
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Label
-from nerf2real.agents.dmpo.inference import PolicyState, PolicyStep
+from nerf2real.agents.dmpo.policy.inference import PolicyState, PolicyStep
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.processes.environments import make_environment
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.suite import protocols
 
 
@@ -18,6 +20,20 @@ def test_the_teacher_gives_way_to_the_student():
   assert schedule.mixture_at(mixture, 5_000, begun=5_000) == (1.0, 0.0)
   assert schedule.mixture_at(mixture, 5_050, begun=5_000) == pytest.approx((0.6, 0.25))
   assert schedule.mixture_at(mixture, 9_999, begun=5_000) == pytest.approx((0.2, 0.5))
+
+
+def test_room_is_left_for_frames_of_students():
+  found = dataclasses.replace(settings.preset("tiny"), teacher_frames=100, max_frames=300)
+  for frames, begun, expected in (
+    (99, None, True),
+    (100, None, False),
+    (100, 100, True),
+    (299, 100, True),
+    (300, 100, False),
+  ):
+    assert schedule.may_collect(found, frames, begun=begun) == expected
+  assert settings.nerf_nav().teacher_frames < settings.nerf_nav().max_frames
+  assert settings.nerf_nav_60x80().teacher_frames < settings.nerf_nav_60x80().max_frames
 
 
 def test_pushes_come_in_steps():
@@ -71,7 +87,7 @@ class _Teacher:
   def reset(self, pose):
     self.poses = []
 
-  def label(self, observation, *, goal, pose):
+  def label(self, observation, *, goal, pose, ball=None):
     self.poses.append(pose)
     return Label(np.full(20, 0.5, np.float32), np.array([1.0, -1.0], np.float32))
 
@@ -109,6 +125,14 @@ def test_every_state_is_labelled_whoever_drives(world):
   expected = np.linalg.norm(arrays["pose"][:, :2] - goal, axis=1)
   assert arrays["goal_distance"] == pytest.approx(expected, abs=1e-4)
   assert arrays["image"].shape == (frames, 12, 16, 3) and arrays["image"].std() > 0
+  by_student = arrays["driver"] == episodes.STUDENT
+  standing = environment._environment.task.standing_action
+  assert arrays["action"][by_student] == pytest.approx(np.tile(standing, (by_student.sum(), 1)))
+  terms = environment._environment.task.reward_terms
+  assert arrays["reward"][-1] == pytest.approx(terms["total"]) and arrays["reward"].std() > 0
+  assert arrays["privileged"].shape == (frames, world[1].privileged_size)
+  assert (arrays["discount"][:-1] == 1).all()
+  assert arrays["discount"][-1] == float(environment._environment.task.ending is None)
 
 
 def test_a_teacher_by_belief_is_given_the_likeliest_pose_and_the_truth_is_kept(world):

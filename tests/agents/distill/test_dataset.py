@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill.dataset import Dataset, Span, Streams, fields
+from nerf2real.agents.distill.dataset import Dataset, Span, Streams, fields, transition_fields
+from nerf2real.agents.dmpo.prior import PriorData
 from nerf2real.agents.dmpo.specs import Layout
 
 LAYOUT = Layout(
@@ -18,9 +19,8 @@ LAYOUT = Layout(
 
 
 def _episode(frames, value):
-  return {
-    name: np.full((frames, *shape), value, dtype) for name, (shape, dtype) in fields(LAYOUT).items()
-  }
+  kept = fields(LAYOUT) | transition_fields(LAYOUT)
+  return {name: np.full((frames, *shape), value, dtype) for name, (shape, dtype) in kept.items()}
 
 
 def _open(folder, capacity=100):
@@ -54,6 +54,27 @@ def test_what_does_not_fit_is_refused(tmp_path):
   with pytest.raises(ValueError, match="holds its 5 frames"):
     data.insert(_episode(2, 0), 1, 2)
   assert data.frames == 4 and len(list(tmp_path.glob("*.npz"))) == 1
+
+
+def test_the_files_are_prior_data_for_dmpo(tmp_path):
+  data = _open(tmp_path)
+  sent = _episode(4, 3) | {"reward": np.arange(5, dtype=np.float32)}  # as the link wants it
+  sent["discount"] = np.array([1, 1, 1, 0], np.float32)
+  assert data.insert(sent, 1, 1) == 4 and set(data.arrays) == set(fields(LAYOUT))
+  prior = PriorData(tmp_path, LAYOUT, max_steps=100)
+  assert prior.steps == 4
+  batch = prior.sample(np.random.default_rng(0), 3, length=5, burn_in=2, lstm_size=4)
+  np.testing.assert_array_equal(batch["reward"][:, :4], np.tile(np.arange(4.0), (3, 1)))
+  assert batch["image"].shape == (3, 5, 2, 2, 3) and (batch["action"][:, :4] == 3).all()
+
+
+def test_episodes_of_an_older_release_are_read_and_no_prior_data(tmp_path):
+  _open(tmp_path)
+  older = {name: array for name, array in _episode(4, 3).items() if name in fields(LAYOUT)}
+  np.savez(tmp_path / "000000_0000000000000abc_1.npz", **older)
+  assert _open(tmp_path).frames == 4
+  with pytest.raises(ValueError, match="holds no transitions with state, privileged, action"):
+    PriorData(tmp_path, LAYOUT, max_steps=100)
 
 
 def test_a_damaged_file_is_named(tmp_path):

@@ -15,7 +15,7 @@ import pytest
 
 from nerf2real.agents.distill import checkpoint, learning, schedule, settings
 from nerf2real.agents.distill.settings import Stage
-from nerf2real.agents.dmpo.export import load_policy
+from nerf2real.agents.dmpo.policy.export import load_policy
 from tests.agents.distill.test_student import LAYOUT, TINY
 
 SCRIPT = Path(__file__).parents[3] / "launch" / "distill.py"

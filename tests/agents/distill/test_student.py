@@ -7,7 +7,8 @@ import pytest
 
 from nerf2real.agents.distill import learning, settings, student
 from nerf2real.agents.distill.collecting import student_policy
-from nerf2real.agents.dmpo import export, scaling
+from nerf2real.agents.dmpo import scaling
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import POSITION, ROTATION, Layout
 from nerf2real.core.serialization import to_plain
 
@@ -132,8 +133,8 @@ def test_updates_lower_the_loss_and_reach_their_own_parameters(kind):
   values = []
   for _ in range(60):
     if kind == "encoder":
-      flat = (batch["image"].reshape(-1, 12, 16, 3), batch["pose"].reshape(-1, 3))
-      state, metrics = updates.encoder(state, *flat, 3e-3)
+      flat = {name: batch[name].reshape(-1, *batch[name].shape[2:]) for name in ("image", "pose")}
+      state, metrics = updates.encoder(state, flat, 3e-3)
     else:
       inputs = {k: v for k, v in batch.items() if k != ("image", "features")[kind != "policy"]}
       state, _, metrics = getattr(updates, kind)(state, inputs, carried, 3e-3)

@@ -10,22 +10,23 @@ import numpy as np
 import pytest
 from dm_env import specs
 
-from nerf2real.agents.dmpo import acting, config, export, inference, learning, networks
+from nerf2real.agents.dmpo import config, networks, training_state
+from nerf2real.agents.dmpo.policy import acting, export, inference
 from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.processes import environments
+from nerf2real.agents.environments import loading
 from nerf2real.core.serialization import to_plain
 
 PRESET = config.override(config.preset("vision_small"), {"network.lstm_size": 8})
 
 
 def _exported(folder, environment_name="agents:cue"):
-  environment = environments.make_environment(environment_name, seed=0)
+  environment = loading.make_environment(environment_name, seed=0)
   layout = Layout.of(environment)
   params = jax.jit(lambda key: networks.init_policy(key, PRESET.network, layout))(jax.random.key(0))
   export.export_policy(
     folder,
-    learning.flatten_params({"policy": params}),
+    training_state.flatten_params({"policy": params}),
     layout=layout,
     environment=environment_name,
     settings=to_plain(PRESET),
@@ -81,7 +82,7 @@ def test_every_transition_once_and_states_where_they_belong(cue):
 def test_exported_policy_needs_neither_jax_nor_the_simulator(cue):
   code = (
     "import sys, numpy as np\n"
-    "from agents.dmpo.export import load_policy\n"
+    "from nerf2real.agents.dmpo.policy.export import load_policy\n"
     f"p = load_policy({str(cue[0])!r}).policy\n"
     "step = p.step(np.zeros((30, 40, 3), np.uint8), np.zeros(1, np.float32), p.initial_state())\n"
     "assert np.isfinite(step.mean).all()\n"
@@ -93,7 +94,7 @@ def test_exported_policy_needs_neither_jax_nor_the_simulator(cue):
 
 def test_the_readme_s_example_runs(cue):
   folder, environment, layout = cue
-  readme = (Path(acting.__file__).parent / "README.md").read_text()
+  readme = (Path(acting.__file__).parents[1] / "README.md").read_text()
   code = readme.partition("```python\n")[2].partition("```")[0]
   code = code.replace("runs/nav/policy/best", str(folder))
   scope = {"observation": environment.reset().observation}
@@ -114,7 +115,7 @@ def test_damaged_or_missing_policy_is_refused(tmp_path):
 
 def test_cue_needs_memory():
   """The best policy with memory gets 22; the mean action of any memoryless one gets 0."""
-  environment = environments.make_environment("agents:cue", seed=0)
+  environment = loading.make_environment("agents:cue", seed=0)
 
   def run(act):
     total = 0.0
@@ -134,7 +135,7 @@ def test_cue_needs_memory():
 
 
 def test_dm_control_by_name_with_canonical_actions_and_history():
-  environment = environments.make_environment("dm_control:cartpole:swingup", seed=1, history=3)
+  environment = loading.make_environment("dm_control:cartpole:swingup", seed=1, history=3)
   layout = Layout.of(environment)
   assert layout.image_name is None and layout.state_size == 3 * 5 and layout.action_size == 1
   first = layout.flatten(environment.reset().observation).state.reshape(-1)
@@ -160,7 +161,7 @@ def test_a_spec_scales_actions():
     def action_spec(self):
       return specs.BoundedArray((2,), np.float64, [-2, 0], [4, 1])
 
-  seen = environments.Canonical(Wide()).step(np.array([0.0, -9.0])).observation["seen"]
+  seen = loading.Canonical(Wide()).step(np.array([0.0, -9.0])).observation["seen"]
   np.testing.assert_allclose(seen, [1.0, 0.0])
 
 
@@ -174,7 +175,7 @@ def test_a_spec_scales_actions():
 )
 def test_unknown_names_are_refused(name, message):
   with pytest.raises(ValueError, match=message):
-    environments.make_environment(name, seed=0)
+    loading.make_environment(name, seed=0)
 
 
 def test_belief_error_is_measured(cue):

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from nerf2real.agents.dmpo import belief, belief_plot, specs
+from nerf2real.agents.dmpo import belief, specs
 from nerf2real.agents.dmpo.config import NetworkConfig
+from nerf2real.agents.dmpo.policy import belief_plot
 from nerf2real.core.floor_map import FloorMap
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import config, learning, networks
+from nerf2real.agents.dmpo import config, learning, networks, objective
 from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
@@ -106,7 +106,7 @@ def test_padding_has_no_influence():
   @jax.jit
   def gradients(batch):
     trained = (state.policy, state.critic, state.duals, state.belief)
-    return jax.grad(learning.total_loss, (0, 1, 2), has_aux=True)(
+    return jax.grad(objective.total_loss, (0, 1, 2), has_aux=True)(
       trained,
       state.target_policy,
       state.target_critic,
@@ -130,7 +130,7 @@ def test_terminal_states_and_padding_do_not_count_for_the_policy():
   discount = jnp.array([[1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 0]], jnp.float32)
   last = jnp.array([3, 3, 2, 2])
   expected = [[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 0, 0], [1, 1, 1, 0]]
-  np.testing.assert_array_equal(learning.policy_weights(discount, last), expected)
+  np.testing.assert_array_equal(objective.policy_weights(discount, last), expected)
 
 
 def test_a_terminal_observation_reaches_no_gradient_of_the_policy():
@@ -147,7 +147,7 @@ def test_a_terminal_observation_reaches_no_gradient_of_the_policy():
   @jax.jit
   def gradient(batch):
     trained = (state.policy, state.critic, state.duals, state.belief)
-    return jax.grad(learning.total_loss, has_aux=True)(
+    return jax.grad(objective.total_loss, has_aux=True)(
       trained,
       state.target_policy,
       state.target_critic,

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import inference, learning, networks
+from nerf2real.agents.dmpo import networks, training_state
 from nerf2real.agents.dmpo.config import NetworkConfig
+from nerf2real.agents.dmpo.policy import inference
 from nerf2real.agents.dmpo.specs import Layout
 
 SMALL = NetworkConfig(
@@ -54,7 +55,7 @@ def test_numpy_policy_agrees_with_jax(recurrent):
     params, config, state=state, images=images / 255.0, initial=initial if recurrent else None
   )
   policy = inference.Policy(
-    learning.flatten_params({"policy": params}),
+    training_state.flatten_params({"policy": params}),
     init_stddev=config.init_stddev,
     min_stddev=config.min_stddev,
   )

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import config, export, learning, networks, scaling
+from nerf2real.agents.dmpo import config, learning, networks, scaling, training_state
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import to_plain
@@ -51,13 +52,13 @@ def state(functions):
   fresh = jax.jit(functions.init)(jax.random.PRNGKey(0))
   fresh = fresh._replace(policy=_noisy(fresh.policy), target_policy=_noisy(fresh.policy, 2))
   scales = scaling.measure(_rows(), LAYOUT)
-  return learning.with_scaling(fresh, scales, keep_policy=False)
+  return training_state.with_scaling(fresh, scales, keep_policy=False)
 
 
 def _exported(state, folder):
   export.export_policy(
     folder,
-    learning.served_parameters(state),
+    training_state.served_parameters(state),
     layout=LAYOUT,
     environment="test",
     settings=to_plain(CONFIG),
@@ -127,13 +128,13 @@ def test_training_begins_with_an_exported_policy_and_its_actions(
   if not with_scales:
     arrays = {name: array for name, array in arrays.items() if not name.startswith("scaling/")}
   fresh = jax.jit(functions.init)(jax.random.PRNGKey(7))
-  begun = learning.with_policy(fresh, arrays)
+  begun = training_state.with_policy(fresh, arrays)
   assert scaling.is_measured(begun.scaling) == with_scales
   if not with_scales:
     other = _rows(seed=9)
     other["state"] = 1.5 * other["state"] + 0.3
     scales = scaling.measure(other, LAYOUT)
-    begun = learning.with_scaling(begun, scales, keep_policy=True)
+    begun = training_state.with_scaling(begun, scales, keep_policy=True)
   image = np.random.default_rng(3).integers(0, 256, (6, 8, 3), dtype=np.uint8)
   for row in _rows(5, seed=4)["state"].astype(np.float32):
     expected = policy.step(image, row, policy.initial_state()).mean
@@ -149,7 +150,7 @@ def test_a_policy_of_other_networks_is_refused(state, tmp_path):
   wide = learning.make_learning(config.override(CONFIG, {"network.lstm_size": 6}), LAYOUT)
   fresh = jax.jit(wide.init)(jax.random.PRNGKey(0))
   with pytest.raises(ValueError, match="policy to begin with has other networks.*expected"):
-    learning.with_policy(fresh, export.load_arrays(tmp_path))
+    training_state.with_policy(fresh, export.load_arrays(tmp_path))
 
 
 def test_updates_see_scaled_inputs_and_keep_the_scaling(functions, state):
@@ -184,4 +185,4 @@ def test_without_scaling_nothing_is_kept_or_served():
   plain = config.override(CONFIG, {"scale_observations": False})
   state = jax.jit(learning.make_learning(plain, LAYOUT).init)(jax.random.PRNGKey(0))
   assert state.scaling == {} and scaling.is_measured(state.scaling)
-  assert not [n for n in learning.served_parameters(state) if n.startswith("scaling")]
+  assert not [n for n in training_state.served_parameters(state) if n.startswith("scaling")]

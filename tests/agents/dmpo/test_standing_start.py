@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from dm_env import specs
 
-from nerf2real.agents.dmpo import acting, config, inference, learning, scaling
+from nerf2real.agents.dmpo import config, learning, scaling, training_state
+from nerf2real.agents.dmpo.policy import acting, inference
 from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
@@ -70,7 +71,7 @@ class Follow(dm_env.Environment):
 def _policy(state):
   network = SETTINGS.network
   return inference.Policy(
-    learning.served_parameters(state), init_stddev=network.init_stddev, min_stddev=1e-6
+    training_state.served_parameters(state), init_stddev=network.init_stddev, min_stddev=1e-6
   )
 
 
@@ -107,11 +108,11 @@ def _train(state, functions, layout):
       rows = replay.sample(rng, 200, names=scaling.NAMES)
       rows = {name: np.concatenate(values) for name, values in rows.items()}
       scales = scaling.measure(rows, layout)
-      state = learning.with_scaling(state, scales, keep_policy=False)
+      state = training_state.with_scaling(state, scales, keep_policy=False)
     while updates * 4 < steps - FILL:
       state, _ = functions.update(state, replay.sample(rng, SETTINGS.batch_size))
       updates += 1
-    agent.policy.update(learning.served_parameters(state))
+    agent.policy.update(training_state.served_parameters(state))
   return state
 
 

@@ -138,3 +138,16 @@ def test_the_end_is_exact():
   assert limiter.request("b", 16, held=0) == 16
   assert limiter.request("c", 16, held=0) == 8
   assert limiter.ending and limiter.request("d", 16, held=0) == 0
+
+
+def test_updates_without_payment_ask_for_no_steps_and_give_no_credits():
+  free, paid = _limiter(steps=100), _limiter(steps=100)
+  for _ in range(50):
+    free.updated(paid=False)
+  assert free.updates == 50 and free.limit == paid.limit and not free.update_due
+  for limiter in (free, paid):
+    limiter.delivered("0", 8)
+    assert limiter.update_due
+    limiter.updated()
+    assert not limiter.update_due
+  assert free.limit == paid.limit

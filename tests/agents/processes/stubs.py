@@ -8,7 +8,7 @@ import dm_env
 import numpy as np
 from dm_env import specs
 
-from nerf2real.agents.dmpo import config, learning, networks
+from nerf2real.agents.dmpo import config, learning, networks, training_state
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import Grant
 from nerf2real.core.serialization import from_plain, to_plain
@@ -101,7 +101,7 @@ class StubLink:
     settings = from_plain(self._description["config"], config.DmpoConfig)
     layout = from_plain(self._description["layout"], Layout)
     state = learning.make_learning(settings, layout).init(networks.jax.random.PRNGKey(0))
-    return 0, learning.served_parameters(state)
+    return 0, training_state.served_parameters(state)
 
   def request(self, wanted, *, held=0):
     values = {"granted": wanted, "version": 0, "stop": False, "ending": False, "steps": 0}

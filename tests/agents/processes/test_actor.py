@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from dm_control.rl import control
 
-from nerf2real.agents.processes import actor, environments, trials
+from nerf2real.agents.environments import loading, trials
+from nerf2real.agents.processes import actor, evaluator, joining
 from tests.agents.processes.stubs import Reach, StubLink, description, documented
 
 CARTPOLE = "dm_control:cartpole:swingup"
@@ -21,14 +22,14 @@ def _act(link, *, seed=0, index=0):
 
 @pytest.fixture(scope="module")
 def cartpole():
-  return description(environments.make_environment(CARTPOLE, seed=0), CARTPOLE)
+  return description(loading.make_environment(CARTPOLE, seed=0), CARTPOLE)
 
 
 @pytest.fixture
 def reach(monkeypatch):
   """An environment in place of the one that its name would give."""
   environment = Reach()
-  monkeypatch.setattr(actor, "make_environment", lambda name, *, seed, history: environment)
+  monkeypatch.setattr(joining, "make_environment", lambda name, *, seed, history: environment)
   return environment
 
 
@@ -64,7 +65,7 @@ def test_a_failing_episode_is_followed_by_another(reach, caplog):
 def test_several_failing_episodes_in_a_row_end_the_actor(reach):
   reach.fail_at = set(range(2, 100))
   link = StubLink(description(reach, "reach"), limit=100)
-  with pytest.raises(actor.EpisodesFailed, match="5 episodes in a row.*There is no place left"):
+  with pytest.raises(joining.EpisodesFailed, match="5 episodes in a row.*There is no place left"):
     _act(link)
   assert len(link.sent) == 1  # what was made before is delivered
 
@@ -102,9 +103,9 @@ def test_times_of_the_stages_are_reported(reach):
 
 def _evaluator(reach, monkeypatch, listed, **changes):
   wrapped = trials.Trials(reach, listed, seed=0)
-  monkeypatch.setattr(actor, "make_environment", lambda name, *, seed, history: wrapped)
+  monkeypatch.setattr(joining, "make_environment", lambda name, *, seed, history: wrapped)
   link = StubLink(description(reach, "reach", **changes))
-  return actor.EvaluatorProcess(link, seed=0), link
+  return evaluator.EvaluatorProcess(link, seed=0), link
 
 
 def test_success_is_measured_on_the_protocol_and_confirmed_on_fresh_trials(reach, monkeypatch):
@@ -141,7 +142,7 @@ def test_only_a_rival_of_the_best_is_confirmed(reach, monkeypatch):
 
 def test_without_success_the_return_is_reported_as_ever(cartpole, monkeypatch):
   link = StubLink(cartpole | {"evaluation_episodes": 1})
-  process = actor.EvaluatorProcess(link, seed=0)
+  process = evaluator.EvaluatorProcess(link, seed=0)
   process._evaluate(300)
   (figures,) = link.reports
   assert "success" not in figures and figures["episodes"] == 1 and figures["return"] >= 0
@@ -152,5 +153,5 @@ def test_failing_evaluations_end_the_evaluator_in_the_end(reach, monkeypatch):
   process, link = _evaluator(reach, monkeypatch, [Trial(wins=True, seed=0)])
   steps = iter(range(0, 100_000, 100))
   link.request = lambda wanted: {"steps": next(steps), "stop": False, "version": 0}
-  with pytest.raises(actor.EpisodesFailed, match="no place left"):
+  with pytest.raises(joining.EpisodesFailed, match="no place left"):
     process.run()

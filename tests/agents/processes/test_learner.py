@@ -10,21 +10,16 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import (
-  config,
-  export,
-  learning,
-  networks,
-  scaling,
-  specs,
-)
+from nerf2real.agents.dmpo import config, learning, networks, scaling, specs
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.replay import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.processes import actor
 from nerf2real.agents.processes.checkpoints import read_info
-from nerf2real.agents.processes.learner import Learner, LearnerError, RunSettings
+from nerf2real.agents.processes.learner import Learner, LearnerError
+from nerf2real.agents.processes.settings import RunSettings
 from tests.agents.processes.stubs import documented
 
 ENVIRONMENT = "dm_control:cartpole:swingup"
@@ -132,6 +127,70 @@ def test_a_run_begins_with_a_policy(finished, tmp_path):
     Run(tmp_path / "other", init_from=source, settings={"network.policy_layers": (8, 8)})
 
 
+def test_a_run_goes_on_from_a_policy_with_earlier_data(finished, tmp_path):
+  """The critic warms up on what it is given, without payment; half of the batches is earlier."""
+  source, _ = finished
+  earlier = Run(tmp_path / "earlier", max_env_steps=240, replay_on_disk=True)
+  earlier.go()
+  run = Run(
+    tmp_path / "run",
+    settings={
+      "critic_warmup": 12,
+      "student_kl": 0.5,
+      "student_kl_updates": 8,
+      "steps_per_update": 40,
+    },
+    init_from=source / "policy" / "newest",
+    prior_data=tmp_path / "earlier",
+    prior_share=0.5,
+    max_env_steps=400,
+  )
+  learner = run.learner
+  policies, shares = [], []
+  sample, update = learner._experience.sample, learner._update
+
+  def sampled(rng):
+    batch = sample(rng)
+    shares.append(len(batch["burn_in"]))
+    return batch
+
+  def updated(previous):
+    policies.append(jax.device_get(learner._state.policy["mlp"]))
+    return update(previous)
+
+  learner._experience.sample, learner._update = sampled, updated
+  run.go()
+  assert set(shares) == {4}
+  same = lambda a, b: all(  # noqa: E731
+    np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+  )
+  assert all(same(policies[1], p) for p in policies[2:13])  # [0]: before the scaling was measured
+  assert not same(policies[1], policies[-1])
+  info = read_info(tmp_path / "run")
+  assert info["updates"] == 12 + (400 - 200) // 40
+  rows = _rows(tmp_path / "run")
+  assert "loss_policy" not in rows[0] and rows[-1]["student_weight"] < 0.5
+  resumed = Run(tmp_path / "run", settings={"student_kl": 0.5, "critic_warmup": 12}, resume=True)
+  assert same(resumed.learner._state.student, learner._state.student)
+  resumed.close()
+
+
+@pytest.mark.parametrize(
+  ("settings", "run", "message"),
+  [
+    ({"student_kl": 1.0}, {}, "student_kl needs a policy to begin with: add --init-from"),
+    ({"frozen_encoder": True}, {}, "frozen_encoder needs a policy to begin with"),
+    ({}, {"prior_share": 1.5}, "--prior-share must be 0 to 1"),
+    ({}, {"prior_data": "nowhere"}, "nowhere holds no prior data"),
+  ],
+)
+def test_a_beginning_that_cannot_be_is_refused(tmp_path, settings, run, message):
+  if "prior_data" in run:
+    run = {"prior_data": tmp_path / run["prior_data"]}
+  with pytest.raises(ValueError, match=message):
+    Run(tmp_path / "run", settings=settings, **run)
+
+
 def test_a_standing_action_is_needed_where_it_is_wanted(tmp_path):
   with pytest.raises(ValueError, match="cartpole.*no standing action"):
     Run(tmp_path, settings={"first_action": "standing"})
@@ -174,10 +233,10 @@ def test_best_is_the_most_successful_on_fresh_trials(tmp_path):
   run = Run(tmp_path)
   learner, best = run.learner, tmp_path / "policy" / "best"
   learner.link._held[0] = learner.link._parameters  # as if the evaluator had fetched them
-  found = lambda: (learner._best_success, learner._best)  # noqa: E731
+  found = lambda: (learner._best.success, learner._best.best_return)  # noqa: E731
   _report(learner, success=0.9, confirmation=0, version=0, **{"return": 9.0})
-  assert learner._best_success is None and not best.exists()
-  assert learner._evaluated == 9.0
+  assert learner._best.success is None and not best.exists()
+  assert learner._best.evaluated == 9.0
   _report(learner, success=0.4, confirmation=1, version=0, **{"return": 5.0})
   assert found() == (0.4, 5.0) and best.exists()
   _report(learner, success=0.3, confirmation=1, version=0, **{"return": 50.0})
@@ -193,20 +252,23 @@ def test_best_without_success_is_the_highest_mean_return(tmp_path):
   run = Run(tmp_path)
   for result, expected in ((5.0, 5.0), (4.0, 5.0), (6.0, 6.0)):
     _report(run.learner, confirmation=0, version=0, **{"return": result})
-    assert run.learner._best == expected
+    assert run.learner._best.best_return == expected
   run.close()
 
 
 def _update_metrics():
   """Names that an update gives with pictures and a belief."""
   layout = Layout("camera", (6, 8, 3), ("s",), (3,), (specs.POSITION, specs.ROTATION), (3, 9), 2)
-  settings = config.preset("vision_small")
+  settings = config.override(config.preset("vision_small"), {"student_kl": 0.1})
   functions = learning.make_learning(settings, layout)
   fields = trajectory_fields(layout, lstm_size=settings.network.lstm_size)
   batch = {
     name: jax.ShapeDtypeStruct((2, 6, *f.shape) if f.per_step else (2, *f.shape), f.dtype)
     for name, f in fields.items()
-  } | {"last": jax.ShapeDtypeStruct((2,), "int32")}
+  } | {
+    "last": jax.ShapeDtypeStruct((2,), "int32"),
+    "student_weight": jax.ShapeDtypeStruct((), "float32"),
+  }
   state = jax.eval_shape(functions.init, jax.ShapeDtypeStruct((2,), "uint32"))
   return set(jax.eval_shape(functions.update, state, batch)[1])
 

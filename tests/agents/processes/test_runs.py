@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from nerf2real.agents.dmpo import acting
-from nerf2real.agents.dmpo.export import load_policy
-from nerf2real.agents.processes import environments
+from nerf2real.agents.dmpo.policy import acting
+from nerf2real.agents.dmpo.policy.export import load_policy
+from nerf2real.agents.environments import loading
 from nerf2real.agents.processes.checkpoints import read_info
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -81,7 +81,7 @@ def rows(run, source=""):
   return [r for r in map(json.loads, lines) if r["source"].startswith(source)]
 
 
-def wait_until(condition, *, timeout=60.0):
+def wait_until(condition, *, timeout=400.0):
   deadline = time.monotonic() + timeout
   while not condition():
     assert time.monotonic() < deadline, "It did not happen in time."
@@ -118,7 +118,7 @@ def test_a_run_ends_by_itself_and_is_resumed(tmp_path):
   assert list((run / "tensorboard").iterdir())
   exported = load_policy(run / "policy" / "newest")
   agent = acting.Agent(exported.policy, exported.layout, seed=0, deterministic=True)
-  environment = environments.make_environment(exported.environment, seed=0)
+  environment = loading.make_environment(exported.environment, seed=0)
   agent.act(exported.layout.flatten(environment.reset().observation))
 
   refused = start(run, *CARTPOLE, *SMALL)

@@ -1,5 +1,6 @@
 """Measured logs: what is written comes back, and bad files are refused with one clear line."""
 
+import json
 import pathlib
 
 import mujoco
@@ -260,11 +261,51 @@ def test_models_that_do_not_fit_are_refused(tmp_path, second, joint_type, actuat
   assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
+# Logs of every sample: motions from which a model is fitted, held-out ones, and references.
+_TRAINED = ("train_1_sweep", "train_2_slow", "train_3_steps")
+_MUJOCO_SAMPLE = (
+  "held_1_multisine",
+  "held_2_sweep",
+  "train_1_sweep",
+  "train_2_slow",
+  "train_3_steps",
+)
+_SERVO_SAMPLE = (
+  *("held_1", "held_2", "reference_1_sweep", "reference_2_slow", "reference_3_steps"),
+  *_TRAINED,
+)
+_SHARED = {
+  "sysid_samples": dict.fromkeys(
+    ("s1_null", "s2_delay", "s3_viscous", "s4_payload"), _MUJOCO_SAMPLE
+  ),
+  "sysid_samples_2": {
+    **dict.fromkeys(
+      ("a_healthy", "b_delay", "c_stribeck", "d_payload", "e_outside"), _SERVO_SAMPLE
+    ),
+    "f_payload_and_late_bus": _MUJOCO_SAMPLE,
+  },
+  "measured": {
+    "emps": ("held_1", "train_1"),
+    **dict.fromkeys(
+      ("xl330_kp100", "xl330_kp200", "xl330_kp800"),
+      ("held_sin_sin", "train_sin_time_square", "train_up_and_down"),
+    ),
+  },
+}
+
+
 @pytest.mark.skipif(not SAMPLES.is_dir(), reason=f"needs the shared samples in {SAMPLES}")
-def test_the_shared_samples_are_read():
-  paths = sorted(SAMPLES.glob("*/*/*.mcap"))
-  assert len(paths) >= 31
-  for path in paths[::6]:
+@pytest.mark.parametrize("folder", _SHARED)
+def test_the_shared_samples_are_read(folder):
+  found: dict[str, tuple[str, ...]] = {}
+  for path in sorted((SAMPLES / folder).glob("*/*.mcap")):
+    found[path.parent.name] = (*found.get(path.parent.name, ()), path.stem)
+  assert found == _SHARED[folder]
+  answers = SAMPLES / folder / "answers.json"
+  if answers.exists():
+    assert set(json.loads(answers.read_text())) == set(found)
+  for sample, names in found.items():  # one log of each: reading all takes a minute
+    path = SAMPLES / folder / sample / f"{names[-1]}.mcap"
     log = logs.read_log(path)
     check_against_model(log, mujoco.MjModel.from_xml_path(str(path.parent / "model.xml")))
     assert log.duration > 5 and np.ptp(log.states.position) > 0

@@ -267,8 +267,8 @@ def test_extended_model_moves_as_the_effect_does(effect: Effect, tmp_path: Path)
 
 def test_extended_model_leaves_what_mjcf_cannot_say(tmp_path: Path) -> None:
   (tmp_path / "model.xml").write_text(PENDULUM)
-  delay = Effect("command_delay", "joint", {"delay": 0.02})
-  assert extended_model.write(tmp_path / "model.xml", tmp_path / "e.xml", [delay]) == [delay]
+  load = Effect("load_friction", "joint", {"coefficient": 0.2})
+  assert extended_model.write(tmp_path / "model.xml", tmp_path / "e.xml", [load]) == [load]
 
 
 def test_audit_reports_gaps_and_rates() -> None:

@@ -298,6 +298,7 @@ def test_shapes_that_the_kernels_cannot_run_are_refused():
     layout.Shape.of(FieldSettings(levels=5))
 
 
+@pytest.mark.slow
 def test_every_kernel_compiles_for_cuda(tmp_path):
   shape = layout.Shape.of(dataclasses.replace(SETTINGS.field, levels=4))
   made = functions.build(shape, layout.STRIDE, layout.CHUNK_RAYS)

@@ -116,7 +116,7 @@ def test_a_ball_appears_where_opencv_projects_it(ball, angles):
     + 0.15 * np.sqrt(1 - sine**2) * (np.cos(turn) * side[0] + np.sin(turn) * side[1])
   )
   camera_from_unit = np.linalg.inv(pose)
-  # OpenCV's pixel centres are whole numbers, ours are halves.
+  # OpenCV's pixel centres are whole numbers, the camera's are halves.
   outline, _ = cv2.projectPoints(
     circle,
     cv2.Rodrigues(camera_from_unit[:3, :3])[0],

@@ -1,0 +1,113 @@
+"""A policy as one folder that an actor, the evaluator and the robot load with NumPy alone.
+
+`policy.npz` holds the arrays by name, `policy.json` the layout, the settings and the digest of the
+arrays. Each file is replaced as a whole; by the digest the two belong together.
+"""
+
+import dataclasses
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerf2real.agents.dmpo.policy.inference import Policy
+from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.core import files
+from nerf2real.core.serialization import from_plain, to_plain
+
+FORMAT_VERSION = 1
+_ARRAYS, _RECORD = "policy.npz", "policy.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportedPolicy:
+  """A loaded policy with what is known of it."""
+
+  policy: Policy
+  layout: Layout
+  environment: str
+  """The name it was trained on."""
+  history: int
+  """Observations that the agent stacks."""
+  info: dict[str, Any]
+  """Counters and settings of the run."""
+
+
+def export_policy(
+  folder: Path,
+  parameters: Mapping[str, np.ndarray],
+  *,
+  layout: Layout,
+  environment: str,
+  settings: Mapping[str, Any],
+  info: Mapping[str, Any],
+) -> None:
+  """Writes a policy.
+
+  Args:
+    folder: where to; what it holds of an older policy is replaced.
+    parameters: flat named arrays, `training_state.served_parameters`.
+    layout: the environment's layout.
+    environment: the environment's name.
+    settings: the agent's settings as plain values, `to_plain(config)`.
+    info: counters such as steps and updates, and the return where it is known.
+  """
+  folder.mkdir(parents=True, exist_ok=True)
+  buffer = io.BytesIO()
+  # The policy alone is enough to act; a belief goes along where there is one.
+  arrays: dict[str, Any] = {name: np.asarray(array) for name, array in parameters.items()}
+  np.savez(buffer, **arrays)
+  data = buffer.getvalue()
+  record = {
+    "format_version": FORMAT_VERSION,
+    "environment": environment,
+    "layout": to_plain(layout),
+    "settings": dict(settings),
+    "info": dict(info),
+    "sha256": hashlib.sha256(data).hexdigest(),
+  }
+  files.write_atomically(folder / _ARRAYS, data)
+  files.write_atomically(folder / _RECORD, json.dumps(record, indent=1))
+
+
+def load_policy(folder: Path | str) -> ExportedPolicy:
+  """Loads a policy that `export_policy` wrote.
+
+  Raises:
+    ValueError: if the folder holds none, one of another format, or files that do not match.
+  """
+  record, parameters = _read(Path(folder))
+  network = record["settings"]["network"]
+  policy = Policy(parameters, init_stddev=network["init_stddev"], min_stddev=network["min_stddev"])
+  return ExportedPolicy(
+    policy=policy,
+    layout=from_plain(record["layout"], Layout),
+    environment=record["environment"],
+    history=record["settings"]["history"],
+    info=record["info"],
+  )
+
+
+def load_arrays(folder: Path | str) -> dict[str, np.ndarray]:
+  """Loads the flat named arrays of a policy; raises ValueError as `load_policy` does."""
+  return _read(Path(folder))[1]
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+  if not (folder / _RECORD).exists():
+    raise ValueError(f"{folder} holds no {_RECORD}: give the folder of an exported policy.")
+  record = json.loads((folder / _RECORD).read_text())
+  if record.get("format_version") != FORMAT_VERSION:
+    raise ValueError(
+      f"{folder} is of format {record.get('format_version')}, expected {FORMAT_VERSION}: export it "
+      "again with this version."
+    )
+  data = (folder / _ARRAYS).read_bytes()
+  if hashlib.sha256(data).hexdigest() != record["sha256"]:
+    raise ValueError(f"{folder}: the arrays are not those of {_RECORD}; export it again.")
+  with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+    return record, {name: arrays[name] for name in arrays.files}

@@ -1,0 +1,1 @@
+"""Environments by name: the suite's tasks, dm_control's, and a small memory task."""

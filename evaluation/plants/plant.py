@@ -1,0 +1,128 @@
+"""The protocol of plants in an evaluation: set a trial up, step it, observe the robot."""
+
+import abc
+from typing import Any, NamedTuple
+
+import dm_env
+import numpy as np
+
+from nerf2real.evaluation.plants import perturbations
+from nerf2real.suite import protocols
+from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.protocols import BallTrial, NavigationTrial
+from nerf2real.suite.tasks import ball_push, nerf_nav, rewards
+
+Trial = NavigationTrial | BallTrial
+
+NAVIGATION, BALL, GAIN = "navigation", "ball", "gain"
+PROTOCOLS = (NAVIGATION, BALL, GAIN)
+TASKS = {NAVIGATION: nerf_nav.NAME, GAIN: nerf_nav.NAME, BALL: ball_push.NAME}
+
+
+class Sight(NamedTuple):
+  """An observer's measurements in an episode; None without an observer."""
+
+  pose: Pose | None
+  ball: np.ndarray | None  # [2] m
+  collided: bool
+  fallen: bool
+
+
+class Plant(abc.ABC):
+  """Where episodes are run."""
+
+  name: str  # "sim", "virtual" or "robot"
+  plant_id: str = ""  # which one
+
+  def __init__(self, scene: Any, protocol: str, perturbation: str):
+    """Notes what is evaluated.
+
+    Args:
+      scene: An opened bundle.
+      protocol: One of PROTOCOLS.
+      perturbation: One of `perturbations.PERTURBATIONS`.
+    """
+    self.scene, self.protocol, self.perturbation = scene, protocol, perturbation
+
+  @property
+  @abc.abstractmethod
+  def environment(self) -> dm_env.Environment:
+    """The environment with the policy's observations and actions."""
+
+  @property
+  @abc.abstractmethod
+  def goal(self) -> np.ndarray:
+    """Where robot or ball shall get to in this trial [2] [m]."""
+
+  @property
+  @abc.abstractmethod
+  def time_limit(self) -> float:
+    """Length of an episode [s]."""
+
+  @abc.abstractmethod
+  def start(self, trial: Trial) -> dm_env.TimeStep:
+    """Sets a trial up."""
+
+  @abc.abstractmethod
+  def step(self, action: np.ndarray) -> dm_env.TimeStep:
+    """Takes one control step."""
+
+  @abc.abstractmethod
+  def sight(self) -> Sight:
+    """Returns what an observer sees now."""
+
+  def reached(self, sight: Sight) -> bool | None:
+    """Returns whether the goal is reached; None where it is not measured."""
+    if self.protocol == BALL:
+      if sight.ball is None:
+        return None
+      half = protocols.CELL_SIZE / 2
+      return bool((np.abs(sight.ball - self.goal) <= half).all())
+    if sight.pose is None:
+      return None
+    return bool(np.hypot(*(self.goal - sight.pose.xy)) <= rewards.SUCCESS_DISTANCE)
+
+  def stopped(self) -> str:
+    """Returns why the plant itself ended the episode; empty if it did not."""
+    return ""
+
+  def judge(self) -> tuple[str, float | None, str] | None:
+    """Returns a person's verdict (outcome, time [s], detail); None where the poses suffice."""
+    return None
+
+  @abc.abstractmethod
+  def close(self) -> None:
+    """Ends the plant."""
+
+
+def trials(protocol: str) -> tuple[tuple[str, Trial], ...]:
+  """Returns the trials of a protocol with their groups, in the order they are run.
+
+  Raises:
+    ValueError: Unknown protocol.
+  """
+  if protocol == NAVIGATION:
+    return tuple((NAVIGATION, trial) for trial in protocols.navigation())
+  if protocol == BALL:
+    return tuple(
+      (trial.setting, trial) for trial in protocols.ball_center() + protocols.ball_wall()
+    )
+  if protocol == GAIN:
+    return tuple((gain_group(trial), trial) for trial in protocols.camera_gain())
+  raise ValueError(f"Unknown protocol {protocol!r}: expected one of {PROTOCOLS}.")
+
+
+def gain_group(trial: NavigationTrial) -> str:
+  """Returns the group of a trial of the gain ablation, by the camera's own number."""
+  return f"gain {round(trial.camera_gain * protocols.DEFAULT_GAIN)}"
+
+
+def keep_clear(scene: Any, starts: np.ndarray) -> np.ndarray:
+  """Returns where nothing may be put: goals and starts [N, 2] [m]."""
+  return np.concatenate([np.asarray(scene.goals, np.float64).reshape(-1, 2), starts])
+
+
+def make_intruder(plant: Plant, starts: np.ndarray) -> perturbations.Intruder | None:
+  """Returns the body that the plant's perturbation puts into its scene, if any."""
+  clear = keep_clear(plant.scene, starts)
+  return perturbations.make_intruder(plant.perturbation, plant.scene, keep_clear=clear)

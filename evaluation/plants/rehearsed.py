@@ -1,0 +1,153 @@
+"""The virtual robot as a plant: reached over its wires, placed and watched as by an observer."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import dm_env
+import numpy as np
+
+from nerf2real import real
+from nerf2real.evaluation.plants import perturbations, swaps
+from nerf2real.evaluation.plants.plant import BALL, TASKS, Sight, Trial, make_intruder
+from nerf2real.evaluation.plants.robot_plant import RobotPlant
+from nerf2real.real.virtual.camera import VirtualCamera
+from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
+from nerf2real.suite.protocols import NavigationTrial
+
+
+class CoveredCamera:
+  """A camera that somebody may cover with a hand."""
+
+  def __init__(self, camera: Any):
+    self._camera = camera
+    self.covered = False
+
+  def read(self) -> tuple[np.ndarray, float]:
+    """Returns the newest picture and its age [s]; black while covered."""
+    picture, age = self._camera.read()
+    return (np.zeros_like(picture) if self.covered else picture), age
+
+  def close(self) -> None:
+    """Closes the camera."""
+    self._camera.close()
+
+
+class RehearsedPlant(RobotPlant):
+  """Episodes on a virtual robot in the true room, faster than real time."""
+
+  name = "virtual"
+
+  def __init__(
+    self,
+    scene: Any,
+    protocol: str,
+    perturbation: str = perturbations.NONE,
+    *,
+    image_size: tuple[int, int] | None,
+    robot_seed: int | None = 1,
+    world: str = "room",
+    time_limit: float | None = None,
+    record: Path | None = None,
+    swap: str = swaps.NONE,
+  ):
+    """Builds the robot and connects to it.
+
+    Args:
+      scene: An opened bundle of the room that the robot stands in.
+      protocol: One of `plants.PROTOCOLS`.
+      perturbation: One of `perturbations.PERTURBATIONS`.
+      image_size: Height and width of the policy's picture; None for no camera.
+      robot_seed: Which robot: the seed of what is hidden in it; None: as in the data sheets.
+      world: "room" or "floor", see `VirtualRobot`.
+      time_limit: Length of an episode [s]; the task's own if None.
+      record: Where the run is recorded; not recorded if None.
+      swap: `swaps.PHYSICS`: nothing is hidden in the robot.
+    """
+    super().__init__(scene, protocol, perturbation, record=record)
+    self.plant_id = "data sheet" if robot_seed is None else f"robot {robot_seed}"
+    known = swap == swaps.PHYSICS
+    self.plant_id += ", data sheet's physics" if known else ""
+    self._intruder = make_intruder(self, self._starts)
+    self.robot = VirtualRobot(
+      world=world,
+      seed=robot_seed,
+      hidden=Hidden.none() if known else None,
+      stepped=True,
+      camera=None if image_size is None else VirtualCamera(),
+      ball=protocol == BALL,
+      furnish=None if self._intruder is None else self._intruder.add_to_spec,
+    )
+    if self._intruder is not None:
+      self._intruder.bind(self.robot.body.model)
+    self._camera: CoveredCamera | None = None
+    try:
+      self._environment = self._connect(image_size, time_limit)
+    except BaseException:
+      self.robot.close()
+      raise
+
+  def _connect(self, image_size: tuple[int, int] | None, time_limit: float | None) -> Any:
+    connection = self.robot.connection()
+    if image_size is not None:
+      self._camera = CoveredCamera(connection.camera)
+      connection = dataclasses.replace(connection, camera=self._camera)
+    return real.load(
+      TASKS[self.protocol],
+      robot=connection,
+      scene=self.scene,
+      image_size=image_size,
+      time_limit=time_limit,
+      recorder=self._recorder,
+    )
+
+  def start(self, trial: Trial) -> dm_env.TimeStep:
+    self._begin = self.robot.clock.now()
+    self._hit = False
+    self._disturb(0.0)
+    pose, ball = self._places(trial)
+    if ball is not None:
+      self.robot.place_ball(*ball)
+    if isinstance(trial, NavigationTrial) and self.robot.camera is not None:
+      self.robot.camera.sensor.gain = trial.camera_gain
+    self.robot.place(*pose)
+    timestep = self._environment.reset()
+    self._begin = self.robot.clock.now()
+    return timestep
+
+  def step(self, action: np.ndarray) -> dm_env.TimeStep:
+    self._disturb(self.robot.clock.now() - self._begin)
+    timestep = self._environment.step(action)
+    if self._intruder is not None:
+      self._hit |= self._intruder.touched(self.robot.body.data)
+    return timestep
+
+  def _disturb(self, time: float) -> None:
+    if self._camera is not None:
+      self._camera.covered = perturbations.is_blocked(self.perturbation, time)
+    if self._intruder is not None:
+      with self.robot.body.lock:
+        self._intruder.move(self.robot.body.data, time)
+
+  def sight(self) -> Sight:
+    truth = self.robot.truth()
+    fallen = (
+      truth.touches_floor
+      or truth.rotation[2, 2] < MIN_UPRIGHT
+      or truth.position[2] < MIN_HEIGHT
+      or self._stopped_by_a_fall()
+    )
+    pose = Pose(float(truth.position[0]), float(truth.position[1]), truth.yaw)
+    ball = None if truth.ball is None else truth.ball[:2]
+    # Touching the room is a failure of navigation alone (paper, "Tasks").
+    touched = truth.touches_room and self.protocol != BALL
+    return Sight(pose, ball, touched or self._hit, bool(fallen))
+
+  def close(self) -> None:
+    self._environment.close()
+    self.robot.close()
+    if self._recorder is not None:
+      self._recorder.close()

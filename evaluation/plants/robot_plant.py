@@ -1,0 +1,65 @@
+"""What a robot and the virtual robot share as plants: both are reached through `real`."""
+
+from pathlib import Path
+from typing import Any
+
+import dm_env
+import numpy as np
+
+from nerf2real.evaluation.plants.plant import BALL, Plant, Trial
+from nerf2real.real.recorder.recorder import Recorder
+from nerf2real.real.safety.monitor import Reason
+from nerf2real.suite import protocols
+from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.protocols import BallTrial
+from nerf2real.suite.tasks.workspace import find_workspace
+
+
+class RobotPlant(Plant):
+  """Episodes in an environment of `real`, which a subclass connects to."""
+
+  _environment: Any
+
+  def __init__(self, scene: Any, protocol: str, perturbation: str, *, record: Path | None):
+    """Finds the starts in the scene and opens the recording.
+
+    Args:
+      scene: An opened bundle of the room.
+      protocol: One of `plant.PROTOCOLS`.
+      perturbation: One of `perturbations.PERTURBATIONS`.
+      record: Where the run is recorded; not recorded if None.
+    """
+    super().__init__(scene, protocol, perturbation)
+    self._starts = protocols.scene_starts(scene)
+    self._workspace = find_workspace(scene) if protocol == BALL else None
+    self._recorder = None if record is None else Recorder(record)
+
+  @property
+  def environment(self) -> dm_env.Environment:
+    return self._environment
+
+  @property
+  def goal(self) -> np.ndarray:
+    return self._environment.goal
+
+  @property
+  def time_limit(self) -> float:
+    return float(self._environment.time_limit)
+
+  def _places(self, trial: Trial) -> tuple[Pose, np.ndarray | None]:
+    """Sets a trial's goal; returns the start of the robot and, for ball pushing, of the ball."""
+    if isinstance(trial, BallTrial):
+      assert self._workspace is not None
+      robot, ball = self._workspace.starts(trial, self.scene.free_space)
+      return Pose(float(robot[0]), float(robot[1]), trial.robot_yaw), ball
+    self._environment.set_goal(trial.goal)
+    x, y = (float(value) for value in self._starts[trial.position])
+    return Pose(x, y, trial.yaw), None
+
+  def _stopped_by_a_fall(self) -> bool:
+    stop = self._environment.stop
+    return stop is not None and stop.reason == Reason.FALL
+
+  def stopped(self) -> str:
+    stop = self._environment.stop
+    return "" if stop is None else f"{stop.reason}: {stop.detail}"

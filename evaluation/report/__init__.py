@@ -1,0 +1,1 @@
+"""The report of an evaluation: tables, maps, pictures of beliefs, the page."""

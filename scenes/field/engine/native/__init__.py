@@ -1,0 +1,1 @@
+"""C++ snippets of the fused kernels: vectors of samples, hash grid, networks."""

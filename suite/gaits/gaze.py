@@ -1,0 +1,91 @@
+"""Keeps the ball in the robot's view: pan and tilt point at it, and sweep while it is not seen.
+
+All that it does while the ball is out of view can be told from the head's own motion, so that a
+policy with the same sensors can learn it.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from nerf2real.suite.gaits.walk import Command
+from nerf2real.suite.op3 import constants
+
+_TIMESTEP = constants.CONTROL_TIMESTEP
+_HEIGHT = 0.33  # m of the camera above a ball's centre: 0.45 m above the floor, less the radius
+_RADIUS = 0.12  # m of the ball (paper: a basketball)
+_HALF_VERTICAL = constants.CAMERA_VERTICAL_FOV / 2
+_HALF_HORIZONTAL = np.arctan(4 / 3 * np.tan(_HALF_VERTICAL))  # pictures are 4:3
+_LEAN = 0.08  # rad that the walking torso leans forward, and the camera with it
+_PAN = 2.3  # rad at which a sweep turns back; chosen: short of the limit in ball pushing, 2.5
+_REACHED = 0.1  # rad from that angle at which it does
+_LEAD = 0.4  # rad that a sweep's target is ahead of the head; chosen: some 2 rad/s
+_SWEEP_TILT = -0.3  # rad: from 0.4 m ahead to the walls
+_LOST = 2.0  # s without a view after which the head sweeps; chosen
+_SWEEPS = 3  # turns of a sweep after which the robot turns, too: the ball is behind it
+
+
+class View(NamedTuple):
+  """A ball as the robot has it."""
+
+  bearing: float  # rad to the left of the torso's heading
+  distance: float  # m on the floor
+
+
+def view_of(pose: tuple[float, float, float], ball: np.ndarray) -> View:
+  """Returns where a ball [2] [m] is from a pose x [m], y [m], yaw [rad]."""
+  offset = np.asarray(ball, np.float64)[:2] - np.asarray(pose[:2])
+  turn = np.arctan2(offset[1], offset[0]) - pose[2]
+  return View(float((turn + np.pi) % (2 * np.pi) - np.pi), float(np.hypot(*offset)))
+
+
+def depression(distance: float) -> float:
+  """Returns the angle [rad] below the horizon at which the camera sees a ball's centre."""
+  return float(np.arctan2(_HEIGHT, max(distance, 1e-6)))
+
+
+def is_seen(view: View, *, pan: float, tilt: float) -> bool:
+  """Returns whether some of the ball is in the picture of a head [rad]."""
+  size = float(np.arctan2(_RADIUS, np.hypot(view.distance, _HEIGHT)))
+  aside = (view.bearing - pan + np.pi) % (2 * np.pi) - np.pi
+  above = -depression(view.distance) - (tilt - _LEAN)
+  return bool(abs(aside) < _HALF_HORIZONTAL + size / 2 and abs(above) < _HALF_VERTICAL + size / 2)
+
+
+class Gaze:
+  """The head's part of pushing a ball."""
+
+  def __init__(self) -> None:
+    self.reset()
+
+  def reset(self) -> None:
+    """Begins an episode: nothing has been seen."""
+    self._unseen = np.inf  # s since the ball was in view
+    self._direction = 1.0  # of a sweep, 1 to the left
+    self._sweeps = 0
+
+  @property
+  def searches(self) -> bool:
+    """Whether the ball's place is unknown."""
+    return self._unseen > _LOST
+
+  def apply(self, command: Command, view: View, *, pan: float, tilt: float) -> Command:
+    """Returns a command with the head's part; a search stops the walk.
+
+    Args:
+      command: What the legs shall do where the ball's place is known.
+      view: Where the ball is.
+      pan: The head's pan now [rad].
+      tilt: And its tilt [rad].
+    """
+    self._unseen = 0.0 if is_seen(view, pan=pan, tilt=tilt) else self._unseen + _TIMESTEP
+    if not self.searches:
+      self._sweeps = 0
+      bearing = float(np.clip(view.bearing, -_PAN, _PAN))
+      return dataclasses.replace(command, head=(bearing, _LEAN - depression(view.distance)))
+    if self._direction * pan > _PAN - _REACHED:
+      self._direction, self._sweeps = -self._direction, self._sweeps + 1
+    target = float(np.clip(pan + self._direction * _LEAD, -_PAN, _PAN))
+    behind = self._sweeps >= _SWEEPS
+    return Command(turn=float(behind), step=behind, head=(target, _SWEEP_TILT))

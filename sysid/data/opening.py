@@ -1,0 +1,54 @@
+"""Opens measured logs of any format that is read: MCAP, CSV, BAM's JSON."""
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+
+from nerf2real.core.robot_logs import reading
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.robot_logs.series import JointSeries
+from nerf2real.core.robot_logs.streaming import LogError
+from nerf2real.sysid.data.bam import UNNAMED, read_bam
+from nerf2real.sysid.data.tables import read_csv
+
+
+def read_log(path: str | Path) -> Log:
+  """Reads a log by its file's ending: `.csv`, `.json` (BAM), else MCAP.
+
+  Raises:
+    FileNotFoundError: no such file.
+    LogError: the log cannot be used.
+  """
+  path = Path(path)
+  readers = {".csv": read_csv, ".json": read_bam}
+  reader = readers.get(path.suffix.lower(), reading.read_log)
+  if not path.is_file():
+    raise FileNotFoundError(f"Found no file {path}, expected a measured log (.mcap, .csv, .json).")
+  return reader(path)
+
+
+def named(log: Log, model: mujoco.MjModel) -> Log:
+  """Returns a log whose joint without a name (BAM's) has that of the model's driven joint.
+
+  Raises:
+    LogError: the model does not drive one joint alone.
+  """
+  if log.joints != (UNNAMED,):
+    return log
+  driven = sorted({model.joint(int(index)).name for index in model.actuator_trnid[:, 0]})
+  if len(driven) != 1:
+    raise LogError(
+      f"{log.name} has one joint without a name, the model drives {driven}: give a model of that "
+      "one servo."
+    )
+
+  def renamed(series: JointSeries | None) -> JointSeries | None:
+    return series and dataclasses.replace(series, joints=(driven[0],))
+
+  commands, states = renamed(log.commands), renamed(log.states)
+  assert commands is not None and states is not None
+  heat = dict(zip(driven, log.temperatures.values(), strict=False))  # of one servo, or none
+  return dataclasses.replace(
+    log, commands=commands, states=states, pwm=renamed(log.pwm), temperatures=heat
+  )

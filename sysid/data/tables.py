@@ -1,0 +1,141 @@
+"""Reads measured logs from CSV files with a header.
+
+One row a reading. Columns are `time` [s] and, with a joint's name after the colon, any of
+`command_position:J`, `command_effort:J`, `position:J`, `velocity:J`, `effort:J`, `duty:J` and
+`temperature:J` (SI, degrees Celsius), and `voltage`. An empty field is a value that was not read at
+that time, so commands and states may have rows of their own.
+"""
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.robot_logs.series import JointSeries, ScalarSeries
+from nerf2real.core.robot_logs.streaming import LogError
+from nerf2real.sysid.data.checks import checked
+
+OF_JOINTS = (
+  *("command_position", "command_effort", "position", "velocity", "effort", "duty"),
+  "temperature",
+)
+ALONE = ("time", "voltage")
+
+
+def read_csv(path: Path) -> Log:
+  """Reads a CSV log.
+
+  Raises:
+    LogError: columns are unknown or missing, a field is no number, time runs backwards, joints have
+      readings at different times, or the log is too short or too slow.
+  """
+  columns = _columns(path)
+  time = columns.pop("time")
+  if np.isnan(time).any():
+    raise LogError(f"{path.name} has rows without a time, expected seconds in every row.")
+  start = float(time[0])
+  quantities: dict[str, dict[str, np.ndarray]] = {}
+  for name, values in columns.items():
+    quantity, _, joint = name.partition(":")
+    quantities.setdefault(quantity, {})[joint] = values
+  stamps = time - start
+  commands = _series(path, stamps, quantities, ("command_position", None, "command_effort"))
+  states = _series(path, stamps, quantities, ("position", "velocity", "effort"))
+  if commands is None or states is None or states.position is None:
+    lacks = (
+      "command_position:JOINT or command_effort:JOINT" if commands is None else "position:JOINT"
+    )
+    raise LogError(f"{path.name} has no column {lacks}, found {sorted(columns)}.")
+  voltage = _scalar(stamps, columns.get("voltage"))
+  heat = {j: _scalar(stamps, v) for j, v in quantities.get("temperature", {}).items()}
+  return checked(
+    Log(
+      name=path.name,
+      start_ns=round(start * 1e9),
+      commands=commands,
+      states=states,
+      pwm=_series(path, stamps, quantities, (None, None, "duty")),
+      imu=None,
+      battery=voltage,
+      temperatures={joint: series for joint, series in heat.items() if series is not None},
+      path=path,
+    )
+  )
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+  """Returns the columns by name, NaN where a field is empty."""
+  try:
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+      rows = [row for row in csv.reader(stream) if row]
+  except (UnicodeDecodeError, csv.Error) as error:
+    raise LogError(f"{path.name} is no CSV text: {error}.") from error
+  if len(rows) < 2:
+    raise LogError(f"{path.name} has {len(rows)} lines, expected a header and readings.")
+  names = [name.strip() for name in rows[0]]
+  for name in names:
+    quantity, _, joint = name.partition(":")
+    if name not in ALONE and not (quantity in OF_JOINTS and joint):
+      raise LogError(
+        f"{path.name} has the column {name!r}, expected {', '.join(ALONE)} or one of "
+        f"{', '.join(OF_JOINTS)} followed by :JOINT."
+      )
+  if "time" not in names or len(set(names)) < len(names):
+    raise LogError(
+      f"{path.name} has the columns {names}, expected each once and `time` among them."
+    )
+  table = np.full((len(rows) - 1, len(names)), math.nan)
+  for index, row in enumerate(rows[1:]):
+    if len(row) != len(names):
+      raise LogError(
+        f"{path.name} line {index + 2} has {len(row)} fields, the header {len(names)}."
+      )
+    for place, field in enumerate(row):
+      try:
+        table[index, place] = float(field) if field.strip() else math.nan
+      except ValueError:
+        raise LogError(
+          f"{path.name} line {index + 2} has {field!r} as {names[place]}, expected a number."
+        ) from None
+  return dict(zip(names, table.T, strict=True))
+
+
+def _series(
+  path: Path,
+  stamps: np.ndarray,
+  quantities: dict[str, dict[str, np.ndarray]],
+  fields: Sequence[str | None],
+) -> JointSeries | None:
+  """Returns the rows in which quantities were read, as position, velocity and effort."""
+  present = [name for name in fields if name is not None and name in quantities]
+  if not present:
+    return None
+  joints = tuple(quantities[present[0]])
+  arrays: dict[str, np.ndarray] = {}
+  for name in present:
+    if set(quantities[name]) != set(joints):
+      raise LogError(
+        f"{path.name} has {name} of {sorted(quantities[name])} and {present[0]} of "
+        f"{sorted(joints)}, expected the same joints."
+      )
+    arrays[name] = np.stack([quantities[name][joint] for joint in joints], axis=1)
+  read = ~np.isnan(np.concatenate(list(arrays.values()), axis=1))
+  rows = read.any(axis=1)
+  if not read[rows].all():
+    line = int(np.flatnonzero(rows & ~read.all(axis=1))[0]) + 2
+    raise LogError(
+      f"{path.name} line {line} has some of {', '.join(present)} and not all, expected all joints' "
+      "in a row, or none."
+    )
+  columns = [None if name is None or name not in arrays else arrays[name][rows] for name in fields]
+  return JointSeries(joints, stamps[rows], stamps[rows], *columns)
+
+
+def _scalar(stamps: np.ndarray, values: np.ndarray | None) -> ScalarSeries | None:
+  if values is None or np.isnan(values).all():
+    return None
+  read = ~np.isnan(values)
+  return ScalarSeries(stamps[read], stamps[read], values[read])

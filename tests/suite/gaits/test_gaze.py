@@ -1,0 +1,99 @@
+"""The head's part of pushing a ball: what is seen, where it points, how it searches."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.gaits.gaze import Gaze, depression, is_seen, view_of
+from nerf2real.suite.gaits.walk import Command
+
+WALK = Command(forward=1.0, turn=0.2)
+
+
+def test_where_a_ball_is_from_the_robot():
+  view = view_of((1.0, 2.0, np.pi / 2), np.array([0.0, 2.0]))
+  assert view == pytest.approx((np.pi / 2, 1.0))  # a quarter turn to the left
+  behind = view_of((0.0, 0.0, 3.0), np.array([-2.0, 0.0]))
+  assert behind.bearing == pytest.approx(np.pi - 3.0)  # across the half turn
+
+
+@pytest.mark.parametrize("distance", [0.4, 1.0, 2.5])
+def test_a_head_that_points_at_the_ball_sees_it_and_one_that_points_away_does_not(distance):
+  ball = view_of((0.0, 0.0, 0.0), distance * np.array([np.cos(0.7), np.sin(0.7)]))
+  tilt = 0.08 - depression(distance)
+  assert is_seen(ball, pan=0.7, tilt=tilt)
+  assert is_seen(ball, pan=0.4, tilt=tilt)
+  assert not is_seen(ball, pan=-0.1, tilt=tilt)
+  assert not is_seen(ball, pan=0.7, tilt=tilt - 0.9)
+
+
+def _step(gaze, head, ball):
+  """Moves an ideal head a little towards its target, as in a control step."""
+  command = gaze.apply(WALK, view_of((0.0, 0.0, 0.0), ball), pan=head[0], tilt=head[1])
+  return command, head + np.clip(np.array(command.head) - head, -0.06, 0.06)
+
+
+@pytest.mark.parametrize("bearing", [0.0, 1.5, -1.5, 2.6, -2.6])
+def test_a_search_finds_the_ball_and_the_head_stays_on_it(bearing):
+  ball = 1.2 * np.array([np.cos(bearing), np.sin(bearing)])
+  gaze, head, standing = Gaze(), np.array([0.0, -0.47]), 0
+  for _ in range(400):
+    command, head = _step(gaze, head, ball)
+    if gaze.searches:
+      assert not command.step and command.forward == 0
+      standing += 1
+  assert standing * 0.025 < 5.0 and not gaze.searches
+  assert command == Command(forward=1.0, turn=0.2, head=command.head)
+  assert head[0] == pytest.approx(np.clip(bearing, -2.3, 2.3), abs=0.02)
+  assert head[1] == pytest.approx(0.08 - depression(1.2), abs=0.02)
+
+
+def test_a_ball_behind_the_robot_makes_it_turn():
+  gaze, head = Gaze(), np.array([0.0, -0.3])
+  commands = []
+  for _ in range(400):
+    command, head = _step(gaze, head, np.array([-1.0, 0.0]))
+    commands.append(command)
+  assert not commands[0].step
+  assert commands[-1].step and commands[-1].turn == 1.0 and commands[-1].forward == 0.0
+
+
+def test_a_ball_that_is_out_of_sight_for_a_moment_is_not_lost():
+  gaze, head = Gaze(), np.array([0.0, -0.2])
+  _, head = _step(gaze, head, np.array([1.0, 0.0]))
+  assert not gaze.searches
+  aside = np.array([np.cos(1.2), np.sin(1.2)])
+  for step in range(100):
+    command = gaze.apply(WALK, view_of((0.0, 0.0, 0.0), aside), pan=-0.5, tilt=-0.2)
+    assert gaze.searches == (step >= 80)  # 2 s
+  assert not command.step
+  gaze.reset()
+  assert gaze.searches
+
+
+def test_the_cameras_angles_are_those_of_the_robot():
+  """The picture's middle, of the simulated robot's head, passes through the ball's centre."""
+  from nerf2real import suite
+  from nerf2real.suite.gaits.floor import EmptyFloor
+  from nerf2real.suite.op3 import constants
+  from nerf2real.suite.tasks.base import Start
+
+  environment = suite.load("nerf_nav", scene=EmptyFloor(), image_size=None, random=0)
+  environment.task.set_start(Start((0.0, 0.0), 0.0))
+  environment.reset()
+  model, data = environment.physics.model.ptr, environment.physics.data.ptr
+  ball = np.array([0.9, 0.4])
+  view = view_of((0.0, 0.0, 0.0), ball)
+  lower, upper = constants.joint_limits()
+  for name, angle in (("head_pan", view.bearing), ("head_tilt", -depression(view.distance))):
+    index = constants.JOINT_NAMES.index(name)
+    assert lower[index] < angle < upper[index]
+    joint = next(i for i in range(model.njnt) if model.joint(i).name.endswith(name))
+    data.qpos[model.jnt_qposadr[joint]] = angle
+  mujoco.mj_kinematics(model, data)
+  mujoco.mj_camlight(model, data)
+  camera = next(i for i in range(model.ncam) if "head" in model.camera(i).name)
+  look = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
+  to_ball = np.array([*ball, 0.12]) - data.cam_xpos[camera]
+  angle = np.arccos(look @ to_ball / np.linalg.norm(to_ball))
+  assert angle < 0.08  # the view is 0.76 rad high

@@ -1,0 +1,143 @@
+"""Logs as CSV and as BAM's JSON."""
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.core.robot_logs.reading import LogError
+from nerf2real.sysid.data.bam import UNNAMED
+from nerf2real.sysid.data.opening import named, read_log
+from nerf2real.sysid.selection.identification import read_logs
+from tests.sysid.synthetic import ARM, PENDULUM
+
+MEASURED = Path(__file__).parents[4] / "shared/data/measured"
+TIME = 0.01 * np.arange(200)
+PATH = np.sin(TIME)
+
+
+def csv_of(folder, lines):
+  path = folder / "log.csv"
+  path.write_text("\n".join(lines) + "\n")
+  return path
+
+
+def rows(start=7.0):
+  """Returns commands and states in rows of their own, temperature now and then."""
+  lines = ["time,command_position:joint,position:joint,effort:joint,voltage,temperature:joint"]
+  for index, (time, place) in enumerate(zip(TIME, PATH, strict=True)):
+    heat = "31" if index % 50 == 0 else ""
+    lines.append(f"{start + time:.4f},{0.5 * place:.6f},,,,")
+    lines.append(f"{start + time + 0.002:.4f},,{place:.6f},{2 * place:.6f},12.1,{heat}")
+  return lines
+
+
+def test_a_csv_log(tmp_path):
+  log = read_log(csv_of(tmp_path, rows()))
+  assert log.joints == log.commands.joints == ("joint",)
+  np.testing.assert_allclose(log.commands.stamp, TIME, atol=1e-9)
+  np.testing.assert_allclose(log.states.stamp, TIME + 0.002, atol=1e-9)
+  np.testing.assert_allclose(log.commands.position[:, 0], 0.5 * PATH, atol=1e-6)
+  np.testing.assert_allclose(log.states.effort[:, 0], 2 * PATH, atol=1e-6)
+  assert log.states.velocity is None and log.commands.effort is None and log.pwm is None
+  assert set(log.battery.value) == {12.1} and len(log.temperatures["joint"].value) == 4
+  (tmp_path / "m.xml").write_text(PENDULUM)
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  assert read_logs([tmp_path / "log.csv"], model)[0].duration == pytest.approx(log.duration)
+
+
+@pytest.mark.parametrize(
+  ("change", "message"),
+  [
+    (lambda t: t[:1], "has 1 lines, expected a header and readings"),
+    (lambda t: [t[0].replace("voltage", "volts"), *t[1:]], "has the column 'volts', expected"),
+    (lambda t: [t[0].replace("time", "voltage", 1), *t[1:]], "expected each once and `time`"),
+    (lambda t: [t[0].replace("command_position", "duty"), *t[1:]], "no column command_position"),
+    (lambda t: [*t[:9], t[9] + ",4", *t[10:]], "line 10 has 7 fields, the header 6"),
+    (lambda t: [*t[:9], t[9].replace(",,,,", ",,x,,"), *t[10:]], "line 10 has 'x' as effort:joint"),
+    (lambda t: [*t[:9], *t[19:21], *t[9:19], *t[21:]], "time runs backwards"),
+    (lambda t: t[:40], "lasts 0.18 s with commands and states"),
+    (lambda t: [t[0], *(r for i, r in enumerate(t[1:]) if i % 40 < 2)], "at least 20 a second"),
+    (
+      lambda t: [*t[:2], t[2].replace(f"{PATH[0]:.6f},", ",", 1), *t[3:]],
+      "line 3 has some of position, effort and not all",
+    ),
+  ],
+)
+def test_a_csv_that_cannot_be_used_is_one_clear_error(change, message, tmp_path):
+  with pytest.raises(LogError, match=message) as caught:
+    read_log(csv_of(tmp_path, change(rows())))
+  assert "\n" not in str(caught.value)
+
+
+def entries():
+  return [
+    {
+      "timestamp": 3.0 + t,
+      "goal_position": 0.5 * p,
+      "position": p,
+      "speed": 1.0,
+      "load": 442.5,
+      "input_volts": 7.3,
+      "temp": 28,
+      "torque_enable": True,
+    }
+    for t, p in zip(TIME, PATH, strict=True)
+  ]
+
+
+def bam_of(folder, content):
+  path = folder / "log.json"
+  path.write_text(json.dumps(content))
+  return path
+
+
+def test_a_bam_log(tmp_path):
+  path = bam_of(tmp_path, {"motor": "xl330", "kp": 100, "entries": entries()})
+  log = read_log(path)
+  assert log.joints == (UNNAMED,)
+  np.testing.assert_allclose(log.states.stamp, TIME, atol=1e-9)
+  np.testing.assert_allclose(log.commands.position[:, 0], 0.5 * PATH)
+  assert set(log.pwm.effort.ravel()) == {0.5} and set(log.battery.value) == {7.3}
+  (found,) = read_logs([path], mujoco.MjModel.from_xml_string(PENDULUM))
+  assert found.joints == found.commands.joints == found.pwm.joints == ("joint",)
+  assert list(found.temperatures) == ["joint"]
+  with pytest.raises(LogError, match=r"the model drives \['elbow', 'shoulder'\]"):
+    named(log, mujoco.MjModel.from_xml_string(ARM))
+  assert read_log(bam_of(tmp_path, {"motor": "mx64", "entries": entries()})).pwm is None
+
+
+@pytest.mark.parametrize(
+  ("content", "message"),
+  [
+    ({"mass": 1.0}, r"has \['mass'\], expected a BAM log with a list of entries"),
+    ([1], "has list, expected a BAM log"),
+    ({"entries": [{**e, "position": None} for e in entries()]}, "entry 0 has None as 'position'"),
+    (
+      {"entries": [{**e, "torque_enable": i < 150} for i, e in enumerate(entries())]},
+      "torque is off in 50 of 200 entries, first at 1.500 s",
+    ),
+    ({"entries": entries()[:50]}, "lasts 0.49 s"),
+  ],
+)
+def test_a_json_that_is_no_usable_bam_log_is_one_clear_error(content, message, tmp_path):
+  with pytest.raises(LogError, match=message) as caught:
+    read_log(bam_of(tmp_path, content))
+  assert "\n" not in str(caught.value)
+
+
+def test_missing_files_and_broken_text(tmp_path):
+  with pytest.raises(FileNotFoundError, match=r"no file .*a\.csv"):
+    read_log(tmp_path / "a.csv")
+  (tmp_path / "b.json").write_text("{")
+  with pytest.raises(LogError, match=r"b\.json is not valid JSON"):
+    read_log(tmp_path / "b.json")
+
+
+@pytest.mark.skipif(not list(MEASURED.glob("**/*.json")), reason="Found no BAM log beside this.")
+def test_measured_bam_logs():
+  for path in MEASURED.glob("**/*.json"):
+    log = read_log(path)
+    assert log.duration > 1 and np.ptp(log.states.position) > 0.1
