@@ -123,6 +123,10 @@ def identify(
       f"Found by a simulation that follows the readings, as courses with play do not repeat:"
       f" {joints}. The errors before and after are of whole courses, which stray.",
     ]
+  if found.in_reference:
+    kinds = ", ".join(row["kind"] for row in found.in_reference)
+    text = f"In the reference, too, so that nothing has changed: {kinds}. The model lacks it."
+    content["notes"] = [*content["notes"], text]
   if found.verdict == "partly":
     joints = ", ".join(item.joint for item in found.unexplained)
     text = (
