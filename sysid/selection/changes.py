@@ -81,24 +81,41 @@ def find(
     tried: joints that are looked at, over which the level of significance is shared.
     settings: tolerances and effort.
   """
-  healthy = JointModel(
-    model, joint, reference, reductions=reductions[1], window_s=settings.window_s
-  )
-  before = JointLikelihood(healthy, settings=settings)
-  first = Explainer(
-    before, constants(healthy, settings), _library(healthy, before), settings=settings
-  )
-  kinds = {t.kind for t in first.library}
-  beyond = threshold(len(kinds) * tried, settings)
-  plant = JointModel(model, joint, logs, reductions=reductions[0], window_s=settings.window_s)
-  now = JointLikelihood(plant, settings=settings)
+  before = _likelihood(model, joint, reference, reductions[1], settings)
+  own = constants(before.plant, settings)
+  first = Explainer(before, own, _library(before.plant), settings=settings)
+  beyond = threshold(len({t.kind for t in first.library}) * tried, settings)
   usual = conclude(before, first.explain(settings.reference_depth), beyond).best
+  now = _likelihood(model, joint, logs, reductions[0], settings)
+  return _compare(joint, now, before, usual, beyond, settings)
+
+
+def _likelihood(
+  model: mujoco.MjModel,
+  joint: str,
+  logs: Sequence[Log],
+  reductions: Sequence[Reduction],
+  settings: Settings,
+) -> JointLikelihood:
+  plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)
+  return JointLikelihood(plant, settings=settings)
+
+
+def _compare(
+  joint: str,
+  now: JointLikelihood,
+  before: JointLikelihood,
+  usual: Scored,
+  beyond: float,
+  settings: Settings,
+) -> Changed:
+  """Explains logs on top of what a reference's best hypothesis holds."""
   paired = now.expect(before, usual.fit.residuals[0])
   known = known_terms(usual, settings)
   explainer = Explainer(
     now,
     known[0],
-    _library(plant, now),
+    _library(now.plant),
     settings=settings,
     known=known[1:],
     freed=freed_constants(known[0], settings),
@@ -107,26 +124,26 @@ def find(
   ranked = explainer.explain()
   found = conclude(now, ranked, beyond, now.squares(as_it_was)[0])
   named = tuple(k for k in found.named if paired or _is_new(before, usual, found.best, k, beyond))
-  own = np.median(usual.fit.held[0][0]) if not paired else 2.0 * now.position_noise**2
+  anyway = 2.0 * now.position_noise**2 if paired else float(np.median(usual.fit.held[0][0]))
   remains = _remains(now, found.best, before, usual, paired, beyond, settings)
-  over = float(np.sqrt(np.median(found.left) / max(own, 1e-300)))
-  verdict = _verdict(found, named, remains, over, settings)
+  left = float(np.median(found.left))
+  verdict = _verdict(found, named, remains, np.sqrt(left / max(anyway, 1e-300)), settings)
   return Changed(
     joint,
     now,
-    Problem(plant),
+    Problem(now.plant),
     explainer,
     known,
     ranked,
     found,
     named,
     verdict,
-    float(np.sqrt(own)),
-    float(np.sqrt(np.median(found.left))),
+    float(np.sqrt(anyway)),
+    float(np.sqrt(left)),
   )
 
 
-def _library(plant: JointModel, likelihood: JointLikelihood) -> list[Term]:
+def _library(plant: JointModel) -> list[Term]:
   """Returns the effects to try; where torque repeats with position is read off the residual."""
   waves = signatures.waves(Problem(plant), OldFit((), np.zeros(0), 0.0, 1.0, 0))
   terms = [*candidates.library(plant), candidates.cogging(plant, waves)]

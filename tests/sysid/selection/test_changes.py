@@ -75,9 +75,8 @@ def found():
   """Reports of a machine with friction of old: unchanged, and with commands late since."""
   patch = pytest.MonkeyPatch()
   library = candidates.library
-  patch.setattr(
-    changes, "_library", lambda plant, _: [t for t in library(plant) if t.kind in KINDS]
-  )
+  few = lambda plant: [t for t in library(plant) if t.kind in KINDS]  # noqa: E731
+  patch.setattr(changes, "_library", few)
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   late = Effect("command_delay", "joint", {"delay": 0.02})
 
