@@ -88,14 +88,15 @@ def _verdict(verdicts: Sequence[str]) -> str:
 def _found(item: Changed) -> Found:
   """Returns a joint's hypotheses as the report shows them."""
   problem = item.problem
-  null = entry(problem, item.null)
   best = item.found.best
-  chosen = entry(problem, best)
-  others = [entry(problem, s) for s in item.ranked if s is not best and s.names]
+  entries = {s.terms: entry(problem, s) for s in item.ranked}  # one of each: they are compared
+  null, chosen = entries[item.null.terms], entries[best.terms]
+  others = [e for t, e in entries.items() if t != best.terms and _changed(t)]
   singles = [e for e in [chosen, *others] if len(_changed(e.fit.terms)) == 1]
   longer = [e for e in [chosen, *others] if len(_changed(e.fit.terms)) > 1]
   declared = race.entry(problem, problem.fit([]))
-  alike = [entry(problem, s) for n in item.found.names for s in n.confounded if s.names]
+  alike = [entries[s.terms] for n in item.found.names for s in n.confounded if s.names]
+  alike = list({id(e): e for e in alike}.values())
   ladder = Ladder(problem, item.known[0], declared, null, singles, longer)
   verdict = "unexplained" if item.verdict in ("partly", "unexplained") else item.verdict
   finding = Finding(verdict, chosen, bool(item.named), False, others, alike)
