@@ -1,4 +1,5 @@
-# make demo: the main job on the built-in room; make test: all tests. Both install first.
+# make demo: the main job on the built-in room; make loop: the closed loop with the shipped policy; make
+# test: all tests. All install first.
 SHELL := /bin/bash
 # the first interpreter that runs, is new enough and can make environments
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -6,10 +7,16 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
   && { echo $$p; break; }; done)
 BIN := .venv/bin
 
-.PHONY: demo test lint install clean
+.PHONY: demo loop test lint install clean
 demo: install
 	$(BIN)/python launch/make_scene.py --capture builtin --preset demo --out out/demo
 	@echo "open out/demo/report.html"
+
+# the closed loop, first case, at reduced size: 6 trials, 5 minutes of training
+loop: install
+	$(BIN)/python launch/close_loop.py --robot virtual --hidden command_delay:0.045 --policy shipped \
+	  --trials 6 --seconds 6 --minutes 5 --out out/loop
+	@echo "open out/loop/loop.html"
 
 test: install lint
 	$(BIN)/python -m pytest

@@ -10,7 +10,7 @@ import numpy as np
 from nerf2real.core.serialization import to_plain
 from nerf2real.evaluation.plants.plant import BALL, Sight
 from nerf2real.suite.gaits.walk import GaitSettings
-from nerf2real.suite.gaits.walker import Walker
+from nerf2real.suite.gaits.walker import SteeringSettings, Walker
 from nerf2real.suite.op3 import constants
 
 
@@ -59,23 +59,36 @@ def resolution(policy: EvaluatedPolicy) -> str:
 class GaitPolicy:
   """The scripted walker, with the observed pose or by dead reckoning without one."""
 
-  name = "gait"
   image_size: tuple[int, int] | None = None
   control = "none"
   trained_on = ""
   belief: Belief | None = None
 
-  def __init__(self, scene: Any, protocol: str, *, settings: GaitSettings | None = None):
+  def __init__(
+    self,
+    scene: Any,
+    protocol: str,
+    *,
+    settings: GaitSettings | None = None,
+    steering: SteeringSettings | None = None,
+    name: str = "gait",
+  ):
     """Creates the policy.
 
     Args:
       scene: An opened bundle.
       protocol: One of `plants.PROTOCOLS`.
       settings: Parameters of the gait.
+      steering: And of its steering.
+      name: For the tables.
     """
+    self.name = name
     head_pan = constants.BALL_PUSHING_HEAD_PAN if protocol == BALL else None
-    self._walker = Walker(scene, gait=settings, head_pan_limit=head_pan)
-    text = json.dumps(to_plain(settings or GaitSettings()), sort_keys=True)
+    self._walker = Walker(scene, gait=settings, steering=steering, head_pan_limit=head_pan)
+    made_of: Any = settings or GaitSettings()
+    if steering is not None:
+      made_of = [made_of, steering]
+    text = json.dumps(to_plain(made_of), sort_keys=True)
     self.policy_id = hashlib.sha256(text.encode()).hexdigest()[:12]
 
   def reset(self, sight: Sight) -> None:

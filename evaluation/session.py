@@ -76,7 +76,7 @@ def make_plant(
   swaps.check(settings.swap, plant=settings.plant, built_in=settings.scene is None)
   record = None
   if settings.record and settings.plant != "sim":
-    record = _free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
+    record = free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
   if settings.plant == "sim":
     from nerf2real.evaluation.plants.simulated import SimulatedPlant
 
@@ -122,7 +122,7 @@ def make_plant(
   )
 
 
-def _free_name(path: Path) -> Path:
+def free_name(path: Path) -> Path:
   """Returns the path, or one with a number behind it if that is taken."""
   number = 1
   found = path

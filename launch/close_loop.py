@@ -1,55 +1,65 @@
-"""Closes the loop once: excites a robot, records, identifies, simulates with the effects, compares.
+"""Closes the loop: a policy fails on a robot, the data say why, it is trained on and works again.
 
-  python launch/close_loop.py --robot virtual --seed 1 --out out/loop
+  python launch/close_loop.py --robot virtual --hidden command_delay:0.045 --policy shipped
+  python launch/close_loop.py --hidden drawn --seed 7 --policy runs/walk/policy/newest --trials 54
+  python launch/close_loop.py --hidden weak_knee --policy shipped --find-severity --out out/severity
+  python launch/close_loop.py --robot virtual --seed 1
 
-The robot is held by its torso in the air and moves all joints: a sweep, a slow motion and steps to
-identify from, a motion of other frequencies to judge by. The declared model is the suite's OP3,
-held likewise. The table at the end is the gap between robot and suite, joint by joint, on motions
-that were not fitted: standing on the floor and in the air, without and with the effects found.
+Trials on the robot, recordings on a stand, identification, the same trials in the simulation with
+what was named, a distillation from the policy, the trials again. What was cut short goes on.
+--find-severity makes what is hidden larger until success falls by 30 points, and does no more.
+Without --policy joint positions are compared: the robot moves in the air (a sweep, a slow motion
+and steps to identify from, another to judge by) and sways on the floor, without and with effects.
 """
 
 import dataclasses
+import functools
 import sys
-from pathlib import Path
 
+from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.launch import command
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Arguments:
-  """Closes the loop once."""
+class Arguments(LoopSettings):
+  """Closes the loop."""
 
-  robot: str = "virtual"
-  """Serial port such as /dev/ttyUSB0, or "virtual"."""
-  seed: int = 1
-  """Of the virtual robot's hidden properties."""
-  seconds: float = 12.0
-  """Length of a recorded motion [s]."""
-  reuse: bool = False
-  """Take the logs that an earlier run left in the folder instead of moving the robot."""
-  out: Path = Path("out/loop")
-  """Folder for logs, model, report and table."""
+  find_severity: bool = False
+  """Only find the size of what is hidden at which success falls by 30 points."""
 
 
 def run(arguments: Arguments) -> None:
-  """Closes the loop and prints the gap."""
+  """Closes the loop and prints what it gave."""
+  say = functools.partial(print, flush=True)
+  if arguments.find_severity:
+    from nerf2real.evaluation.loop import severity
+
+    say(severity.as_text(severity.find_severity(arguments, say)))
+    return
+  if arguments.policy:
+    from nerf2real.evaluation.loop import story, telling
+    from nerf2real.launch.distill import SCRIPTS
+
+    told = story.close(arguments, SCRIPTS, say)
+    telling.write(arguments.out / "loop.html", told)
+    say(telling.as_text(told))
+    say(f"page: {arguments.out / 'loop.html'}")
+    return
   from nerf2real.evaluation.loop.closing import close_loop
 
-  closed = close_loop(
-    arguments.out,
-    robot=arguments.robot,
-    seed=arguments.seed,
-    seconds=arguments.seconds,
-    reuse=arguments.reuse,
-  )
-  print(closed.table)
-  print(f"report: {closed.report}")
+  closed = close_loop(arguments)
+  say(closed.table)
+  say(f"report: {closed.report}")
 
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
   return command.main(
-    Arguments, run, environment=command.DRAWING, errors=(ValueError, OSError, RuntimeError)
+    Arguments,
+    run,
+    environment=command.DRAWING | command.ONE_THREAD,
+    errors=(ValueError, OSError, RuntimeError),
+    interrupted="stopped: the same command goes on from here",
   )
 
 

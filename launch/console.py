@@ -13,6 +13,7 @@ SCRIPTS = {
   "scene": "make_scene",
   "film": "film_room",
   "view": "view",
+  "export": "export_scene",
   "rollout": "rollout",
   "tune-gait": "tune_gait",
   "train": "local_distributed",

@@ -5,7 +5,8 @@
 
 Learner, collectors and evaluator are supervised processes; those that die are replaced. Ctrl-C ends
 the run with its state saved; --resume goes on, also with more --minutes. Arguments that are not
-listed here go to the learner (see `launch/distill_learner.py --help`), such as --teacher steady.
+listed here go to the learner (see `launch/distill_learner.py --help`), such as --teacher steady, or
+--init-from runs/walk/policy/newest to train a policy on.
 """
 
 import dataclasses
@@ -33,8 +34,8 @@ class Arguments(training.TrainingSettings):
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   preset: str | None = None
-  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push, or tiny to try the
-  machinery; "nerf_nav" if not given."""
+  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push, adapt to train a policy on
+  (with --init-from), or tiny to try the machinery; "nerf_nav" if not given."""
 
 
 def run(arguments: Arguments, forwarded: list[str]) -> None:

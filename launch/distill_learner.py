@@ -33,12 +33,14 @@ class Arguments:
   listen: str = DEFAULT_ENDPOINT
   """Where to listen, such as tcp/0.0.0.0:7447."""
   preset: str = "nerf_nav"
-  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push, or tiny to try the
-  machinery."""
+  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push, adapt to train a policy on, or
+  tiny to try the machinery."""
   env: str | None = None
   """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
   teacher: str | None = None
   """quick, steady, ball, or the folder of an exported policy; the preset's if not given."""
+  init_from: Path | None = None
+  """Folder of an exported policy that the student begins with; its networks are taken along."""
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   minutes: float = 60.0
@@ -54,8 +56,12 @@ class Arguments:
 
 
 def settings_of(arguments: Arguments) -> Any:
-  """Returns the settings of a run: the preset's with changes, or those it began with."""
-  from nerf2real.agents.distill import settings
+  """Returns the settings of a run: the preset's with changes, or those it began with.
+
+  Raises:
+    ValueError: The preset is unknown, or there is no policy to begin with.
+  """
+  from nerf2real.agents.distill import beginning, settings
 
   if arguments.resume:
     return read_json(arguments.run / settings.SETTINGS, settings.DistillSettings)
@@ -64,6 +70,9 @@ def settings_of(arguments: Arguments) -> Any:
     "teacher": arguments.teacher,
     "max_frames": arguments.max_env_steps,
   }
+  if arguments.init_from is not None:
+    changes["init_from"] = str(arguments.init_from)
+    changes["agent"] = beginning.agent_of(arguments.init_from)
   given = {name: value for name, value in changes.items() if value is not None}
   return dataclasses.replace(settings.preset(arguments.preset), **given)
 

@@ -2,6 +2,7 @@
 
   python launch/make_scene.py --capture room.mp4 --out out/room --marker-side 0.2
   python launch/make_scene.py --capture builtin --out out/demo --preset demo
+  python launch/make_scene.py --capture room.mp4 --out out/room --check
 
 A second run with the same --out continues where the first one stopped.
 """
@@ -17,14 +18,16 @@ if TYPE_CHECKING:
   from nerf2real.scenes.bundle import Bundle
   from nerf2real.scenes.settings import SceneSettings
 
+FILM_AGAIN = 3  # exit status of --check
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Arguments:
   """Makes a scene bundle from a video or pictures of a room."""
 
   capture: str
-  """A video, a folder of pictures, a COLMAP model, a transforms.json, or "builtin" for the
-  project's own room."""
+  """A video, a folder of pictures, a COLMAP model, a transforms.json, an RGB-D sequence with poses
+  (TUM's or 7-Scenes' layout), or "builtin" for the project's own room."""
   out: Path
   """Folder of the bundle."""
   preset: Literal["fast", "demo", "paper"] = "fast"
@@ -43,6 +46,9 @@ class Arguments:
   """"colmap" adds the Poisson mesh of the COLMAP points to the report."""
   name: str | None = None
   """The scene's name; the output folder's if not given."""
+  check: bool = False
+  """Stops after keyframes and poses with a verdict: what to film again, and where (check.png in
+  --out). Exit status 3 where something should be filmed again. The scene continues from there."""
 
 
 def settings_of(arguments: Arguments) -> "SceneSettings":
@@ -82,8 +88,20 @@ def _print_figures(scene: "Bundle") -> None:
     rich.print(f"[yellow]warning:[/] {warning}")
 
 
-def run(arguments: Arguments) -> None:
-  """Makes the scene and prints its figures."""
+def _check(arguments: Arguments, source: Path, settings: "SceneSettings") -> int:
+  """Prints the verdict on the capture; returns the exit status."""
+  from nerf2real.scenes.checking import check_capture
+
+  verdict = check_capture(source, arguments.out, settings=settings)
+  print(verdict.paragraph)
+  if verdict.picture is not None:
+    verdict.save_picture(arguments.out / "check.png")
+    print(f"where: {arguments.out / 'check.png'}")
+  return 0 if verdict.good else FILM_AGAIN
+
+
+def run(arguments: Arguments) -> int:
+  """Makes the scene and prints its figures; returns the exit status."""
   from nerf2real.scenes import pipeline
   from nerf2real.scenes.builtin import yardstick
 
@@ -93,6 +111,8 @@ def run(arguments: Arguments) -> None:
     source, measure = yardstick.VIDEO, yardstick.measure
     if settings.marker_side is None:
       settings = dataclasses.replace(settings, marker_side=yardstick.MARKER_SIDE)
+  if arguments.check:
+    return _check(arguments, source, settings)
   scene = pipeline.make_scene(
     source,
     arguments.out,
@@ -103,6 +123,7 @@ def run(arguments: Arguments) -> None:
   )
   _print_figures(scene)
   print(f"report: {arguments.out / 'report.html'}")
+  return 0
 
 
 def main() -> int:

@@ -1,6 +1,7 @@
 """Shows a scene bundle, or a task in it, in the browser.
 
 python launch/view.py out/livingroom
+python launch/view.py out/livingroom --splats livingroom.ply
 python launch/view.py --task nerf_nav
 """
 
@@ -25,6 +26,8 @@ class Arguments:
   """Folder of the scene bundle; the built-in room if not given."""
   task: str | None = None
   """Shows a task of the suite in the scene, such as nerf_nav, instead of the scene alone."""
+  splats: Path | None = None
+  """Splats to show as a layer, as launch/export_scene.py --to splat writes them."""
   host: str = "127.0.0.1"
   """Address to serve on; 0.0.0.0 lets other machines connect."""
   port: int = 8080
@@ -43,9 +46,11 @@ def run(arguments: Arguments) -> None:
     server, wait = viewer.server, lambda: viewer.run(never)
   else:
     from nerf2real.scenes.bundle import Bundle
+    from nerf2real.scenes.export.splats.splats import Splats
     from nerf2real.scenes.viewer import view_bundle
 
-    server = view_bundle(Bundle.load(arguments.bundle), host=host, port=port)
+    splats = None if arguments.splats is None else Splats.load_ply(arguments.splats)
+    server = view_bundle(Bundle.load(arguments.bundle), host=host, port=port, splats=splats)
   print(f"open http://{host}:{server.get_port()} (Ctrl-C ends)", flush=True)
   with contextlib.suppress(KeyboardInterrupt):
     wait()

@@ -5,13 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import trimesh
 
 from nerf2real.core import files
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
+from nerf2real.scenes.field.views import held_out_rows
 from nerf2real.scenes.geometry import collision, convex, floor_picture, map_server, mesh
-from nerf2real.scenes.quality import held_out, report
+from nerf2real.scenes.quality import held_out, report, sight_lines
 from nerf2real.scenes.results import Measure, Reconstruction, SceneResults
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import StageResult
@@ -44,6 +46,7 @@ def assemble(
   _copy_files(results, out)
   parts = collision.read_parts(out / "collision")
   figures = _figures(results)
+  figures |= _sight_line_figures(results, parts, settings)
   if measure is not None:
     truth = measure(_reconstruction(results, parts, collision_top=settings.collision.top))
     figures |= truth.figures
@@ -144,6 +147,30 @@ def _figures(results: SceneResults) -> dict[str, Any]:
     "floor_tilt_from_cameras_deg": alignment.floor_tilt_from_cameras_deg,
     "scale_source": alignment.scale_source,
     "scale_spread": alignment.scale_spread,
+  }
+
+
+def _sight_line_figures(
+  results: SceneResults, parts: list[convex.Part], settings: SceneSettings
+) -> dict[str, float]:
+  """Judges the parts by sight lines of held-out pictures; nothing where points have no pictures."""
+  place, names = results.world.value, np.array(results.poses.value.names)
+  upper = np.minimum(place.extent_upper, [np.inf, np.inf, settings.collision.top])
+  lines = sight_lines.sight_lines(
+    pycolmap.Reconstruction(str(results.poses.stage.folder / "sfm")),
+    names[held_out_rows(len(names), settings.held_out_every)].tolist(),
+    place.world_from_unit,
+    lower=place.extent_lower,
+    upper=upper,
+  )
+  found = sight_lines.judge_parts(lines, parts)
+  if found is None:
+    return {}
+  return {
+    "sight_lines": float(found.lines),
+    "sight_lines_blocked": found.blocked,
+    "points_missed": found.missed,
+    "points_to_parts_p95_m": found.distance_p95,
   }
 
 

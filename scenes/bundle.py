@@ -21,6 +21,7 @@ from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 
 FORMAT = "scene-bundle"
 FORMAT_VERSION = 1
+STAGES = ".stages"  # folder of the cached stages inside a bundle that was made here
 BUILT_IN = Path(__file__).parent / "data" / "room"  # the room that is shipped with the project
 
 
@@ -98,6 +99,11 @@ class Bundle:
   def collision_parts(self) -> list[Path]:
     """The convex parts as Wavefront files in the world frame [m]."""
     return [self.folder / "collision" / name for name in self.scene["collision_parts"]]
+
+  @property
+  def keyframes_folder(self) -> Path:
+    """The capture's keyframes; it exists only where the bundle was made."""
+    return self.folder / STAGES / "keyframes" / "images"
 
   @property
   def visual_path(self) -> Path:

@@ -59,8 +59,10 @@ def world(
         side=marker_side,
       )
     points, normals = depth.value.surface_points(stride=2)
+    known = capture.value.known
+    sensed = 1 / found.unit_from_source.scale if known is not None and known.is_metric else None
     result = world_frame.align(
-      Evidence(found.points, found.world_from_camera, points, normals, marker),
+      Evidence(found.points, found.world_from_camera, points, normals, marker, sensed),
       settings=settings,
       override=override,
       progress=part(progress, 0.6, 1.0),

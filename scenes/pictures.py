@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pycolmap
 
+from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field import anchors, photometry
 from nerf2real.scenes.field.views import Views
@@ -48,7 +49,27 @@ class PosedPictures:
     seen = photometry.point_colors(model, found.names, pictures)
     gains = photometry.picture_gains(*seen, count=len(images))
     known = anchors.known_points(model, found.names, found.world_from_camera, camera=camera)
+    known = np.concatenate([known, self._measured(camera)])
     return Views(camera, pictures, found.world_from_camera, found.names, gains, anchors=known)
+
+  def _measured(self, camera: Camera) -> np.ndarray:
+    """Depth that a sensor measured, as anchors float32 [A, 4] of pictures of a camera's size."""
+    source, found = self.capture.value.known, self.poses.value
+    if source is None or not len(source.sightings):
+      return np.zeros((0, 4), np.float32)
+    row = np.full(len(self.capture.value.images), -1)
+    row_of = {name: k for k, name in enumerate(found.names)}
+    for k, path in enumerate(self.capture.value.images):
+      row[k] = row_of.get(path.name, -1)
+    seen = source.sightings.copy()
+    seen[:, 0] = row[seen[:, 0].astype(int)]
+    pixels = seen[:, 1:3] * [
+      camera.width / source.camera.width,
+      camera.height / source.camera.height,
+    ]
+    seen[:, 1:3] = np.minimum(np.floor(pixels), [camera.width - 1, camera.height - 1])
+    seen[:, 3] *= found.unit_from_source.scale
+    return seen[seen[:, 0] >= 0].astype(np.float32)
 
   def training(self) -> Views:
     """Reads the pictures that are trained on."""

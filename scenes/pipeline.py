@@ -8,13 +8,13 @@ from pathlib import Path
 
 from nerf2real.core import files
 from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages
-from nerf2real.scenes.alignment import overrides
+from nerf2real.scenes.alignment import overrides, surroundings
 from nerf2real.scenes.capture.capture import source_kind
 from nerf2real.scenes.results import Measure, SceneResults, Source
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import Stages
 
-STAGES = ".stages"  # folder of the cached stages inside a bundle
+STAGES = bundle.STAGES
 
 
 def make_scene(
@@ -52,6 +52,8 @@ def make_scene(
 
   capture = image_stages.keyframes(cache, film, settings.capture)
   poses = image_stages.poses(cache, capture, settings.localise)
+  if fixed.floor_points is None:
+    surroundings.require_room(poses.value.world_from_camera, poses.value.points)
   pictures = image_stages.PosedPictures(
     capture, poses, settings.train_width, settings.held_out_every
   )

@@ -1,31 +1,39 @@
-"""A scene bundle in the browser: its field, meshes, convex parts and the capture's cameras."""
+"""A scene bundle in the browser, as layers: field, splats, meshes, parts, free floor, cameras."""
 
-import os
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 import viser
+from scipy.spatial.transform import Rotation
 from viser import transforms
 
 from nerf2real.core import palette
 from nerf2real.scenes.bundle import Bundle
-from nerf2real.scenes.field.field import Field
+from nerf2real.scenes.export.splats.splats import Splats
+from nerf2real.scenes.export.views import capture_cameras, overlooking_pose, renderer_of
 from nerf2real.scenes.field.render import browser as field_view
-from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 from nerf2real.scenes.geometry.mesh import load_glb
-from nerf2real.scenes.poses import localise
 
 _CAMERA_STEP = 3  # every third camera is drawn
+_FLOOR_LIFT = 0.02  # of the free floor above the floor, or it would flicker with it [m]
+_SETBACK = 0.04  # of the field's depth behind what stands on its surfaces [m]
 
 
-def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
-  """Adds meshes, parts, cameras and the free-space map, each with a switch."""
-  shown = server.scene.add_mesh_trimesh("/visual", load_glb(bundle.visual_path))
-  shown.visible = False
-  parts = []
+class Layer(NamedTuple):
+  """Something of the scene that is switched on and off as a whole."""
+
+  label: str
+  handles: list[Any]
+  shown: bool  # at first
+
+
+def _parts(server: viser.ViserServer, bundle: Bundle) -> list[Any]:
+  handles = []
   for index, path in enumerate(bundle.collision_parts):
     part = trimesh.load_mesh(path)
-    parts.append(
+    handles.append(
       server.scene.add_mesh_simple(
         f"/parts/{index:03d}",
         part.vertices,
@@ -35,39 +43,87 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
         flat_shading=True,
       )
     )
-    parts[-1].visible = False
-  frusta = []
-  sfm = localise.load(bundle.folder / "sfm")
-  for name, pose in list(zip(sfm.names, sfm.world_from_camera, strict=True))[::_CAMERA_STEP]:
-    world = bundle.world_from_unit.apply_pose(pose)
-    frusta.append(
+  return handles
+
+
+def _cameras(server: viser.ViserServer, bundle: Bundle) -> list[Any]:
+  handles = []
+  camera, poses, names = capture_cameras(bundle)
+  for name, world in list(zip(names, poses, strict=True))[::_CAMERA_STEP]:
+    handles.append(
       server.scene.add_camera_frustum(
         f"/cameras/{name}",
-        fov=sfm.camera.vertical_fov,
-        aspect=sfm.camera.width / sfm.camera.height,
+        fov=camera.vertical_fov,
+        aspect=camera.width / camera.height,
         scale=0.08,
         wxyz=transforms.SO3.from_matrix(world[:3, :3]).wxyz,
         position=world[:3, 3],
-        color=(213, 94, 0),
+        color=palette.rgb(palette.VERMILION),
         thickness=0.004,
       )
     )
-    frusta[-1].visible = False  # the view starts among them
-  grid = server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
+  return handles
 
-  for label, handles, on in (
-    ("surface mesh", [shown], False),
-    ("convex parts", parts, False),
-    ("cameras", frusta, False),
-    ("floor grid", [grid], True),
-  ):
-    switch = server.gui.add_checkbox(label, on)
+
+def free_floor_mesh(space: FreeSpaceMap, *, height: float) -> tuple[np.ndarray, np.ndarray]:
+  """Squares over the C reachable cells of a map: vertices [4 C, 3] [m] and faces [2 C, 3]."""
+  row, column = np.nonzero(space.reachable)
+  corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+  places = space.origin + space.resolution * (np.stack([column, row], -1)[:, None] + corners)
+  vertices = np.concatenate([places, np.full((*places.shape[:2], 1), height)], -1)
+  first = 4 * np.arange(len(row))[:, None]
+  faces = np.concatenate([first + np.array(three) for three in ([0, 1, 2], [0, 2, 3])])
+  return vertices.reshape(-1, 3), faces
+
+
+def _splats(server: viser.ViserServer, splats: Splats) -> list[Any]:
+  spread = Rotation.from_quat(splats.rotations, scalar_first=True).as_matrix()
+  spread = spread * splats.scales[:, None]
+  shown = server.scene.add_gaussian_splats(
+    "/splats",
+    centers=splats.positions,
+    covariances=spread @ spread.transpose(0, 2, 1),
+    rgbs=np.clip(splats.colors, 0, 1),
+    opacities=splats.opacities[:, None],
+  )
+  return [shown]
+
+
+def _layers(server: viser.ViserServer, bundle: Bundle, splats: Splats | None) -> list[Layer]:
+  """Adds everything but the field."""
+  floor = server.scene.add_mesh_simple(
+    "/free_floor",
+    *free_floor_mesh(bundle.free_space, height=_FLOOR_LIFT),
+    color=palette.rgb(palette.GREEN),
+    opacity=0.5,
+    side="double",
+  )
+  grid = server.scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.5)
+  surface = server.scene.add_mesh_trimesh("/visual", load_glb(bundle.visual_path))
+  found = [Layer("splats", _splats(server, splats), True)] if splats is not None else []
+  return [
+    *found,
+    Layer("surface mesh", [surface], False),
+    Layer("convex parts", _parts(server, bundle), False),
+    Layer("free floor", [floor], False),
+    Layer("cameras", _cameras(server, bundle), False),  # the view starts among them
+    Layer("floor grid", [grid], True),
+  ]
+
+
+def _add_switches(server: viser.ViserServer, layers: list[Layer]) -> None:
+  for layer in layers:
+    switch = server.gui.add_checkbox(layer.label, layer.shown)
+    for handle in layer.handles:
+      handle.visible = layer.shown
 
     @switch.on_update
-    def _(event, switch=switch, handles=handles):
+    def _(event, switch=switch, handles=layer.handles):
       for handle in handles:
         handle.visible = switch.value
 
+
+def _add_figures(server: viser.ViserServer, bundle: Bundle) -> None:
   figures = [
     f"| {key} | {value:.4g} |" if isinstance(value, float) else f"| {key} | {value} |"
     for key, value in bundle.figures.items()
@@ -77,27 +133,24 @@ def _add_scene(server: viser.ViserServer, bundle: Bundle) -> None:
     server.gui.add_markdown("\n".join(["| figure | value |", "| --- | --- |", *figures]))
 
 
-def _overlooking_camera(bundle: Bundle) -> tuple[np.ndarray, np.ndarray]:
-  """Position and direction [3] of the capture's camera that had most of the room before it.
+def view_bundle(
+  bundle: Bundle, *, host: str, port: int, splats: Splats | None = None
+) -> viser.ViserServer:
+  """Serves a bundle's viewer: layers that switch on and off; returns the running server.
 
-  From where nothing was filmed the field is fog.
+  Args:
+    bundle: The scene.
+    host: Address to serve on.
+    port: Port to serve on.
+    splats: Shown beside the field, which starts switched off then.
   """
-  poses = localise.load(bundle.folder / "sfm").world_from_camera
-  world = bundle.world_from_unit.apply_pose(poses)
-  eyes, forward = world[:, :3, 3], world[:, :3, 2]
-  depth = np.einsum("ni,ni->n", 0.5 * sum(bundle.extent) - eyes, forward)
-  best = int(np.argmax(depth))
-  return eyes[best], forward[best]
-
-
-def view_bundle(bundle: Bundle, *, host: str, port: int) -> viser.ViserServer:
-  """Serves a bundle's viewer; returns the running server."""
   server = viser.ViserServer(host=host, port=port, label=f"scene {bundle.name}", verbose=False)
   server.scene.set_up_direction("+z")
-  eye, forward = _overlooking_camera(bundle)
-  server.initial_camera.position = tuple(eye)
-  server.initial_camera.look_at = tuple(eye + forward)
-  renderer = Renderer(Field.load(bundle.field_path), threads=os.cpu_count() or 1)
-  field_view.serve_field(server, field_view.FieldView(renderer, bundle.world_from_unit))
-  _add_scene(server, bundle)
+  pose = overlooking_pose(bundle)
+  server.initial_camera.position = tuple(pose[:3, 3])
+  server.initial_camera.look_at = tuple(pose[:3, 3] + pose[:3, 2])
+  view = field_view.FieldView(renderer_of(bundle), bundle.world_from_unit)
+  field_view.serve_field(server, view, setback=_SETBACK, shown=splats is None)
+  _add_switches(server, _layers(server, bundle, splats))
+  _add_figures(server, bundle)
   return server

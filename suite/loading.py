@@ -29,6 +29,7 @@ def load(
   *,
   scene: Any = None,
   effects: Any = None,
+  draw_effects: bool = False,
   image_size: tuple[int, int] | None = (30, 40),
   random: Any = None,
   camera: CameraSettings | None = None,
@@ -45,6 +46,7 @@ def load(
     task: "nerf_nav" or "ball_push".
     scene: Folder of a scene bundle, or an opened `scenes.bundle.Bundle`; None is the built-in room.
     effects: An `effects.json`, or a sequence of effects: what the nominal model lacks.
+    draw_effects: Whether every episode draws the effects' values from their intervals.
     image_size: (height, width) of the robot's camera; None for an environment without pictures.
     random: A seed or `np.random.RandomState`: the same seed gives the same episodes.
     camera: Settings of the robot's camera.
@@ -80,6 +82,7 @@ def load(
     privileged=privileged,
     randomisation=randomisation or RandomisationSettings(),
     effects=_effects(effects),
+    draw_effects=draw_effects,
   )
   built = _TASKS[task](bundle, camera=robot_camera, settings=settings)
   if furnish is not None:

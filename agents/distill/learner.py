@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from nerf2real.agents.distill import settings as stages
+from nerf2real.agents.distill.beginning import begin_with
 from nerf2real.agents.distill.checkpoint import STATE, Counters, load_state, save_state
 from nerf2real.agents.distill.dataset import Dataset
 from nerf2real.agents.distill.schedule import stage_at
@@ -87,6 +88,10 @@ class Learner:
     self._times = StageTimes()
     self._trainer = Trainer(settings, self._layout, self._data, seed=seed, times=self._times)
     self._counters = Counters()
+    if settings.init_from:  # its student drives from the first frame on
+      arrays = load_arrays(Path(settings.init_from))
+      self._trainer.state = begin_with(self._trainer.state, arrays)
+      self._counters = Counters(begun=0)
     if resume:
       self._trainer.state, self._counters = load_state(run / STATE, like=self._trainer.state)
     write_json(run / SETTINGS, settings)
@@ -104,7 +109,7 @@ class Learner:
     self._stop = threading.Event()
     self._periods = Periods()
     self._evaluation: dict[str, Any] = {}  # the last one
-    self._is_fit = False  # whether encoder and policy belong together now
+    self._is_fit = bool(settings.init_from)  # whether encoder and policy belong together now
     self._compiled: set[str] = set()  # kinds of stages whose update was called
     self._recent: list[dict[str, jax.Array]] = []
     self._rates = Rates(self._data.frames, self._counters.updates)
@@ -123,7 +128,9 @@ class Learner:
       },
     )
     self._set_status()
-    if (run / POLICY).exists():
+    if settings.init_from and not resume:
+      self._publish()
+    elif (run / POLICY).exists():
       self._link.publish_parameters(
         load_arrays(run / POLICY), version=max(1, self._counters.updates)
       )

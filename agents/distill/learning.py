@@ -183,10 +183,11 @@ def standardised(
   labels: np.ndarray,
   layout: Layout,
   min_spread: float,
+  keep_policy: bool = False,
 ) -> TrainingState:
   """Returns a state that has seen no update, with the inputs' and actions' scales of first data.
 
-  Its student does what the teacher does on average.
+  Its student does what the teacher does on average, or with `keep_policy` what it did before.
 
   Args:
     state: the state.
@@ -194,13 +195,17 @@ def standardised(
     labels: the teacher's actions [N, A].
     layout: the environment's layout.
     min_spread: smallest spread of an action.
+    keep_policy: rewrites the first layer for standardised inputs in place of the last one's bias.
   """
   public = dataclasses.replace(layout, privileged_names=(), privileged_sizes=())
   scales = scaling.measure({"state": state_rows}, public)
   policy = state.student["policy"]
-  mean = policy["mean"] | {"b": jnp.asarray(labels.mean(0))}
+  if keep_policy:
+    policy = jax.tree.map(jnp.asarray, scaling.unfold(policy, scales))
+  else:
+    policy = policy | {"mean": policy["mean"] | {"b": jnp.asarray(labels.mean(0))}}
   return state._replace(
-    student=state.student | {"policy": policy | {"mean": mean}},
+    student=state.student | {"policy": policy},
     scales=jax.tree.map(jnp.asarray, scales),
     spread=jnp.asarray(np.maximum(labels.std(0), min_spread)),
   )

@@ -64,6 +64,8 @@ class DistillSettings:
   """Where data are collected, as `agents.environments.loading` names it, without pushes."""
   teacher: str = "quick"
   """One of `teacher.TEACHERS`, or the folder of an exported policy."""
+  init_from: str = ""
+  """Folder of an exported policy that the student begins with; random weights if empty."""
   agent: DmpoConfig = DmpoConfig(network=NetworkConfig(init_stddev=0.1))
   """The student's networks and augmentation; the exported policy carries them. Noise of 0.1 leaves
   a walking robot on its feet, so that DMPO may go on from the student."""
@@ -157,6 +159,20 @@ def nerf_nav() -> DistillSettings:
   )
 
 
+def adapt() -> DistillSettings:
+  """Navigation: a student that walks already is trained on, in minutes, where something changed."""
+  return DistillSettings(
+    environment="suite:nerf_nav",
+    mixture=MixtureSettings(first_share=0.5, anneal_frames=20_000),
+    # The encoder has learned; what the change asks of it, the last part gives.
+    stages=(Stage(kind=POLICY, share=0.4), Stage(kind=END_TO_END, share=0.6)),
+    settling=0,
+    first_frames=4_000,
+    learning_rate=3e-4,
+    evaluation_period=3_600.0,
+  )
+
+
 def ball_push() -> DistillSettings:
   """Ball pushing: the walker whose head follows the ball."""
   return DistillSettings(
@@ -221,6 +237,7 @@ PRESETS: Mapping[str, Callable[[], DistillSettings]] = {
   "nerf_nav": nerf_nav,
   "nerf_nav_60x80": nerf_nav_60x80,
   "ball_push": ball_push,
+  "adapt": adapt,
   "tiny": tiny,
 }
 

@@ -65,6 +65,7 @@ class Trainer:
       labels=self._data.arrays["label"][frames],
       layout=self._layout,
       min_spread=self._settings.min_action_spread,
+      keep_policy=bool(self._settings.init_from),
     )
 
   def begin_stage(self, kind: str) -> None:

@@ -4,7 +4,8 @@ Names: `dm_control:cartpole:swingup`, `suite:nerf_nav`, `agents:cue`; options fo
 mark: `suite:nerf_nav?image_size=60x80&scene=out/demo&pushes=false&camera_rate=15`. Options of
 `suite:` environments:
 
-- `scene`, `effects`: folder of a bundle, an effects.json;
+- `scene`, `effects`: folder of a bundle, an effects.json; `draw_effects=true`: every episode draws
+  the effects' values from their intervals;
 - `image_size`: such as 30x40, height x width; `lens`: a camera_info YAML (a calibrated camera);
 - `time_limit`, `physics_timestep` [s];
 - every field of `RandomisationSettings`, such as `pushes=false` or `push_force=2,6`;
@@ -74,6 +75,8 @@ def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
   for key in ("scene", "effects"):
     if key in options:
       arguments[key] = options.pop(key)
+  if "draw_effects" in options:
+    arguments["draw_effects"] = _parse("draw_effects", options.pop("draw_effects"), False)
   for key in ("time_limit", "physics_timestep"):
     if key in options:
       arguments[key] = _parse(key, options.pop(key), 0.0)

@@ -98,8 +98,10 @@ def _quartiles(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
   return center, low, middle, high
 
 
-def bars(title: str, x: str, series: Sequence[Bars], names: Sequence[str]) -> Chart:
-  """Returns horizontal bars of series over names from top to bottom."""
+def bars(
+  title: str, x: str, series: Sequence[Bars], names: Sequence[str], *, stacked: bool = False
+) -> Chart:
+  """Returns horizontal bars of series over names from top to bottom, side by side or stacked."""
   figure = go.Figure()
   for name, color, values in series:
     figure.add_bar(
@@ -109,8 +111,9 @@ def bars(title: str, x: str, series: Sequence[Bars], names: Sequence[str]) -> Ch
       orientation="h",
       marker_color=color,
     )
-  figure.update_layout(showlegend=len(series) > 1, barmode="group")
-  return _laid_out(figure, title, x, "", 90 + (12 + 12 * len(series)) * len(names))
+  figure.update_layout(showlegend=len(series) > 1, barmode="stack" if stacked else "group")
+  rows = 1 if stacked else len(series)
+  return _laid_out(figure, title, x, "", 90 + (12 + 12 * rows) * len(names))
 
 
 def intervals(title: str, rows: Sequence[Interval]) -> Chart | None:

@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerf2real import sysid
-from nerf2real.evaluation.loop import gap, recording
-from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model
+from nerf2real.core.files import atomic_path, write_atomically
+from nerf2real.evaluation.loop import gap, machines, naming, recording
+from nerf2real.evaluation.loop.settings import LoopSettings, claim
+from nerf2real.real.loading import Connection
 
 
 class Closed(NamedTuple):
@@ -18,44 +19,39 @@ class Closed(NamedTuple):
   report: Path
 
 
-def close_loop(
-  out: Path,
-  *,
-  robot: str = recording.VIRTUAL,
-  seed: int = 1,
-  seconds: float = 12.0,
-  reuse: bool = False,
-) -> Closed:
+def close_loop(settings: LoopSettings) -> Closed:
   """Excites, records, identifies, simulates and compares; writes logs, model, report and table.
 
-  Args:
-    out: Folder to write.
-    robot: Serial port, or "virtual".
-    seed: Of the virtual robot's hidden properties.
-    seconds: Length of a recorded motion [s].
-    reuse: Takes the logs that an earlier loop left in the folder instead of moving the robot.
+  Logs and findings that an interrupted loop left in the folder are kept.
 
   Raises:
     RuntimeError: The recorder or the robot did not keep up.
-    ValueError: The logs cannot be identified from.
+    ValueError: The logs cannot be identified from, or the folder is another loop's.
   """
-  out.mkdir(parents=True, exist_ok=True)
-  model, identified = out / "declared.xml", out / "identified"
-  model.write_text(declared_model())
-  if not reuse:
-    moved = recording.record_motions(out, robot=robot, seed=seed, seconds=seconds)
-    np.savez(out / "standing.npz", actions=moved["actions"], positions=moved["positions"])
+  altered = machines.hidden_effects(settings.hidden, settings.seed)
+  claim(settings)
+  out, seconds = settings.out, settings.seconds
+  if settings.robot == recording.VIRTUAL:
+    with machines.virtual_robot(settings.seed, altered) as (connection, virtual):
+      _record(out, connection, virtual, seconds)
+  else:
+    _record(out, Connection(port=settings.robot), None, seconds)
   standing = np.load(out / "standing.npz")
-  content = sysid.identify(
-    model,
-    [out / f"{name}.mcap" for name in TRAIN],
-    held=[out / f"{name}.mcap" for name in HELD],
-    out=identified,
-  )
+  named = naming.name(out / "identified", out, settings.reference)
   before = gap.suite_motion(None, standing["actions"])
-  after = gap.suite_motion(identified / "effects.json", standing["actions"])
-  table = gap.gap_table(standing["positions"], before, after, content)
-  if robot == recording.VIRTUAL:
-    table += gap.hidden_table(seed, content, identified / "details.json")
-  (out / "gap.md").write_text(table)
-  return Closed(content, table, identified / "report.html")
+  after = gap.suite_motion(named.effects_path, standing["actions"])
+  table = gap.gap_table(standing["positions"], before, after, named.content)
+  if settings.robot == recording.VIRTUAL:
+    table += gap.hidden_table(settings.seed, named.content, out / "identified" / "details.json")
+    table += "".join(f"\nUndeclared: {effect}.\n" for effect in altered)
+  write_atomically(out / "gap.md", table)
+  return Closed(named.content, table, out / "identified" / "report.html")
+
+
+def _record(out: Path, connection: Connection, virtual: Any, seconds: float) -> None:
+  """Records what is missing in the folder."""
+  recording.record_stand(out, connection, virtual, seconds=seconds)
+  if not (out / "standing.npz").exists():
+    moved = recording.record_standing(connection, virtual, seconds=seconds)
+    with atomic_path(out / "standing.npz") as path:
+      np.savez(path, **moved)  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """The virtual robot as a plant: reached over its wires, placed and watched as by an observer."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ from nerf2real import real
 from nerf2real.evaluation.plants import perturbations, swaps
 from nerf2real.evaluation.plants.plant import BALL, TASKS, Sight, Trial, make_intruder
 from nerf2real.evaluation.plants.robot_plant import RobotPlant
-from nerf2real.real.virtual.camera import VirtualCamera
-from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual import undeclared
+from nerf2real.real.virtual.camera import LENS
 from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
 from nerf2real.suite.protocols import NavigationTrial
@@ -49,6 +51,8 @@ class RehearsedPlant(RobotPlant):
     *,
     image_size: tuple[int, int] | None,
     robot_seed: int | None = 1,
+    altered: Sequence[Undeclared] = (),
+    session: float = 0.0,
     world: str = "room",
     time_limit: float | None = None,
     record: Path | None = None,
@@ -62,6 +66,8 @@ class RehearsedPlant(RobotPlant):
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the policy's picture; None for no camera.
       robot_seed: Which robot: the seed of what is hidden in it; None: as in the data sheets.
+      altered: Undeclared effects that the robot has besides.
+      session: Time that its battery was in use before [s].
       world: "room" or "floor", see `VirtualRobot`.
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
@@ -72,12 +78,15 @@ class RehearsedPlant(RobotPlant):
     known = swap == swaps.PHYSICS
     self.plant_id += ", data sheet's physics" if known else ""
     self._intruder = make_intruder(self, self._starts)
+    if altered:
+      self.plant_id += ", altered"
+    build = undeclared.build(None if known else robot_seed, altered, age=session)
     self.robot = VirtualRobot(
       world=world,
       seed=robot_seed,
-      hidden=Hidden.none() if known else None,
+      hidden=build.hidden,
       stepped=True,
-      camera=None if image_size is None else VirtualCamera(),
+      camera=None if image_size is None else build.camera,
       ball=protocol == BALL,
       furnish=None if self._intruder is None else self._intruder.add_to_spec,
     )
@@ -95,6 +104,8 @@ class RehearsedPlant(RobotPlant):
     if image_size is not None:
       self._camera = CoveredCamera(connection.camera)
       connection = dataclasses.replace(connection, camera=self._camera)
+      if self._recorder is not None:
+        self._recorder.camera_info(self.robot.clock.wall(self.robot.clock.now()), LENS)
     return real.load(
       TASKS[self.protocol],
       robot=connection,

@@ -30,6 +30,7 @@ class SimulatedPlant(Plant):
     image_size: tuple[int, int] | None,
     camera: CameraSettings | None = None,
     effects: Any = None,
+    draw_effects: bool = False,
     seed: int = 0,
     time_limit: float | None = None,
     swap: str = swaps.NONE,
@@ -43,6 +44,7 @@ class SimulatedPlant(Plant):
       image_size: Height and width of the picture; None for no camera.
       camera: Settings of the camera; the suite's own if None.
       effects: An effects.json, or effects.
+      draw_effects: Whether every episode draws the effects' values from their intervals.
       seed: Of what differs between episodes, with the trial's own.
       time_limit: Length of an episode [s]; the task's own if None.
       swap: What is taken from the virtual robot: `swaps.PICTURE` or `swaps.DELAY`.
@@ -57,6 +59,7 @@ class SimulatedPlant(Plant):
       TASKS[protocol],
       scene=scene,
       effects=effects,
+      draw_effects=draw_effects,
       image_size=image_size,
       camera=swaps.camera_of_the_robot(camera) if swap == swaps.DELAY else camera,
       renderer=self._room,

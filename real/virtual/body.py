@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.core import rotations
-from nerf2real.real.virtual.hidden import Hidden
+from nerf2real.real.virtual.hidden import Hidden, Load
 from nerf2real.real.virtual.motors import Motors
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.sensors import filters
@@ -146,6 +146,11 @@ class Body:
         data.eq_active[self._weld] = 1
       self._lowering = not held
 
+  def turn(self, yaw: float) -> None:
+    """Turns the hand that holds the robot to a heading [rad]."""
+    with self.lock:
+      self.data.mocap_quat[self._hand] = rotations.yaw_quaternion(yaw)
+
   def advance(self, time: float) -> None:
     """Simulates up to a time [s]."""
     with self.lock:
@@ -250,6 +255,8 @@ def _build(world: str, hidden: Hidden, ball: bool, furnish, looks: bool) -> mujo
     furnish(spec)
   spec.option.timestep = STEP
   spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+  level = rotations.matrix_from_rotvec([*hidden.floor_slope, 0.0])
+  spec.option.gravity = level.T @ spec.option.gravity
   for geom in spec.geoms:
     geom.solref[0] = hidden.contact_time
   spec.attach(_robot(hidden), prefix=PREFIX, frame=spec.worldbody.add_frame())
@@ -294,15 +301,17 @@ def _robot(hidden: Hidden) -> mujoco.MjSpec:
     joint.limited, joint.range = True, [low - _STOP_MARGIN, high + _STOP_MARGIN]
   torso = spec.body(constants.TORSO_LINK)
   torso.add_freejoint(name="root")
-  if hidden.payload > 0:
-    torso.add_body(name="payload", pos=list(hidden.payload_position)).add_geom(
-      type=mujoco.mjtGeom.mjGEOM_SPHERE,
-      size=[0.01, 0, 0],
-      mass=hidden.payload,
-      group=4,
-      contype=0,
-      conaffinity=0,
-    )
+  loads = [Load(constants.TORSO_LINK, hidden.payload, hidden.payload_position), *hidden.loads]
+  for index, load in enumerate(loads):
+    if load.mass > 0:
+      spec.body(load.link).add_body(name=f"load_{index}", pos=list(load.position)).add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[0.01, 0, 0],
+        mass=load.mass,
+        group=4,
+        contype=0,
+        conaffinity=0,
+      )
   for name in constants.FOOT_LINKS:
     for geom in spec.body(name).geoms:
       geom.friction[0] = hidden.foot_friction

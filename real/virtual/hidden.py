@@ -1,10 +1,19 @@
 """Hidden parameters of the virtual robot: drawn from a seed, or set by a test."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
 from nerf2real.real.virtual.motors import GEAR_SHARE, MotorParameters
+
+
+class Load(NamedTuple):
+  """A point mass fixed to a link."""
+
+  link: str
+  mass: float  # kg
+  position: tuple[float, float, float]  # m in the link
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -21,6 +30,11 @@ class Hidden:
   """kg fixed to the torso."""
   payload_position: tuple[float, float, float] = (0.0, 0.0, 0.06)
   """m in the torso."""
+  loads: tuple[Load, ...] = ()
+  """Masses on other links."""
+  floor_slope: tuple[float, float] = (0.0, 0.0)
+  """Turn of floor and room about the world's x and y axes [rad]; positions stay those of the room,
+  in which the floor is z = 0, and gravity turns the other way."""
   foot_friction: float = 0.8
   """Sliding coefficient."""
   contact_time: float = 0.012

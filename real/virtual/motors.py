@@ -6,7 +6,9 @@ Then a DC motor behind a gear, in quantities of the output shaft:
 
   current = (voltage - k * speed) / R          k = 12 V / 46 rpm, R = 12 V / 2.3 A
   torque  = k * current
-  friction = dry + share * |torque|            opposes motion; the solver of MuJoCo applies it
+  friction = dry + share * |torque| + rest     opposes motion; the solver of MuJoCo applies it
+
+The last term, none in a usual servo, grows while the joint rests and is gone when it moves.
 
 The constants of speed (no load) and of torque (stall) in the data sheet differ by 28 %: that is the
 `share` of the torque which the gear takes away. N servos.
@@ -31,6 +33,7 @@ _HEATING, _WARMING_TIME, _AMBIENT = 8.0, 600.0, 25.0  # K/W, s, degrees C
 _COMPUTER_CURRENT = 1.5  # A that everything but the servos draws: chosen
 _DIP_TIME = 0.1  # s, time constant of the servos' supply voltage: chosen
 _BROWN_OUT = 6.0  # V below which a servo's controller resets: chosen
+_REST_SPEED = 0.05  # rad/s below which a joint rests; chosen: above the creep of soft friction
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -51,6 +54,14 @@ class MotorParameters:
   """V without load."""
   battery_resistance: float = 0.08
   """Ohm."""
+  battery_course: tuple[tuple[float, float], ...] = ()
+  """(s in use, V without load), straight lines between; constant `battery_voltage` if empty."""
+  battery_age: float = 0.0
+  """s that the battery was in use when the robot was switched on."""
+  rest_friction: float = 0.0
+  """N m by which dry friction grows while a joint rests."""
+  rest_time: float = 0.5
+  """s, time constant of that growth."""
 
   @classmethod
   def nominal(cls, count: int) -> "MotorParameters":
@@ -81,7 +92,10 @@ class Motors:
     self.duty = np.zeros(count)
     self.current = np.zeros(count)  # A
     self.temperature = np.full(count, _AMBIENT)
-    self.supply = parameters.battery_voltage  # V
+    self._rested = np.zeros(count)  # s
+    self._begun: float | None = None  # s, of the first step
+    self._course = np.array(parameters.battery_course, np.float64).reshape(-1, 2).T
+    self.supply = self._battery(0.0)  # V
     self.slow_supply = self.supply  # V, as the servos measure it: without short dips
     self.stuck, self.is_stuck = np.zeros(count, bool), False
     self.forced_voltage: float | None = None
@@ -94,6 +108,12 @@ class Motors:
   def browned_out(self) -> bool:
     """Whether the supply is too low for the servos' controllers."""
     return self.supply < _BROWN_OUT
+
+  def _battery(self, time: float) -> float:
+    """Returns the battery's voltage without load [V] after a time in which torque was computed."""
+    if not self._course.size:
+      return self.parameters.battery_voltage
+    return float(np.interp(time + self.parameters.battery_age, *self._course))
 
   def measure(self, angle: np.ndarray, speed: np.ndarray) -> None:
     """Reads the encoders: joint angles [N] [rad] and speeds [N] [rad/s]."""
@@ -126,9 +146,14 @@ class Motors:
     if self.forced_voltage is not None:
       self.supply = self.forced_voltage
     else:
-      self.supply = values.battery_voltage - values.battery_resistance * drawn
+      self._begun = time if self._begun is None else self._begun
+      self.supply = self._battery(time - self._begun) - values.battery_resistance * drawn
     self.slow_supply += (self.supply - self.slow_supply) * (period / _DIP_TIME)
     share = period / _WARMING_TIME
     self.temperature *= 1 - share
     self.temperature += (_HEATING * RESISTANCE * share) * current * current + _AMBIENT * share
-    return torque, values.dry_friction + values.gear_share * np.abs(torque)
+    friction = values.dry_friction + values.gear_share * np.abs(torque)
+    if values.rest_friction > 0:
+      self._rested = np.where(np.abs(self.speed) < _REST_SPEED, self._rested + period, 0.0)
+      friction += values.rest_friction * (1 - np.exp(-self._rested / values.rest_time))
+    return torque, friction

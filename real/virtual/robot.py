@@ -106,6 +106,11 @@ class VirtualRobot:
     self.body.advance(self.clock.now())
     self.body.hold(held)
 
+  def turn(self, yaw: float) -> None:
+    """Turns the held robot to a heading [rad]."""
+    self.body.advance(self.clock.now())
+    self.body.turn(yaw)
+
   def push(self, force: np.ndarray) -> None:
     """Pushes the torso with a force [3] [N] in the world, until the next call."""
     self.body.advance(self.clock.now())

@@ -22,6 +22,7 @@ class Evidence(NamedTuple):
   surface_points: np.ndarray | None = None  # dense: lifted depth or mesh vertices [Q, 3]
   surface_normals: np.ndarray | None = None  # theirs [Q, 3]
   marker: MarkerScale | None = None
+  sensor_scale: float | None = None  # metres per unit, where a depth sensor measured
 
   @property
   def positions(self) -> np.ndarray:

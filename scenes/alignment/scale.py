@@ -1,4 +1,4 @@
-"""Finds the metric scale: by hand, from a marker, from the cameras' height, or guessed."""
+"""Finds the metric scale: by hand, from a marker or depth sensor, cameras' height, or a guess."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ def choose_scale(
   guessed_camera_height: float,
   max_marker_spread: float,
 ) -> Choice[Scale]:
-  """Finds the metric scale from the override, a marker, a known camera height or a guess.
+  """Finds the metric scale from the override, a marker, a depth sensor, a camera height or a guess.
 
   Args:
     evidence: Cameras and marker.
@@ -52,6 +52,8 @@ def choose_scale(
       f"The marker's scale is uncertain by {100 * marker.spread:.1f} %, more than "
       f"{100 * max_marker_spread:g} %: not used. Film it from nearer and more sides.",
     )
+  if evidence.sensor_scale is not None:
+    return Choice(Scale(evidence.sensor_scale), "depth_sensor", warnings)
   if camera_height is not None:
     return Choice(Scale(camera_height / height), "camera_height", warnings)
   warnings += (

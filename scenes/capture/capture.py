@@ -11,12 +11,14 @@ import numpy as np
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.capture.rgbd import find_rgbd
 from nerf2real.scenes.capture.sources import (
   KnownPoses,
   find_colmap_model,
   find_transforms,
   list_images,
   read_colmap,
+  read_rgbd,
   read_transforms,
 )
 from nerf2real.scenes.capture.video import (
@@ -63,7 +65,7 @@ class Capture:
   """Keyframes on disk and what is known about them. Shape: N keyframes."""
 
   kind: str
-  """"video", "images", "colmap" or "transforms"."""
+  """"video", "images", "colmap", "transforms" or "rgbd"."""
   folder: Path
   """Where the keyframes lie."""
   images: list[Path]
@@ -85,7 +87,7 @@ class Capture:
 
 
 def source_kind(source: Path) -> str:
-  """Returns the kind of a source: "video", "images", "colmap" or "transforms".
+  """Returns the kind of a source: "video", "images", "colmap", "transforms" or "rgbd".
 
   Raises:
     CaptureError: If it does not exist or is none of these.
@@ -94,6 +96,8 @@ def source_kind(source: Path) -> str:
     raise CaptureError(f"{source} does not exist.")
   if find_transforms(source) is not None:
     return "transforms"
+  if find_rgbd(source) is not None:
+    return "rgbd"
   if source.is_dir():
     if find_colmap_model(source) is not None:
       return "colmap"
@@ -175,10 +179,9 @@ def _read_pictures(
   source: Path, kind: str, folder: Path, settings: CaptureSettings, progress: Progress
 ) -> Capture:
   known = None
-  if kind == "colmap":
-    known = read_colmap(source)
-  elif kind == "transforms":
-    known = read_transforms(source)
+  readers = {"colmap": read_colmap, "transforms": read_transforms, "rgbd": read_rgbd}
+  if kind in readers:
+    known = readers[kind](source)
   files = list(known.files) if known else list_images(source) or list_images_below(source)
   if len(files) < settings.min_images:
     raise CaptureError(
@@ -190,7 +193,7 @@ def _read_pictures(
   if known is None:
     return dataclasses.replace(capture, times=None)
   indices = [int(path.stem.split("_")[-1]) for path in capture.images]
-  known = known.selected(indices, _written_camera(known.camera, capture))
+  known = known.selected(indices, _written_camera(known.camera, capture)).lifted()
   return dataclasses.replace(capture, times=None, known=known)
 
 

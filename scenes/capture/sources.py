@@ -1,7 +1,7 @@
-"""Sources with known cameras: COLMAP models, and transforms.json of nerfstudio and instant-ngp.
+"""Sources with known cameras: COLMAP models, transforms.json, RGB-D sequences (`rgbd`).
 
 World frames are the source's own; poses come out with OpenCV camera axes. Shapes: N pictures, P
-points.
+points, A sightings.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from nerf2real.core.cameras import Camera, focal_length
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.scenes.capture import rgbd
 from nerf2real.scenes.capture.video import CaptureError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -28,7 +29,7 @@ class KnownPoses:
   """Cameras and points that came with the pictures."""
 
   kind: str
-  """"colmap" or "transforms"."""
+  """"colmap", "transforms" or "rgbd"."""
   camera: Camera
   """Of the original pictures."""
   files: tuple[Path, ...]
@@ -41,9 +42,16 @@ class KnownPoses:
   """[P, 3]."""
   point_errors: np.ndarray
   """Mean reprojection error [P] [pixel]."""
+  depth_files: tuple[Path, ...] = ()
+  """Depth picture of each pose; empty where there was no sensor."""
+  depth_unit: float = rgbd.MILLIMETRE
+  """Of the depth pictures, in the unit of the poses."""
+  sightings: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4)))
+  """Measured depth [A, 4]: picture, pixel x and y, distance along the pixel's ray."""
 
   def __post_init__(self):
     # JSON does not keep the columns of an array without rows.
+    object.__setattr__(self, "sightings", self.sightings.reshape(-1, 4))
     for name in ("points", "point_colors"):
       object.__setattr__(self, name, getattr(self, name).reshape(-1, 3))
 
@@ -54,7 +62,41 @@ class KnownPoses:
       camera=camera,
       files=tuple(self.files[i] for i in indices),
       world_from_camera=self.world_from_camera[indices],
+      depth_files=tuple(self.depth_files[i] for i in indices) if self.depth_files else (),
     )
+
+  @property
+  def is_metric(self) -> bool:
+    """Whether a depth sensor measured: poses are then in metres."""
+    return len(self.sightings) > 0
+
+  def lifted(self) -> "KnownPoses":
+    """Returns the poses with points from the depth pictures; as they are where there are none."""
+    if not self.depth_files:
+      return self
+    seen = rgbd.sightings(self.depth_files, self.depth_unit, self.camera)
+    picture = seen[:, 0].astype(int)
+    rays = self.camera.rays(seen[:, 1:3])
+    local = seen[:, 3:] * rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    poses = self.world_from_camera[picture]
+    return dataclasses.replace(
+      self,
+      sightings=seen,
+      points=np.einsum("aij,aj->ai", poses[:, :3, :3], local) + poses[:, :3, 3],
+      point_colors=np.concatenate(
+        [self._colors(k, seen[picture == k, 1:3]) for k in range(len(self.files))]
+      ),
+      point_errors=np.zeros(len(seen)),
+    )
+
+  def _colors(self, index: int, pixels: np.ndarray) -> np.ndarray:
+    """Colours uint8 [A, 3] of a picture at pixels [A, 2] of the camera."""
+    image = cv2.imread(str(self.files[index]))
+    if image is None:
+      raise CaptureError(f"{self.files[index]} cannot be read as a picture.")
+    scale = np.array([image.shape[1], image.shape[0]]) / [self.camera.width, self.camera.height]
+    column, row = np.floor(pixels * scale).astype(int).T
+    return image[row, column, ::-1]
 
 
 def find_colmap_model(source: Path) -> Path | None:
@@ -218,6 +260,8 @@ def read_transforms(source: Path) -> KnownPoses:
       raise CaptureError(f"{files[0]} cannot be read as a picture.")
     values = {**values, "w": picture.shape[1], "h": picture.shape[0]}
   camera = one_camera([_transforms_camera({**values, **frame}, path) for frame in frames], path)
+  named = [frame.get("depth_file_path") for frame in frames]
+  depth_files = tuple(_frame_file(path.parent, name) for name in named if name)
   poses = []
   for frame, matrix in zip(frames, matrices, strict=True):
     if matrix.shape == (3, 4):
@@ -239,4 +283,29 @@ def read_transforms(source: Path) -> KnownPoses:
     points=empty,
     point_colors=empty.astype(np.uint8),
     point_errors=np.zeros(0),
+    depth_files=depth_files if len(depth_files) == len(frames) else (),
+  )
+
+
+def read_rgbd(source: Path) -> KnownPoses:
+  """Reads an RGB-D sequence with known poses, in TUM's or 7-Scenes' layout."""
+  layout = rgbd.find_rgbd(source)
+  if layout is None:
+    raise CaptureError(f"{source} holds no RGB-D sequence: expected rgb.txt and groundtruth.txt.")
+  read = rgbd.read_tum if layout == "tum" else rgbd.read_seven_scenes
+  camera, files, poses, depth, unit = read(source)
+  missing = [file for file in (*files, *depth) if not file.is_file()]
+  if missing:
+    raise CaptureError(f"{len(missing)} pictures of {source} are missing, as {missing[0].name}.")
+  empty = np.zeros((0, 3))
+  return KnownPoses(
+    kind="rgbd",
+    camera=camera,
+    files=tuple(files),
+    world_from_camera=poses,
+    points=empty,
+    point_colors=empty.astype(np.uint8),
+    point_errors=np.zeros(0),
+    depth_files=tuple(depth),
+    depth_unit=unit,
   )

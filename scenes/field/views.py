@@ -18,6 +18,12 @@ _SAMPLES_PER_BLUR = (
 )
 
 
+def held_out_rows(count: int, every: int) -> np.ndarray:
+  """Which of `count` pictures are kept from training, bool [count]: as LLFF, one of `every`."""
+  held: np.ndarray = np.arange(count) % every == every // 2
+  return held
+
+
 @dataclasses.dataclass(frozen=True)
 class Views:
   """Pictures of one camera with their poses in the unit frame."""
@@ -80,7 +86,7 @@ class Views:
 
   def split(self, every: int = 8) -> tuple["Views", "Views"]:
     """Returns (training, held out): one of `every` pictures is held out, as LLFF does."""
-    held = np.arange(len(self)) % every == every // 2
+    held = held_out_rows(len(self), every)
     if held.all() or not held.any():
       raise ValueError(
         f"Cannot hold out every {every}th of {len(self)} pictures; expected at least {every}."

@@ -156,6 +156,18 @@ class FreeSpaceMap(FreeSpace):
     yaw = rng.uniform(-np.pi, np.pi, count)
     return np.column_stack([self.origin + self.resolution * chosen, yaw])
 
+  def roomiest(self) -> np.ndarray:
+    """Pose x, y, yaw [3] at the reachable place that is farthest from everything, yaw 0 [m].
+
+    Raises:
+      FreeSpaceError: There is no place to stand.
+    """
+    if not self.reachable.any():
+      raise FreeSpaceError(self._full())
+    space = np.where(self.reachable, self.clearance, -1)
+    row, column = np.unravel_index(np.argmax(space), space.shape)
+    return np.array([*(self.origin + self.resolution * (np.array([column, row]) + 0.5)), 0.0])
+
   def default_goals(self, *, count: int = 3, clearance: float = 0.15) -> np.ndarray:
     """Goals [count, 2] that lie far apart along the paths a robot must take, with room around.
 

@@ -19,7 +19,8 @@ from skimage import measure
 from nerf2real.scenes.geometry import fusion
 
 _FIELD_OF_VIEW = 1.5  # tangent; farther out a lens polynomial may fold back into the picture
-_SAME_DEPTH = 0.04  # relative; a vertex this far behind the seen depth is hidden
+_SAME_DEPTH = 0.04  # relative; a point this far behind the seen depth is hidden
+_UNSEEN_GREY = 128  # colour of points that no view sees
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -123,17 +124,26 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
 
 
 def paint(mesh: Mesh, views: fusion.DepthViews) -> Mesh:
-  """Colours every vertex with the mean of the views that see it.
+  """Colours every vertex with the mean of the views that see it, see `point_colors`."""
+  return mesh._replace(colors=point_colors(mesh.vertices, mesh.normals, views))
 
-  A view sees a vertex if its depth picture agrees within 4 % of the depth. Vertices that no view
-  sees take mid grey.
+
+def point_colors(points: np.ndarray, normals: np.ndarray, views: fusion.DepthViews) -> np.ndarray:
+  """Colours uint8 [P, 3] of surface points [P, 3] with unit normals [P, 3], from the views.
+
+  A colour is the mean of the views that see a point, weighted by cosine over squared distance. A
+  view sees a point if its depth picture agrees within 4 % of the depth. Points that no view sees
+  take mid grey.
+
+  Raises:
+    ValueError: The views have no colour pictures.
   """
   if views.color is None:
     raise ValueError("Painting a mesh needs views with colour pictures, found depth only.")
-  normals, camera = mesh.normals, views.camera
-  total = np.zeros((len(mesh.vertices), 4))
+  camera = views.camera
+  total = np.zeros((len(points), 4))
   for pose, depth, color in zip(views.frame_from_camera, views.depth, views.color, strict=True):
-    away = pose[:3, 3] - mesh.vertices
+    away = pose[:3, 3] - points
     local = -away @ pose[:3, :3]
     distance = np.linalg.norm(away, axis=-1)
     facing = (away * normals).sum(-1) / distance
@@ -147,18 +157,18 @@ def paint(mesh: Mesh, views: fusion.DepthViews) -> Mesh:
     weight = facing[index] / distance[index] ** 2
     total[index] += weight[:, None] * np.c_[color[row, column], np.ones(len(index))]
   known = total[:, 3] > 0
-  colors = np.full((len(mesh.vertices), 3), 128, np.uint8)
+  colors = np.full((len(points), 3), _UNSEEN_GREY, np.uint8)
   colors[known] = np.round(total[known, :3] / total[known, 3:])
-  return mesh._replace(colors=colors)
+  return colors
 
 
-_Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64)  # glTF's axes from the world's
+Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64)  # glTF's axes from the world's
 
 
 def save_glb(mesh: Mesh, path: pathlib.Path) -> None:
   """Writes a glTF binary with vertex colours; y up, as glTF prescribes."""
   shown = trimesh.Trimesh(
-    mesh.vertices @ _Y_UP.T, mesh.faces, vertex_colors=mesh.colors, process=False
+    mesh.vertices @ Y_UP.T, mesh.faces, vertex_colors=mesh.colors, process=False
   )
   content = shown.export(file_type="glb")
   assert isinstance(content, bytes)  # other formats give text or a mapping
@@ -174,5 +184,5 @@ def load_glb(path: pathlib.Path) -> trimesh.Trimesh:
   if not path.is_file():
     raise ValueError(f"The surface mesh {path} does not exist: make the bundle again.")
   shown = trimesh.load_mesh(path, process=False)
-  shown.vertices = shown.vertices @ _Y_UP
+  shown.vertices = shown.vertices @ Y_UP
   return shown

@@ -70,6 +70,14 @@ FIGURES: Mapping[str, Meaning] = {
   "collision_error_m": Meaning(
     "m", "95th percentile of parts to seen surface and back, the worse", "lower"
   ),
+  "sight_lines": Meaning("", "lines from held-out pictures to localised points that judge below"),
+  "sight_lines_blocked": Meaning(
+    "", "share of them that a part blocks more than 5 cm before the point", "near 0"
+  ),
+  "points_missed": Meaning("", "share of their points with no part or floor within 5 cm", "near 0"),
+  "points_to_parts_p95_m": Meaning(
+    "m", "95th percentile of their points' distance from parts or floor", "lower"
+  ),
   "collision_parts": Meaning("", "convex parts that MuJoCo collides"),
   "floor_tilt_deg": Meaning(
     "deg", "angle between the floor found and the true vertical's floor", "near 0"

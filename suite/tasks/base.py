@@ -4,7 +4,7 @@ import abc
 import collections
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -14,7 +14,8 @@ from dm_env import specs
 
 from nerf2real.suite import specs as policy_specs
 from nerf2real.suite.arena import SceneArena
-from nerf2real.suite.effects import EffectStack
+from nerf2real.suite.effects import Effect, EffectStack
+from nerf2real.suite.effects.drawing import as_gravity, draw_effects
 from nerf2real.suite.environment import Reading
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.randomisation import draws as randomising
@@ -156,13 +157,8 @@ class RobotTask(composer.Task):
     model = self._model
     self._indices = RobotIndices(physics, self._robot)
     self._touch = touch.Touch(model, root=self._indices.root, feet=self._indices.feet)
-    self._effects = self._bind_effects()
-    self._randomiser = randomising.Randomiser(
-      model,
-      torso=self._robot.torso.full_identifier,
-      ball=self._ball_geom(),
-      imu_sites=(self._robot.imu.full_identifier,),
-    )
+    self._effects = self._bind_effects(self.settings.effects)
+    self._randomiser = self._make_randomiser()
     self._picture: DelayedPicture | None = None
     if self.robot_camera is not None:
       self.robot_camera.bind(model, int(physics.bind(self._robot.camera).element_id))
@@ -175,15 +171,24 @@ class RobotTask(composer.Task):
       )
     self._substep = 0
 
-  def _bind_effects(self) -> EffectStack:
+  def _make_randomiser(self) -> randomising.Randomiser:
+    """Returns the randomiser of the model as it is now, with its constant effects."""
+    return randomising.Randomiser(
+      self._model,
+      torso=self._robot.torso.full_identifier,
+      ball=self._ball_geom(),
+      imu_sites=(self._robot.imu.full_identifier,),
+    )
+
+  def _bind_effects(self, declared: Sequence[Effect]) -> EffectStack:
     """Writes the constant effects into the model; the others act at every step and reading."""
     prefix = f"{self._robot.mjcf_model.model}/"
     robot_names = {*constants.JOINT_NAMES, *self._robot.bodies}
     effects = [
       dataclasses.replace(effect, target=prefix + effect.target)
       if effect.target in robot_names
-      else effect
-      for effect in self.settings.effects
+      else as_gravity(effect)
+      for effect in declared
     ]
     joints = [prefix + name for name in constants.JOINT_NAMES]
     stack = EffectStack(effects).bind(self._model, joints=joints)
@@ -191,10 +196,19 @@ class RobotTask(composer.Task):
     self._effects_act = not stack.is_constant
     return stack
 
+  def _redraw_effects(self, random_state: np.random.RandomState) -> None:
+    """Puts effects with other values of their intervals into the model."""
+    self._randomiser.restore()
+    self._effects.unbind()
+    self._effects = self._bind_effects(draw_effects(self.settings.effects, random_state))
+    self._randomiser = self._make_randomiser()
+
   def initialize_episode(self, physics: Any, random_state: np.random.RandomState) -> None:
     self.draws = randomising.draw_episode(
       self.settings.randomisation, random_state, time_limit=self.settings.time_limit
     )
+    if self.settings.draw_effects and self.settings.effects:
+      self._redraw_effects(random_state)
     self._randomiser.apply(self.draws)
     self._effects.reset()
     self._place(random_state)

@@ -22,6 +22,8 @@ class TaskSettings:
   """Whether to give the observations that only the critic may see."""
   effects: Sequence[Effect] = ()
   """What the nominal model lacks; targets with or without "op3/"."""
+  draw_effects: bool = False
+  """Whether every episode draws the effects' values from their intervals."""
   randomisation: RandomisationSettings = dataclasses.field(default_factory=RandomisationSettings)
   """Which parts of an episode are random."""
 

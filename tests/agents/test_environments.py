@@ -42,6 +42,7 @@ def test_randomisation_lens_and_camera_reach_the_suite(tmp_path):
     ("camera_rate=50", "at most that of the control, 40 Hz"),
     ("protocol=ball", "no protocol 'ball': expected one of navigation, gain"),
     ("lens=/nowhere.yaml", "nowhere.yaml"),
+    ("draw_effects=1", "draw_effects must be true or false"),
     ("colour=red", "Unknown options"),
   ],
 )

@@ -14,6 +14,7 @@ from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
 from nerf2real.evaluation.policies import GaitPolicy
 from nerf2real.evaluation.settings import EvaluationSettings
+from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite import loading, protocols
 from nerf2real.suite.tasks.workspace import find_workspace
@@ -89,6 +90,21 @@ def test_the_gait_reaches_a_goal_on_the_virtual_robot(scene):
   assert found.outcome == "success" and found.setting.plant_id == "robot 2"
   start = protocols.scene_starts(scene)[trial.position]
   assert found.path[0][1:3] == pytest.approx(start, abs=0.06)
+
+
+def test_a_virtual_robot_is_altered_and_does_not_say_how(scene):
+  altered = undeclared.parse_all(["command_delay:0.045", "supply_course:2,12.5,100"])
+  plant = RehearsedPlant(
+    scene, "navigation", image_size=None, altered=altered, session=50.0, world="floor"
+  )
+  try:
+    motors = plant.robot.body.motors
+    assert motors.parameters.goal_delay > 0.045
+    motors.torque(0.0, 0.001)
+    assert motors.supply == pytest.approx(11.5, abs=0.3)  # half of the course is over
+    assert plant.plant_id == "robot 1, altered"
+  finally:
+    plant.close()
 
 
 def _standing_in(intruder, time):

@@ -45,6 +45,11 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def render(world_from_camera: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
   """Renders the planes by one homography each, the nearest in front: BGR uint8 [H, W, 3]."""
+  return cast(world_from_camera, camera)[0]
+
+
+def cast(world_from_camera: np.ndarray, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
+  """Renders the planes: BGR uint8 [H, W, 3] and z-depth [H, W] [m], inf where there is nothing."""
   image = np.zeros((camera.height, camera.width, 3), np.uint8)
   depth = np.full((camera.height, camera.width), np.inf)
   rays = camera.rays()
@@ -64,7 +69,7 @@ def render(world_from_camera: np.ndarray, camera: Camera = CAMERA) -> np.ndarray
     )
     image[inside] = colors[inside]
     depth[inside] = distance[inside]
-  return image
+  return image, depth
 
 
 def walk(count: int) -> np.ndarray:

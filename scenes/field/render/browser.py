@@ -86,10 +86,10 @@ class ClientLoop:
 
 
 def serve_field(
-  server: viser.ViserServer, view: FieldView, *, setback: float = 0.0
+  server: viser.ViserServer, view: FieldView, *, setback: float = 0.0, shown: bool = True
 ) -> viser.GuiCheckboxHandle:
-  """Draws the field for every client, with a switch on the page; returns the switch."""
-  enabled = server.gui.add_checkbox("radiance field", True)
+  """Draws the field for every client, with a switch on the page, `shown` at first; returns it."""
+  enabled = server.gui.add_checkbox("radiance field", shown)
   loops: dict[int, ClientLoop] = {}
 
   @server.on_client_connect

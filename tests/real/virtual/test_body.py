@@ -31,6 +31,16 @@ def test_it_hangs_in_the_hand_and_stands_when_let_go():
   assert truth.rotation[2, 2] > 0.999
 
 
+def test_a_person_turns_the_robot_in_the_hand():
+  body = Body()
+  _stand(body, 0.2)
+  for yaw in np.linspace(0.0, 0.6, 40):
+    body.turn(yaw)
+    body.advance(body.time + 0.025)
+  body.advance(body.time + 0.3)
+  assert body.truth().yaw == pytest.approx(0.6, abs=0.02) and body.truth().held
+
+
 def test_it_falls_without_torque_and_that_is_noticed():
   body = Body()
   body.hold(False)

@@ -9,6 +9,7 @@ import pytest
 
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.evaluation.loop import closing, gap, motions, recording
+from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.launch import close_loop as script
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 from nerf2real.suite.op3 import constants
@@ -51,6 +52,21 @@ def test_a_gate_notes_only_what_comes_while_it_is_open():
   assert notes.seen == [2, 3]
 
 
+def test_a_log_appears_whole_and_is_kept(tmp_path):
+  path = tmp_path / "slow.mcap"
+
+  def stop(gate):
+    raise RuntimeError("the robot fell")
+
+  with pytest.raises(RuntimeError, match="fell"):
+    recording.record(path, stop)
+  assert not path.exists()
+  recording.record(path, lambda gate: None)
+  whole = path.read_bytes()
+  recording.record(path, stop)  # not played again
+  assert whole and path.read_bytes() == whole
+
+
 def test_effects_change_how_the_suite_moves(tmp_path):
   effects = [
     Effect("parameter_error", "l_knee", {"damping": 1.1, "gain": 0.95}),
@@ -78,8 +94,8 @@ def test_an_unreachable_robot_is_one_line(monkeypatch, capsys, tmp_path):
 
 @pytest.mark.slow
 def test_the_loop_closes_on_the_virtual_robot(tmp_path):
-  content = closing.close_loop(tmp_path, seed=1, seconds=6.0).content
-  model = mujoco.MjModel.from_xml_path(str(tmp_path / "declared.xml"))
+  content = closing.close_loop(LoopSettings(out=tmp_path, seed=1, seconds=6.0)).content
+  model = mujoco.MjModel.from_xml_path(str(tmp_path / "identified/declared.xml"))
   for name in ("sweep", "slow", "steps", "mixed"):
     log = read_log(tmp_path / f"{name}.mcap")
     check_against_model(log, model)
@@ -88,7 +104,7 @@ def test_the_loop_closes_on_the_virtual_robot(tmp_path):
   assert content["verdict"] in ("effects", "unexplained")  # the virtual servos are other ones
   assert "load_friction" in {e["kind"] for e in [*content["effects"], *content["alternatives"]]}
   assert content["error"]["train"]["after"] < content["error"]["train"]["before"]
-  assert json.loads((tmp_path / "identified/report.json").read_text()) == content
+  assert json.loads((tmp_path / "identified/finding.json").read_text()) == content
   assert read_effects(tmp_path / "identified/effects.json")
   table = (tmp_path / "gap.md").read_text()
   assert all(f"| {name} |" in table for name in constants.JOINT_NAMES)

@@ -1,0 +1,88 @@
+"""Judges splats of the built-in room with a foreign renderer: MuJoCo Warp on its CPU device.
+
+  python launch/export_scene.py --to splat --out out/room.ply
+  python benchmarks/splats.py --splats out/room.ply
+
+Needs `pip install mujoco-warp`. The pictures are the film's own from the robot's 24 places, 60x80.
+"""
+
+import argparse
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import rich
+from rich.table import Table
+
+from nerf2real.core.serialization import from_plain
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.builtin import yardstick
+from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.export.mjcf import mujoco_quaternion
+from nerf2real.scenes.export.splats.splats import Splats
+from nerf2real.scenes.export.views import render_views, renderer_of
+from nerf2real.scenes.quality import image_quality
+
+_HEIGHT, _WIDTH = 60, 80
+
+
+def draw_with_mujoco_warp(splats: Splats, poses: np.ndarray, *, samples: int) -> np.ndarray:
+  """Draws splats at poses [N, 4, 4] (OpenCV axes): uint8 [N, H, W, 3]."""
+  import mujoco_warp
+
+  spec = mujoco.MjSpec()
+  for number, pose in enumerate(poses):
+    fov = float(np.degrees(yardstick.robot_camera(_HEIGHT, _WIDTH).vertical_fov))
+    spec.worldbody.add_camera(
+      name=f"view_{number}", pos=pose[:3, 3], quat=mujoco_quaternion(pose), fovy=fov
+    )
+  # a scene needs one geom; it lies out of sight
+  spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0, 0, -50])
+  model = spec.compile()
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  context = mujoco_warp.create_render_context(
+    model,
+    cam_res=(_WIDTH, _HEIGHT),
+    render_rgb=True,
+    samples_per_pixel=samples,
+    splat_position=splats.positions.astype(np.float32),
+    splat_rotation=splats.rotations.astype(np.float32),
+    splat_scale=splats.scales.astype(np.float32),
+    splat_rgba=np.c_[np.clip(splats.colors, 0, 1), splats.opacities].astype(np.float32),
+  )
+  mujoco_warp.render(mujoco_warp.put_model(model), mujoco_warp.put_data(model, data), context)
+  packed = context.rgb_data.numpy()[0].reshape(len(poses), _HEIGHT, _WIDTH)
+  return np.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], -1).astype(np.uint8)
+
+
+def main() -> None:
+  """Prints the table."""
+  parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+  parser.add_argument("--splats", type=Path, required=True, help="PLY of the built-in room")
+  parser.add_argument("--samples", type=int, default=1, help="samples a pixel of the renderer")
+  arguments = parser.parse_args()
+  bundle = Bundle.load()
+  arrays = np.load(yardstick.ROBOT_VIEWS)
+  world_from_room = from_plain(bundle.figures["room_from_world"], Similarity).inverse()
+  poses = world_from_room.apply_pose(arrays["world_from_camera"])
+  truth = arrays[f"images_{_HEIGHT}x{_WIDTH}"]
+  field = render_views(
+    bundle, renderer_of(bundle), yardstick.robot_camera(_HEIGHT, _WIDTH), poses
+  ).color
+  assert field is not None
+  splats = Splats.load_ply(arguments.splats)
+  drawn = draw_with_mujoco_warp(splats, poses, samples=arguments.samples)
+  table = Table("pictures", "against", "PSNR, dB, mean of 24", title=f"{len(splats)} splats")
+  for name, found, other, with_what in (
+    ("field", field, truth, "truth"),
+    ("splats", drawn, truth, "truth"),
+    ("splats", drawn, field, "field"),
+  ):
+    values = [image_quality.psnr(a, b) for a, b in zip(found, other, strict=True)]
+    table.add_row(name, with_what, f"{np.mean(values):.2f}")
+  rich.print(table)
+
+
+if __name__ == "__main__":
+  main()

@@ -1,0 +1,108 @@
+"""What identification says of a robot's recordings: the one place that calls the analyser.
+
+The rest of the loop knows `Named` alone: verdict, effects with intervals, what is explained.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+
+from nerf2real import sysid
+from nerf2real.core.files import write_atomically
+from nerf2real.core.robot_logs.reading import read_log
+from nerf2real.core.serialization import write_json
+from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model
+from nerf2real.evaluation.loop.recording import FLOOR
+from nerf2real.suite.effects import Effect, read_effects, write_effects
+from nerf2real.suite.op3 import constants
+from nerf2real.suite.op3.op3 import OP3
+from nerf2real.sysid.sensors import floor
+
+NONE = "none"
+_FINDING = "finding.json"  # the loop's own file: written last, so that it stands for a whole stage
+CONSTANTS = ("parameter_error",)  # errors of declared constants: no effect, and no name
+
+
+class Named(NamedTuple):
+  """A finding."""
+
+  verdict: str  # "none", "effects", "unexplained", ...
+  content: dict[str, Any]  # of the analyser's report.json
+  effects: list[Effect]  # with intervals; constants of the joints concerned among them
+  effects_path: Path  # effects.json
+  share: float | None  # of the held-out squared error above the noise, explained
+  notes: list[str]
+  seconds: float  # of the analysis
+
+  @property
+  def named(self) -> list[Effect]:
+    """The effects without errors of declared constants."""
+    return [effect for effect in self.effects if effect.kind not in CONSTANTS]
+
+
+def name(out: Path, logs: Path, reference: Path | None = None) -> Named:
+  """Identifies what a robot's logs show beyond the declared model, or reads what was found.
+
+  Args:
+    out: Folder of the analyser's files.
+    logs: Folder with the logs of `recording.record_stand`, and with `floor.mcap` if there is one.
+    reference: Folder with logs of the same robot from before; they calibrate the constants.
+
+  Raises:
+    ValueError: The logs cannot be identified from.
+  """
+  if not (out / _FINDING).exists():
+    out.mkdir(parents=True, exist_ok=True)
+    model = out / "declared.xml"
+    write_atomically(model, declared_model())
+    content = sysid.identify(
+      model,
+      [logs / f"{name}.mcap" for name in TRAIN],
+      held=[logs / f"{name}.mcap" for name in HELD],
+      reference=[] if reference is None else [reference / f"{name}.mcap" for name in TRAIN],
+      out=out,
+    )
+    effects, notes = _floor(logs / f"{FLOOR}.mcap")
+    write_effects(out / "effects.json", [*read_effects(out / "effects.json"), *effects])
+    if effects and content["verdict"] == NONE:
+      content["verdict"] = "effects"
+    content["notes"] = [*content["notes"], *notes]
+    write_json(out / _FINDING, content)
+  return read(out)
+
+
+def read(out: Path) -> Named:
+  """Reads what `name` found."""
+  content = json.loads((out / _FINDING).read_text())
+  effects = read_effects(out / "effects.json")
+  return Named(
+    verdict=content["verdict"],
+    content=content,
+    effects=effects,
+    effects_path=out / "effects.json",
+    share=_share(content["error"]),
+    notes=list(content["notes"]),
+    seconds=float(content["seconds"]),
+  )
+
+
+def _share(error: dict[str, Any]) -> float | None:
+  """Returns 1 - (after^2 - noise^2) / (before^2 - noise^2) of the held-out error, within [0, 1]."""
+  held, noise = error.get("held"), error.get("floor") or 0.0
+  if not held or held["before"] <= noise:
+    return None
+  left = max(held["after"] ** 2 - noise**2, 0.0)
+  return max(0.0, 1.0 - left / (held["before"] ** 2 - noise**2))
+
+
+def _floor(log: Path) -> tuple[list[Effect], list[str]]:
+  """Returns the floor's slope from a robot that stood at several headings, and notes."""
+  if not log.exists():
+    return [], []
+  spec = mujoco.MjSpec.from_string(OP3().mjcf_model.to_xml_string())
+  spec.body(constants.TORSO_LINK).add_freejoint()
+  spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
+  part = floor.find(spec.compile(), [read_log(log)])
+  return ([], []) if part is None else (part.effects, part.notes)

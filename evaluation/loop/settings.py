@@ -1,0 +1,113 @@
+"""Settings of a closed loop, and the folder that belongs to one loop alone."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from nerf2real.core import files
+
+WALKER = "walker"
+SHIPPED = "shipped"
+_IDENTITY = "loop_settings.json"
+# Beside the agents: part of the package where a policy is shipped with it.
+SHIPPED_FOLDER = Path(__file__).resolve().parents[2] / "agents" / "policies" / "nerf_nav"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoopSettings:
+  """What is closed, and how much of it."""
+
+  policy: str = ""
+  """"shipped", the folder of an exported policy, or "walker"; without one the loop is that of joint
+  positions: excite, record, identify, simulate, compare."""
+  robot: str = "virtual"
+  """Serial port such as /dev/ttyUSB0, or "virtual"."""
+  camera: str = "0"
+  """A robot's camera: device number, file or URL."""
+  offsets: Path | None = None
+  """A robot's offset.yaml."""
+  lens: Path | None = None
+  """Its camera's camera_info YAML: with it the stand is filmed, and the camera identified."""
+  hidden: tuple[str, ...] = ()
+  """Undeclared effects of the virtual robot: command_delay:0.045, a case such as weak_knee, a file
+  with one a line, or "drawn" by the seed; printed at the end alone."""
+  seed: int = 1
+  """Of the virtual robot: its own build, and what "drawn" draws."""
+  reference: Path | None = None
+  """Folder with logs of a robot's stand from before; the virtual robot records its own."""
+  scene: Path | None = None
+  """Folder of a scene bundle; the built-in room if not given."""
+  seconds: float = 12.0
+  """Length of a recorded motion [s]."""
+  trials: int = 18
+  """Trials of the navigation protocol, spread over its 54."""
+  time_limit: float | None = None
+  """Length of a trial [s]; the task's own if not given."""
+  minutes: float = 30.0
+  """Time to train the policy on [min]."""
+  preset: str = "adapt"
+  """Settings of that distillation."""
+  teacher: str = "auto"
+  """quick, steady, the folder of a policy, or auto: the walker that succeeds more often with the
+  effects in the simulation."""
+  actors: int = 1
+  """Collectors of the distillation."""
+  out: Path = Path("out/loop")
+  """Folder of everything; the same command goes on in it."""
+
+  @property
+  def camera_source(self) -> int | str:
+    """The robot's camera: a device's number, or a file or URL."""
+    return int(self.camera) if self.camera.isdigit() else self.camera
+
+
+def policy_folder(settings: LoopSettings) -> Path | None:
+  """Returns the folder of the policy; None for the scripted walker.
+
+  Raises:
+    ValueError: There is none.
+  """
+  if settings.policy == WALKER:
+    return None
+  folder = SHIPPED_FOLDER if settings.policy == SHIPPED else Path(settings.policy)
+  if not (folder / "policy.json").is_file():
+    raise ValueError(
+      f"Found no policy.json in {folder} (--policy {settings.policy}): expected the folder of an "
+      f'exported policy, "{SHIPPED}" where the package ships one, or "{WALKER}".'
+    )
+  return folder
+
+
+def claim(settings: LoopSettings) -> None:
+  """Makes the folder this loop's; trials, minutes and names may change from run to run.
+
+  What is hidden is noted as a digest: a folder tells nobody before the end.
+
+  Raises:
+    ValueError: It is another loop's.
+  """
+  folder = policy_folder(settings) if settings.policy else None
+  digest = "" if folder is None else json.loads((folder / "policy.json").read_text())["sha256"]
+  own: dict[str, Any] = {
+    "policy": digest or settings.policy,
+    "robot": settings.robot,
+    "seed": settings.seed,
+    "hidden": hashlib.sha256(repr(settings.hidden).encode()).hexdigest()[:12],
+    "scene": str(settings.scene or ""),
+    "seconds": settings.seconds,
+    "time_limit": settings.time_limit,
+  }
+  path = settings.out / _IDENTITY
+  settings.out.mkdir(parents=True, exist_ok=True)
+  if not path.exists():
+    files.write_atomically(path, json.dumps(own, indent=1))
+    return
+  found = json.loads(path.read_text())
+  other = sorted(name for name in own if found.get(name) != own[name])
+  if other:
+    raise ValueError(
+      f"{settings.out} holds a loop with another {', '.join(other)}: take another folder with "
+      "--out, or the arguments that it began with."
+    )

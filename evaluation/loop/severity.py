@@ -1,0 +1,69 @@
+"""How large an effect must be until a policy's success falls: a table of what it is robust to."""
+
+import dataclasses
+from typing import Any
+
+from nerf2real.core.serialization import to_plain, write_json
+from nerf2real.evaluation.episodes import Store
+from nerf2real.evaluation.loop import machines, trials
+from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
+from nerf2real.evaluation.loop.trials import Condition, Say, Tally, tally
+from nerf2real.suite.scene import open_scene
+
+FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0)
+LOSS = 0.3  # of success; chosen: a fall that 54 trials tell from chance
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+  """The trials at one size."""
+
+  factor: float  # of the sizes that were given; 0: nothing hidden
+  effects: tuple[str, ...]
+  tally: Tally
+
+
+def find_severity(settings: LoopSettings, say: Say) -> list[Step]:
+  """Runs the trials with the hidden effects at growing sizes until success falls by `LOSS`.
+
+  Writes severity.json.
+
+  Raises:
+    ValueError: Nothing is hidden, the robot is a real one, or the settings cannot be run.
+  """
+  hidden = machines.hidden_effects(settings.hidden, settings.seed)
+  if not hidden or settings.robot != "virtual":
+    raise ValueError(
+      f"Found the robot {settings.robot!r} and {len(hidden)} hidden effects, expected the virtual "
+      "robot and at least one: --hidden command_delay:0.02 --find-severity."
+    )
+  policy = policy_folder(settings)
+  claim(settings)
+  scene: Any = open_scene(settings.scene)
+  store = Store(settings.out)
+  steps: list[Step] = []
+  for factor in (0.0, *FACTORS):
+    altered = tuple(effect.scaled(factor) for effect in hidden) if factor else ()
+    name = f"severity {factor:g}"
+    condition = Condition(name=name, policy=policy, altered=altered)
+    found = tally(name, trials.run(settings, condition, scene, store, say))
+    steps.append(Step(factor, tuple(str(effect) for effect in altered), found))
+    say(f"{factor:g} times: {found}")
+    if steps[0].tally.share - found.share >= LOSS:
+      break
+  write_json(settings.out / "severity.json", [to_plain(step) for step in steps])
+  return steps
+
+
+def as_text(steps: list[Step]) -> str:
+  """Returns the steps as a table in Markdown."""
+  lines = ["| times | hidden | success | how the trials ended |", "| --- | --- | --- | --- |"]
+  for step in steps:
+    ended = ", ".join(f"{n} {name}" for name, n in step.tally.outcomes.items() if n)
+    lines.append(
+      f"| {step.factor:g} | {', '.join(step.effects) or 'nothing'} | {step.tally} | {ended} |"
+    )
+  lost = steps[0].tally.share - steps[-1].tally.share
+  end = "falls" if lost >= LOSS else "does not fall"
+  lines += ["", f"Success {end} by {100 * LOSS:.0f} points: by {100 * lost:.0f} at the last size."]
+  return "\n".join(lines) + "\n"

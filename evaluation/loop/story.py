@@ -1,0 +1,192 @@
+"""Closes the loop with a policy: it fails on a robot, the data say why, it is trained on.
+
+Stages, each of which leaves files and is not repeated: trials before, recordings, finding, trials
+in the simulation with the effects put in, training, trials after.
+"""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from nerf2real.agents.supervision.training import Scripts
+from nerf2real.core.camera_info import read_camera_info
+from nerf2real.core.serialization import to_plain, write_json
+from nerf2real.evaluation.episodes import OUTCOMES, Episode, Store
+from nerf2real.evaluation.loop import machines, naming, recording, training, trials
+from nerf2real.evaluation.loop.comparing import Comparison, compare
+from nerf2real.evaluation.loop.naming import Named
+from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
+from nerf2real.evaluation.loop.training import Trained
+from nerf2real.evaluation.loop.trials import Condition, Say, Tally, tally
+from nerf2real.real.loading import Connection
+from nerf2real.real.virtual.camera import LENS
+from nerf2real.suite.scene import open_scene
+
+HEALTHY, BEFORE, AFTER = "robot as it was", "robot before", "robot after"
+NOMINAL, WITH_EFFECTS = "simulation, nominal", "simulation with the effects"
+TRAINED = "simulation with the effects, trained on"
+_TIMES = "times.json"
+
+
+class Story(NamedTuple):
+  """What a loop gave."""
+
+  settings: LoopSettings
+  episodes: dict[str, list[Episode]]  # by condition
+  named: Named
+  trained: Trained | None  # None: nothing was named, the policy stays
+  comparison: Comparison | None  # with what was hidden; None: of a real robot nobody knows
+  times: dict[str, float]  # s of each stage
+
+  @property
+  def tallies(self) -> dict[str, Tally]:
+    """Counts of every condition."""
+    return {name: tally(name, found) for name, found in self.episodes.items()}
+
+
+def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
+  """Closes the loop, going on where an earlier run stopped; writes loop.json.
+
+  Args:
+    settings: Of the loop.
+    scripts: Of the distillation's learner and collectors.
+    say: Called with a line at a time; what is hidden is not among them.
+
+  Raises:
+    ValueError: The settings cannot be run, or the folder is another loop's.
+    RuntimeError: Robot, recorder or training did not keep up.
+  """
+  hidden = machines.hidden_effects(settings.hidden, settings.seed)
+  policy = policy_folder(settings)
+  claim(settings)
+  scene = open_scene(settings.scene)
+  store = Store(settings.out)
+  stages = _Stages(settings.out / _TIMES)
+  found: dict[str, list[Episode]] = {}
+
+  def run(condition: Condition) -> None:
+    with stages.timed(condition.name):
+      found[condition.name] = trials.run(settings, condition, scene, store, say)
+    say(str(tally(condition.name, found[condition.name])))
+
+  if settings.robot == recording.VIRTUAL:
+    run(Condition(name=HEALTHY, policy=policy))
+  run(Condition(name=BEFORE, policy=policy, altered=hidden))
+  with stages.timed("recording"):
+    reference = _record(settings, hidden, say)
+  with stages.timed("identification"):
+    named = naming.name(settings.out / "identified", settings.out / "stand", reference)
+  say(f"verdict: {named.verdict}: {', '.join(e.kind for e in named.named) or 'nothing'}")
+  run(Condition(name=NOMINAL, policy=policy, simulated=True))
+  trained: Trained | None = None
+  after = policy
+  if named.named:
+    effects = named.effects_path
+    run(Condition(name=WITH_EFFECTS, policy=policy, simulated=True, effects=effects))
+    with stages.timed("training"):
+      trained = training.train(settings, policy, effects, scene=scene, scripts=scripts)
+    after = trained.policy
+    run(Condition(name=TRAINED, policy=after, simulated=True, effects=effects))
+  run(Condition(name=AFTER, policy=after, altered=hidden))
+  comparison = compare(hidden, named.effects) if settings.robot == recording.VIRTUAL else None
+  story = Story(settings, found, named, trained, comparison, stages.seconds)
+  write_json(settings.out / "loop.json", summary(story))
+  return story
+
+
+def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
+  """Records the stand, and the virtual robot's before; returns the folder of the reference."""
+  seconds, out = settings.seconds, settings.out
+  wanted = [out / "stand" / f"{name}.mcap" for name in (*_logs(), recording.FLOOR)]
+  if settings.robot != recording.VIRTUAL:
+    lens = None if settings.lens is None else read_camera_info(settings.lens)
+    camera = None if lens is None else settings.camera_source
+    connection = Connection(port=settings.robot, camera=camera, offsets=settings.offsets)
+    recording.record_stand(out / "stand", connection, None, seconds=seconds, lens=lens)
+    recording.record_floor(out / "stand", connection, None)
+    return settings.reference
+  age = trials.session_seconds(settings, BEFORE)
+  for folder, altered, used in ((out / "stand", hidden, age), (out / "reference", (), 0.0)):
+    if all((folder / path.name).exists() for path in wanted):
+      continue
+    say(f"recording the motions of the stand in {folder}")
+    with machines.virtual_robot(settings.seed, altered, films=True, age=used) as (link, robot):
+      recording.record_stand(folder, link, robot, seconds=seconds, lens=LENS)
+    with machines.virtual_robot(settings.seed, altered, age=used) as (link, robot):
+      recording.record_floor(folder, link, robot)
+  return settings.reference or out / "reference"
+
+
+def _logs() -> tuple[str, ...]:
+  return (*recording.TRAIN, *recording.HELD)
+
+
+def summary(story: Story) -> dict[str, Any]:
+  """Returns a loop as plain values: counts, finding, training, what was hidden."""
+  named = story.named
+  return {
+    "settings": to_plain(story.settings),
+    "success": {name: to_plain(found) for name, found in story.tallies.items()},
+    "verdict": named.verdict,
+    "effects": [to_plain(effect) for effect in named.effects],
+    "share_explained": named.share,
+    "error_held_rad": named.content["error"]["held"],
+    "notes": named.notes,
+    "trained": None if story.trained is None else to_plain(story.trained),
+    "hidden": None if story.comparison is None else to_plain(story.comparison),
+    "recovered": recovered(story),
+    "gap_to_robot": {name: to_plain(found) for name, found in gaps(story).items()},
+    "recorded_s": story.settings.seconds * len(_logs()),
+    "seconds": {name: round(value, 1) for name, value in story.times.items()},
+  }
+
+
+class Gap(NamedTuple):
+  """How far a simulation's trials are from the robot's before."""
+
+  success: float  # share in the simulation less the robot's
+  outcomes: float  # total variation distance between how the trials ended, 0 to 1
+
+
+def gaps(story: Story) -> dict[str, Gap]:
+  """Returns the gaps between simulation and robot, without and with the effects."""
+  robot = story.tallies[BEFORE]
+
+  def gap(found: Tally) -> Gap:
+    kinds = [
+      abs(found.outcomes[o] / found.trials - robot.outcomes[o] / robot.trials) for o in OUTCOMES
+    ]
+    return Gap(found.share - robot.share, sum(kinds) / 2)
+
+  tallies = story.tallies
+  return {name: gap(tallies[name]) for name in (NOMINAL, WITH_EFFECTS) if name in tallies}
+
+
+def recovered(story: Story) -> float | None:
+  """Returns the share of the lost success that came back; None where none was lost."""
+  tallies = story.tallies
+  if HEALTHY not in tallies:
+    return None
+  lost = tallies[HEALTHY].share - tallies[BEFORE].share
+  return None if lost <= 0 else (tallies[AFTER].share - tallies[BEFORE].share) / lost
+
+
+class _Stages:
+  """Times of stages, added up over the runs of a loop."""
+
+  def __init__(self, path: Path):
+    self._path = path
+    self.seconds: dict[str, float] = json.loads(path.read_text()) if path.exists() else {}
+
+  @contextmanager
+  def timed(self, name: str) -> Iterator[None]:
+    """Adds the time of a block to a stage."""
+    begun = time.monotonic()
+    try:
+      yield
+    finally:
+      self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begun
+      write_json(self._path, self.seconds)

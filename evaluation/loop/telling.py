@@ -1,0 +1,212 @@
+"""The page of a closed loop: five numbers, and the story in pictures, from failure to recovery."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from nerf2real.core.floor_map import FloorMap
+from nerf2real.core.pages import charts, page
+from nerf2real.core.pages.blocks import (
+  Block,
+  Details,
+  Figure,
+  Figures,
+  Grid,
+  Legend,
+  Picture,
+  Preformatted,
+  Table,
+  Text,
+  Times,
+)
+from nerf2real.core.pages.page import Section
+from nerf2real.core.serialization import to_plain
+from nerf2real.evaluation.episodes import OUTCOMES
+from nerf2real.evaluation.loop import story as loop
+from nerf2real.evaluation.loop.comparing import Comparison, describe
+from nerf2real.evaluation.loop.naming import Named
+from nerf2real.evaluation.loop.story import Story
+from nerf2real.evaluation.loop.trials import Tally
+from nerf2real.evaluation.report import maps
+from nerf2real.suite.scene import open_scene
+
+_HEIGHT = 360  # of maps [pixel]
+_NOTHING = "-"
+
+
+_LEAD = (
+  "A policy meets a robot with something that nobody declared: the robot's own recordings name it, "
+  "the simulation gets it, and the policy is trained on."
+)
+_VIRTUAL = " Robot means a virtual robot here; no figure of this page is of hardware."
+
+
+def write(path: Path, story: Story) -> None:
+  """Writes the page."""
+  floor = maps.draw_floor(open_scene(story.settings.scene), height=_HEIGHT)
+  before, simulated, after = (
+    _paths(story, floor, title, text, names)
+    for title, text, names in (
+      (
+        "Before",
+        "Paths of the same trials, seen from above; a dot is where a failure ended.",
+        (loop.HEALTHY, loop.BEFORE),
+      ),
+      (
+        "In the simulation",
+        "The same trials without and with the effects, drawn from their intervals every episode: "
+        f"where the finding is right, the policy fails here as on the robot. {_gaps(story)}",
+        (loop.NOMINAL, loop.WITH_EFFECTS),
+      ),
+      ("After", "The same trials on the same robot.", (loop.BEFORE, loop.AFTER)),
+    )
+  )
+  settings = Preformatted(json.dumps(to_plain(story.settings), indent=1))
+  sections = [
+    Section("Five numbers", "", [Figures(five_numbers(story))]),
+    before,
+    _finding(story.named),
+    simulated,
+    _training(story),
+    after,
+    _outcomes(list(story.tallies.values())),
+    *([] if story.comparison is None else [_hidden(story.comparison)]),
+    Section("Time", "", [Times(story.times)]),
+    Section("Settings", "", [Details("all", [settings])]),
+  ]
+  lead = _LEAD + (_VIRTUAL if story.settings.robot == "virtual" else "")
+  page.write(path, page.Page("The loop closed", lead, sections, origin=page.Origin.of_process()))
+
+
+def five_numbers(story: Story) -> list[Figure]:
+  """Returns success as the robot was, before, in the simulation with effects, after; what came
+  back."""
+  tallies = story.tallies
+  share = loop.recovered(story)
+  wanted = (
+    (loop.HEALTHY, "without what was hidden"),
+    (loop.BEFORE, "with it"),
+    (loop.WITH_EFFECTS, "the same trials with what was named: as close as the name is right"),
+    (loop.AFTER, "trained on with what was named"),
+  )
+  figures = [
+    Figure(
+      f"success, {name}", _percent(tallies.get(name)), "", meaning, "95 % interval in brackets"
+    )
+    for name, meaning in wanted
+  ]
+  value = _NOTHING if share is None else f"{100 * share:.0f} %"
+  return [*figures, Figure("lost success that came back", value, "", "after against before")]
+
+
+def as_text(story: Story) -> str:
+  """Returns the numbers, and what was named beside what was hidden, in lines."""
+  lines = [f"{f.name}: {f.value}" for f in five_numbers(story)]
+  if story.comparison is not None:
+    rows = story.comparison.rows
+    lines += [f"hidden: {row.hidden}; named: {row.named or 'nothing'}" for row in rows]
+    lines += [f"named besides: {'; '.join(story.comparison.wrong) or 'nothing'}"]
+  return "\n".join(["", *lines])
+
+
+def _gaps(story: Story) -> str:
+  """Returns how far the simulation's success is from the robot's, in words."""
+  parts = [f"{100 * gap.success:+.0f} points ({name})" for name, gap in loop.gaps(story).items()]
+  return f"Success against the robot's before: {', '.join(parts)}."
+
+
+def _percent(found: Tally | None) -> str:
+  return _NOTHING if found is None else str(found)
+
+
+def _paths(story: Story, floor: FloorMap, title: str, text: str, names: Sequence[str]) -> Section:
+  cells = [
+    Picture(maps.draw_paths(floor, story.episodes[name]), f"{name}: {story.tallies[name]}")
+    for name in names
+    if name in story.episodes
+  ]
+  return Section(title, text, [Legend({o: maps.COLORS[o] for o in OUTCOMES}), Grid(cells, 2)])
+
+
+def _finding(named: Named) -> Section:
+  blocks: list[Block] = []
+  if named.effects:
+    rows = [
+      (e.kind, e.target or "all", name, value, *e.intervals.get(name, (_NOTHING, _NOTHING)))
+      for e in named.effects
+      for name, value in e.parameters.items()
+      if isinstance(value, int | float)
+    ]
+    table = Table(("effect", "where", "parameter", "value", "low", "high"), rows)
+    blocks.append(table if len(rows) <= 12 else Details(f"all {len(rows)} values", [table]))
+  held = named.content["error"]["held"]
+  share = _NOTHING if named.share is None else f"{100 * named.share:.0f} %"
+  noise = named.content["error"]["floor"]
+  blocks.append(
+    Text(
+      f"Held-out error of joint positions: declared model {1e3 * held['before']:.2f} mrad, "
+      f"extended {1e3 * held['after']:.2f} mrad, noise {1e3 * noise:.2f} mrad. "
+      f"Share of the squared error above the noise that is explained: {share}."
+    )
+  )
+  blocks += [Text(note) for note in named.notes]
+  listed = "; ".join(describe(e) for e in named.named) or "nothing"
+  return Section("What the recordings say", f"Verdict: {named.verdict}. {listed}.", blocks)
+
+
+def _training(story: Story) -> Section:
+  if story.trained is None:
+    return Section("Trained on", "Nothing was named: the policy stays as it was.")
+  made = story.trained
+  chosen = "; ".join(f"{n}: {k} of {made.trials}" for n, k in made.teachers.items())
+  figures = [
+    Figure("training", round(made.minutes, 1), "min", "of updates"),
+    Figure("frames", made.frames, "", "control steps collected"),
+    Figure("teacher", made.teacher, "", f"walkers with the effects: {chosen}" if chosen else ""),
+    Figure(
+      "success in the simulation with the effects",
+      _percent(story.tallies.get(loop.TRAINED)),
+      "",
+      "of the policy that was trained on",
+    ),
+  ]
+  return Section("Trained on", "Distillation, effects drawn every episode.", [Figures(figures)])
+
+
+def _outcomes(tallies: Sequence[Tally]) -> Section:
+  names = [found.name for found in tallies]
+  series = [
+    charts.Bars(
+      outcome, maps.COLORS[outcome], [100 * t.outcomes[outcome] / t.trials for t in tallies]
+    )
+    for outcome in OUTCOMES
+  ]
+  chart = charts.bars("How the trials ended", "per cent", series, names, stacked=True)
+  rows = [
+    (
+      t.name,
+      t.trials,
+      *(t.outcomes[o] for o in OUTCOMES),
+      f"{100 * t.low:.0f} to {100 * t.high:.0f}",
+    )
+    for t in tallies
+  ]
+  header = ("condition", "trials", *OUTCOMES, "success, 95 % interval [%]")
+  return Section("How the trials ended", "", [chart, Table(header, rows)])
+
+
+def _hidden(found: Comparison) -> Section:
+  rows = [
+    (
+      row.hidden,
+      row.named or "nothing",
+      "yes" if row.right else "no",
+      _NOTHING if row.covered is None else ("yes" if row.covered else "no"),
+    )
+    for row in found.rows
+  ]
+  header = ("hidden", "named", "right", "intervals hold the value")
+  text = "Nothing was hidden." if not rows else ""
+  besides = "; ".join(found.wrong) or "nothing"
+  blocks: list[Block] = [Table(header, rows)] if rows else []
+  return Section("What was hidden", text, [*blocks, Text(f"Named besides: {besides}.")])

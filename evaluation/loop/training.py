@@ -1,0 +1,161 @@
+"""Trains a policy on by distillation, with effects drawn from their intervals every episode."""
+
+import contextlib
+import json
+import signal
+import urllib.parse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from nerf2real.agents.distill import settings as distillation
+from nerf2real.agents.distill.checkpoint import STATE
+from nerf2real.agents.distill.teacher import TEACHERS
+from nerf2real.agents.supervision import training
+from nerf2real.core.serialization import to_plain, write_json
+from nerf2real.evaluation import runner
+from nerf2real.evaluation.loop.settings import LoopSettings
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import NAVIGATION
+from nerf2real.evaluation.policies import GaitPolicy
+from nerf2real.evaluation.session import choose
+
+POLICY = Path("policy") / "newest"
+_WALKERS = ("quick", "steady")  # teachers that navigate
+_TRIALS = 6  # of each teacher, spread over the protocol; chosen: seconds without pictures
+_DONE = 0.99  # of the minutes, from which a training is taken for finished
+
+
+class Trained(NamedTuple):
+  """A policy that was trained on."""
+
+  policy: Path  # folder of the export
+  teacher: str
+  teachers: dict[str, int]  # successes of each walker with the effects, of `trials`
+  trials: int
+  minutes: float  # of training
+  frames: int  # collected
+
+
+def environment_name(settings: LoopSettings, policy: Path | None, effects: Path) -> str:
+  """Returns the policy's environment, or the preset's, with effects from their intervals."""
+  own = distillation.preset(settings.preset).environment
+  if policy is not None:
+    own = str(json.loads((policy / "policy.json").read_text())["environment"])
+  path, _, query = own.partition("?")
+  options = dict(urllib.parse.parse_qsl(query))
+  options |= {"effects": str(effects), "draw_effects": "true"}
+  if settings.scene is not None:
+    options["scene"] = str(settings.scene)
+  return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
+
+
+def train(
+  settings: LoopSettings,
+  policy: Path | None,
+  effects: Path,
+  *,
+  scene: Any,
+  scripts: training.Scripts,
+) -> Trained:
+  """Trains a policy on, or goes on with that.
+
+  Args:
+    settings: The loop's.
+    policy: The student begins with it; None: with random weights.
+    effects: effects.json, drawn from its intervals.
+    scene: The bundle.
+    scripts: Of learner and collectors.
+
+  Raises:
+    RuntimeError: The training failed or was stopped; the same loop goes on with it.
+  """
+  run = settings.out / "training"
+  run.mkdir(parents=True, exist_ok=True)
+  teacher, teachers, count = _choose_teacher(settings, effects, scene)
+  if _minutes(run) < _DONE * settings.minutes:
+    forwarded = ["--minutes", str(settings.minutes), "--teacher", teacher]
+    if policy is not None:
+      forwarded += ["--init-from", str(policy)]
+    arguments = training.TrainingSettings(
+      env=environment_name(settings, policy, effects.resolve()),
+      actors=settings.actors,
+      run=run,
+      preset=settings.preset,
+      seed=settings.seed,
+      resume=(run / STATE).exists(),
+      evaluator=False,
+    )
+    with _signals_kept():
+      failure = training.train(arguments, scripts, forwarded=forwarded, command="close_loop")
+    if failure:
+      raise RuntimeError(f"The training failed: {failure}")
+    if _minutes(run) < _DONE * settings.minutes:
+      raise RuntimeError(
+        f"The training ended after {_minutes(run):.1f} of {settings.minutes:g} minutes: the same "
+        "command goes on with it."
+      )
+  if not (run / POLICY / "policy.json").exists():
+    raise RuntimeError(
+      f"The training gave no policy in {_minutes(run):.1f} minutes, too few for a first student: "
+      f"the same command with more than --minutes {settings.minutes:g} goes on with it."
+    )
+  info = json.loads((run / POLICY / "policy.json").read_text())["info"]
+  return Trained(run / POLICY, teacher, teachers, count, _minutes(run), int(info["steps"]))
+
+
+@contextlib.contextmanager
+def _signals_kept() -> Iterator[None]:
+  """Puts the handlers of Ctrl-C and SIGTERM back, which a supervised run replaces."""
+  kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+  try:
+    yield
+  finally:
+    for number, handler in kept.items():
+      signal.signal(number, handler)
+
+
+def _minutes(run: Path) -> float:
+  """Returns the minutes that a distillation has trained; 0 before its first saved state."""
+  import numpy as np
+
+  if not (run / STATE).exists():
+    return 0.0
+  with np.load(run / STATE, allow_pickle=False) as stored:
+    return float(json.loads(stored["counters"].tobytes())["elapsed"]) / 60
+
+
+def _choose_teacher(
+  settings: LoopSettings, effects: Path, scene: Any
+) -> tuple[str, dict[str, int], int]:
+  """Returns the teacher, each walker's successes with the effects, and how many trials it had."""
+  if settings.teacher != "auto":
+    return settings.teacher, {}, 0
+  path = settings.out / "training" / "teachers.json"
+  if path.exists():
+    kept = json.loads(path.read_text())
+    return kept["teacher"], kept["successes"], kept["trials"]
+  from nerf2real.evaluation.plants.simulated import SimulatedPlant
+
+  chosen = choose(plants.trials(NAVIGATION), min(_TRIALS, settings.trials))
+  successes: dict[str, int] = {}
+  plant = SimulatedPlant(
+    scene,
+    NAVIGATION,
+    image_size=None,
+    effects=effects,
+    draw_effects=True,
+    time_limit=settings.time_limit,
+  )
+  with contextlib.closing(plant):
+    for name in _WALKERS:
+      made = TEACHERS[name]()
+      walker = GaitPolicy(scene, NAVIGATION, settings=made.gait, steering=made.steering, name=name)
+      successes[name] = sum(
+        runner.run_trial(plant, walker, trial, group=group, index=index).success
+        for index, (group, trial) in chosen
+      )
+  teacher = max(successes, key=lambda name: successes[name])
+  found = {"teacher": teacher, "successes": successes, "trials": len(chosen)}
+  write_json(path, to_plain(found))
+  return teacher, successes, len(chosen)

@@ -1,0 +1,247 @@
+"""Fits 3D Gaussian splats to pictures that a radiance field renders from a robot's places.
+
+Every step renders a new picture of the field, so there is no training set to overfit.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.rotations import camera_axes
+from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.export import views
+from nerf2real.scenes.export.splats import projection, rasteriser, start
+from nerf2real.scenes.export.splats.splats import Splats
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitSettings:
+  """Settings of the splats and their fit."""
+
+  max_splats: int = 60_000
+  """At most so many; at most 200,000 are sensible in a browser."""
+  steps: int = 2000
+  """Pictures that are fitted to, one a step."""
+  seconds: float | None = None
+  """The fit ends after this wall time [s] at the latest."""
+  seed_views: int = 150
+  """Pictures that the splats start from, half from the robot's places, half from the capture's."""
+  finest: float = 0.012
+  """Least distance of neighbouring splats at the start [m]."""
+  eye_height: float = 0.44
+  """Of the robot's camera above the floor [m]: a standing OP3's."""
+  vertical_fov: float = 0.7557
+  """Of the robot's camera [rad]: 43.3 degrees, a Logitech C920 as mounted."""
+  size: tuple[int, int] = (60, 80)
+  """Height and width of the robot's pictures [pixel]."""
+  fine_share: float = 0.3
+  """Share of the steps with pictures of twice the size, half of them from the capture's places:
+  for eyes that come nearer than the robot."""
+  viewer_blur: float = 0.3
+  """Variance [pixel^2] that rasterisers of splats add (Kerbl et al. 2023; gsplat's eps2d). Half of
+  the steps are without it, as renderers that cast rays have none."""
+  rate: float = 1.0
+  """Factor on all learning rates."""
+  seed: int = 0
+  """Of places and steps."""
+
+
+# Learning rates of Adam by column of the packed parameters: offsets, logarithms of scales,
+# rotations, logits, colours. Chosen: a splat is in the picture in a tenth of the steps or less.
+_RATES = np.repeat([0.04, 0.04, 0.03, 0.1, 0.02], [3, 3, 4, 1, 3]).astype(np.float32)
+_MOMENTUM, _SQUARES, _EPSILON = 0.9, 0.99, 1e-12  # of Adam (Kingma and Ba 2015)
+_FINAL = 0.05  # of the learning rates, at the last step
+_LOWEST_TILT, _HIGHEST_TILT = 0.1, 0.55  # rad downwards: the paper's head tilt and a gait's sway
+_MARGIN = 1.15  # of the field of view within which splats may reach into the picture
+_FEWEST = 8192  # splats that are projected at least
+_NO_BLUR = 0.01  # variance that stands for none: a Gaussian thinner than a pixel must not vanish
+
+
+def robot_poses(
+  bundle: Bundle, count: int, *, eye_height: float, rng: np.random.Generator
+) -> np.ndarray:
+  """Poses [N, 4, 4] of a robot's camera in the world: anywhere it fits, looking ahead and down."""
+  places = bundle.free_space.sample(rng, count)
+  tilts = rng.uniform(_LOWEST_TILT, _HIGHEST_TILT, count)
+  poses = np.tile(np.eye(4), (count, 1, 1))
+  for pose, (x, y, yaw), tilt in zip(poses, places, tilts, strict=True):
+    level = np.cos(tilt)
+    pose[:3, :3] = camera_axes(np.array([np.cos(yaw) * level, np.sin(yaw) * level, -np.sin(tilt)]))
+    pose[:3, 3] = x, y, eye_height
+  return poses
+
+
+class Fit:
+  """Parameters of splats and the state of their optimiser, Adam on the splats in the picture."""
+
+  def __init__(self, points: start.Seeds):
+    """Starts splats at points."""
+    self.points = points
+    self.rows = start.rows_of(points)
+    self._starts = points.positions.astype(np.float32)
+    self._spacing = points.spacing.astype(np.float32)
+    self._mean, self._square = np.zeros_like(self.rows), np.zeros_like(self.rows)
+    self._seen = np.zeros(len(self.rows), np.float32)  # steps that each splat took part in
+    self._project = jax.jit(projection.project)
+    self._pull = jax.jit(_pull)
+
+  def _draw(self, camera: Camera, eye: projection.Eye):
+    """Draws the splats that may be in the picture."""
+    positions = self._starts + self._spacing[:, None] * self.rows[:, :3]
+    local = positions @ eye.rotation.T + eye.translation
+    shown = np.flatnonzero(
+      (local[:, 2] > 0)
+      & (np.abs(local[:, :2]) < _MARGIN * eye.slope * local[:, 2:] + self._spacing[:, None]).all(-1)
+    )
+    # few shapes, so that few programs are compiled; what is added lies behind every camera
+    count = max(_FEWEST, 1 << int(np.ceil(np.log2(max(len(shown), 1)))))
+    padded = np.zeros(count, np.int64)
+    padded[: len(shown)] = shown
+    starts = self._starts[padded]
+    starts[len(shown) :] = -1e3 * eye.rotation[2] - eye.rotation.T @ eye.translation
+    arguments = (self.rows[padded], starts, self._spacing[padded], eye)
+    gaussians, depth = self._project(*arguments)
+    arrays = [np.asarray(array) for array in gaussians]
+    centres, conics, opacities, _ = arrays
+    tiles = rasteriser.assign(
+      centres, conics, opacities, np.asarray(depth), width=camera.width, height=camera.height
+    )
+    inputs = (*tiles, *arrays, camera.width, camera.height)
+    return shown, arguments, inputs, rasteriser.composite(*inputs)
+
+  def render(self, camera: Camera, world_from_camera: np.ndarray, *, blur: float) -> np.ndarray:
+    """Renders the splats: float32 [H, W, 3], not clipped."""
+    eye = projection.Eye.at(camera, world_from_camera, blur=blur)
+    image: np.ndarray = self._draw(camera, eye)[-1][0]
+    return image
+
+  def step(
+    self,
+    camera: Camera,
+    world_from_camera: np.ndarray,
+    truth: np.ndarray,
+    *,
+    blur: float,
+    rate: float = 1.0,
+  ) -> float:
+    """Takes one step towards a picture.
+
+    Args:
+      camera: Of the picture; without distortion.
+      world_from_camera: Its pose [4, 4].
+      truth: The picture [H, W, 3], 0 to 1.
+      blur: Variance added to the 2D Gaussians [pixel^2].
+      rate: Factor on the learning rates.
+
+    Returns:
+      The mean squared error before the step.
+    """
+    eye = projection.Eye.at(camera, world_from_camera, blur=blur)
+    shown, arguments, inputs, (image, left, looked) = self._draw(camera, eye)
+    error = image - truth.astype(np.float32)
+    drawn = (*inputs, left, looked, (2 / error.size) * error)
+    slopes = rasteriser.composite_backward(*drawn)  # type: ignore[call-arg]
+    gradient = self._pull(*arguments, projection.Projected(*slopes))
+    self._descend(shown, np.asarray(gradient)[: len(shown)], rate)
+    return float(np.mean(error**2))
+
+  def _descend(self, shown: np.ndarray, gradient: np.ndarray, rate: float) -> None:
+    self._seen[shown] += 1
+    mean = _MOMENTUM * self._mean[shown] + (1 - _MOMENTUM) * gradient
+    square = _SQUARES * self._square[shown] + (1 - _SQUARES) * gradient**2
+    self._mean[shown], self._square[shown] = mean, square
+    times = self._seen[shown, None]
+    ratio = mean / (1 - _MOMENTUM**times)
+    ratio /= np.sqrt(square / (1 - _SQUARES**times)) + _EPSILON
+    self.rows[shown] -= rate * _RATES * ratio
+
+  @property
+  def splats(self) -> Splats:
+    """The splats as they are now."""
+    return start.splats_of(self.rows, self.points)
+
+
+def _pull(rows, starts, spacing, eye, slopes):
+  """Derivatives of a loss by packed parameters, of those by the 2D Gaussians."""
+  _, pull = jax.vjp(lambda r: projection.project(r, starts, spacing, eye)[0], rows)
+  return pull(slopes)[0]
+
+
+def fit(
+  bundle: Bundle, *, settings: FitSettings | None = None, progress: Progress = no_progress
+) -> Splats:
+  """Fits splats to a bundle's field, world frame.
+
+  Args:
+    bundle: The scene.
+    settings: How.
+    progress: Called with the fraction done and a text.
+
+  Raises:
+    FreeSpaceError: The scene has no free floor to look from.
+  """
+  settings = settings or FitSettings()
+  rng = np.random.default_rng(settings.seed)
+  renderer = views.renderer_of(bundle)
+  height, width = settings.size
+  robot = Camera.from_vertical_fov(settings.vertical_fov, width, height)
+  filmed, capture, _ = views.capture_cameras(bundle)
+  wide = Camera.from_vertical_fov(
+    filmed.vertical_fov, round(height * filmed.width / filmed.height), height
+  )
+
+  def poses(count: int) -> np.ndarray:
+    return robot_poses(bundle, count, eye_height=settings.eye_height, rng=rng)
+
+  half = settings.seed_views // 2
+  found = [
+    views.render_views(bundle, renderer, camera.resized(2 * camera.width, 2 * camera.height), at)
+    for camera, at in ((robot, poses(half)), (wide, capture[rng.integers(0, len(capture), half)]))
+  ]
+  lower, upper = bundle.extent
+  far = 2 * float(np.linalg.norm(upper - lower))
+  offered = [start.seeds(view, far=far, spacing=2.0) for view in found]
+  points = start.Seeds(*(np.concatenate(column) for column in zip(*offered, strict=True)))
+  points = start.thin_to(points, count=settings.max_splats, finest=settings.finest)
+  fitted = Fit(points)
+
+  def picture() -> tuple[Camera, np.ndarray]:
+    if rng.random() >= settings.fine_share:
+      return robot, poses(1)[0]
+    if rng.random() < 0.5:
+      return robot.resized(2 * width, 2 * height), poses(1)[0]
+    return wide.resized(2 * wide.width, 2 * height), capture[rng.integers(len(capture))]
+
+  _run(bundle, fitted, renderer, picture, settings, rng, progress)
+  return fitted.splats
+
+
+def _run(
+  bundle: Bundle,
+  fitted: Fit,
+  renderer,
+  picture: Callable[[], tuple[Camera, np.ndarray]],
+  settings: FitSettings,
+  rng: np.random.Generator,
+  progress: Progress,
+) -> None:
+  unit_from_world = bundle.world_from_unit.inverse()
+  began, mean = time.monotonic(), 0.0
+  for step in range(settings.steps):
+    camera, pose = picture()
+    truth = renderer.render(camera, unit_from_world.apply_pose(pose))[0] / 255.0
+    blur = settings.viewer_blur if rng.random() < 0.5 else _NO_BLUR
+    spent = time.monotonic() - began
+    done = max(step / settings.steps, spent / settings.seconds if settings.seconds else 0.0)
+    if done >= 1:
+      break
+    rate = settings.rate * _FINAL**done
+    error = fitted.step(camera, pose, truth, blur=blur, rate=rate)
+    mean += (error - mean) / min(step + 1, 100)
+    if step % 20 == 0:
+      progress(done, f"step {step}, {-10 * np.log10(max(mean, 1e-10)):.1f} dB")

@@ -1,0 +1,132 @@
+"""Judges contact geometry of a real room by sight lines of held-out pictures to localised points.
+
+Where a picture shows a point, the line between is free: a part across it is wrong. Where there is a
+point, there is matter: a point far from every part and from the floor is missed. No truth is
+needed, so every capture has the figure; what the judge itself gets wrong is measured on the
+built-in room, where its points can be held against the truth. The held-out pictures trained
+nothing, but the points may have guided training through other pictures that see them, too.
+Shapes: S sight lines, P points.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import pycolmap
+from scipy import spatial
+
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.geometry import collision, convex
+from nerf2real.scenes.quality.collision_error import sample_parts
+
+TOLERANCE = 0.05  # m that matter may be away, as the other figures of contact geometry count
+_MOST_ERROR = 1.0  # reprojection error of points that judge [pixel]
+_FEWEST_VIEWS = 4  # pictures that see them
+_STEPS = 200  # of a march along a sight line; the closest of lines graze surfaces at centimetres
+_CONTACT = 0.005  # m from a true surface at which a march ends
+
+
+class SightLines(NamedTuple):
+  """Lines from cameras to the points that they see, world frame."""
+
+  eyes: np.ndarray  # [S, 3] m
+  points: np.ndarray  # [S, 3] m
+
+  @property
+  def lengths(self) -> np.ndarray:
+    """Lengths [S] [m]."""
+    length: np.ndarray = np.linalg.norm(self.points - self.eyes, axis=-1)
+    return length
+
+
+class Judgement(NamedTuple):
+  """What sight lines say of a geometry."""
+
+  lines: int  # that judged
+  blocked: float  # share that matter crosses more than the tolerance before the point
+  missed: float  # share of points with no matter within the tolerance
+  distance_median: float  # of points from matter [m]
+  distance_p95: float  # its 95th percentile [m]
+
+
+def sight_lines(
+  model: pycolmap.Reconstruction,
+  names: Sequence[str],
+  world_from_unit: Similarity,
+  *,
+  lower: np.ndarray,
+  upper: np.ndarray,
+) -> SightLines:
+  """Lists the sight lines of pictures to well localised points inside a box.
+
+  Args:
+    model: The localised model with its observations, unit frame.
+    names: Pictures that were held out.
+    world_from_unit: Maps the model to the world.
+    lower: Lower corner of the contact geometry [3] [m].
+    upper: Upper corner [3] [m].
+  """
+  good = {
+    number: point.xyz
+    for number, point in model.points3D.items()
+    if point.error < _MOST_ERROR and point.track.length() >= _FEWEST_VIEWS
+  }
+  eyes, points = [np.zeros((0, 3))], [np.zeros((0, 3))]
+  for image in model.images.values():
+    seen = [good[p.point3D_id] for p in image.points2D if p.point3D_id in good]
+    if image.name in set(names) and seen:
+      points.append(world_from_unit.apply(np.stack(seen)))
+      eye = world_from_unit.apply(image.cam_from_world().inverse().translation)
+      eyes.append(np.broadcast_to(eye, points[-1].shape))
+  eye, point = np.concatenate(eyes), np.concatenate(points)
+  inside = ((point > lower) & (point < upper)).all(-1)
+  return SightLines(eye[inside], point[inside])
+
+
+def judge(lines: SightLines, reach: np.ndarray, distance: np.ndarray) -> Judgement:
+  """Judges a geometry by its first hit along each line [S] and the points' distance from it [S]."""
+  return Judgement(
+    len(reach),
+    float((reach < lines.lengths - TOLERANCE).mean()),
+    float((distance > TOLERANCE).mean()),
+    float(np.median(distance)),
+    float(np.percentile(distance, 95)),
+  )
+
+
+def judge_parts(lines: SightLines, parts: Sequence[convex.Part]) -> Judgement | None:
+  """Judges convex parts and the floor plane at z = 0; None where there is no sight line."""
+  if not len(lines.eyes):
+    return None
+  model = collision.spec(parts).compile()
+  data = mujoco.MjData(model)
+  mujoco.mj_forward(model, data)
+  directions = (lines.points - lines.eyes) / lines.lengths[:, None]
+  reach, geom = np.empty(len(directions)), np.zeros(1, np.int32)
+  for row, (eye, direction) in enumerate(zip(lines.eyes, directions, strict=True)):
+    found = mujoco.mj_ray(model, data, eye, direction, None, 1, -1, geom)
+    reach[row] = found if geom[0] >= 0 else np.inf
+  to_parts = spatial.cKDTree(sample_parts(parts)).query(lines.points)[0]
+  return judge(lines, reach, np.minimum(to_parts, np.abs(lines.points[:, 2])))
+
+
+def judge_truth(
+  lines: SightLines, distance_to_surface: Callable[[np.ndarray], np.ndarray]
+) -> Judgement:
+  """Judges the true surface, whose every fault is the judge's own.
+
+  Args:
+    lines: Sight lines in the truth's frame.
+    distance_to_surface: Distances [P] of points [P, 3] from the true surface, outside it [m].
+  """
+  directions = (lines.points - lines.eyes) / lines.lengths[:, None]
+  reach = np.zeros(len(directions))
+  going = np.arange(len(directions))
+  for _ in range(_STEPS):
+    near = np.abs(distance_to_surface(lines.eyes[going] + reach[going, None] * directions[going]))
+    reach[going] += near
+    going = going[(near > _CONTACT) & (reach[going] < lines.lengths[going] + TOLERANCE)]
+    if not len(going):
+      break
+  return judge(lines, reach, np.abs(distance_to_surface(lines.points)))

@@ -1,0 +1,145 @@
+"""RGB-D sequences with known poses: TUM's and 7-Scenes' folders, transforms.json with depth."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.scenes.alignment import scale
+from nerf2real.scenes.alignment.evidence import Evidence
+from nerf2real.scenes.alignment.floor import Floor
+from nerf2real.scenes.alignment.overrides import Overrides
+from nerf2real.scenes.capture import keyframes
+from nerf2real.scenes.capture.capture import (
+  CaptureError,
+  CaptureSettings,
+  read_capture,
+  source_kind,
+)
+from nerf2real.scenes.poses import localise
+from tests.scenes import synthetic_capture as synthetic
+
+SETTINGS = CaptureSettings(num_keyframes=8)
+POSES = synthetic.walk(16)
+INFO = """image_width: 320
+image_height: 240
+distortion_model: plumb_bob
+camera_matrix: {data: [280.0, 0, 159.5, 0, 280.0, 119.5, 0, 0, 1]}
+distortion_coefficients: {data: [0, 0, 0, 0, 0]}
+"""
+
+
+def _pictures(folder, color, depth, unit):
+  """Writes colour and depth pictures under the names' patterns."""
+  for row, pose in enumerate(POSES):
+    image, reach = synthetic.cast(pose)
+    for name, picture in (
+      (color.format(row), image),
+      (depth.format(row), np.where(np.isfinite(reach), reach / unit, 0).astype(np.uint16)),
+    ):
+      (folder / name).parent.mkdir(parents=True, exist_ok=True)
+      cv2.imwrite(str(folder / name), picture)
+
+
+@pytest.fixture(scope="module")
+def tum(tmp_path_factory):
+  folder = tmp_path_factory.mktemp("tum")
+  _pictures(folder, "rgb/{:03d}.png", "depth/{:03d}.png", 1 / 5000)
+  (folder / "camera_info.yaml").write_text(INFO)
+  times = 100 + np.arange(len(POSES)) / 30
+  for kind, late in (("rgb", 0.0), ("depth", 0.004)):
+    rows = [f"{t + late:.4f} {kind}/{k:03d}.png" for k, t in enumerate(times)]
+    (folder / f"{kind}.txt").write_text("\n".join(["# a comment", *rows]))
+  rows = []
+  for t, pose in zip(times, POSES, strict=True):
+    numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+    rows.append(f"{t - 0.002:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
+  (folder / "groundtruth.txt").write_text("\n".join(rows))
+  return folder
+
+
+def _off_the_planes(points):
+  """Distance [P] of points [P, 3] from the nearest of the three planes."""
+  return np.abs(points - [3.0, 3.0, 0.0]).min(-1)
+
+
+def _check(capture):
+  known = capture.known
+  numbers = [int(path.stem.split("_")[1]) for path in capture.images]
+  np.testing.assert_allclose(known.world_from_camera, POSES[numbers], atol=1e-5)
+  assert known.is_metric and len(known.sightings) > 8 * 200
+  assert _off_the_planes(known.points).max() < 0.005
+  # a point lies where its pixel looks
+  picture, x, y, reach = known.sightings[len(known.sightings) // 2]
+  pose = known.world_from_camera[int(picture)]
+  local = (known.points[len(known.points) // 2] - pose[:3, 3]) @ pose[:3, :3]
+  np.testing.assert_allclose(known.camera.project(local), [x, y], atol=1e-3)
+  assert np.linalg.norm(local) == pytest.approx(reach)
+
+
+def test_a_tum_sequence_gives_poses_and_depth(tum, tmp_path):
+  assert source_kind(tum) == "rgbd"
+  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+  _check(capture)
+  keyframes.save(capture, tmp_path)
+  again = keyframes.load(tmp_path, tmp_path / "images")
+  np.testing.assert_allclose(again.known.sightings, capture.known.sightings)
+
+
+def test_a_seven_scenes_sequence_gives_poses_and_depth(tmp_path):
+  folder = tmp_path / "seq-01"
+  _pictures(folder, "frame-{:06d}.color.png", "frame-{:06d}.depth.png", 1e-3)
+  (folder / "camera_info.yaml").write_text(INFO)
+  for row, pose in enumerate(POSES):
+    np.savetxt(folder / f"frame-{row:06d}.pose.txt", pose)
+  _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
+
+
+def test_transforms_with_depth_give_points(tmp_path):
+  _pictures(tmp_path, "rgb/{:03d}.png", "depth/{:03d}.png", 1e-3)
+  frames = []
+  for row, pose in enumerate(POSES):
+    matrix = pose.copy()
+    matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
+    names = {"file_path": f"rgb/{row:03d}.png", "depth_file_path": f"depth/{row:03d}.png"}
+    frames.append(names | {"transform_matrix": matrix.tolist()})
+  about = {"w": 320, "h": 240, "fl_x": 280.0, "frames": frames}
+  (tmp_path / "transforms.json").write_text(json.dumps(about))
+  _check(read_capture(tmp_path, tmp_path / "images", settings=SETTINGS))
+
+
+def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path):
+  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+  found = localise.localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
+  assert found.registered_fraction == 1.0 and "rgbd" in found.strategy
+  metres = found.unit_from_source.inverse()
+  assert _off_the_planes(metres.apply(found.points)).max() < 0.006
+  floor = Floor(np.array([0, 0, 1.0]), -0.5, 100, 1.0, 0.0, 0.0)
+  evidence = Evidence(found.points, found.world_from_camera, sensor_scale=metres.scale)
+  chosen = scale.choose_scale(
+    evidence,
+    Overrides(),
+    floor=floor,
+    camera_height=1.0,
+    guessed_camera_height=1.4,
+    max_marker_spread=0.05,
+  )
+  assert chosen.source == "depth_sensor" and chosen.value.metres_per_unit == metres.scale
+
+
+def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
+  folder = tmp_path / "tum"
+  folder.mkdir()
+  (folder / "rgb.txt").write_text("1.0 rgb/0.png\n")
+  (folder / "groundtruth.txt").write_text("9.0 0 0 0 0 0 0 1\n")
+  with pytest.raises(CaptureError, match="no picture has a pose"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  (folder / "groundtruth.txt").write_text("1.0 0 0 0 0 0 0 1\n")
+  with pytest.raises(CaptureError, match="missing, as 0.png"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  (folder / "groundtruth.txt").write_text("1.0 0 0\n")
+  with pytest.raises(CaptureError, match="expected 8 columns"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)

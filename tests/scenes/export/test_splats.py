@@ -1,0 +1,126 @@
+"""Splats: their derivatives, their file in a foreign reader, their start, their fit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nerf2real.core.cameras import Camera
+from nerf2real.scenes.export.splats import fitting, projection, rasteriser, start
+from nerf2real.scenes.export.splats.splats import Splats
+from tests.scenes import furnished_room
+
+CAMERA = Camera(width=20, height=16, fx=18.0, fy=18.0, cx=10.0, cy=8.0)
+
+
+def _parameters(rng, count):
+  points = start.Seeds(
+    positions=rng.uniform([-1, -1, 2], [1, 1, 4], (count, 3)),
+    normals=rng.normal(size=(count, 3)),
+    colors=rng.uniform(size=(count, 3)),
+    spacing=np.full(count, 0.5),
+  )
+  return points
+
+
+def test_derivatives_are_those_of_finite_differences():
+  rng = np.random.default_rng(3)
+  points = _parameters(rng, 6)
+  rows, starts = start.rows_of(points), points.positions
+  rows[:, 3:6] += 1.5  # so wide that no pixel comes and goes with a finite step
+  eye = projection.Eye.at(CAMERA, np.eye(4), blur=0.3)
+  weights = rng.normal(size=(16, 20, 3))
+
+  def loss(gaussians):
+    tiles = rasteriser.assign(*gaussians[:3], depth, width=20, height=16)
+    inputs = (*tiles, *gaussians, 20, 16)
+    image, left, looked = rasteriser.composite(*inputs)
+    return float((image * weights).sum()), inputs, left, looked
+
+  gaussians, found = projection.project(rows, starts, points.spacing, eye)
+  depth = np.asarray(found)
+  gaussians = projection.Projected(*(np.array(array, np.float64) for array in gaussians))
+  _, inputs, left, looked = loss(gaussians)
+  slopes = rasteriser.composite_backward(*inputs, left, looked, weights)
+  for kind, slope in zip(projection.Projected._fields, slopes, strict=True):
+    values = getattr(gaussians, kind)
+    for index in np.ndindex(values.shape):
+      step = 1e-4 * abs(values[index]) + 1e-6
+      ends = []
+      for sign in (-1, 1):
+        moved = values.copy()
+        moved[index] += sign * step
+        ends.append(loss(gaussians._replace(**{kind: moved}))[0])
+      expected = (ends[1] - ends[0]) / (2 * step)
+      assert slope[index] == pytest.approx(expected, rel=1e-3, abs=1e-5 * np.abs(slope).max())
+
+
+def test_a_round_splat_covers_what_its_size_says():
+  """A Gaussian of 0.1 m at 2 m with a focal length of 18 pixels has a deviation of 0.9 pixels."""
+  row = np.array([[0.0, 0, 0, *np.log([0.1] * 3), 0.3, 0.1, -0.7, 0.2, 0, 1, 1, 1]])
+  eye = projection.Eye.at(CAMERA, np.eye(4), blur=0.3)
+  found, depth = projection.project(row, np.array([[0.0, 0.0, 2.0]]), np.ones(1), eye)
+  np.testing.assert_allclose(found.centres, [[10.0, 8.0]], atol=1e-5)
+  np.testing.assert_allclose(1 / found.conics[0, [0, 2]], 0.9**2 + 0.3, rtol=1e-4)
+  np.testing.assert_allclose(found.conics[0, 1], 0.0, atol=1e-5)
+  assert float(depth[0]) == pytest.approx(2.0)
+
+
+def test_the_file_opens_with_plyfile(tmp_path):
+  plyfile = pytest.importorskip("plyfile")
+  rng = np.random.default_rng(0)
+  rotations = rng.normal(size=(7, 4))
+  splats = Splats(
+    positions=rng.normal(size=(7, 3)),
+    rotations=rotations / np.linalg.norm(rotations, axis=1, keepdims=True),
+    scales=rng.uniform(0.01, 0.1, (7, 3)),
+    opacities=rng.uniform(0.1, 0.9, 7),
+    colors=rng.uniform(size=(7, 3)),
+  )
+  splats.save_ply(tmp_path / "room.ply")
+  vertex = plyfile.PlyData.read(str(tmp_path / "room.ply"))["vertex"]
+  np.testing.assert_allclose(
+    np.stack([vertex[axis] for axis in "xyz"], 1), splats.positions, rtol=1e-6
+  )
+  np.testing.assert_allclose(
+    np.exp([vertex[f"scale_{k}"] for k in range(3)]).T, splats.scales, rtol=1e-5
+  )
+  np.testing.assert_allclose(1 / (1 + np.exp(-vertex["opacity"])), splats.opacities, rtol=1e-5)
+  np.testing.assert_allclose(0.5 + 0.28209479 * vertex["f_dc_1"], splats.colors[:, 1], rtol=1e-5)
+  again = Splats.load_ply(tmp_path / "room.ply")
+  np.testing.assert_allclose(again.rotations, splats.rotations, atol=1e-6)
+
+
+def _views(size):
+  camera = Camera.from_vertical_fov(0.9, size[1], size[0])
+  poses = furnished_room.walk(6)
+  views = furnished_room.depth_views(poses, camera)
+  points = poses[:, None, None, :3, 3] + np.einsum(
+    "nij,nhwj->nhwi", poses[:, :3, :3], camera.rays() * views.depth[..., None]
+  )
+  color = 127 + 100 * np.sin(points * [2.0, 3.0, 4.0])
+  return dataclasses.replace(views, color=color.astype(np.uint8))
+
+
+def test_splats_start_on_the_surface_and_are_finer_where_seen_from_near():
+  views = _views((24, 32))
+  points = start.thin_to(start.seeds(views, far=10.0, spacing=1.0), count=2500, finest=0.02)
+  assert 1000 < len(points.positions) <= 2500
+  assert np.percentile(furnished_room.distance(points.positions), 95) < 0.02
+  eyes = views.positions
+  nearest = np.linalg.norm(points.positions[:, None] - eyes, axis=-1).min(1)
+  near, far = nearest < np.quantile(nearest, 0.2), nearest > np.quantile(nearest, 0.8)
+  assert points.spacing[near].mean() < 0.8 * points.spacing[far].mean()
+
+
+def test_a_short_fit_brings_the_pictures_nearer():
+  views = _views((24, 32))
+  assert views.color is not None
+  points = start.thin_to(start.seeds(views, far=10.0, spacing=1.5), count=1500, finest=0.03)
+  fit = fitting.Fit(points)
+  errors = [
+    fit.step(views.camera, views.frame_from_camera[k % 6], views.color[k % 6] / 255.0, blur=0.3)
+    for k in range(90)
+  ]
+  before, after = (-10 * np.log10(np.mean(part)) for part in (errors[:6], errors[-6:]))
+  assert after > before + 5 and after > 28

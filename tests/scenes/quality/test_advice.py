@@ -1,0 +1,97 @@
+"""Verdicts on captures: blur, exposure, gaps, the loop, and which side of a room was not filmed."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from nerf2real.core.cameras import Camera
+from nerf2real.scenes.capture.capture import Capture, CaptureSettings
+from nerf2real.scenes.quality import advice
+from nerf2real.scenes.quality.coverage import coverage
+from tests.scenes import furnished_room
+
+CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+EXTENT = (np.array([-2.5, -2.0, 0.0]), np.array([2.5, 2.0, 2.5]))
+
+
+def _capture(tmp_path, *, sharpness=200.0, brightness=120.0, count=20) -> Capture:
+  return Capture(
+    kind="video",
+    folder=tmp_path,
+    images=[tmp_path / f"frame_{k:06d}.jpg" for k in range(count)],
+    width=640,
+    height=480,
+    sharpness=np.broadcast_to(sharpness, count),
+    brightness=np.broadcast_to(brightness, count),
+    times=3.0 * np.arange(count),
+    warnings=[],
+  )
+
+
+def test_good_pictures_are_good_and_bad_ones_are_named_with_their_times(tmp_path):
+  good = advice.judge_pictures(_capture(tmp_path), CaptureSettings())
+  assert all(finding.good for finding in good)
+  values = np.full(20, 200.0)
+  values[4:12] = 5.0
+  light = np.where(np.arange(20) < 5, 30.0, 200.0)
+  blur, exposure = advice.judge_pictures(
+    _capture(tmp_path, sharpness=values, brightness=light), CaptureSettings()
+  )
+  assert not blur.good and "40%" in blur.text and "0:12 to 0:33" in blur.text
+  assert not exposure.good and "factor of 6.7" in exposure.text
+
+
+def _poses(yaws, tilt):
+  """Cameras in the middle of the room that look around at an angle downwards."""
+  middle = np.array([0.0, 0.0, 1.4])
+  eyes = middle + 0.4 * np.stack([np.cos(yaws), np.sin(yaws), 0 * yaws], -1)
+  ways = np.stack([np.cos(yaws), np.sin(yaws), 0 * yaws - np.tan(tilt)], -1)
+  return np.array([furnished_room.look_at(e, e + w) for e, w in zip(eyes, ways, strict=True)])
+
+
+def test_a_walk_that_looks_everywhere_covers_floor_and_walls():
+  around = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+  poses = np.concatenate([_poses(around, 0.2), _poses(around, 0.9)])
+  found = coverage(CAMERA, poses, EXTENT)
+  assert found.shares[0] > 0.9 and found.shares[1] > 0.9
+  assert all(finding.good for finding in advice.judge_coverage(found, poses))
+
+
+def test_the_side_that_was_not_filmed_is_named_and_drawn():
+  poses = _poses(np.linspace(-1.0, 1.0, 40), 0.3)  # towards +x only: 12 o'clock is 57 degrees right
+  found = coverage(CAMERA, poses, EXTENT)
+  assert found.gaps[:, 0].mean() < -0.3
+  walls = advice.judge_coverage(found, poses)[1]
+  assert not walls.good
+  hours = {int(word) for word in walls.text.replace(",", "").split() if word.isdigit()}
+  # -x lies 123 degrees to the right of the first picture: 4 o'clock
+  assert hours & {3, 4, 5} and not hours & {10, 11, 1}
+  picture = advice.draw(found, poses, EXTENT)
+  marked = (picture == advice._GAP).all(-1)
+  assert marked[:, : picture.shape[1] // 2].sum() > 2 * marked[:, picture.shape[1] // 2 :].sum()
+
+
+def _model(tracks):
+  """A stand-in for a localised model with 20 pictures and the given tracks."""
+  images = {k: SimpleNamespace(name=f"frame_{k:06d}.jpg") for k in range(20)}
+  points = [
+    SimpleNamespace(track=SimpleNamespace(elements=[SimpleNamespace(image_id=k) for k in track]))
+    for track in tracks
+  ]
+  return SimpleNamespace(images=images, points3D=dict(enumerate(points)))
+
+
+@pytest.mark.parametrize(("tracks", "closed"), [([(0, 19)] * 40, True), ([(0, 5)] * 40, False)])
+def test_a_loop_is_closed_where_the_end_sees_what_the_beginning_saw(tracks, closed):
+  names = [f"frame_{k:06d}.jpg" for k in range(20)]
+  shared = advice._shared_points(_model(tracks), names)
+  assert (shared >= advice._LOOP_POINTS) == closed
+
+
+def test_without_poses_the_verdict_is_the_reason(tmp_path):
+  verdict = advice.judge(_capture(tmp_path), CaptureSettings(), reason="3 of 20 were localised.")
+  assert not verdict.good and verdict.picture is None
+  assert verdict.paragraph.startswith("Film again") and "3 of 20" in verdict.paragraph
+  assert advice._shared_points(pycolmap.Reconstruction(), []) is None
