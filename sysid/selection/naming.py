@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.selection.decision import USUAL
 from nerf2real.sysid.selection.explain import Scored, clear
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -77,11 +78,23 @@ def conclude(
       top = max(same, key=lambda s: s.evidence)
       if clear(top, best) > beyond:
         best = top
+  best = _usual(joint, best, ranked, beyond)
   names = tuple(_name(joint, best, kind, ranked, beyond) for kind in sorted(best.names))
   left = best.fit.held[0][0]
   bare = next(s for s in ranked if not s.names)
   share = _share(left, bare.fit.held[0][0] if without is None else without)
   return Explanation(best, names, left, *share)
+
+
+def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
+  """Returns the most usual of the hypotheses that predict what the best one does."""
+  order = {kind: index for index, kind in enumerate(USUAL)}
+  alike = [
+    s
+    for s in ranked
+    if len(s.names) == len(best.names) and clear(best, s) < beyond and _same(joint, best, s)
+  ]
+  return min([best, *alike], key=lambda s: sorted(order.get(k, len(order)) for k in s.names))
 
 
 def _name(
