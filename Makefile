@@ -1,5 +1,5 @@
-# make demo: the main job on the built-in room; make loop: the closed loop with the shipped policy; make
-# test: all tests. All install first.
+# make see: a walking robot in the browser; make demo: the main job on the built-in room; make loop: the
+# closed loop with the shipped policy; make test: all tests. All install first.
 SHELL := /bin/bash
 # the first interpreter that runs, is new enough and can make environments
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -7,7 +7,10 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
   && { echo $$p; break; }; done)
 BIN := .venv/bin
 
-.PHONY: demo loop test lint install clean
+.PHONY: see demo loop test lint install clean
+see: install
+	$(BIN)/python launch/view.py --task nerf_nav --policy walker
+
 demo: install
 	$(BIN)/python launch/make_scene.py --capture builtin --preset demo --out out/demo
 	@echo "open out/demo/report.html"
@@ -34,7 +37,7 @@ install: .venv/installed
 	@$(PYTHON) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: $(PYTHON) is older than Python 3.11 or has no venv module (package python3-venv)"; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all,test,dev]'
 	@touch $@
 
 clean:

@@ -24,6 +24,7 @@ from benchmarks.ledger.records import ROOT, Record
 MOVE = "b263fe5"  # commit that moved the code into folders; earlier figures are of the code before
 TEMPLATES = Path(__file__).parent / "ledger" / "tables.md"
 PAGE = Path("docs/figures.md")
+_OVERVIEW = "root"  # the block on top of the page of all figures
 _READMES = ("README.md", "*/README.md", "*/*/README.md")
 _LINKS = "nerf2real"  # holds links to the folders
 _VALUE = re.compile(r"\{([a-z0-9_.]+)/([A-Za-z0-9_]+)(\.[a-z]+)?(:[^{}]*)?\}")
@@ -87,8 +88,9 @@ def fill(text: str, blocks: Mapping[str, str], records: Mapping[str, Record]) ->
   return prose.BLOCK.sub(block, text)
 
 
-def figures_page(records: Mapping[str, Record]) -> str:
-  """Returns docs/figures.md: every record, a table a topic."""
+def figures_page(records: Mapping[str, Record], blocks: Mapping[str, str]) -> str:
+  """Returns docs/figures.md: the most important figures, then every record, a table a topic."""
+  overview = render(blocks[_OVERVIEW], records).replace("](", "](../").rstrip()
   lines = [
     "# All figures",
     "",
@@ -98,6 +100,7 @@ def figures_page(records: Mapping[str, Record]) -> str:
     f"was not noted. *Old*: not measured since commit {MOVE} moved the code.",
     "",
     "AMD EPYC is all that the processor of that virtual machine says of its name.",
+    *("", "## At a glance", "", overview),
   ]
   topics: dict[str, list[Record]] = {}
   for record in records.values():
@@ -148,7 +151,7 @@ def differences(
 ) -> dict[Path, str]:
   """Returns the files that differ from what the records give, with what they should hold."""
   texts = {path: fill(path.read_text(), blocks, records) for path in readmes(root)}
-  texts[root / PAGE] = figures_page(records)
+  texts[root / PAGE] = figures_page(records, blocks)
   return {
     path: text for path, text in texts.items() if not path.is_file() or path.read_text() != text
   }
@@ -165,7 +168,7 @@ def check(
     f"{path.relative_to(root)}: differs from its records; run python benchmarks/tables.py --write"
     for path in differences(root, records, blocks)
   ]
-  used: set[str] = set()
+  used = {_OVERVIEW}  # on the page of all figures
   for path in readmes(root):
     text, name = path.read_text(), str(path.relative_to(root))
     used |= {match[1] for match in prose.BLOCK.finditer(text)}

@@ -2,7 +2,7 @@
 
 The content goes to a temporary sibling, which is renamed when it is complete; after an error the
 sibling is removed and what was there before is untouched. A full disk or an exhausted quota is
-raised as `DiskFullError`, one line for the user.
+raised as `DiskFullError`, one line for the user. A line is appended whole or not at all.
 """
 
 import contextlib
@@ -14,35 +14,43 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-_FULL = (errno.ENOSPC, errno.EDQUOT)
+_REASONS = {
+  errno.ENOSPC: "the disk is full",
+  errno.EDQUOT: "the disk quota is used up",
+  errno.EFBIG: "the limit of a file's size is reached",
+}
 
 
 class DiskFullError(OSError):
-  """The disk or the quota is exhausted; the message is one line that names the path."""
+  """The disk, quota or file size is exhausted; the message is one line that names the path."""
 
   def __str__(self) -> str:
     return str(self.strerror)
 
 
 def is_disk_full(error: BaseException) -> bool:
-  """Returns whether an error means that the disk or the quota is exhausted."""
-  return isinstance(error, OSError) and error.errno in _FULL
+  """Returns whether an error means that the disk, the quota or the file's size is exhausted."""
+  return isinstance(error, OSError) and error.errno in _REASONS
 
 
 @contextlib.contextmanager
 def explain_disk_full(path: str | Path) -> Iterator[None]:
-  """Raises DiskFullError, naming `path`, where the block raises ENOSPC or EDQUOT."""
+  """Raises DiskFullError, naming `path`, where the block raises ENOSPC, EDQUOT or EFBIG."""
   try:
     yield
   except DiskFullError:
     raise
   except OSError as error:
-    if not is_disk_full(error):
+    if error.errno not in _REASONS:
       raise
-    reason = "the disk is full" if error.errno == errno.ENOSPC else "the disk quota is used up"
-    raise DiskFullError(
-      error.errno, f"Could not write {path}: {reason}. Free some space and try again.", str(path)
-    ) from error
+    raise disk_full(path, error.errno) from error
+
+
+def disk_full(path: str | Path, number: int = errno.ENOSPC) -> DiskFullError:
+  """Returns the error for a path that could not be written, of an error number."""
+  reason = _REASONS[number]
+  text = f"Could not write {path}: {reason}. Free some space and try again."
+  return DiskFullError(number, text, str(path))
 
 
 @contextlib.contextmanager
@@ -73,6 +81,26 @@ def write_atomically(path: str | Path, content: str | bytes) -> None:
   """Writes text (UTF-8) or bytes; see `atomic_path` for the errors."""
   with atomic_path(path) as partial:
     partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def append_line(path: str | Path, text: str) -> None:
+  """Appends a line of text (UTF-8); after an error the file is as it was before.
+
+  Raises:
+    DiskFullError: The disk or the quota is exhausted.
+  """
+  path = Path(path)
+  existed = path.exists()
+  with explain_disk_full(path), path.open("ab", buffering=0) as stream:
+    before, rest = stream.tell(), memoryview(f"{text}\n".encode())
+    try:
+      while rest:
+        rest = rest[stream.write(rest) :]
+    except OSError:
+      stream.truncate(before)
+      if not existed:
+        path.unlink()
+      raise
 
 
 @contextlib.contextmanager

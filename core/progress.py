@@ -1,11 +1,13 @@
-"""Progress reports of long computations, and the progress bar that shows them."""
+"""Progress reports of long computations, and what shows them: a bar, or lines where it is piped."""
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 
 from rich import progress as rich_progress
 from rich.console import Console
 
+_LINE_PERIOD = 10.0  # s between lines
 Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is being done
 
 
@@ -29,9 +31,16 @@ def part(progress: Progress, start: float, end: float) -> Progress:
 def progress_bar(
   name: str, *, shown: bool = True, console: Console | None = None
 ) -> Iterator[Progress]:
-  """Draws a progress bar in the terminal while the block runs; yields what moves it."""
+  """Shows progress while the block runs; yields what moves it.
+
+  A terminal gets a bar. A pipe or a file gets plain lines, at most one in ten seconds.
+  """
   if not shown:
     yield no_progress
+    return
+  console = console or Console(stderr=True)
+  if not console.is_terminal:
+    yield _Lines(name, console)
     return
   columns = (
     rich_progress.TextColumn(f"{name:<12}"),
@@ -44,3 +53,23 @@ def progress_bar(
   with rich_progress.Progress(*columns, console=console) as bar:
     task = bar.add_task("", total=1.0)
     yield lambda fraction, text: bar.update(task, completed=fraction, description=text)
+
+
+class _Lines:
+  """Prints progress as lines: share done, time, time left."""
+
+  def __init__(self, name: str, console: Console):
+    self._name, self._console = name, console
+    self._begin = self._printed = time.monotonic()
+    self._told = False
+
+  def __call__(self, fraction: float, text: str) -> None:
+    now = time.monotonic()
+    ends = fraction >= 1.0 and self._told  # a short stage says nothing
+    if now - self._printed < _LINE_PERIOD and not ends:
+      return
+    self._printed, self._told = now, True
+    took = now - self._begin
+    left = f", about {took / fraction - took:.0f} s left" if 0.01 < fraction < 1.0 else ""
+    line = f"{self._name}: {fraction:.0%} after {took:.0f} s{left}: {text}"
+    self._console.print(line, soft_wrap=True, highlight=False, markup=False)

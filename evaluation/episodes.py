@@ -93,7 +93,7 @@ class Episode:
 
 
 class Store:
-  """The episodes of an evaluation's folder."""
+  """The episodes of an evaluation's folder; of two of one trial the first counts."""
 
   def __init__(self, folder: Path):
     """Opens a folder, and reads what earlier runs left.
@@ -104,15 +104,16 @@ class Store:
     self.path = Path(folder) / FILE
     self.path.parent.mkdir(parents=True, exist_ok=True)
     self.episodes: list[Episode] = []
+    self.duplicates = 0  # episodes that were left out
     if self.path.exists():
       self._read()
 
   def _read(self) -> None:
     text = self.path.read_text()
-    lines = text.splitlines()
+    lines, keys = text.splitlines(), self.done()
     for number, line in enumerate(lines):
       try:
-        self.episodes.append(from_plain(json.loads(line), Episode))
+        episode = from_plain(json.loads(line), Episode)
       except ValueError as error:
         if number == len(lines) - 1:  # the run was cut off while it wrote: that episode is rerun
           kept = "".join(f"{whole}\n" for whole in lines[:-1])
@@ -122,6 +123,11 @@ class Store:
           f"{self.path}, line {number + 1} is damaged ({error}): remove that line, its episode is "
           "run again."
         ) from error
+      if episode.key in keys:  # two processes wrote into the folder: counted once
+        self.duplicates += 1
+        continue
+      keys.add(episode.key)
+      self.episodes.append(episode)
     if text and not text.endswith("\n"):
       files.write_atomically(self.path, text + "\n")
 
@@ -131,8 +137,7 @@ class Store:
 
   def add(self, episode: Episode) -> None:
     """Keeps an episode."""
-    with self.path.open("a") as stream:
-      stream.write(json.dumps(to_plain(episode)) + "\n")
+    files.append_line(self.path, json.dumps(to_plain(episode)))
     self.episodes.append(episode)
 
 

@@ -73,8 +73,22 @@ def _encode(picture: np.ndarray) -> str:
   return base64.b64encode(data.tobytes()).decode()
 
 
+Watch = Callable[[dm_env.TimeStep, EvaluatedPolicy], None]
+"""Called with every step of an episode, the first one included, and the policy."""
+
+
+def unwatched(timestep: dm_env.TimeStep, policy: EvaluatedPolicy) -> None:
+  """Looks at nothing."""
+
+
 def run_trial(
-  plant: Plant, policy: EvaluatedPolicy, trial: Trial, *, group: str, index: int
+  plant: Plant,
+  policy: EvaluatedPolicy,
+  trial: Trial,
+  *,
+  group: str,
+  index: int,
+  watch: Watch = unwatched,
 ) -> Episode:
   """Runs one trial; it ends at the goal, on a failure or at the time limit.
 
@@ -84,8 +98,10 @@ def run_trial(
     trial: Where it starts.
     group: Of the trial within its protocol.
     index: Of the trial in its protocol.
+    watch: Sees every step.
   """
   timestep = plant.start(trial)
+  watch(timestep, policy)
   sight = plant.sight()
   policy.reset(sight)
   trace, step, reached = _Trace(), 0, False
@@ -93,6 +109,7 @@ def run_trial(
     action = policy.act(timestep.observation, goal=plant.goal, sight=sight)
     trace.add(step, sight, policy, timestep.observation.get("camera"))
     timestep = plant.step(action)
+    watch(timestep, policy)
     step += 1
     sight = plant.sight()
     failed = sight.collided or sight.fallen
@@ -143,6 +160,7 @@ def run_all(
   *,
   store: episodes.Store,
   report: Callable[[Episode, int, int], None] = lambda episode, number, count: None,
+  watch: Watch = unwatched,
 ) -> int:
   """Runs the trials that the store does not hold yet; returns how many were run.
 
@@ -152,6 +170,7 @@ def run_all(
     trials: Index in the plant's protocol, and group and trial.
     store: Keeps every episode as it ends.
     report: Called with an episode, its number and the number of trials.
+    watch: Sees every step of every episode.
   """
   setting, done = setting_of(plant, policy), store.done()
   listed = list(trials)
@@ -162,7 +181,7 @@ def run_all(
       continue
     while True:
       try:
-        episode = run_trial(plant, policy, trial, group=group, index=index)
+        episode = run_trial(plant, policy, trial, group=group, index=index, watch=watch)
         break
       except RepeatError:
         continue

@@ -4,37 +4,44 @@ Every evaluation adds its episodes to a folder, from which one report is made. O
 short goes on where it stopped.
 """
 
+import contextlib
 import dataclasses
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import dm_env
 import numpy as np
 
 from nerf2real.agents.environments.loading import camera_settings
+from nerf2real.core.files import write_atomically
+from nerf2real.core.folder_lock import lock_folder
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.controls import under_control
+from nerf2real.evaluation.driving import density
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants import swaps
 from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
+from nerf2real.evaluation.policy_names import WALKERS, policy_folder
 from nerf2real.evaluation.report import page as report
 from nerf2real.evaluation.report import tables
-from nerf2real.evaluation.settings import GAIT, EvaluationSettings
-from nerf2real.suite import loading
+from nerf2real.evaluation.settings import EvaluationSettings
+from nerf2real.suite.scene import open_scene
+
+_FILMED = (60, 80)  # pixels of the robot's picture in a film, if its policy looks at none
 
 
 def load_policy(settings: EvaluationSettings, scene: Any) -> EvaluatedPolicy:
   """Returns the policy that the settings name, with its observations falsified if they say so."""
   policy: EvaluatedPolicy
-  if settings.policy == GAIT:
+  if settings.policy in WALKERS:
     policy = GaitPolicy(scene, settings.protocol)
   else:
-    policy = LearnedPolicy(
-      Path(settings.policy), seed=settings.seed, stochastic=settings.stochastic
-    )
+    folder = policy_folder(settings.policy, task=plants.TASKS[settings.protocol])
+    policy = LearnedPolicy(folder, seed=settings.seed, stochastic=settings.stochastic)
   return under_control(policy, settings.control, scene=scene, protocol=settings.protocol)
 
 
@@ -159,13 +166,29 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
     The report's path; None after a dry run, which keeps nothing.
 
   Raises:
-    ValueError: A dry run of a plant that is no robot.
+    FolderInUseError: Another process evaluates into the folder.
+    ValueError: No trials; a dry run that is of no robot, or a film that is not of "sim".
   """
-  scene = loading.open_scene(settings.scene)
+  if settings.trials is not None and settings.trials < 1:
+    raise ValueError(f"--trials {settings.trials}: expected at least 1, or none for all.")
+  if settings.video is not None:
+    if settings.plant != "sim":
+      raise ValueError(f"--video films --plant sim, found --plant {settings.plant}.")
+    from nerf2real.suite.views.film import check_film
+
+    check_film(settings.video)
+  scene = open_scene(settings.scene)
   if settings.dry_run:
     _dry_run(settings, scene, say)
     return None
+  with lock_folder(settings.out):
+    return _evaluate(settings, scene, say)
+
+
+def _evaluate(settings: EvaluationSettings, scene: Any, say: Callable[[str], None]) -> Path:
   store = episodes.Store(settings.out)
+  if store.duplicates:
+    say(f"left out {store.duplicates} episodes that {store.path} holds twice")
   path = settings.out / "report.html"
   try:
     _run_trials(settings, scene, store, settings.trials, say)
@@ -181,7 +204,7 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
   text = "\n".join(tables.as_text(table) for table in shown)
   say(f"\n{text}")
   if settings.markdown is not None:
-    settings.markdown.write_text(text)
+    write_atomically(settings.markdown, text)
   return path
 
 
@@ -196,6 +219,28 @@ def _dry_run(settings: EvaluationSettings, scene: Any, say: Callable[[str], None
     _run_trials(settings, scene, episodes.Store(Path(folder)), settings.trials or 1, say)
 
 
+@contextlib.contextmanager
+def _filming(settings: EvaluationSettings, plant: Plant) -> Iterator[runner.Watch]:
+  """Yields what films the episodes, or does nothing."""
+  if settings.video is None:
+    yield runner.unwatched
+    return
+  from nerf2real.suite.views.film import Film, describe, open_film
+
+  with open_film(settings.video) as sink:
+    environment: Any = plant.environment
+    film = Film(environment, sink)
+
+    def watch(timestep: dm_env.TimeStep, policy: EvaluatedPolicy) -> None:
+      if timestep.first():
+        film.restart()
+      else:
+        text = describe(settings.protocol, environment.task)
+        film.add(timestep.observation, text, density=density(policy.belief, film.map_extent))
+
+    yield watch
+
+
 def _run_trials(
   settings: EvaluationSettings,
   scene: Any,
@@ -205,11 +250,16 @@ def _run_trials(
 ) -> None:
   policy = load_policy(settings, scene)
   size = policy.image_size or settings.camera_size
+  size = _FILMED if settings.video and size is None else size
   chosen = choose(plants.trials(settings.protocol), count)
   for single in each_plant(settings):
     plant = make_plant(single, scene, size, trained_on=policy.trained_on)
     say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
     try:
-      runner.run_all(plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)))
+      with _filming(settings, plant) as watch:
+        runner.run_all(
+          plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)), watch=watch
+        )
     finally:
       plant.close()
+    plant.check_recording()

@@ -4,15 +4,15 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-GAIT = "gait"
+WALKER = "walker"
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSettings:
   """What is evaluated, where and how."""
 
-  policy: str = GAIT
-  """Folder of an exported policy, or "gait" for the scripted walker."""
+  policy: str = WALKER
+  """"walker" (scripted), "shipped", a run's folder, or that of an exported policy."""
   plant: Literal["sim", "virtual", "both", "robot"] = "sim"
   """Where: the training simulation, virtual robots in the true room, both after one another, or a
   robot."""
@@ -56,6 +56,8 @@ class EvaluationSettings:
   """Length of an episode [s]; the task's own if not given."""
   markdown: Path | None = None
   """Writes the tables of everything in the folder to a Markdown file, too."""
+  video: Path | None = None
+  """Films the episodes that are run in simulation (.mp4, .webp or .gif)."""
   dry_run: bool = False
   """Robot only: reads everything and puts all questions, moves and keeps nothing; one trial without
   --trials."""

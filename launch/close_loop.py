@@ -30,6 +30,13 @@ class Arguments(LoopSettings):
 
 def run(arguments: Arguments) -> None:
   """Closes the loop and prints what it gave."""
+  from nerf2real.core.folder_lock import lock_folder
+
+  with lock_folder(arguments.out, name=".loop.lock"):  # its stages lock folders of their own
+    _close(arguments)
+
+
+def _close(arguments: Arguments) -> None:
   say = functools.partial(print, flush=True)
   if arguments.find_severity:
     from nerf2real.evaluation.loop import severity

@@ -10,13 +10,19 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import tyro
 
+from nerf2real.core.folder_lock import discarded_on, lock_folder
+
 FAILED = 1  # exit status: the input or the machine was at fault
 WRONG_ARGUMENTS = 2  # exit status, as of argparse and tyro: the same command cannot succeed
+_LEARNER = ".learner.lock"  # beside the lock of the run's supervisor
+_PATIENCE = 20.0  # s for a learner whose supervisor was killed to save what it has
+_LAST_PORT = 65535
 _SIGNALLED = 128  # plus the signal's number: the shell's convention
 
 DRAWING = {"MUJOCO_GL": "egl"}
@@ -34,6 +40,14 @@ class CommandError(Exception):
     """Takes the message, without "error:", and the exit status."""
     super().__init__(str(message))
     self.status = status
+
+
+class RefusedError(CommandError):
+  """Ends a command that cannot start with its arguments: nothing is left of it."""
+
+  def __init__(self, message: object):
+    """Takes the message, without "error:"."""
+    super().__init__(message, status=WRONG_ARGUMENTS)
 
 
 def main(
@@ -75,6 +89,7 @@ def main(
     return _SIGNALLED + signal.SIGPIPE
   received = [signal.SIGINT]
   try:
+    _check_port(getattr(values[0], "port", None))
     with _terminated_as_interrupted(received):
       return function(*values) or 0
   except CommandError as error:
@@ -82,10 +97,29 @@ def main(
   except errors as error:
     message, status = str(error), FAILED
   except KeyboardInterrupt:
+    for number in (signal.SIGINT, signal.SIGTERM):  # a second one would only add a trace
+      signal.signal(number, signal.SIG_IGN)
     _say(f"\n{interrupted}")
     return _SIGNALLED + received[-1]
   _say(f"error: {message}")
   return status
+
+
+def _hide_interrupt(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+  """Ends in one line where Ctrl-C comes while a script still imports."""
+  if issubclass(kind, KeyboardInterrupt):
+    _say("\ninterrupted")
+  else:
+    sys.__excepthook__(kind, error, trace)
+
+
+sys.excepthook = _hide_interrupt
+
+
+def _check_port(port: int | None) -> None:
+  """Raises RefusedError for a number that is no port's; servers would wait for ever."""
+  if port is not None and not 0 <= port <= _LAST_PORT:
+    raise RefusedError(f"--port {port}: expected 0 (a free one) to {_LAST_PORT}, such as 8080.")
 
 
 def _say(text: str) -> None:
@@ -107,6 +141,23 @@ def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]
     yield
   finally:
     signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def learner_folder(run: Path) -> Iterator[None]:
+  """Holds the lock of a run's folder, as its one learner; a refused start leaves nothing in it.
+
+  Raises:
+    CommandError: The folder cannot be written, or another learner writes it. This is no refusal for
+      good: where the other one was on a machine that was lost, a supervisor tries again.
+  """
+  with contextlib.ExitStack() as stack:
+    stack.enter_context(discarded_on(RefusedError, run))
+    try:
+      stack.enter_context(lock_folder(run, name=_LEARNER, patience=_PATIENCE))
+    except OSError as error:
+      raise CommandError(error) from error
+    yield
 
 
 def device(camera: str | None) -> str | int | None:

@@ -51,7 +51,7 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
-  return command.main(Arguments, run, errors=(), forwards=True)
+  return command.main(Arguments, run, errors=(OSError,), forwards=True)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from typing import Any
 import tyro
 
 from nerf2real.agents.link import sessions
-from nerf2real.agents.supervision.statuses import REFUSED
 from nerf2real.core.serialization import read_json
 from nerf2real.launch import command
 from nerf2real.launch.learner import DEFAULT_ENDPOINT, set_threads
@@ -64,6 +63,8 @@ def settings_of(arguments: Arguments) -> Any:
   from nerf2real.agents.distill import beginning, settings
 
   if arguments.resume:
+    if not (arguments.run / settings.SETTINGS).exists():
+      raise ValueError(f"{arguments.run} holds no run to continue: leave --resume out.")
     return read_json(arguments.run / settings.SETTINGS, settings.DistillSettings)
   changes: dict[str, Any] = {
     "environment": arguments.env,
@@ -83,12 +84,16 @@ def run(arguments: Arguments) -> None:
   Raises:
     CommandError: It cannot start with these arguments, or episodes can no longer be taken in.
   """
-  from nerf2real.agents.distill.learner import Learner
-
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s", force=True)
   set_threads(arguments.threads)
+  with command.learner_folder(arguments.run):
+    _distil(arguments)
+
+
+def _distil(arguments: Arguments) -> None:
+  from nerf2real.agents.distill.learner import Learner
+
   try:
-    arguments.run.mkdir(parents=True, exist_ok=True)
     learner = Learner(
       settings_of(arguments),
       arguments.run,
@@ -99,7 +104,7 @@ def run(arguments: Arguments) -> None:
       resume=arguments.resume,
     )
   except (ValueError, OSError, sessions.LinkError) as error:
-    raise command.CommandError(error, status=REFUSED) from error
+    raise command.RefusedError(error) from error
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())
   try:

@@ -53,14 +53,17 @@ def run(arguments: Arguments) -> None:
       status=command.WRONG_ARGUMENTS,
     )
   from nerf2real import sysid
+  from nerf2real.core.progress import progress_bar
 
-  content = sysid.identify(
-    arguments.model,
-    list(arguments.logs),
-    held=arguments.held,
-    reference=arguments.reference,
-    out=arguments.out,
-  )
+  with progress_bar("identify") as progress:
+    content = sysid.identify(
+      arguments.model,
+      list(arguments.logs),
+      held=arguments.held,
+      reference=arguments.reference,
+      out=arguments.out,
+      progress=progress,
+    )
   _print_content(content, arguments.out)
 
 

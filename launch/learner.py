@@ -20,7 +20,7 @@ import tyro
 
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.link import sessions
-from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
+from nerf2real.agents.supervision.statuses import NOT_SAVED
 from nerf2real.core.serialization import from_plain
 from nerf2real.launch import command
 
@@ -97,6 +97,8 @@ def agent_settings(arguments: Arguments) -> tuple[str, configs.DmpoConfig]:
   from nerf2real.agents.processes.checkpoints import read_info
 
   info: dict[str, Any] | None = read_info(arguments.run) if arguments.resume else None
+  if arguments.resume and info is None:
+    raise ValueError(f"{arguments.run} holds no checkpoint to go on from: leave --resume out.")
   if info is not None:
     environment, config = info["environment"], from_plain(info["config"], configs.DmpoConfig)
     given = arguments.env or environment
@@ -140,12 +142,17 @@ def run(arguments: Arguments) -> None:
     CommandError: It cannot start with these arguments, trajectories can no longer be taken in, or
       what was learned was not saved.
   """
+  logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
+  set_threads(arguments.threads)
+  with command.learner_folder(arguments.run):
+    _learn(arguments)
+
+
+def _learn(arguments: Arguments) -> None:
   from nerf2real.agents.processes.checkpoints import CheckpointError
   from nerf2real.agents.processes.learner import Learner, LearnerError
   from nerf2real.agents.processes.settings import RunSettings
 
-  logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s")
-  set_threads(arguments.threads)
   try:
     environment, config = agent_settings(arguments)
     names = {field.name for field in dataclasses.fields(RunSettings)} - {"environment"}
@@ -161,7 +168,8 @@ def run(arguments: Arguments) -> None:
       join=arguments.connect is not None,
     )
   except (ValueError, OSError, sessions.LinkError, CheckpointError) as error:
-    raise command.CommandError(error, status=REFUSED) from error
+    raise command.RefusedError(error) from error
+  _say_hello(arguments, learner)
   for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: learner.stop())
   try:
@@ -172,6 +180,20 @@ def run(arguments: Arguments) -> None:
     raise command.CommandError(
       f"The run ended and was not saved: {learner.problem}", status=NOT_SAVED
     )
+
+
+def _say_hello(arguments: Arguments, learner: Any) -> None:
+  """Logs where the learner listens, what it goes on from and what it computes on."""
+  import jax
+
+  device = jax.devices()[0]
+  counts = f"{learner.limiter.steps:,} steps and {learner.limiter.updates:,} updates"
+  logging.info(
+    "Listening at %s." if not arguments.connect else "Joined %s.",
+    arguments.connect or arguments.listen,
+  )
+  logging.info("Resumed with %s." if arguments.resume else "A new run: %s.", counts)
+  logging.info("Updates on %s (%s).", device.device_kind, device.platform)
 
 
 def main() -> int:

@@ -63,7 +63,7 @@ def supervised(train: Callable[[], str]) -> None:
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
-  return command.main(Arguments, run, errors=(), forwards=True)
+  return command.main(Arguments, run, errors=(OSError,), forwards=True)
 
 
 if __name__ == "__main__":

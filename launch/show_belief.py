@@ -8,7 +8,6 @@ green triangle the goal. Prints the distance between the belief's mean and the t
 """
 
 import dataclasses
-import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -41,6 +40,7 @@ def run(arguments: Arguments) -> None:
   import cv2
   import numpy as np
 
+  from nerf2real.core.files import write_atomically
   from nerf2real.evaluation.report.belief_pictures import draw_episode
 
   drawn = draw_episode(
@@ -51,7 +51,10 @@ def run(arguments: Arguments) -> None:
     max_steps=arguments.max_steps,
   )
   arguments.out.parent.mkdir(parents=True, exist_ok=True)
-  cv2.imwrite(os.fspath(arguments.out), drawn.picture[..., ::-1])
+  done, data = cv2.imencode(arguments.out.suffix, drawn.picture[..., ::-1])
+  if not done:
+    raise ValueError(f"{arguments.out} cannot be written: expected a name such as belief.png.")
+  write_atomically(arguments.out, data.tobytes())
   print(
     f"{len(drawn.errors)} steps, mean distance of the belief from the truth "
     f"{np.mean(drawn.errors):.2f} m, at the end {drawn.errors[-1]:.2f} m: {arguments.out}"

@@ -44,11 +44,15 @@ def run(arguments: Arguments) -> None:
   """Searches, and prints and writes every round."""
   import numpy as np
 
+  from nerf2real.core.files import write_atomically
   from nerf2real.suite.gaits import tuning, walk
 
   settings = walk.GaitSettings()
   if arguments.start is not None:
-    known = json.loads(arguments.start.read_text())["settings"]
+    try:
+      known = json.loads(arguments.start.read_text())["settings"]
+    except (ValueError, KeyError) as error:
+      raise ValueError(f"{arguments.start} is no result of an earlier search: {error}.") from error
     kept = {name: known[name] for name in tuning.BOUNDS if name in known}
     settings = dataclasses.replace(settings, **kept)
   names = ("generations", "population", "seconds", "worlds", "turning", "spread", "seed")
@@ -66,12 +70,12 @@ def run(arguments: Arguments) -> None:
         "walks": found.walks,
         "mean": dataclasses.asdict(found.mean),
       }
-      arguments.out.write_text(json.dumps(record, indent=1))
+      write_atomically(arguments.out, json.dumps(record, indent=1))
 
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
-  return command.main(Arguments, run, errors=(OSError,))
+  return command.main(Arguments, run, errors=(OSError, ValueError))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,11 @@
 """Shows a scene bundle, or a task in it, in the browser.
 
-python launch/view.py out/livingroom
-python launch/view.py out/livingroom --splats livingroom.ply
-python launch/view.py --task nerf_nav
+  python launch/view.py out/livingroom
+  python launch/view.py out/livingroom --splats livingroom.ply
+  python launch/view.py --task nerf_nav
+  python launch/view.py --task nerf_nav --policy runs/nav
+
+In a task the robot can be pushed: by the buttons, or by the handle above it.
 """
 
 import contextlib
@@ -28,6 +31,8 @@ class Arguments:
   """Shows a task of the suite in the scene, such as nerf_nav, instead of the scene alone."""
   splats: Path | None = None
   """Splats to show as a layer, as launch/export_scene.py --to splat writes them."""
+  policy: str = "walker"
+  """What acts in a task: walker, shipped, a run's folder, an exported policy's, stand or random."""
   host: str = "127.0.0.1"
   """Address to serve on; 0.0.0.0 lets other machines connect."""
   port: int = 8080
@@ -40,9 +45,19 @@ def run(arguments: Arguments) -> None:
   never = threading.Event()
   wait: Callable[[], object] = never.wait
   if arguments.task is not None:
+    from nerf2real.evaluation.driving import choose_driver
     from nerf2real.suite.viewer.task_viewer import view_task
+    from nerf2real.suite.views.drivers import SCRIPTED
 
-    viewer = view_task(arguments.task, scene=arguments.bundle, host=host, port=port)
+    chosen = choose_driver(arguments.policy, task=arguments.task)
+    viewer = view_task(
+      arguments.task,
+      scene=arguments.bundle,
+      drivers={chosen.name: chosen.make} | SCRIPTED,
+      image_size=chosen.image_size or (30, 40),
+      host=host,
+      port=port,
+    )
     server, wait = viewer.server, lambda: viewer.run(never)
   else:
     from nerf2real.scenes.bundle import Bundle

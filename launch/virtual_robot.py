@@ -60,6 +60,8 @@ def run(arguments: Arguments) -> None:
   from nerf2real.real.virtual.camera import VirtualCamera
   from nerf2real.real.virtual.robot import VirtualRobot
 
+  if not 0 <= arguments.loss <= 1:
+    raise ValueError(f"--loss {arguments.loss:g}: expected a share, 0 to 1, such as 0.05.")
   camera = VirtualCamera() if arguments.camera else None
   with (
     contextlib.suppress(KeyboardInterrupt),

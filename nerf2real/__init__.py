@@ -2,3 +2,5 @@
 
 The packages lie at the top of the checkout; the links beside this file give them their names.
 """
+
+__version__ = "0.1.0"

@@ -20,13 +20,98 @@ from nerf2real.scenes.quality import collision_error
 from nerf2real.scenes.results import Contact
 from nerf2real.scenes.stages import Made, StageResult, Stages
 
-_WORLD_VERSION = 2  # 2: the axes are unique
+_WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
+
+
+def outlook(
+  cache: Stages,
+  capture: Made[Capture],
+  poses: Made[Localisation],
+  settings: world_frame.AlignSettings,
+  *,
+  voxel: float,
+  marker_side: float | None,
+  override: Overrides,
+  override_key: str,
+) -> Made[markers.MarkerScale | None]:
+  """Finds markers, and refuses before the training what it could not help.
+
+  A world frame is found from the sparse points alone: where they show no floor, or the scale makes
+  the cameras' walk larger than a grid of voxels may be, the stages after the training would fail.
+
+  Args:
+    cache: The stages of the job.
+    capture: The keyframes, in which markers are looked for.
+    poses: Cameras and sparse points, unit frame.
+    settings: Of the alignment.
+    voxel: Edge of the surface mesh's voxels [m].
+    marker_side: Side of the black square of a marker in the room [m], or None.
+    override: What a person fixed.
+    override_key: Hash of the file that says so.
+
+  Returns:
+    The scale that markers give; None without one.
+
+  Raises:
+    ValueError: No floor was found, or the room is too large for its voxels.
+  """
+  found = poses.value
+
+  def write(folder: Path, progress: Progress) -> None:
+    marker = None
+    if marker_side is not None:
+      images = [capture.value.folder / name for name in found.names]
+      marker = markers.marker_scale(
+        markers.detect(images, progress=part(progress, 0.0, 0.8)),
+        camera=found.camera,
+        frame_from_camera=found.world_from_camera,
+        side=marker_side,
+      )
+    evidence = Evidence(
+      found.points,
+      found.world_from_camera,
+      marker=marker,
+      sensor_scale=_sensed_scale(capture.value, found),
+    )
+    frame = world_frame.align(
+      evidence, settings=settings, override=override, progress=part(progress, 0.8, 1.0)
+    )
+    # Sparse points stray; but the extent will hold every camera, and the floor below it.
+    cameras = frame.world_from_unit.apply(evidence.positions)
+    top = min(frame.camera_height, settings.max_height)
+    try:
+      fusion.grid_shape([*cameras.min(0)[:2], 0.0], [*cameras.max(0)[:2], top], voxel)
+    except ValueError as error:
+      raise ValueError(
+        f"{error} That box holds the cameras alone; its scale is from {frame.scale_source}: give "
+        "lengths in metres."
+      ) from error
+    write_json(folder / "marker.json", _FoundMarker(marker))
+
+  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
+  everything["voxel"] = voxel
+  stage = cache.run("outlook", write, settings=everything, inputs={"poses": poses.stamp})
+  return Made(read_json(stage.folder / "marker.json", _FoundMarker).scale, stage)
+
+
+@dataclasses.dataclass(frozen=True)
+class _FoundMarker:
+  """What the file of a stage holds."""
+
+  scale: markers.MarkerScale | None
+
+
+def _sensed_scale(capture: Capture, poses: Localisation) -> float | None:
+  """Metres a unit of length of poses that came with the capture; None where they are not metric."""
+  known = capture.known
+  return 1 / poses.unit_from_source.scale if known is not None and known.is_metric else None
 
 
 def world(
   cache: Stages,
   capture: Made[Capture],
   poses: Made[Localisation],
+  marker: Made[markers.MarkerScale | None],
   depth: Made[fusion.DepthViews],
   settings: world_frame.AlignSettings,
   *,
@@ -38,8 +123,9 @@ def world(
 
   Args:
     cache: The stages of the job.
-    capture: The keyframes, in which markers are looked for.
+    capture: The keyframes, which may have come with metric poses.
     poses: Cameras and sparse points, unit frame.
+    marker: The scale that markers give.
     depth: Rendered depth, unit frame.
     settings: Of the alignment.
     marker_side: Side of the black square of a marker in the room [m], or None.
@@ -49,25 +135,15 @@ def world(
   found = poses.value
 
   def write(folder: Path, progress: Progress) -> None:
-    marker = None
-    if marker_side is not None:
-      images = [capture.value.folder / name for name in found.names]
-      marker = markers.marker_scale(
-        markers.detect(images, progress=part(progress, 0.0, 0.6)),
-        camera=found.camera,
-        frame_from_camera=found.world_from_camera,
-        side=marker_side,
-      )
     points, normals = depth.value.surface_points(stride=2)
-    known = capture.value.known
-    sensed = 1 / found.unit_from_source.scale if known is not None and known.is_metric else None
+    sensed = _sensed_scale(capture.value, found)
     result = world_frame.align(
-      Evidence(found.points, found.world_from_camera, points, normals, marker, sensed),
+      Evidence(found.points, found.world_from_camera, points, normals, marker.value, sensed),
       settings=settings,
       override=override,
-      progress=part(progress, 0.6, 1.0),
+      progress=progress,
     )
-    if marker_side is not None and marker is None:
+    if marker_side is not None and marker.value is None:
       missing = (
         f"No marker of side {marker_side} m was read consistently in three pictures or more: "
         "print it larger, lay it flat, film it from nearer."
@@ -76,7 +152,7 @@ def world(
     write_json(folder / "alignment.json", result)
 
   everything = {"align": settings, "marker_side": marker_side, "override": override_key}
-  inputs = {"depth": depth.stamp}
+  inputs = {"depth": depth.stamp, "outlook": marker.stamp}
   stage = cache.run("world", write, settings=everything, inputs=inputs, version=_WORLD_VERSION)
   return Made(read_json(stage.folder / "alignment.json", world_frame.Alignment), stage)
 

@@ -7,6 +7,7 @@ cached by the hash of both (`stages`), so that a second run continues where the 
 from pathlib import Path
 
 from nerf2real.core import files
+from nerf2real.core.folder_lock import lock_folder
 from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages
 from nerf2real.scenes.alignment import overrides, surroundings
 from nerf2real.scenes.capture.capture import source_kind
@@ -42,18 +43,51 @@ def make_scene(
     The finished bundle.
 
   Raises:
+    FolderInUseError: Another process makes a scene in the folder.
     ValueError: The capture or a setting cannot be used; the message is one line.
   """
   out, source = Path(out), Path(source)
   fixed = overrides.read(override) if override else overrides.Overrides()
   source_kind(source)  # raises where it cannot be used
-  film = Source(source, files.hash_path(source))
-  cache = Stages(out / STAGES, show_progress=show_progress)
+  with lock_folder(out):
+    return _run_stages(
+      Source(source, files.hash_path(source)),
+      out,
+      Stages(out / STAGES, show_progress=show_progress),
+      settings=settings,
+      override=fixed,
+      override_key=files.hash_path(override) if override else "",
+      name=name or out.name,
+      measure=measure,
+    )
+
+
+def _run_stages(
+  film: Source,
+  out: Path,
+  cache: Stages,
+  *,
+  settings: SceneSettings,
+  override: overrides.Overrides,
+  override_key: str,
+  name: str,
+  measure: Measure | None,
+) -> bundle.Bundle:
 
   capture = image_stages.keyframes(cache, film, settings.capture)
   poses = image_stages.poses(cache, capture, settings.localise)
-  if fixed.floor_points is None:
+  if override.floor_points is None:
     surroundings.require_room(poses.value.world_from_camera, poses.value.points)
+  marker = geometry_stages.outlook(
+    cache,
+    capture,
+    poses,
+    settings.align,
+    voxel=settings.mesh.voxel,
+    marker_side=settings.marker_side,
+    override=override,
+    override_key=override_key,
+  )
   pictures = image_stages.PosedPictures(
     capture, poses, settings.train_width, settings.held_out_every
   )
@@ -64,11 +98,12 @@ def make_scene(
     cache,
     capture,
     poses,
+    marker,
     depth,
     settings.align,
     marker_side=settings.marker_side,
-    override=fixed,
-    override_key=files.hash_path(override) if override else "",
+    override=override,
+    override_key=override_key,
   )
   metric_depth = depth.value.transformed(world.value.world_from_unit)
   surface = geometry_stages.surface(cache, world, metric_depth, settings.mesh)
@@ -91,5 +126,5 @@ def make_scene(
     baseline=baseline,
   )
   return assembly.assemble(
-    results, out, name=name or out.name, settings=settings, stages=cache.results, measure=measure
+    results, out, name=name, settings=settings, stages=cache.results, measure=measure
   )

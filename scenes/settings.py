@@ -11,6 +11,18 @@ from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.geometry.mesh import MeshSettings
 from nerf2real.scenes.poses.localise import LocaliseSettings
 
+MARKER_SIDES = (0.01, 2.0)  # m: from a coin's size to a poster's
+CAMERA_HEIGHTS = (0.05, 10.0)  # m: from a crawling robot's to a tripod's on a gallery
+
+
+def check_length(what: str, found: float | None, limits: tuple[float, float]) -> None:
+  """Raises ValueError for a length outside its limits [m]: another unit was meant."""
+  if found is not None and not limits[0] <= found <= limits[1]:
+    raise ValueError(
+      f"{what} is in metres: found {found:g}, expected {limits[0]:g} to {limits[1]:g}, such as "
+      f"{found / 100:g} for {found:g} centimetres."
+    )
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneSettings:
@@ -42,6 +54,8 @@ class SceneSettings:
   """"colmap" adds the Poisson mesh of the COLMAP points to the report, as the paper compares."""
 
   def __post_init__(self):
+    check_length("The marker's side", self.marker_side, MARKER_SIDES)
+    check_length("The cameras' height", self.align.camera_height, CAMERA_HEIGHTS)
     if self.baseline not in ("none", "colmap"):
       raise ValueError(f"Unknown baseline {self.baseline!r}; expected 'none' or 'colmap'.")
 

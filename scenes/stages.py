@@ -62,8 +62,7 @@ class Stages:
   """Runs the stages of one job in a folder, with a progress bar for each."""
 
   def __init__(self, folder: Path, *, show_progress: bool = True):
-    self.folder = Path(folder)
-    self.folder.mkdir(parents=True, exist_ok=True)
+    self.folder = Path(folder)  # made by the first stage
     self.results: dict[str, StageResult] = {}
     self._show_progress = show_progress
 
@@ -130,8 +129,13 @@ class Stages:
     finally:
       seconds = earlier + time.monotonic() - start
       with contextlib.suppress(OSError):  # a full disk must not hide the error that is under way
-        self._write_record(work, {"seconds": seconds})
+        if _is_empty(work):  # nothing that another run could continue from
+          shutil.rmtree(work)
+          self.folder.rmdir()
+        else:
+          self._write_record(work, {"seconds": seconds})
     made = uuid.uuid4().hex
+    work.mkdir(parents=True, exist_ok=True)
     self._write_record(work, {"key": key, "made": made, "seconds": seconds, **description})
     files.replace_folder(work, final)
     result = StageResult(final, key, made, seconds, cached=False)
@@ -148,3 +152,8 @@ class Stages:
   @staticmethod
   def _write_record(folder: Path, record: Mapping[str, Any]) -> None:
     files.write_atomically(folder / _RECORD, json.dumps(record, indent=1, sort_keys=True))
+
+
+def _is_empty(folder: Path) -> bool:
+  """Returns whether a stage's folder holds nothing but its record."""
+  return all(path.name == _RECORD for path in folder.iterdir())

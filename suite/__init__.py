@@ -7,12 +7,13 @@ imported when `load` is: constants, specifications and filters are for a robot's
 import warnings
 from typing import TYPE_CHECKING, Any
 
+from nerf2real.suite.registry import known_tasks, register_task
 from nerf2real.suite.tasks.catalogue import ALL_TASKS
 
 if TYPE_CHECKING:
   from nerf2real.suite.loading import load
 
-__all__ = ["ALL_TASKS", "load"]
+__all__ = ["ALL_TASKS", "known_tasks", "load", "register_task"]
 
 # Without MUJOCO_GL, dm_control tries GLFW when it is imported, which warns if there is no display.
 # The simulation needs none.

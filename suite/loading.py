@@ -8,20 +8,13 @@ from nerf2real.core import errors
 from nerf2real.suite.effects import Effect, read_effects
 from nerf2real.suite.environment import Environment
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.registry import find_task
 from nerf2real.suite.scene import open_scene
 from nerf2real.suite.sensors.camera import CameraSettings, FieldRenderer, RobotCamera
-from nerf2real.suite.tasks import ball_push, nerf_nav
-from nerf2real.suite.tasks.base import RobotTask
-from nerf2real.suite.tasks.catalogue import ALL_TASKS, TIME_LIMITS
 from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP, TaskSettings
 
 if TYPE_CHECKING:
   from nerf2real.scenes.field.render.renderer import Renderer
-
-_TASKS: dict[str, type[RobotTask]] = {
-  nerf_nav.NAME: nerf_nav.NerfNav,
-  ball_push.NAME: ball_push.BallPush,
-}
 
 
 def load(
@@ -43,7 +36,7 @@ def load(
   """Loads a task in a scene.
 
   Args:
-    task: "nerf_nav" or "ball_push".
+    task: "nerf_nav", "ball_push", or one that was registered; `suite.known_tasks` lists them.
     scene: Folder of a scene bundle, or an opened `scenes.bundle.Bundle`; None is the built-in room.
     effects: An `effects.json`, or a sequence of effects: what the nominal model lacks.
     draw_effects: Whether every episode draws the effects' values from their intervals.
@@ -63,8 +56,7 @@ def load(
   Raises:
     ValueError: If an argument is none of what is expected; the message lists what is.
   """
-  if task not in _TASKS:
-    raise ValueError(errors.unknown_name("task", task, ALL_TASKS))
+  found = find_task(task)
   camera = camera or CameraSettings()
   lens = None if image_size is None else camera.camera(image_size)
   bundle = open_scene(scene)
@@ -77,14 +69,14 @@ def load(
       settings=camera,
     )
   settings = TaskSettings(
-    time_limit=TIME_LIMITS[task] if time_limit is None else time_limit,
+    time_limit=found.time_limit if time_limit is None else time_limit,
     physics_timestep=physics_timestep,
     privileged=privileged,
     randomisation=randomisation or RandomisationSettings(),
     effects=_effects(effects),
     draw_effects=draw_effects,
   )
-  built = _TASKS[task](bundle, camera=robot_camera, settings=settings)
+  built = found.task(bundle, camera=robot_camera, settings=settings)
   if furnish is not None:
     furnish(built.root_entity.mjcf_model)
   try:

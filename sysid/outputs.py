@@ -10,10 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from nerf2real.core.files import write_atomically
+from nerf2real.core.folder_lock import lock_folder
 from nerf2real.core.pages import page
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.suite.effects.files import from_list, to_list
@@ -32,6 +35,7 @@ from nerf2real.sysid.selection.identification import (
 )
 from nerf2real.sysid.sensors import sensing
 
+_ANALYSIS, _SENSORS, _ERRORS = 0.8, 0.85, 0.95  # shares of the work done after each, about
 _LISTED = 6  # alternatives in the report
 
 
@@ -43,6 +47,7 @@ def identify(
   reference: Sequence[Path] = (),
   out: Path,
   settings: Settings | None = None,
+  progress: Progress = no_progress,
 ) -> dict[str, Any]:
   """Finds the effect that a model lacks and writes down what it found.
 
@@ -55,17 +60,18 @@ def identify(
     reference: logs of the same apparatus without the effect; they calibrate the constants first.
     out: folder to write.
     settings: thresholds and effort.
+    progress: called with the fraction done and a text.
 
   Returns:
     The content of report.json.
 
   Raises:
     FileNotFoundError: a file is missing.
+    FolderInUseError: another process identifies into the folder.
     OSError: the folder cannot be written.
     LogError: a log cannot be used, or the held or reference logs lack a joint of the others.
     ValueError: the model cannot be read, or there is no log.
   """
-  began = time.perf_counter()
   settings = settings or Settings()
   if not train:
     raise ValueError("Found no log to identify from, expected at least one --logs file.")
@@ -74,14 +80,41 @@ def identify(
   healthy = read_logs(reference, compiled)
   check_motion(logs)
   _check_joints(logs, [*others, *healthy])
-  out = Path(out)
-  out.mkdir(parents=True, exist_ok=True)
-  found = analyse(compiled, logs, reference=healthy, settings=settings)
-  sensed = sensing.find(compiled, logs, healthy)
+  with lock_folder(out):
+    return _identify(
+      Path(model),
+      compiled,
+      logs,
+      held=others,
+      reference=healthy,
+      out=Path(out),
+      settings=settings,
+      progress=progress,
+    )
+
+
+def _identify(
+  model: Path,
+  compiled: mujoco.MjModel,
+  logs: list[Log],
+  *,
+  held: list[Log],
+  reference: list[Log],
+  out: Path,
+  settings: Settings,
+  progress: Progress,
+) -> dict[str, Any]:
+  """Analyses logs that were read, and writes; see `identify`."""
+  began = time.perf_counter()
+  analysing = part(progress, 0.0, _ANALYSIS)
+  found = analyse(compiled, logs, reference=reference, settings=settings, progress=analysing)
+  progress(_ANALYSIS, "sensors and floor")
+  sensed = sensing.find(compiled, logs, reference)
   if sensed.effects:
     found.objects += sensed.effects
     found.effects += sensed.rows
     found.verdict = "effects" if found.verdict == "none" else found.verdict
+  progress(_SENSORS, "errors on the logs")
   whole = [*found.calibration, *found.objects, *found.learned]
   content: dict[str, Any] = {
     "verdict": found.verdict,
@@ -91,8 +124,8 @@ def identify(
     "residual_at": residual_at(found),
     "error": {
       "train": _errors(found, logs, whole, settings),
-      "held": _errors(found, others, whole, settings) if others else None,
-      "floor": _floor(others or logs, [s.joint for s in found.screened]),
+      "held": _errors(found, held, whole, settings) if held else None,
+      "floor": _floor(held or logs, [s.joint for s in found.screened]),
     },
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
@@ -135,13 +168,12 @@ def identify(
     content["notes"] = [*content["notes"], text]
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
-  extended_model.write(
-    Path(model), out / "model_extended.xml", [*found.calibration, *found.objects]
-  )
-  details = _details(found, Path(model), whole, sensed)
+  extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
+  details = _details(found, model, whole, sensed)
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
+  progress(_ERRORS, "report")
   content["seconds"] = round(time.perf_counter() - began, 1)
-  made = report.page(found, content, details, others, whole, settings.window_s)
+  made = report.page(found, content, details, held, whole, settings.window_s)
   page.write(out / "report.html", made)
   content["seconds"] = round(time.perf_counter() - began, 1)
   write_atomically(out / "report.json", json.dumps(content, indent=2, allow_nan=False) + "\n")

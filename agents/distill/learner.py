@@ -259,6 +259,7 @@ class Learner:
       "success": self._evaluation.get("success"),
       "localisation_error": self._evaluation.get("localisation_error"),
       "replay_steps": frames,
+      "replay_needed": self._settings.first_frames,
     }
     self._link.set_status(status | self._rates.measure(frames, updates))
 

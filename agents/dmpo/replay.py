@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.core import files
 
 _INDEX_FILE = "index.json"
 _ORIGIN = "origin"  # uint64 [capacity, 3]: actor's key, trajectory's number, insertion number + 1
@@ -118,7 +119,7 @@ class Replay:
     }
     if folder is not None and not existing:
       index = {name: [list(shape), dtype] for name, (shape, dtype) in shapes.items()}
-      (folder / _INDEX_FILE).write_text(json.dumps(index))
+      files.write_atomically(folder / _INDEX_FILE, json.dumps(index))
     order = self._arrays[_ORIGIN][:, 2]
     self.inserted = int(order.max(initial=0))  # trajectories ever inserted into this ring
     self._size = int(np.count_nonzero(order))

@@ -303,6 +303,7 @@ class Learner:
       "updates": updates,
       "filled": ready,
       "replay_steps": self.replay.steps,
+      "replay_needed": self._config.min_replay_steps,
       "problem": self._problem,
       "evaluation": self._best.evaluated,
       "best": best["best_return"],

@@ -40,7 +40,7 @@ class MetricsLog:
     try:
       self._file.write(json.dumps(row | plain) + "\n")
       if self._events is not None:
-        group = "actor" if source.startswith("actor") else source
+        group = source.partition("-")[0]  # "evaluator-0-1f2e3d4c" is another run's name tomorrow
         numeric = {
           f"{group}/{name}": float(value)
           for name, value in plain.items()

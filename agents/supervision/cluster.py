@@ -166,11 +166,12 @@ def train(
     raise RunRefusedError("--tls-certificate, --tls-key and --tls-authority belong together")
   settings = dataclasses.replace(settings, run=settings.run.absolute())
   training.check(settings)
-  ray = _connect(settings.address)
-  try:
-    return _train(ray, settings, scripts, forwarded, command)
-  finally:
-    ray.shutdown()
+  with training.locked(settings.run):
+    ray = _connect(settings.address)
+    try:
+      return _train(ray, settings, scripts, forwarded, command)
+    finally:
+      ray.shutdown()
 
 
 def _connect(address: str) -> Any:
@@ -240,7 +241,6 @@ def _open_router(
   settings: ClusterSettings, host: str, passwords: dict[str, str]
 ) -> tuple[Any, str]:
   """Opens the run's router with passwords of its own; returns session and endpoint."""
-  settings.run.mkdir(parents=True, exist_ok=True)
   users = settings.run / "users.txt"
   training.write_private(users, "".join(f"{user}:{word}\n" for user, word in passwords.items()))
   endpoint = settings.listen

@@ -67,7 +67,7 @@ class StatusView:
       rows = {
         "steps": f"{s['steps']:,} ({s['steps_per_second']:.0f}/s)",
         "updates": f"{s['updates']:,} ({s['updates_per_second']:.1f}/s)"
-        + ("" if s["filled"] else ", filling the replay"),
+        + ("" if s["filled"] else f", {filling(s)}"),
         **_returns(s),
         "success": _number(s["success"]),
         "localisation error": _number(s["localisation_error"]) + " m",
@@ -97,6 +97,7 @@ class StatusView:
       parts = [
         f"steps {s['steps']:,} ({s['steps_per_second']:.0f}/s)",
         f"updates {s['updates']:,} ({s['updates_per_second']:.1f}/s)",
+        *([] if s["filled"] else [filling(s)]),
         *(f"{n} {s[n]:.3g}" for n in ("return", "evaluation", "success") if s.get(n) is not None),
         f"{s['actors']} actors",
         f"dropped {s['dropped']}",
@@ -106,6 +107,13 @@ class StatusView:
     if self.problem:
       parts.append(self.problem)
     return ", ".join(parts) or "starting"
+
+
+def filling(status: dict[str, Any]) -> str:
+  """Returns how far the replay is filled, before the first update."""
+  needed = status.get("replay_needed")
+  of = "" if needed is None else f" of {needed:,}"
+  return f"filling the replay: {status['replay_steps']:,}{of}"
 
 
 def _returns(status: dict[str, Any]) -> dict[str, str]:

@@ -141,6 +141,7 @@ class Supervisor:
     self._learner = _Kept(_resumed(learner) if resume else learner)
     self._others = [_Kept(job) for job in others]
     self.restarts = 0
+    self.refused = False  # the learner's first start was refused: nothing was learned
 
   @property
   def waiting(self) -> list[str]:
@@ -176,6 +177,8 @@ class Supervisor:
       hopeless = status in (REFUSED, NOT_SAVED)
       if hopeless or kept.starts_within(self._window) > _MAX_RESTARTS:
         kept.over = True
+        first = kept is self._learner and len(kept.started) == 1
+        self.refused = first and status == REFUSED
         return _death(kept, status)
       self.restarts += 1
       if kept is self._learner:

@@ -1,5 +1,6 @@
 """A supervised run: learner, actors and evaluator as processes, with a status on the console."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -8,7 +9,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from rich.live import Live
 from nerf2real.agents.link import sessions
 from nerf2real.agents.supervision.status_view import StatusView
 from nerf2real.agents.supervision.supervisor import Job, LocalProcess, Process, Supervisor
+from nerf2real.core.files import append_line, atomic_path
+from nerf2real.core.folder_lock import FolderInUseError, discarded_on, lock_folder
 
 _JOIN_TIMEOUT = 1800.0  # s; a starved machine takes minutes to build the networks, or to be free
 _POLL = 0.5  # s between looks at the processes
@@ -28,6 +31,10 @@ _END_TIMEOUT = 60.0  # s for a checkpoint at the end
 
 class RunRefusedError(ValueError):
   """A run cannot start with its settings; the message is one line for the user."""
+
+
+class _LearnerRefusedError(Exception):
+  """The learner's first start was refused; the message is why."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,12 +71,18 @@ class Scripts:
 
 
 def check(settings: TrainingSettings) -> None:
-  """Raises RunRefusedError for settings that cannot be run."""
+  """Raises RunRefusedError for settings that cannot be run; touches nothing."""
   if settings.actors < 1:
     raise RunRefusedError(f"at least one actor is needed, found --actors {settings.actors}")
-  if any((settings.run / "checkpoints").glob("newest-*")) and not settings.resume:
+  saved = any((settings.run / "checkpoints").glob("newest-*"))
+  if saved and not settings.resume:
     raise RunRefusedError(
       f"{settings.run} holds a run: add --resume, or name another folder with --run"
+    )
+  if settings.resume and not saved:
+    raise RunRefusedError(
+      f"{settings.run} holds no checkpoint to go on from: leave --resume out, or name the folder "
+      "of a run with --run"
     )
 
 
@@ -106,9 +119,10 @@ def make_jobs(
 
 def write_private(path: Path, text: str) -> None:
   """Writes a file that only its user may read."""
-  descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-  with os.fdopen(descriptor, "w") as stream:
-    stream.write(text)
+  with atomic_path(path) as partial:
+    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with os.fdopen(descriptor, "w") as stream:
+      stream.write(text)
 
 
 def note_launch(run: Path, command: str) -> None:
@@ -121,8 +135,7 @@ def note_launch(run: Path, command: str) -> None:
     "processor": next((n.partition(":")[2].strip() for n in lines if "model name" in n), ""),
     "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
   }
-  with (run / "launches.jsonl").open("a") as stream:
-    stream.write(json.dumps(row) + "\n")
+  append_line(run / "launches.jsonl", json.dumps(row))
 
 
 def free_port(host: str = "127.0.0.1") -> int:
@@ -196,9 +209,38 @@ def train(
     Why the run failed; empty if it did not.
 
   Raises:
-    RunRefusedError: the settings cannot be run.
+    RunRefusedError: the settings cannot be run, or another process runs in the folder.
   """
   check(settings)
+  try:
+    with discarded_on(_LearnerRefusedError, settings.run), locked(settings.run):
+      return _train(settings, scripts, port=port, forwarded=forwarded, command=command)
+  except _LearnerRefusedError as error:
+    return str(error)
+
+
+@contextlib.contextmanager
+def locked(run: Path) -> Iterator[None]:
+  """Holds the lock of a run's folder, as its one supervisor.
+
+  Raises:
+    RunRefusedError: another process holds it.
+  """
+  try:
+    with lock_folder(run):
+      yield
+  except FolderInUseError as error:
+    raise RunRefusedError(str(error)) from error
+
+
+def _train(
+  settings: TrainingSettings,
+  scripts: Scripts,
+  *,
+  port: int | None,
+  forwarded: Sequence[str],
+  command: str,
+) -> str:
   run = settings.run
   (run / "logs").mkdir(parents=True, exist_ok=True)
   # A password of this run's own: others on the machine cannot join.
@@ -232,6 +274,8 @@ def train(
   console = Console()
   view = StatusView(str(run), endpoint, link)
   failure = supervise(supervisor, view, console)
+  if supervisor.refused:
+    raise _LearnerRefusedError(failure)
   if not failure:
     say_where(console, settings, supervisor)
   return failure

@@ -8,6 +8,7 @@ from typing import Any, BinaryIO
 
 from mcap_ros2.writer import Writer
 
+from nerf2real.core import files
 from nerf2real.core.robot_logs import messages
 
 CHUNK_SIZE = 64 * 1024
@@ -68,12 +69,14 @@ class LogWriter:
 
 @contextlib.contextmanager
 def open_log(path: str | Path) -> Iterator[LogWriter]:
-  """Opens a log for writing, its folder is made; the file is complete when the context ends."""
+  """Opens a log for writing, its folder is made; the file appears, complete, at the context's end.
+
+  Raises:
+    DiskFullError: The disk or the quota is exhausted.
+  """
   path = Path(path)
   path.parent.mkdir(parents=True, exist_ok=True)
-  with path.open("wb") as stream:
+  with files.atomic_path(path) as partial, partial.open("wb") as stream:
     writer = LogWriter(stream)
-    try:
-      yield writer
-    finally:
-      writer.finish()
+    yield writer
+    writer.finish()

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
+from nerf2real.evaluation import policy_names
 
-WALKER = "walker"
-SHIPPED = "shipped"
+WALKER = policy_names.WALKER
 _IDENTITY = "loop_settings.json"
-# Beside the agents: part of the package where a policy is shipped with it.
-SHIPPED_FOLDER = Path(__file__).resolve().parents[2] / "agents" / "policies" / "nerf_nav"
+TASK = "nerf_nav"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,13 +70,7 @@ def policy_folder(settings: LoopSettings) -> Path | None:
   """
   if settings.policy == WALKER:
     return None
-  folder = SHIPPED_FOLDER if settings.policy == SHIPPED else Path(settings.policy)
-  if not (folder / "policy.json").is_file():
-    raise ValueError(
-      f"Found no policy.json in {folder} (--policy {settings.policy}): expected the folder of an "
-      f'exported policy, "{SHIPPED}" where the package ships one, or "{WALKER}".'
-    )
-  return folder
+  return policy_names.policy_folder(settings.policy, task=TASK)
 
 
 def claim(settings: LoopSettings) -> None:

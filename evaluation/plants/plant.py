@@ -10,13 +10,17 @@ from nerf2real.evaluation.plants import perturbations
 from nerf2real.suite import protocols
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.protocols import BallTrial, NavigationTrial
-from nerf2real.suite.tasks import ball_push, nerf_nav, rewards
+from nerf2real.suite.tasks import catalogue, rewards
 
 Trial = NavigationTrial | BallTrial
 
 NAVIGATION, BALL, GAIN = "navigation", "ball", "gain"
 PROTOCOLS = (NAVIGATION, BALL, GAIN)
-TASKS = {NAVIGATION: nerf_nav.NAME, GAIN: nerf_nav.NAME, BALL: ball_push.NAME}
+TASKS = {
+  NAVIGATION: catalogue.NERF_NAV,
+  GAIN: catalogue.NERF_NAV,
+  BALL: catalogue.BALL_PUSH,
+}
 
 
 class Sight(NamedTuple):
@@ -33,6 +37,7 @@ class Plant(abc.ABC):
 
   name: str  # "sim", "virtual" or "robot"
   plant_id: str = ""  # which one
+  _recorder: Any = None  # a `real.recorder.recorder.Recorder`
 
   def __init__(self, scene: Any, protocol: str, perturbation: str):
     """Notes what is evaluated.
@@ -93,6 +98,11 @@ class Plant(abc.ABC):
   @abc.abstractmethod
   def close(self) -> None:
     """Ends the plant."""
+
+  def check_recording(self) -> None:
+    """Raises OSError, after `close`, if what was to be recorded is not whole."""
+    if self._recorder is not None:
+      self._recorder.raise_failure()
 
 
 def trials(protocol: str) -> tuple[tuple[str, Trial], ...]:

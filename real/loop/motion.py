@@ -82,7 +82,8 @@ class Motion:
       _log.warning("the robot did not stand still: the gyroscope's old zero is kept")
 
   def _take_hold(self) -> None:
-    self._operator.support(True)
+    if not self._settings.dry_run:  # without torque it lies, hangs or sits where it is
+      self._operator.support(True)
     self._monitor.held = True
     self._pause(self._settings.grip_time)
 

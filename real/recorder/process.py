@@ -7,14 +7,16 @@ import pickle
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import BinaryIO
 
 import cv2
 import numpy as np
 
+from nerf2real.core.files import explain_disk_full
 from nerf2real.core.robot_logs import messages
 from nerf2real.core.robot_logs.writer import LogWriter
-from nerf2real.real.recorder.recorder import LENGTH, Call
+from nerf2real.real.recorder.recorder import LENGTH, OPEN, Call
 
 _CHUNK = 1 << 20  # bytes: chunks end by time before they are so large
 _FLUSH_PERIOD = 0.25  # s between chunks; chosen: what a killed recorder loses
@@ -65,13 +67,17 @@ def main() -> None:
   """Writes until the pipe ends."""
   signal.signal(signal.SIGINT, signal.SIG_IGN)  # until the pipe's end
   try:
-    stream = open(sys.argv[1], "wb")  # noqa: SIM115  (closed below)
-  except OSError as error:
+    with explain_disk_full(sys.argv[1]):
+      _record(Path(sys.argv[1]))
+  except OSError as error:  # the reason, for the recorder; a trace would end in the terminal
     print(error, flush=True)
     sys.exit(1)
-  with stream:
+
+
+def _record(path: Path) -> None:
+  with path.open("wb") as stream:
     log = LogWriter(stream, chunk_size=_CHUNK, flush_period=_FLUSH_PERIOD)
-    print("open", flush=True)
+    print(OPEN, flush=True)
     try:
       for name, seconds, arguments, fields in receive(sys.stdin.buffer):
         log.write(BUILDERS[name](nanoseconds(seconds), *arguments, **fields))

@@ -25,9 +25,10 @@ from typing import Any
 import numpy as np
 
 from nerf2real.core.cameras import Camera
-from nerf2real.core.robot_logs import messages
+from nerf2real.core.robot_logs import messages, streaming
 
 LENGTH = struct.Struct("<I")  # before every pickled message in the pipe
+OPEN = "open"  # the other process's word once the file is there
 _QUEUE = 2000  # readings: about four seconds at full rates
 _START_TIMEOUT = 20.0  # s for the other process to import and open the file
 _CLOSE_TIMEOUT = 20.0  # s for it to write what is left
@@ -60,6 +61,7 @@ class Recorder:
     )
     self._wait_until_open()
     self._queue: queue.Queue[tuple[Call, ...] | None] = queue.Queue(_QUEUE)
+    self.failure = ""  # why the file is not whole, known once it is closed
     self.dropped = 0  # readings that found the queue full or the process gone
     self._closed = False
     self._sender = threading.Thread(target=self._send, daemon=True, name="recorder")
@@ -75,7 +77,7 @@ class Recorder:
     reader.start()
     reader.join(_START_TIMEOUT)
     text = answer[0].decode().strip() if answer else f"no answer in {_START_TIMEOUT:g} s"
-    if text != "open":
+    if text != OPEN:
       self._process.kill()
       self._process.wait()
       raise OSError(f"The recorder cannot write {self.path}: {text or 'it ended at once'}.")
@@ -206,16 +208,39 @@ class Recorder:
       _log.error("The recorder of %s hangs and is ended.", self.path)
       self._process.kill()
       self._process.wait()
-    if self._process.stdout is not None:
-      self._process.stdout.close()
+    assert self._process.stdout is not None
+    words = self._process.stdout.read().decode(errors="replace").strip()
+    self._process.stdout.close()
+    if self._process.returncode:
+      self.failure = self._describe(words)
     if self.dropped:
       _log.warning("The recorder of %s dropped %d readings.", self.path, self.dropped)
+
+  def _describe(self, words: str) -> str:
+    """Returns why the file is not whole; one that holds no message is removed."""
+    try:
+      held = next(iter(streaming.read_messages(self.path, recover=True)), None)
+    except (OSError, ValueError):
+      held = None
+    if held is None:
+      self.path.unlink(missing_ok=True)
+      left = "Nothing was recorded."
+    else:
+      left = f"{self.path} holds what was recorded until then."
+    return f"{words or f'The recorder of {self.path} was killed.'} {left}"
+
+  def raise_failure(self) -> None:
+    """Raises OSError if the file that was closed is not whole."""
+    if self.failure:
+      raise OSError(self.failure)
 
   def __enter__(self) -> "Recorder":
     return self
 
-  def __exit__(self, *_: object) -> None:
+  def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
     self.close()
+    if kind is None:
+      self.raise_failure()
 
 
 def _joint_state(

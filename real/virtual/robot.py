@@ -76,7 +76,7 @@ class VirtualRobot:
       if stepped:
         self.camera = SteppedCamera(self.eyes, self.clock, camera, seed=seed or 0)
       else:
-        self.stream = CameraStream(self.eyes.picture, camera)
+        self.stream = CameraStream(self.eyes.picture, camera, release=self.eyes.close)
         self.stream.start()
 
   @property

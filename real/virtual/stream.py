@@ -34,6 +34,7 @@ class CameraStream:
     render: Callable[[], np.ndarray],
     settings: VirtualCamera | None = None,
     *,
+    release: Callable[[], None] = lambda: None,
     port: int = 0,
     seed: int = 0,
   ):
@@ -42,12 +43,14 @@ class CameraStream:
     Args:
       render: Returns the true picture now, RGB uint8 [H, W, 3]; always called from the stream's own
         thread, which may therefore own an OpenGL context that the first call makes.
+      release: Frees what `render` made; called from the same thread when the pictures end.
       settings: Rate, latency and the sensor's response; the lens is the renderer's.
       port: 0 takes a free one.
       seed: Of the noise.
     """
     settings = settings or VirtualCamera()
-    self._render, self._period, self._latency = render, 1.0 / settings.rate, settings.latency
+    self._render, self._release = render, release
+    self._period, self._latency = 1.0 / settings.rate, settings.latency
     self.sensor = Sensor(settings, seed=seed)
     self._blocked = False
     self._frozen = False
@@ -99,6 +102,12 @@ class CameraStream:
       self.sensor.exposure = float(np.clip(values["exposure"], 0.0, MAX_EXPOSURE))
 
   def _take_pictures(self) -> None:
+    try:
+      self._take_until_stopped()
+    finally:
+      self._release()
+
+  def _take_until_stopped(self) -> None:
     due = time.monotonic()
     while not self._stop.is_set():
       taken = time.monotonic()

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numba
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerf2real.core import cameras, similarity
 from nerf2real.core.progress import Progress, no_progress
@@ -189,6 +190,24 @@ def _fuse(
           weights[i, j, k] += weight
 
 
+def grid_shape(lower: ArrayLike, upper: ArrayLike, voxel: float) -> np.ndarray:
+  """Returns the shape [3] of the grid over a box; raises ValueError where it is too large.
+
+  Args:
+    lower: Lower corner of the box [3].
+    upper: Upper corner [3].
+    voxel: Edge of a voxel.
+  """
+  lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+  shape = np.maximum(np.ceil((upper - lower) / voxel).astype(int), 1) + 1
+  if np.prod(shape, dtype=np.float64) > _MAX_VOXELS:
+    raise ValueError(
+      f"A box of {np.round(upper - lower, 3)} at voxels of {voxel:.4g} has {shape} voxels, more "
+      f"than {_MAX_VOXELS}: crop the extent or take larger voxels."
+    )
+  return shape
+
+
 def fuse(
   views: DepthViews,
   *,
@@ -215,12 +234,7 @@ def fuse(
   section 3; the tangent planes are an addition.
   """
   lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-  shape = np.maximum(np.ceil((upper - lower) / voxel).astype(int), 1) + 1
-  if np.prod(shape, dtype=np.float64) > _MAX_VOXELS:
-    raise ValueError(
-      f"A box of {np.round(upper - lower, 3)} at voxels of {voxel:.4g} has {shape} voxels, more "
-      f"than {_MAX_VOXELS}: crop the extent or take larger voxels."
-    )
+  shape = grid_shape(lower, upper, voxel)
   truncation = 3 * voxel if truncation is None else truncation
   depth = np.where(np.isfinite(views.depth), views.depth, 0).astype(np.float32)
   rays = views.camera.rays()

@@ -48,6 +48,12 @@ class NerfNav(RobotTask):
     """The present goal [2] in the world [m]."""
     return self._goal.copy()
 
+  def next_goal(self) -> None:
+    """Goes on to the next goal within the episode, as after one that was reached."""
+    present = int(np.argmin(np.linalg.norm(self._goals - self._goal, axis=1)))
+    self._goal = self._goals[(present + 1) % len(self._goals)]
+    self.success, self.success_time = False, float("nan")
+
   def set_start(self, start: Start | None, *, goal_index: int | None = None) -> None:
     """Fixes the start pose and the goal of the episodes to come; None draws them again."""
     if goal_index is not None and not 0 <= goal_index < len(self._goals):

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.geometry.mesh import load_glb
 from nerf2real.suite import loading
 from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.viewer.elements import bars, geom_mesh
+from nerf2real.suite.views.drivers import SCRIPTED, Driver, MakeDriver, move_on
 from nerf2real.suite.views.third_person import best_azimuth, clear_distance, direction
 
 _SPRING = 40.0  # N/m between the handle that is dragged and the torso
@@ -28,6 +31,7 @@ _SHOW_STEPS, _PICTURE_STEPS = 2, 4  # control steps between showings of the moti
 _HANDLE_HEIGHT = 0.28  # m of the handle above the torso, so that it does not hide the robot
 _SETBACK = 0.02  # m by which the field's floor is lowered, so that it does not swallow the feet
 _LINE_WIDTH = 0.015  # m of the lines on the floor
+_TIME_LIMIT = 120.0  # s; chosen: several goals before the robot starts anew
 _DIRECTIONS = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}
 
 
@@ -35,7 +39,12 @@ class TaskViewer:
   """One environment, shown and controlled through a viser server."""
 
   def __init__(
-    self, environment: Any, server: viser.ViserServer, *, field: field_view.FieldView | None = None
+    self,
+    environment: Any,
+    server: viser.ViserServer,
+    *,
+    field: field_view.FieldView | None = None,
+    drivers: Mapping[str, MakeDriver] = SCRIPTED,
   ):
     """Fills the page.
 
@@ -43,15 +52,18 @@ class TaskViewer:
       environment: From `suite.load`.
       server: The page's server.
       field: Draws the room as a radiance field; None: only as a mesh.
+      drivers: What may act, by name; the first one does.
     """
     self._environment, self.server = environment, server
     self._steps = 0
     self._last_episode = ""
-    self._rng = np.random.default_rng(0)
+    self._makers = dict(drivers)
+    self._drivers: dict[str, Driver] = {}
+    self._acting = ""  # the name of the one that acted last
     self._push_until, self._push = 0.0, np.zeros(3)
     self._dragging = False
     self._reset_asked = False
-    environment.reset()
+    self._timestep = environment.reset()
     self._geoms = self._add_geoms()
     self._add_controls()
     self._add_room(field)
@@ -152,7 +164,7 @@ class TaskViewer:
   def _add_controls(self) -> None:
     gui = self.server.gui
     self._running = gui.add_checkbox("run", True)
-    self._policy = gui.add_dropdown("policy", ("stand", "random"))
+    self._policy = gui.add_dropdown("policy", tuple(self._makers))
     self._follow = gui.add_checkbox("find the robot when it starts anew", True)
     gui.add_button("reset").on_click(lambda _: setattr(self, "_reset_asked", True))
     camera = self._environment.task.robot_camera
@@ -203,14 +215,12 @@ class TaskViewer:
     environment = self._environment
     if self._reset_asked:
       self._reset_asked = False
-      environment.reset()
+      self._timestep = environment.reset()
       self._start_episode()
     task = environment.task
     task.hand_force = self._hand_force()
-    action = task.standing_action
-    if self._policy.value == "random":
-      action = np.clip(action + self._rng.normal(0, 0.5, action.shape), -1, 1)
-    timestep = environment.step(action)
+    timestep = self._timestep = environment.step(self._driver().act(self._timestep.observation))
+    move_on(task)
     if timestep.last():
       outcome = task.outcome
       self._last_episode = (
@@ -222,6 +232,16 @@ class TaskViewer:
     self._steps += 1
     if self._steps % _SHOW_STEPS == 0:
       self._show(timestep.observation.get("camera"))
+
+  def _driver(self) -> Driver:
+    """Returns what acts; one that was chosen anew, or in a new episode, begins here."""
+    name = self._policy.value
+    if name not in self._drivers:
+      self._drivers[name] = self._makers[name](self._environment.task)
+    if name != self._acting or self._timestep.first():
+      self._acting = name
+      self._drivers[name].restart()
+    return self._drivers[name]
 
   def _start_episode(self) -> None:
     """Forgets a push and shows the robot where it stands now."""
@@ -266,19 +286,34 @@ class TaskViewer:
 
 
 def view_task(
-  task: str, *, scene: Path | None = None, host: str = "127.0.0.1", port: int = 8080
+  task: str,
+  *,
+  scene: Path | None = None,
+  drivers: Mapping[str, MakeDriver] = SCRIPTED,
+  image_size: tuple[int, int] = (30, 40),
+  host: str = "127.0.0.1",
+  port: int = 8080,
 ) -> TaskViewer:
   """Serves a task's page; the returned viewer's `run` steps it.
 
   Args:
     task: Name of the task.
     scene: Folder of a scene bundle; None is the built-in room.
+    drivers: What may act, by name; the first one does.
+    image_size: Height and width of the robot's picture [pixel].
     host: Address to serve on.
     port: Port to serve on.
   """
   bundle = loading.open_scene(scene)
   renderer = loading.load_renderer(bundle)
-  environment = suite.load(task, scene=bundle, renderer=renderer)
+  environment = suite.load(
+    task,
+    scene=bundle,
+    renderer=renderer,
+    image_size=image_size,
+    time_limit=_TIME_LIMIT,
+    randomisation=RandomisationSettings(pushes=False),  # by hand only
+  )
   server = viser.ViserServer(host=host, port=port, label=f"task {task}", verbose=False)
   field = field_view.FieldView(renderer, bundle.world_from_unit)
-  return TaskViewer(environment, server, field=field)
+  return TaskViewer(environment, server, field=field, drivers=drivers)

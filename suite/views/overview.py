@@ -3,6 +3,7 @@
 import numpy as np
 
 from nerf2real.core import palette
+from nerf2real.core.floor_map import Extent
 from nerf2real.scenes.geometry import floor_picture
 from nerf2real.suite.tasks import rewards
 from nerf2real.suite.tasks.base import RobotTask
@@ -28,13 +29,24 @@ class TopDown:
     self._floor = floor_picture.draw(scene.free_space, scene.extent, height=height, margin=_MARGIN)
     self._trail: list[np.ndarray] = []
 
+  @property
+  def extent(self) -> Extent:
+    """What the picture shows: smallest and largest x and y [m]."""
+    return self._floor.extent
+
   def restart(self) -> None:
     """Forgets the trail."""
     self._trail.clear()
 
-  def draw(self) -> np.ndarray:
-    """Returns the picture now, RGB uint8 [H, W, 3], and lengthens the trail."""
+  def draw(self, density: np.ndarray | None = None) -> np.ndarray:
+    """Returns the picture now, RGB uint8 [H, W, 3], and lengthens the trail.
+
+    Args:
+      density: Where a policy expects to be, on a grid of the whole extent; None: nothing is drawn.
+    """
     task, floor = self._task, self._floor.copy()
+    if density is not None:
+      floor.heat(density)
     self._trail.append(task.state.position[:2].copy())
     workspace = getattr(task, "workspace", None)
     if workspace is not None:

@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.data.compatibility import check_against_model
@@ -97,18 +98,23 @@ def analyse(
   *,
   reference: Sequence[Log] = (),
   settings: Settings | None = None,
+  progress: Progress = no_progress,
 ) -> Identified:
   """Finds what a model lacks."""
   settings = settings or Settings()
+<<<<<<< HEAD
   if reference and len(logs[0].commands.joints) == 1:
     return since_reference.analyse(model, logs, reference)
+=======
+  progress(0.0, "looking for joints whose residual stands out")
+>>>>>>> main
   screened = screening.screen(model, logs, reference=reference, window_s=settings.window_s)
   if not screened:
     raise ValueError(
       "Found no joint with an actuator that all logs command, expected at least one."
     )
   common.expect_like_the_others(screened)
-  found = _race(screened, settings)
+  found = _race(screened, settings, part(progress, 0.1, 0.7))
   shared: list[common.Shared] = []
   while len(screened) > 1 and len(shared) < _MOST_SHARED:
     effect = common.shared_effect(found, screened)
@@ -116,7 +122,8 @@ def analyse(
       break
     shared.append(effect)
     common.declare(effect, screened)
-    found = _race(screened, settings)
+    found = _race(screened, settings, part(progress, 0.7, 0.8))
+  progress(0.8, "comparing the joints")
   chain.without_refuted(model, found, screened, settings.thresholds)
   found = _without_contradictions(found, settings)
   found += _others(found, screened, settings)
@@ -127,12 +134,13 @@ def analyse(
   return result
 
 
-def _race(screened: list[Screened], settings: Settings) -> list[Found]:
+def _race(screened: list[Screened], settings: Settings, progress: Progress) -> list[Found]:
   screened.sort(key=lambda s: -s.excess)
-  return [
-    race_joint(s, settings.thresholds, settings.effort, seed=settings.seed)
-    for s in _suspects(screened, settings)
-  ]
+  suspects, found = _suspects(screened, settings), []
+  for index, suspect in enumerate(suspects):
+    progress(index / len(suspects), f"hypotheses for {suspect.joint}")
+    found.append(race_joint(suspect, settings.thresholds, settings.effort, seed=settings.seed))
+  return found
 
 
 def _suspects(screened: list[Screened], settings: Settings) -> list[Screened]:

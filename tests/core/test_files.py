@@ -2,6 +2,7 @@
 
 import errno
 import pickle
+import resource
 
 import pytest
 from hypothesis import given
@@ -115,3 +116,19 @@ def test_folder_hash_sees_names_and_content(tmp_path):
   assert len({before, renamed, files.hash_path(tmp_path)}) == 3
   with pytest.raises(FileNotFoundError, match="does not exist"):
     files.hash_path(tmp_path / "absent")
+
+
+def test_a_line_is_appended_whole_or_not_at_all(tmp_path):
+  path = tmp_path / "lines.jsonl"
+  files.append_line(path, "first")
+  limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+  resource.setrlimit(resource.RLIMIT_FSIZE, (9, limit[1]))
+  try:
+    with pytest.raises(files.DiskFullError) as caught:
+      files.append_line(path, "a line that does not fit")
+  finally:
+    resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+  assert str(path) in str(caught.value) and "limit of a file's size" in str(caught.value)
+  assert path.read_text() == "first\n"
+  files.append_line(path, "second")
+  assert path.read_text() == "first\nsecond\n"

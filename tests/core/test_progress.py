@@ -1,6 +1,7 @@
 """Parts of a computation report their share of the whole."""
 
 import io
+import time
 
 import pytest
 from hypothesis import given
@@ -32,7 +33,8 @@ def test_parts_nest():
 
 def test_the_bar_shows_name_and_text():
   stream = io.StringIO()
-  with progress_bar("depth", console=Console(file=stream, width=120)) as progress:
+  console = Console(file=stream, width=120, force_terminal=True)
+  with progress_bar("depth", console=console) as progress:
     progress(0.5, "picture 1 of 2")
   for word in ("depth", "50%", "picture 1 of 2"):
     assert word in stream.getvalue()
@@ -42,3 +44,23 @@ def test_a_hidden_bar_is_silent(capsys):
   with progress_bar("depth", shown=False) as progress:
     progress(0.5, "picture 1 of 2")
   assert progress is no_progress and capsys.readouterr().out == ""
+
+
+def test_a_pipe_gets_lines_with_the_time_left(monkeypatch):
+  now = [0.0]
+  monkeypatch.setattr(time, "monotonic", lambda: now[0])
+  stream = io.StringIO()
+  with progress_bar("depth", console=Console(file=stream)) as progress:
+    for now[0], fraction in ((1.0, 0.01), (20.0, 0.25), (25.0, 0.3), (80.0, 1.0)):
+      progress(fraction, "picture")
+  assert stream.getvalue().splitlines() == [
+    "depth: 25% after 20 s, about 60 s left: picture",
+    "depth: 100% after 80 s: picture",
+  ]
+
+
+def test_a_short_stage_says_nothing_in_a_pipe():
+  stream = io.StringIO()
+  with progress_bar("depth", console=Console(file=stream)) as progress:
+    progress(1.0, "done before")
+  assert stream.getvalue() == ""

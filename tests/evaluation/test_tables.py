@@ -137,3 +137,15 @@ def test_report_holds_tables_paths_and_every_episode(tmp_path):
     assert text in page
   assert page.count("data:image/jpeg") == 2 and '"seed": 3' in html.unescape(page)
   assert json.loads(json.dumps(found[0].path)) == path
+
+
+def test_a_trial_that_is_there_twice_is_counted_once(tmp_path):
+  """Two processes that wrote into one folder would turn three trials into six."""
+  store = episodes.Store(tmp_path)
+  for index in range(3):
+    store.add(episode(index=index))
+  store.path.write_text(2 * store.path.read_text())
+  again = episodes.Store(tmp_path)
+  assert [e.index for e in again.episodes] == [0, 1, 2] and again.duplicates == 3
+  (table,) = tables.paper_tables(again.episodes)
+  assert table.rows[0].cells[0] == "100±0% (n=3)"

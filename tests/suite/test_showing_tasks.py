@@ -4,10 +4,12 @@ import av
 import numpy as np
 import pytest
 import viser
+from PIL import Image
 
 from nerf2real import suite
 from nerf2real.suite.viewer.elements import bars
 from nerf2real.suite.viewer.task_viewer import TaskViewer
+from nerf2real.suite.views.drivers import Random, Walking
 from nerf2real.suite.views.rollout import run_episodes
 from tests.suite.synthetic import FlatRenderer, make_room
 
@@ -27,7 +29,7 @@ def room(tmp_path, monkeypatch):
 @pytest.mark.parametrize("task", suite.ALL_TASKS)
 def test_rollout_writes_a_video_of_the_length_asked_for(task, room, tmp_path):
   path = tmp_path / "videos" / "out.mp4"
-  run_episodes(task, video=path, seconds=1.0, policy="random")
+  run_episodes(task, video=path, seconds=1.0, driver=Random)
   frames = [f.to_ndarray(format="rgb24") for f in av.open(str(path)).decode(video=0)]
   assert len(frames) == 20
   height, width = frames[0].shape[:2]
@@ -38,7 +40,7 @@ def test_rollout_writes_a_video_of_the_length_asked_for(task, room, tmp_path):
 
 
 def test_rollout_reports_how_episodes_ended(room):
-  lines = run_episodes(seconds=6.0, policy="random")
+  lines = run_episodes(seconds=6.0, driver=Random)
   assert lines and all("ended by fall" in line and "no success" in line for line in lines)
 
 
@@ -47,6 +49,7 @@ def test_viewer_shows_the_state_and_pushes(room):
   server = viser.ViserServer(host="127.0.0.1", port=18_734, verbose=False)
   try:
     viewer = TaskViewer(environment, server)
+    viewer._policy.value = "stand"
     viewer._start_push("left")
     before = environment.task.state
     for _ in range(8):
@@ -67,3 +70,30 @@ def test_viewer_shows_the_state_and_pushes(room):
 def test_bars_grow_to_their_side():
   page = bars({"turn": -1.5, "speed": 0.75})
   assert "left:0.0%;width:50.0%" in page and "left:50.0%;width:25.0%" in page
+
+
+def test_the_walker_takes_the_next_goal(room):
+  """Its goals follow each other, and its actions are those of the suite."""
+  environment = suite.load("nerf_nav", random=3)
+  environment.reset()
+  task = environment.task
+  driver = Walking(task)
+  before = task.goal.copy()
+  task.next_goal()
+  assert not np.array_equal(task.goal, before) and not task.success
+  action = driver.act({"gyroscope": np.zeros((5, 3)), "gravity": np.tile([0, 0, -1.0], (5, 1))})
+  assert action.shape == (20,) and np.abs(action).max() <= 1
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_an_animation_has_half_the_frames_and_plays(suffix, room, tmp_path):
+  path = tmp_path / f"out{suffix}"
+  run_episodes("nerf_nav", video=path, seconds=0.5, driver=Random)
+  with Image.open(path) as film:
+    film.load()
+    assert film.n_frames == 5 and film.info["duration"] == 100 and film.height == 202
+
+
+def test_a_film_of_another_kind_is_refused(room, tmp_path):
+  with pytest.raises(ValueError, match=r"expected one that ends in \.mp4"):
+    run_episodes("nerf_nav", video=tmp_path / "out.avi", seconds=0.5)

@@ -212,3 +212,11 @@ def test_wrong_arguments_are_one_line(tmp_path):
   output = finish(process, timeout=60, run=run)
   assert process.returncode == 1 and "has no task 'cartpole:fly'" in output
   assert "Traceback" not in output
+  assert not run.exists(), "a refused start leaves nothing"
+
+
+def test_nothing_to_resume_is_refused_at_once(tmp_path):
+  process = start(tmp_path / "run", "--resume", "--env", "dm_control:cartpole:swingup")
+  output = finish(process, timeout=60, run=tmp_path / "run")
+  assert process.returncode == 2 and "holds no checkpoint to go on from" in output
+  assert output.count("\n") == 1 and not (tmp_path / "run").exists()

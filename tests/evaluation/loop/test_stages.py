@@ -45,19 +45,10 @@ def test_a_folder_belongs_to_one_loop(tmp_path):
 
 def test_a_policy_that_is_not_there_is_one_line(tmp_path):
   assert policy_folder(_settings(tmp_path)) is None
-  for policy in ("shipped", str(tmp_path / "nothing")):
-    settings = _settings(tmp_path, policy=policy)
-    if policy == "shipped" and _is_shipped():
-      continue
-    with pytest.raises(ValueError, match="Found no policy.json in") as found:
-      policy_folder(settings)
-    assert "\n" not in str(found.value)
-
-
-def _is_shipped():
-  from nerf2real.evaluation.loop.settings import SHIPPED_FOLDER
-
-  return (SHIPPED_FOLDER / "policy.json").exists()
+  assert (policy_folder(_settings(tmp_path, policy="shipped")) / "policy.json").exists()
+  with pytest.raises(ValueError, match="Unknown policy") as found:
+    policy_folder(_settings(tmp_path, policy=str(tmp_path / "nothing")))
+  assert "\n" not in str(found.value)
 
 
 def test_drawn_effects_follow_the_seed():

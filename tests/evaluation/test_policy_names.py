@@ -1,0 +1,56 @@
+"""Policies are found by name, wherever they lie; what is missing is said in one line."""
+
+import numpy as np
+import pytest
+
+from nerf2real.evaluation import policy_names
+from nerf2real.evaluation.driving import choose_driver
+from nerf2real.suite.views import drivers
+
+
+def _put(folder):
+  folder.mkdir(parents=True)
+  (folder / "policy.json").write_text("{}")
+  return folder
+
+
+def test_folders_of_runs_and_policies(tmp_path):
+  newest = _put(tmp_path / "run" / "policy" / "newest")
+  assert policy_names.policy_folder(str(newest), task="nerf_nav") == newest
+  assert policy_names.policy_folder(str(tmp_path / "run"), task="nerf_nav") == newest
+  best = _put(tmp_path / "run" / "policy" / "best")
+  assert policy_names.policy_folder(str(tmp_path / "run"), task="nerf_nav") == best
+  with pytest.raises(ValueError, match="Unknown policy 'none': expected walker, shipped, or a"):
+    policy_names.policy_folder("none", task="nerf_nav")
+
+
+def test_shipped_policy_is_found_where_it_is_dropped(tmp_path, monkeypatch):
+  monkeypatch.setattr(policy_names.agents, "__path__", [str(tmp_path)])
+  with pytest.raises(ValueError, match="No policy for nerf_nav is shipped .* --policy walker"):
+    policy_names.policy_folder("shipped", task="nerf_nav")
+  folder = _put(tmp_path / "policies" / "nerf_nav")
+  assert policy_names.policy_folder("shipped", task="nerf_nav") == folder
+
+
+@pytest.mark.parametrize("name", ["walker", "gait"])
+def test_the_walker_has_two_names(name):
+  assert choose_driver(name, task="nerf_nav") == ("walker", drivers.Walking, None)
+
+
+class _Task:
+  """A task with three goals, at the first of which the robot stands since a time."""
+
+  def __init__(self, since):
+    self.outcome = type("Outcome", (), {"success": True, "success_time": 2.0, "duration": since})
+    self.goals = np.eye(3, 2)
+    self.moved = 0
+
+  def next_goal(self):
+    self.moved += 1
+
+
+@pytest.mark.parametrize(("duration", "moved"), [(2.5, 0), (3.1, 1)])
+def test_the_next_goal_comes_a_second_after_one_was_reached(duration, moved):
+  task = _Task(duration)
+  drivers.move_on(task)
+  assert task.moved == moved

@@ -1,0 +1,70 @@
+"""Ctrl-C and SIGTERM end commands without traces, leaving what is whole."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _start(script, *arguments):
+  return subprocess.Popen(
+    [sys.executable, ROOT / "launch" / f"{script}.py", *map(str, arguments)],
+    env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
+    stdout=subprocess.PIPE,
+    stderr=subprocess.PIPE,
+    text=True,
+  )
+
+
+def _end(process, number):
+  process.send_signal(number)
+  out, err = process.communicate(timeout=120)
+  assert "Traceback" not in err and "Exception" not in err and "terminate called" not in err, err
+  return out, err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_virtual_robot_frees_its_camera(number):
+  process = _start("virtual_robot", "--world", "floor")
+  assert process.stdout.readline().startswith("port: ")
+  url = process.stdout.readline().split()[1]
+  subprocess.run(  # until the first picture, when the renderer is there
+    [sys.executable, "-c", f"import cv2; assert cv2.VideoCapture({url!r}).read()[0]"], check=True
+  )
+  _, err = _end(process, number)
+  assert process.returncode == 0 and err == ""
+
+
+def test_an_interrupted_rollout_leaves_a_video_that_plays(tmp_path):
+  video = tmp_path / "out.mp4"
+  process = _start("rollout", "--seconds", "600", "--video", video)
+  assert process.stderr.readline().startswith("filming")
+  _, err = _end(process, signal.SIGINT)
+  assert process.returncode == 128 + signal.SIGINT and err.splitlines()[-1] == "interrupted"
+  with av.open(str(video)) as container:
+    assert sum(1 for _ in container.decode(video=0)) >= 1
+  assert [path.name for path in tmp_path.iterdir()] == ["out.mp4"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+  ("script", "arguments", "ready"),
+  [
+    ("view", ("--port", "0"), "open http"),
+    ("view", ("--task", "nerf_nav", "--port", "0"), "open http"),
+    ("evaluate", ("--out", "{}", "--policy", "walker"), " 1/54"),
+    ("router", ("--listen", "tcp/127.0.0.1:0"), "Routing"),
+  ],
+)
+def test_others(tmp_path, script, arguments, ready):
+  process = _start(script, *(text.format(tmp_path / "out") for text in arguments))
+  assert any(ready in line for line in process.stdout)
+  _end(process, signal.SIGTERM)
+  if script == "evaluate":
+    assert {"episodes.jsonl", "report.html"} == {p.name for p in (tmp_path / "out").iterdir()}

@@ -1,0 +1,81 @@
+"""What cannot succeed is refused at once, in one line, and leaves nothing."""
+
+import os
+
+import pytest
+
+from nerf2real.real.safety.operator import Terminal
+from nerf2real.real.virtual.robot import VirtualRobot
+from tests.launch.test_identify import _log
+
+
+@pytest.mark.parametrize(
+  ("script", "arguments", "status", "words"),
+  [
+    ("view", ("--port", "80000"), 2, "expected 0 (a free one) to 65535"),
+    ("replay_log", ("{log}", "--port", "-1"), 2, "expected 0 (a free one) to 65535"),
+    (
+      *("local_distributed", ("--env", "agents:cue", "--run", "{out}", "--port", "80000"), 2),
+      "--port 80000",
+    ),
+    ("local_distributed", ("--run", "{out}", "--resume"), 2, "holds no checkpoint"),
+    ("distill", ("--run", "{out}", "--resume"), 2, "holds no checkpoint"),
+    ("learner", ("--run", "{out}", "--resume"), 2, "holds no checkpoint"),
+    ("distill_learner", ("--run", "{out}", "--resume"), 2, "holds no run to continue"),
+    ("learner", ("--run", "{out}", "--env", "agents:none"), 2, "has no task 'none'"),
+    (
+      "learner",
+      (
+        "--run",
+        "{out}",
+      ),
+      2,
+      "Say what to learn",
+    ),
+    ("make_scene", ("--capture", "builtin", "--out", "{out}", "--marker-side", "20"), 1, "metres"),
+    ("make_scene", ("--capture", "none.mp4", "--out", "{out}"), 1, "none.mp4"),
+    ("make_scene", ("--capture", "{log}", "--out", "{out}"), 1, "log.mcap"),
+    ("evaluate", ("--policy", "none", "--out", "{out}"), 1, "none"),
+    ("evaluate", ("--scene", "none", "--out", "{out}"), 1, "none"),
+    ("evaluate", ("--dry-run", "--out", "{out}"), 1, "expected --plant robot"),
+    ("identify", ("--model", "none.xml", "--logs", "{log}", "--out", "{out}"), 1, "none.xml"),
+    ("rollout", ("--scene", "none", "--video", "{out}/x.mp4"), 1, "none"),
+    ("close_loop", ("--policy", "none", "--out", "{out}"), 1, "none"),
+  ],
+)
+def test_refused_at_once(run, tmp_path, script, arguments, status, words):
+  log, out = tmp_path / "log.mcap", tmp_path / "out" / "deep"
+  log.write_text("no log")
+  ended = run(script, *(text.format(log=log, out=out) for text in arguments))
+  assert ended.status == status, ended
+  (line,) = ended.err.splitlines()
+  assert line.startswith("error: ") and words.format(out=out) in line, line
+  assert sorted(path.name for path in tmp_path.iterdir()) == ["log.mcap"]
+
+
+def test_a_dry_run_needs_no_terminal_and_asks_for_nothing(run, monkeypatch, capsys):
+  """Nothing moves, so nobody must hold the robot."""
+  with open(os.devnull) as nowhere, VirtualRobot(stepped=True) as robot:
+    robot.operator = Terminal(nowhere.fileno())
+    monkeypatch.setattr("nerf2real.real.check.connected", lambda _: _Opened(robot.connection()))
+    ended = run("check_robot", "--robot", "virtual", "--dry-run", "--seconds", "0.5")
+  assert ended.status == 0 and ended.out.strip().endswith("passed"), ended
+  assert "HOLD" not in ended.out
+
+
+class _Opened:
+  def __init__(self, connection):
+    self._connection = connection
+
+  def __enter__(self):
+    return self._connection
+
+  def __exit__(self, *_):
+    pass
+
+
+def test_a_log_that_can_be_read_is_served(run, tmp_path):
+  """The page of a good log is written: the refusals above are of the arguments."""
+  log = _log(tmp_path / "log.mcap")
+  ended = run("replay_log", log, "--html", tmp_path / "log.html")
+  assert ended.status == 0 and (tmp_path / "log.html").stat().st_size > 10_000

@@ -1,0 +1,62 @@
+"""What the training could not help is refused before it."""
+
+import types
+
+import numpy as np
+import pytest
+
+from nerf2real.scenes import geometry_stages
+from nerf2real.scenes.alignment import overrides, world_frame
+from nerf2real.scenes.settings import SceneSettings
+from nerf2real.scenes.stages import Made, Stages
+from tests.scenes import furnished_room
+
+
+def _poses(points):
+  poses = furnished_room.walk(12)
+  return types.SimpleNamespace(value=_Found(points, poses), stamp="poses")
+
+
+class _Found(types.SimpleNamespace):
+  def __init__(self, points, poses):
+    super().__init__(points=points, world_from_camera=poses, names=[], camera=None)
+
+
+def _floor(rng, height=0.0):
+  return np.column_stack([rng.uniform(-2, 2, (2000, 2)), rng.normal(height, 0.002, 2000)])
+
+
+def _outlook(tmp_path, points, **changes) -> Made:
+  return geometry_stages.outlook(
+    Stages(tmp_path / ".stages", show_progress=False),
+    None,
+    _poses(points),
+    world_frame.AlignSettings(**changes),
+    voxel=0.02,
+    marker_side=None,
+    override=overrides.Overrides(),
+    override_key="",
+  )
+
+
+def test_a_room_with_a_floor_passes_and_is_done_once(tmp_path):
+  points = _floor(np.random.default_rng(0))
+  made = _outlook(tmp_path, points, camera_height=1.4)
+  assert made.value is None and not made.stage.cached
+  assert _outlook(tmp_path, points, camera_height=1.4).stage.cached
+
+
+def test_a_capture_without_a_floor_is_refused_and_leaves_nothing(tmp_path):
+  ceiling = _floor(np.random.default_rng(0), height=3.0)
+  with pytest.raises(ValueError, match="film the floor"):
+    _outlook(tmp_path, ceiling)
+  assert list(tmp_path.iterdir()) == []
+
+
+def test_centimetres_for_metres_are_refused(tmp_path):
+  points = _floor(np.random.default_rng(0))
+  with pytest.raises(ValueError, match="from camera_height: give lengths in metres"):
+    _outlook(tmp_path, points, camera_height=140.0)
+  for wrong in ({"marker_side": 20.0}, {"align": world_frame.AlignSettings(camera_height=140.0)}):
+    with pytest.raises(ValueError, match=r"is in metres: found \d+, expected"):
+      SceneSettings(**wrong)
