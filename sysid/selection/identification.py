@@ -102,12 +102,10 @@ def analyse(
 ) -> Identified:
   """Finds what a model lacks."""
   settings = settings or Settings()
-<<<<<<< HEAD
   if reference and len(logs[0].commands.joints) == 1:
+    progress(0.0, "comparing with the reference")
     return since_reference.analyse(model, logs, reference)
-=======
   progress(0.0, "looking for joints whose residual stands out")
->>>>>>> main
   screened = screening.screen(model, logs, reference=reference, window_s=settings.window_s)
   if not screened:
     raise ValueError(
