@@ -26,8 +26,8 @@ class Arguments:
   held: tuple[Path, ...] = ()
   """Logs on which only errors are reported."""
   reference: tuple[Path, ...] = ()
-  """Logs of the same apparatus without the effect: they calibrate the declared constants first, and
-  are how bright the place is."""
+  """Logs of the same apparatus without the effect, best of the same motions: what differs is looked
+  for (one joint), or they calibrate the declared constants (several); they are how bright it is."""
   out: Path | None = None
   """Folder to write."""
   evaluate: Path | None = None

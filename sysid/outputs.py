@@ -26,8 +26,8 @@ from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection import decision, detection
+from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.identification import (
-  Identified,
   Settings,
   analyse,
   load_model,
@@ -119,6 +119,7 @@ def _identify(
   content: dict[str, Any] = {
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else found.effects,
+    "in_reference": found.in_reference,
     "alternatives": _alternatives(found),
     "residual_at": residual_at(found),
     "error": {
@@ -155,6 +156,16 @@ def _identify(
       f"Found by a simulation that follows the readings, as courses with play do not repeat:"
       f" {joints}. The errors before and after are of whole courses, which stray.",
     ]
+  if found.in_reference:
+    kinds = ", ".join(row["kind"] for row in found.in_reference)
+    text = f"In the reference, too, so that nothing has changed: {kinds}. The model lacks it."
+    content["notes"] = [*content["notes"], text]
+  if found.verdict == "partly":
+    joints = ", ".join(item.joint for item in found.unexplained)
+    text = (
+      f"More remains than the reference leaves, at {joints}: what is named is certain, not all."
+    )
+    content["notes"] = [*content["notes"], text]
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])

@@ -119,7 +119,8 @@ def score(truth: Entry, report: Entry) -> Score:
 
 def _named(report: Entry) -> list[Entry]:
   """Returns the effects that a report stands for."""
-  return list(report.get("effects", [])) if report.get("verdict") == "effects" else []
+  stands = report.get("verdict") in ("effects", "partly")
+  return list(report.get("effects", [])) if stands else []
 
 
 def _words(effects: list[Entry]) -> str:

@@ -47,15 +47,17 @@ class _Draft:
   runs: dict[str, recording.Recording] = dataclasses.field(default_factory=dict)
   """Recordings made, by log and effects: measuring an effect's size and writing need the same."""
 
-  def run(self, log: str, drawn: list[effects.Drawn], *, twin: bool = False) -> recording.Recording:
-    """Returns a recording of the machine, or its twin, with effects."""
+  def run(
+    self, log: str, drawn: list[effects.Drawn], *, twin: bool = False, again: bool = False
+  ) -> recording.Recording:
+    """Returns a recording of the machine, or its twin, with effects; `again` draws other noise."""
     twin = twin and self.declared_error != 0.0
-    key = f"{log} {drawn} {twin}"
+    key = f"{log} {drawn} {twin} {again}"
     if key not in self.runs:
       machine = copy.deepcopy(self.twin if twin else self.machine)
       for effect in drawn:
         effect.apply(machine)
-      noise = (*self.seed, list(self.commands).index(log))
+      noise = (*self.seed, list(self.commands).index(log) + len(self.commands) * again)
       self.runs[key] = recording.record(
         self.apparatus, machine, self.reading, commands=self.commands[log], seed=noise
       )
@@ -143,7 +145,7 @@ def make_set(
     recording.write(folder / f"{name}.mcap", joints, recorded, draft.reading)
     if reference and name.startswith("train"):
       path = folder / f"reference_{name[6:]}.mcap"
-      recording.write(path, joints, draft.run(name, []), draft.reading)
+      recording.write(path, joints, draft.run(name, [], again=True), draft.reading)
   ratio = float(np.max(draft.held_errors(drawn, twin=True) / floor))
   answer = {
     "plant": plant,

@@ -36,6 +36,18 @@ class Term:
   centre: tuple[float, ...] = ()
   """Means of the prior; empty for zeros."""
   fixed: tuple[tuple[str, float], ...] = ()
+  known: bool = False
+  """Whether reference logs show it, too."""
+  freed: bool = False
+  """Whether constants may differ from those that reference logs show."""
+
+  @property
+  def name(self) -> str | None:
+    """What is claimed with this term: a kind of effect; None for constants and known effects."""
+    if self.kind == "calibration":
+      return "parameter_error" if self.freed else None
+    return None if self.known else self.kind
+
   """Parameters that are a choice between models and not fitted."""
 
   def apply(self, plant: JointPlant, p: Array, x: Array) -> None:
@@ -73,7 +85,7 @@ class Term:
     """Returns the fitted effect."""
     values = {n: float(v) for n, v in zip(self.names, x, strict=True)} | dict(self.fixed)
     if self.kind == "calibration":
-      factors = {n: 1.0 + values[n] for n in values if n not in ("skew", "latency")}
+      factors = {n: 1.0 + values[n] for n in values if n not in ("skew", "latency", "zero")}
       bounds = {n: (1.0 + a, 1.0 + b) for n, (a, b) in (intervals or {}).items() if n in factors}
       return Effect("parameter_error", self.target, factors, bounds)
     known = {p.name for p in kind_of(self.kind).parameters}
@@ -110,6 +122,7 @@ def _calibration(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["measurement_delay"]] += v.get("skew", 0.0)
   p[I["effort_delay"]] += v.get("skew", 0.0)
   p[I["command_delay"]] += v.get("latency", 0.0)
+  p[I["encoder_offset"]] += v.get("zero", 0.0)
 
 
 def _adder(*pairs: tuple[str, str]):
@@ -212,7 +225,7 @@ _APPLY = {
   "asymmetric_friction": _asymmetric,
   "quadratic_drag": _adder(("coefficient", "drag")),
   "backlash": _backlash,
-  "encoder_offset": _setter(("offset", "encoder_offset")),
+  "encoder_offset": _adder(("offset", "encoder_offset")),
   "motor_gain": _gain,
   "torque_limit": _limit,
   "supply_sag": _sag,

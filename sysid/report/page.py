@@ -15,7 +15,7 @@ from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import residual_plots
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
 from nerf2real.sysid.selection import decision, race
-from nerf2real.sysid.selection.identification import Identified
+from nerf2real.sysid.selection.findings import Identified
 
 Array = np.ndarray
 
@@ -25,6 +25,8 @@ _LADDER = 12  # hypotheses a joint
 _VERDICTS = {
   "none": "The declared model explains the logs as well as any candidate: nothing is named.",
   "effects": "These effects explain what the declared model leaves.",
+  "partly": "These effects are certain and explain most of what the declared model leaves; more"
+  " remains than reference logs leave, and no name for it is clear. What remains is said below.",
   "unexplained": "There is something that no candidate explains well enough to be named. Where it"
   " sits is said below; a learned force lowers the error meanwhile where that is possible, and the"
   " ladder shows the candidates that came nearest.",
@@ -104,6 +106,10 @@ def _verdict(content: dict[str, Any]) -> Section:
     blocks += [chart] if chart is not None else []
   if nearest:
     blocks += [Heading("In the extended model, but not claimed"), Table(_HEADER, nearest)]
+  usual, _ = _parameters(content["in_reference"])
+  if usual:
+    blocks += [Heading("In the reference, too: the model lacks them, nothing changed")]
+    blocks += [Table(_HEADER, usual)]
   if alike:
     blocks += [Heading("One of these, the sensors cannot tell which"), Table(_HEADER, alike)]
   return Section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], blocks)

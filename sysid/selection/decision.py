@@ -18,7 +18,7 @@ _TIE = 0.03  # nats within which the usual kind is named rather than the rare on
 _SIMPLER = 0.06
 """Nats within which fewer values are named rather than more: what three values cost by the Bayesian
 information criterion (Schwarz 1978) with some 200 independent readings; ours."""
-_USUAL = (
+USUAL = (
   *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
   *("gravity_tilt", "encoder_offset", "spring"),
 )
@@ -93,7 +93,7 @@ def usual_first(entries: list[Entry], *, alone: bool) -> list[Entry]:
   ties = [
     e for e in entries if e.score - best < (_SIMPLER if _values_that_show(e) < most else _TIE)
   ]
-  order = {kind: index for index, kind in enumerate(_USUAL)}
+  order = {kind: index for index, kind in enumerate(USUAL)}
   if alone:
     order["gravity_tilt"] = len(order)
   fewest = min(_values_that_show(e) for e in ties)

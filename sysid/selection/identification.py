@@ -14,7 +14,6 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.opening import named, read_log
@@ -28,10 +27,12 @@ from nerf2real.sysid.selection import (
   learned,
   race,
   screening,
+  since_reference,
 )
 from nerf2real.sysid.selection.common import WHOLE
 from nerf2real.sysid.selection.decision import Thresholds
 from nerf2real.sysid.selection.explanation import Effort, Ladder, even_out
+from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.joint import (
   Found,
   decide,
@@ -70,44 +71,6 @@ class Settings:
   """Of resampling."""
 
 
-@dataclasses.dataclass
-class Identified:
-  """What an identification found, before it is written down."""
-
-  model: mujoco.MjModel
-  logs: list[Log]
-  screened: list[Screened]
-  found: list[Found]
-  audits: list[dict[str, Any]]
-  verdict: str = "none"
-  effects: list[dict[str, Any]] = dataclasses.field(default_factory=list)
-  """Entries of the report that are claimed."""
-  nearest: list[dict[str, Any]] = dataclasses.field(default_factory=list)
-  """Entries of joints that stay unexplained: in the extended model, not claimed."""
-  objects: list[Effect] = dataclasses.field(default_factory=list)
-  """The same as effects that can be simulated."""
-  calibration: list[Effect] = dataclasses.field(default_factory=list)
-  """Declared constants corrected, one effect a joint."""
-  clocks: dict[str, Clocks] = dataclasses.field(default_factory=dict)
-  learned: list[Effect] = dataclasses.field(default_factory=list)
-
-  @property
-  def unexplained(self) -> list[Found]:
-    """The joints that stay unexplained, the one that leaves most first."""
-    items = [f for f in self.found if f.finding.verdict == "unexplained"]
-    return sorted(items, key=lambda f: -f.screened.excess)
-
-  @property
-  def followed(self) -> list[Found]:
-    """The joints with named effects that were judged by a simulation that follows the readings."""
-    return [f for f in self.found if f.finding.named and f.ladder.problem.plant.follows]
-
-  @property
-  def least_explained(self) -> Found:
-    """The joint that stays unexplained and leaves most, else the one that was raced first."""
-    return (self.unexplained or self.found)[0]
-
-
 def load_model(path: Path) -> mujoco.MjModel:
   """Reads a MuJoCo model; a file that is missing or wrong is one clear error."""
   if not Path(path).is_file():
@@ -139,6 +102,9 @@ def analyse(
 ) -> Identified:
   """Finds what a model lacks."""
   settings = settings or Settings()
+  if reference and len(logs[0].commands.joints) == 1:
+    progress(0.0, "comparing with the reference")
+    return since_reference.analyse(model, logs, reference)
   progress(0.0, "looking for joints whose residual stands out")
   screened = screening.screen(model, logs, reference=reference, window_s=settings.window_s)
   if not screened:

@@ -88,6 +88,7 @@ def test_extended_model_has_the_error_that_is_reported(
   assert set(content) == {
     "verdict",
     "effects",
+    "in_reference",
     "alternatives",
     "residual_at",
     "error",

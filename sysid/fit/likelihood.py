@@ -1,0 +1,210 @@
+"""Likelihood of one joint's logs by blocks of time, robust to what no hypothesis holds.
+
+A block b of a channel (positions simulated from the commands alone; efforts given the measured
+motion) has the mean squared residual m_b. Its variance is unknown, about s^2, worth as many
+observations as the block has; with that integrated out
+
+    log p_b = -n_b log(1 + m_b / s^2)
+
+a multivariate t density. n_b counts independent samples: those of the block over the residual's
+correlation time. s is what the best hypothesis leaves in the median block, so that evidence counts
+in units of what remains. Shapes: N samples of all logs, B blocks, C channels, n values.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerf2real.sysid.fit.noise import effort_noise, timing
+from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.joint import JointModel, Simulated
+from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.model.measured import Measured
+from nerf2real.sysid.settings import SETTINGS
+
+Array = np.ndarray
+
+
+class JointLikelihood:
+  """The logs of one joint, cut into blocks; turns hypotheses into residuals and nats."""
+
+  def __init__(self, plant: JointModel, *, settings=SETTINGS):
+    self.plant, self.settings = plant, settings
+    self.position_noise, self.stamp_noise = timing(plant)
+    logs = plant.logs
+    self.effort: list[Array] | None = None
+    self.is_duty = False
+    if all(log.duty is not None for log in logs):
+      self.effort, self.is_duty = [log.duty for log in logs], True  # type: ignore[misc]
+    elif all(log.effort is not None for log in logs) and plant.holds:
+      self.effort = [log.effort for log in logs]  # type: ignore[misc]
+    self.channels = ["course"] + (["effort"] if self.effort is not None else [])
+    self.floor = np.array(
+      [self.position_noise] + ([effort_noise(self.effort)] if self.effort else [])
+    )
+    self.mask = np.concatenate([log.valid for log in logs]).astype(float)
+    self.speed = np.concatenate([log.velocity for log in logs])
+    self.speed_matters = not self.is_duty
+    shaky = self.stamp_noise * self.speed / self.position_noise
+    self.gain = np.array([self.mask / np.sqrt(1.0 + shaky**2), self.mask][: len(self.channels)])
+    self._cut()
+    self.expected: Array | float = 0.0
+    self.scale = np.maximum(self.floor, 1e-12)
+    self.independent = np.ones(len(self.channels))
+
+  def _cut(self) -> None:
+    starts, folds, offset = [], [], 0
+    alone = len(self.plant.logs) == 1
+    log_of = []
+    for index, log in enumerate(self.plant.logs):
+      label = np.floor((log.time - log.time[0]) / self.settings.block_s).astype(int)
+      first = np.unique(label, return_index=True)[1]
+      if len(first) > 1 and len(label) - first[-1] < 0.5 * np.median(np.diff(first)):
+        first = first[:-1]
+      starts.append(first + offset)
+      half = np.arange(len(first)) // 2 % self.settings.folds
+      folds.append(half if alone else np.full(len(first), index))
+      log_of.append(np.full(len(first), index))
+      offset += len(label)
+    self.starts, self.fold = np.concatenate(starts), np.concatenate(folds)
+    self.log_of = np.concatenate(log_of)
+    self.size = offset
+    self.counts = np.maximum(np.add.reduceat(self.gain**2, self.starts, axis=1), 1.0)
+    lengths = np.diff(np.append(self.starts, offset))
+    self.block_of = np.repeat(np.arange(len(self.starts)), lengths)
+
+  def simulate(
+    self, terms: Sequence[Term], xs: Array, logs: Sequence[int] | None = None
+  ) -> list[list[tuple[Simulated, Simulated | None]]]:
+    """Returns every log's open-loop run, and its run along the readings where efforts are known."""
+    chosen = range(len(self.plant.logs)) if logs is None else logs
+    rows = []
+    for x in np.atleast_2d(xs):
+      p, loads = compose(self.plant, terms, x)
+      rows.append([self._pair(p, loads, i) for i in chosen])
+    return rows
+
+  def _pair(self, p, loads, index) -> tuple[Simulated, Simulated | None]:
+    open_loop = self.plant.run(p, loads, index)
+    along = self.plant.run(p, loads, index, follow=True) if self.effort is not None else None
+    return open_loop, along
+
+  def residuals(self, terms: Sequence[Term], xs: Array) -> Array:
+    """Returns measured minus simulated [X, C, N]; masked samples are 0."""
+    rows = []
+    for outputs in self.simulate(terms, xs):
+      course = [
+        log.position - o.position for log, (o, _) in zip(self.plant.logs, outputs, strict=True)
+      ]
+      channels = [np.concatenate(course)]
+      if self.effort is not None:
+        channels.append(self._efforts([along for _, along in outputs]))
+      rows.append(channels)
+    result = np.nan_to_num(np.array(rows), nan=1e3, posinf=1e3, neginf=-1e3)
+    return (result - self.expected) * self.gain
+
+  def expect(self, reference: "JointLikelihood", residuals: Array) -> bool:
+    """Takes what a reference leaves for expected, where it was driven by the very same commands.
+
+    What no model of the machine holds is then the same in both, and cancels.
+
+    Args:
+      reference: logs of the machine before.
+      residuals: what its baseline leaves there [C, N], weighted as `residuals` gives it.
+
+    Returns:
+      Whether every log has its like.
+    """
+    ends = np.cumsum([len(log.time) for log in reference.plant.logs])
+    starts = np.append(0, ends[:-1])
+    parts = []
+    residuals = residuals / np.maximum(reference.gain, 1e-9)
+    for log in self.plant.logs:
+      like = next((i for i, r in enumerate(reference.plant.logs) if _same_commands(log, r)), None)
+      if like is None:
+        return False
+      other, keep = reference.plant.logs[like], reference.mask[starts[like] : ends[like]] > 0
+      rows = residuals[:, starts[like] : ends[like]]
+      parts.append(np.array([np.interp(log.time, other.time[keep], r[keep]) for r in rows]))
+    self.expected = np.concatenate(parts, axis=1)
+    return True
+
+  def _efforts(self, along: Sequence[Simulated | None]) -> Array:
+    assert self.effort is not None
+    measured = np.concatenate(self.effort)
+    torque = np.concatenate([a.torque for a in along])  # type: ignore[union-attr]
+    jump = np.concatenate([a.jump for a in along])  # type: ignore[union-attr]
+    soft = 1.0 / np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2) * self.mask
+    scale = self._factor(soft * measured, soft * torque)
+    left = soft * (measured - scale * torque)
+    if not self.is_duty:  # a current's torque lacks what the back-EMF takes
+      speed = soft * self.speed
+      left = left - float(left @ speed) / (float(speed @ speed) + 1e-12) * speed
+    return left
+
+  def _factor(self, measured: Array, torque: Array) -> float:
+    """Returns measured over simulated effort, within what a data sheet leaves open."""
+    scale = float(measured @ torque) / (float(torque @ torque) + 1e-12)
+    full = float(self.plant.declared[INDEX["highest"]])
+    if not self.is_duty:
+      spread, nominal = self.settings.effort_scale, 1.0
+      if self.speed_matters:
+        both = np.array([torque, self.speed * self.mask])
+        scale = float(np.linalg.lstsq(both.T, measured, rcond=None)[0][0])
+    elif np.isfinite(full):
+      spread, nominal = self.settings.duty_scale, 1.0 / full
+    else:
+      return scale
+    return float(np.clip(scale, nominal / (1.0 + spread), nominal * (1.0 + spread)))
+
+  def squares(self, residuals: Array) -> Array:
+    """Returns mean squares of blocks [..., C, B]."""
+    return np.add.reduceat(residuals**2, self.starts, axis=-1) / self.counts
+
+  def loglik(self, squares: Array) -> Array:
+    """Returns nats of blocks [..., B], channels added."""
+    n = self.independent[:, None] * self.counts
+    return -(n * np.log1p(squares / self.scale[:, None] ** 2)).sum(axis=-2)
+
+  def weights(self, squares: Array) -> Array:
+    """Returns the weight of every sample [C, N] in a step of least squares."""
+    n = self.independent[:, None] * self.counts
+    w = n / (self.counts * (self.scale[:, None] ** 2 + squares))
+    return w[:, self.block_of]
+
+  def rescale(self, residuals: Array) -> None:
+    """Sets the scale and the number of independent samples by the residuals [C, N] of a fit."""
+    squares = self.squares(residuals)
+    self.scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
+    for c, row in enumerate(residuals):
+      self.independent[c] = 1.0 / _correlation_time(
+        row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts
+      )
+
+
+def _same_commands(one: Measured, other: Measured) -> bool:
+  """Tells whether two logs hold the same commands at the same times."""
+  end = min(one.command_time[-1], other.command_time[-1])
+  period = float(np.median(np.diff(one.command_time))) if len(one.command_time) > 1 else 1.0
+  grid = np.arange(0.0, end, period) + 0.5 * period
+  values = [
+    log.command[np.clip(np.searchsorted(log.command_time, grid) - 1, 0, None)]
+    for log in (one, other)
+  ]
+  apart = np.abs(values[0] - values[1])
+  lengths = one.command_time[-1], other.command_time[-1]
+  alike = abs(lengths[0] - lengths[1]) < 0.05 * max(lengths)
+  return bool(alike and np.mean(apart > 1e-3 * max(np.ptp(values[0]), 1e-12)) < 0.05)
+
+
+def _correlation_time(row: Array, starts: Array) -> float:
+  """Returns the integrated autocorrelation time in samples, up to the first negative value."""
+  length = max(8, int(np.median(np.diff(starts)))) if len(starts) > 1 else len(row)
+  centred = row - row.mean()
+  power = np.abs(np.fft.rfft(centred, 2 * len(row))) ** 2
+  correlation = np.fft.irfft(power)[: 2 * length]
+  correlation = correlation / max(correlation[0], 1e-30)
+  negative = np.flatnonzero(correlation < 0.05)
+  end = negative[0] if len(negative) else len(correlation)
+  return float(max(1.0, 1.0 + 2.0 * correlation[1:end].sum()))

@@ -1,0 +1,55 @@
+"""Noise of readings, from their scatter about smooth motion and their resolution."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerf2real.sysid.model.measured import quantum
+from nerf2real.sysid.model.plant import JointPlant
+
+Array = np.ndarray
+
+_NINE_TENTHS = 0.79  # rms of the inner 90 % of a normal distribution over its own
+
+
+def position_noise(plant: JointPlant) -> float:
+  """Returns the noise of the position readings: scatter about a local cubic, at least the
+  rounding to the sensor's steps."""
+  scatter, steps = [], []
+  for log in plant.logs:
+    third = np.diff(log.position, n=3)
+    large = np.quantile(np.abs(third), 0.9)
+    kept = third[np.abs(third) <= max(large, 1e-300)]
+    scatter.append(float(np.sqrt(np.mean(kept**2))) / np.sqrt(20.0) / _NINE_TENTHS)
+    steps.append(quantum(log.position))
+  return max(float(np.median(scatter)), min(steps) / np.sqrt(12.0), 1e-9)
+
+
+def effort_noise(efforts: Sequence[Array]) -> float:
+  """Returns the noise of effort readings: the median of second differences, at least a step."""
+  steps = [quantum(e) for e in efforts]
+  jitter = [float(np.median(np.abs(np.diff(e, n=2)))) / 1.65 for e in efforts]
+  return max(*steps, float(np.median(jitter)), 1e-9)
+
+
+def timing(plant: JointPlant) -> tuple[float, float]:
+  """Returns the noise of readings at rest and how far their stamps are off, rad (m) and s.
+
+  Readings of a joint that moves at v scatter by the noise at rest and by v times the stamps' error.
+  """
+  scatter, speed = [], []
+  for log in plant.logs:
+    scatter.append(np.diff(log.position, n=3) ** 2 / 20.0)
+    speed.append(log.velocity[2:-1] ** 2)
+  s, v = np.concatenate(scatter), np.concatenate(speed)
+  slow, fast = v <= np.quantile(v, 0.3), v >= np.quantile(v, 0.8)
+  steps = min(quantum(log.position) for log in plant.logs) / np.sqrt(12.0)
+  rest = max(float(_trimmed(s[slow])), steps**2, 1e-18)
+  error = max(_trimmed(s[fast]) - rest, 0.0) / max(float(v[fast].mean()), 1e-18)
+  return float(np.sqrt(rest)), float(np.sqrt(error))
+
+
+def _trimmed(values: Array) -> float:
+  """Returns the mean of the lower 90 %, made that of all for normal noise."""
+  kept = values[values <= np.quantile(values, 0.9)]
+  return float(kept.mean()) / _NINE_TENTHS**2 if len(kept) else 0.0

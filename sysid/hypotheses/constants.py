@@ -1,0 +1,36 @@
+"""Nominal constants of a joint with tolerances: what every hypothesis may vary."""
+
+import numpy as np
+
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.settings import SETTINGS, Settings
+
+NAME = "calibration"
+
+
+def constants(plant: JointModel, settings: Settings = SETTINGS) -> Term:
+  """Returns the constants of a joint that its model has, with their tolerances as prior."""
+  p, tolerance = plant.declared, dict(settings.tolerances)
+  inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
+  present = {
+    "damping": p[INDEX["damping"]] > 0,
+    "armature": p[INDEX["armature"]] > 0.1 * inertia,
+    "friction": p[INDEX["friction"]] > 0,
+    "gain": True,
+    "mass": True,
+    "zero": plant.holds,
+    "skew": True,
+    "latency": True,
+  }
+  names = tuple(n for n, there in present.items() if there)
+  sigma = tuple(tolerance[n] for n in names)
+  limit = tuple(
+    min(5.0 * s, 0.9) if n not in ("zero", "skew", "latency") else 5.0 * s
+    for n, s in zip(names, sigma, strict=True)
+  )
+  low = tuple(0.0 if n == "latency" else -b for n, b in zip(names, limit, strict=True))
+  zeros = (0.0,) * len(names)
+  scale = tuple(0.005 if n in ("skew", "latency") else t for n, t in zip(names, sigma, strict=True))
+  return Term(NAME, plant.joint, names, low, limit, scale, (zeros,), sigma, zeros)

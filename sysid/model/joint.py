@@ -1,0 +1,109 @@
+"""One joint of a model along measured logs, as the compiled kernel simulates it: in open loop from
+the commands, or with its state pulled to the readings.
+
+What masses and gravity add is linear and kept on the step grid, so that a hypothesis costs a sum of
+arrays, not a pass over the model. Shapes: N samples of a log, T grid points, P kernel parameters.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.rotations import matrix_from_rotvec
+from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.plant import JointPlant
+from nerf2real.sysid.model.reduction import Reduction, Surroundings
+
+Array = np.ndarray
+I = kernel.INDEX  # noqa: E741
+
+FOLLOWED_S = 0.02
+"""s in which a state that follows the readings makes up for a difference."""
+
+
+class Load(NamedTuple):
+  """A linear change of what a joint feels: factors of the parts of a basis."""
+
+  key: str
+  """"mass", "gravity" or the name of a body that carries more."""
+  factors: Array
+
+
+class Simulated(NamedTuple):
+  """A log as simulated, at its samples [N]."""
+
+  position: Array
+  torque: Array
+  jump: Array
+
+
+class JointModel(JointPlant):
+  """A joint of a declared model and what several logs hold of it."""
+
+  def __init__(
+    self,
+    model: mujoco.MjModel,
+    joint: str,
+    logs: Sequence[Log],
+    *,
+    reductions: Sequence[Reduction] | None = None,
+    window_s: float = 0.5,
+  ):
+    super().__init__(model, joint, logs, reductions=reductions, window_s=window_s)
+    self._bases: dict[str, list[Array]] = {}
+    self._fields = [np.array(fields) for fields in self._nominal]  # inertia, here, across, at, bias
+    periods = np.concatenate([np.diff(log.time) for log in self.logs])
+    period = max(float(np.median(periods)), 1e-6)
+    share = 1.0 - float(np.exp(-period / FOLLOWED_S))
+    self._follow = share, share**2 / (2.0 - share) / period  # Benedict and Bordner 1962
+
+  def basis(self, key: str) -> list[Array]:
+    """Returns the parts [K, 4, T] of a basis, one array a log: inertia, here, across, bias."""
+    if key not in self._bases:
+      if key == "mass":
+        self._bases[key] = [f[None, [0, 1, 2, 4]] for f in self._fields]
+      elif key == "gravity":
+        self._bases[key] = self._parts([r.gravity(self.joint) for r in self.reductions])
+      else:
+        body = self._body(key)
+        self._bases[key] = self._parts([r.moments(self.joint, body) for r in self.reductions])
+    return self._bases[key]
+
+  def _parts(self, logs: Sequence[Sequence[Surroundings]]) -> list[Array]:
+    result = []
+    for index, parts in enumerate(logs):
+      grid, time = self._grids[index], self.logs[index].time
+      rows = [
+        [np.interp(grid, time, f) for f in (p.inertia, p.here, p.across, p.bias)] for p in parts
+      ]
+      result.append(np.array(rows))
+    return result
+
+  def tilt_load(self, x: float, y: float) -> Load:
+    """Returns what turning gravity by the rotation vector (x, y, 0) adds."""
+    before = self.model.opt.gravity
+    return Load("gravity", matrix_from_rotvec([x, y, 0.0]) @ before - before)
+
+  def run(self, p: Array, loads: Sequence[Load], index: int, *, follow: bool = False) -> Simulated:
+    """Simulates one log.
+
+    Args:
+      p: kernel parameters [P].
+      loads: what changes of masses and gravity.
+      index: of the log.
+      follow: whether the state is pulled to the readings.
+    """
+    fields = self._fields[index]
+    if loads:
+      fields = fields.copy()
+      for load in loads:
+        change = np.tensordot(load.factors, self.basis(load.key)[index], 1)
+        fields[[0, 1, 2, 4]] += change
+    if follow:
+      p = p.copy()
+      p[I["follow"]], p[I["follow_speed"]] = self._follow
+    out = self._run(p, index, tuple(fields), None)
+    return Simulated(out.position, out.torque, out.jump)

@@ -1,0 +1,222 @@
+"""Explains one joint: sets of effects grown forward, scored by left-out likelihood."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.fit.posterior import Fit, Fitter, Layout
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.settings import SETTINGS, Settings
+
+Array = np.ndarray
+
+
+@dataclasses.dataclass
+class Scored:
+  """A fitted hypothesis of one joint, with its evidence."""
+
+  terms: tuple[Term, ...]
+  fit: Fit
+  nats: Array
+  """[B] log-likelihood of the left-out blocks."""
+
+  @property
+  def names(self) -> frozenset[str]:
+    """Kinds of its effects."""
+    return named(self.terms)
+
+  @property
+  def evidence(self) -> float:
+    """Sum of the blocks' nats, less what the priors cost."""
+    sigma, centre = self.fit.layout.sigma, self.fit.layout.centre
+    return float(self.nats.sum() - 0.5 * np.sum(((self.fit.x - centre) / sigma) ** 2))
+
+
+def named(terms: Sequence[Term]) -> frozenset[str]:
+  """Returns the kinds of effects that are not the machine's anyway."""
+  return frozenset(t.name for t in terms if t.name is not None)
+
+
+def clear(better: Scored, other: Scored) -> float:
+  """Returns how clear a difference of evidence is, in its standard errors (Vuong 1989).
+
+  The blocks' differences are paired; neighbours may be correlated.
+  """
+  d = better.nats - other.nats
+  return standardised(d, better.evidence - other.evidence, 1.0)
+
+
+def standardised(differences: Array, total: float | None = None, least: float = 1e-300) -> float:
+  """Returns a sum of blocks' differences over its standard error."""
+  total = float(differences.sum()) if total is None else total
+  e = differences - differences.mean()
+  own = float(e @ e)
+  variance = max(own + 2.0 * float(e[1:] @ e[:-1]), own) * len(e) / max(len(e) - 1, 1)
+  return total / max(np.sqrt(variance), least)
+
+
+class Explainer:
+  """Grows hypotheses of one joint."""
+
+  def __init__(
+    self,
+    joint: JointLikelihood,
+    constants: Term,
+    library: Sequence[Term],
+    *,
+    settings: Settings = SETTINGS,
+    start: Array | None = None,
+    known: Sequence[Term] = (),
+    freed: Term | None = None,
+  ):
+    """Fits the constants, setting the residual's scale as they improve.
+
+    Args:
+      joint: the logs.
+      constants: that every hypothesis varies.
+      library: effects to try.
+      settings: effort.
+      start: of the constants.
+      known: effects that every hypothesis has.
+      freed: constants that may differ from those of a reference.
+    """
+    self.joint, self.constants, self.settings = joint, constants, settings
+    self.library, self.freed = list(library), freed
+    self.scored: dict[tuple[Term, ...], Scored] = {}
+    base = (constants, *known)
+    x = np.concatenate([t.starts[0] for t in base]) if start is None else start
+    declared = joint.residuals((), np.zeros((1, 0)))[0]
+    joint.rescale(declared)
+    fitter = Fitter([joint], Layout([base]))
+    left = np.inf
+    for _ in range(self.settings.rounds):
+      fit = self._look_about(fitter, fitter.fit(x, iterations=2))
+      joint.rescale(fit.residuals[0])
+      x, before, left = fit.x, left, float(np.log(joint.scale).sum())
+      if left > before - 0.01:
+        break
+    self.null = self._score(base, fitter.fit(x, iterations=4))
+
+  def _look_about(self, fitter: Fitter, fit: Fit) -> Fit:
+    """Returns a fit from a better place if there is one: held commands make stairs of latencies."""
+    tried = []
+    for at, name in enumerate(self.constants.names):
+      if name in ("latency", "skew"):
+        for value in np.arange(-3, 5) * 0.002:
+          tried.append(fit.x.copy())
+          tried[-1][at] = np.clip(value, fitter.layout.low[at], fitter.layout.high[at])
+    costs = fitter.costs(np.array(tried))
+    best = int(np.argmin(costs))
+    return fitter.fit(tried[best], iterations=1) if costs[best] < fit.cost - 1.0 else fit
+
+  def _score(self, terms: tuple[Term, ...], fit: Fit) -> Scored:
+    fitter = Fitter([self.joint], Layout([terms]))
+    fitter.leave_out(fit)
+    result = Scored(terms, fit, self.joint.loglik(fit.held[0]))
+    self.scored[terms] = result
+    return result
+
+  def _rescore(self) -> None:
+    """Scores all hypotheses anew after the scale has changed."""
+    for s in self.scored.values():
+      s.nats = self.joint.loglik(s.fit.held[0])
+
+  def extend(self, parent: Scored, keep: int) -> list[Scored]:
+    """Returns the best hypotheses that add one effect to a parent, fitted to the end."""
+    quick: list[tuple[float, tuple[Term, ...], Fit]] = []
+    for terms, starts, stale, fresh in self._candidates(parent):
+      fitter = Fitter([self.joint], Layout([terms]))
+      costs = fitter.costs(starts)
+      best = None
+      for k in np.argsort(costs)[: 1 if parent.names else self.settings.starts]:
+        fit = fitter.fit(starts[k], iterations=2, known=stale, fresh=fresh, quick=True)
+        if best is None or fit.cost < best.cost:
+          best = fit
+      assert best is not None
+      quick.append((best.cost, terms, best))
+    quick.sort(key=lambda q: q[0])
+    chosen: dict[frozenset[str], tuple[float, tuple[Term, ...], Fit]] = {}
+    for q in quick:  # the best form of every kind
+      chosen.setdefault(named(q[1]), q)
+    results = []
+    for _, terms, fit in list(chosen.values())[:keep]:
+      done = Fitter([self.joint], Layout([terms])).fit(fit.x, iterations=4)
+      results.append((terms, done if done.cost < fit.cost + 1.0 else fit))
+    return [self._score(terms, fit) for terms, fit in results]
+
+  def _candidates(self, parent: Scored):
+    """Yields terms, starts [S, n], a Jacobian to take over and which values are new [n]."""
+    known, x = parent.fit.jacobian[0], parent.fit.x
+    old = [t.kind for t in parent.terms]
+    at = 0
+    for position, term in enumerate(parent.terms):  # an effect that references show may be larger
+      count = len(term.names)
+      if term.known:
+        free = next(
+          (t for t in self.library if t.kind == term.kind and t.fixed == term.fixed), None
+        )
+        if free is not None:
+          terms = (*parent.terms[:position], free, *parent.terms[position + 1 :])
+          starts = [x]
+          for factor in (0.5, 1.5, 3.0):
+            starts.append(x.copy())
+            starts[-1][at] *= factor
+          fresh = np.zeros(len(x), bool)
+          fresh[at : at + count] = True
+          yield terms, np.array(starts), [known], fresh
+      at += count
+    if self.freed is not None and not parent.terms[0].freed:
+      fresh = np.zeros(len(x), bool)
+      fresh[: len(self.freed.names)] = True
+      yield (self.freed, *parent.terms[1:]), x[None], [known], fresh
+    for term in self.library:
+      if term.kind in old:
+        continue
+      blank = np.zeros((len(term.names), *known.shape[1:]))
+      begin = np.array([np.concatenate([x, s]) for s in term.starts])
+      fresh = np.arange(begin.shape[1]) >= len(x)
+      yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
+
+  def adopt(self, best: Scored) -> None:
+    """Sets the scale by the best hypothesis; all are scored anew."""
+    self.joint.rescale(best.fit.residuals[0])
+    self._rescore()
+
+  def refit(self, item: Scored, iterations: int = 6) -> Scored:
+    """Returns a hypothesis fitted on under the present scale."""
+    fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit.x, iterations=iterations)
+    return self._score(item.terms, fit)
+
+  def explain(self, depth: int | None = None) -> list[Scored]:
+    """Grows sets of effects until one more is not clear; returns all scored, the best first.
+
+    Args:
+      depth: effects at most; those of the settings for None.
+    """
+    s, limit = self.settings, depth or self.settings.depth
+    parents, best = [self.null], self.null
+    for depth in range(limit):
+      grown = [g for p in parents for g in self.extend(p, s.kept)]
+      if not grown:
+        break
+      top = max(grown, key=lambda g: g.evidence)
+      if top.evidence > best.evidence:
+        self.adopt(top)
+        if depth == 0:
+          self.null = self.refit(self.null)
+        for item in sorted(grown, key=lambda g: -g.evidence)[: s.kept]:
+          self.refit(item, 3)
+      grown = sorted(
+        (g for g in self.scored.values() if len(g.names) == depth + 1), key=lambda g: -g.evidence
+      )
+      if clear(grown[0], best) < s.worth:
+        break
+      best = grown[0]
+      parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
+    return self.ranked()
+
+  def ranked(self) -> list[Scored]:
+    """Returns all scored hypotheses, the best first."""
+    return sorted(self.scored.values(), key=lambda s: -s.evidence)

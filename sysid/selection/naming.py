@@ -1,0 +1,125 @@
+"""Which effects of a joint are named: those that no hypothesis without them does as well as.
+
+One rule, one level of significance: an effect of the best hypothesis is named where every tried
+hypothesis without it is clearly worse (paired differences of left-out likelihood over their
+standard error, Vuong 1989), at the family-wise level of all effects tried. Where a hypothesis
+without it predicts the same motion, these logs cannot tell the two apart; both are said.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import norm
+
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.selection.decision import USUAL
+from nerf2real.sysid.selection.explain import Scored, clear
+from nerf2real.sysid.settings import SETTINGS, Settings
+
+Array = np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Name:
+  """An effect of the best hypothesis."""
+
+  kind: str
+  clear: float
+  """Standard errors by which the best hypothesis is better than any that lacks it."""
+  certain: bool
+  """Whether that is beyond the threshold."""
+  confounded: tuple[Scored, ...]
+  """Hypotheses without it that predict the same."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+  """What is concluded of one joint."""
+
+  best: Scored
+  names: tuple[Name, ...]
+  left: Array
+  """[B] mean squared position residual of left-out blocks."""
+  share: float
+  """Of the squared residual without effects that the names explain, on left-out blocks."""
+  share_low: float
+  """Lower end of that share's 95 % interval."""
+
+  @property
+  def named(self) -> tuple[str, ...]:
+    """Kinds that are certain."""
+    return tuple(n.kind for n in self.names if n.certain)
+
+
+def threshold(tried: int, settings: Settings = SETTINGS) -> float:
+  """Returns the standard errors that one of so many effects must be clear by."""
+  return float(norm.isf(settings.level / max(tried, 1)))
+
+
+def conclude(
+  joint: JointLikelihood,
+  ranked: Sequence[Scored],
+  beyond: float,
+  without: Array | None = None,
+) -> Explanation:
+  """Returns the best hypothesis and what of it is certain.
+
+  Args:
+    joint: the logs.
+    ranked: tried hypotheses, the one without effects among them.
+    beyond: standard errors that count as clear.
+    without: mean squares [B] that the baseline leaves as it was; those of the fitted one for None.
+  """
+  best = next(s for s in ranked if not s.names)
+  for size in range(1, max(len(s.names) for s in ranked) + 1):
+    same = [s for s in ranked if len(s.names) == size]
+    if same:
+      top = max(same, key=lambda s: s.evidence)
+      if clear(top, best) > beyond:
+        best = top
+  best = _usual(joint, best, ranked, beyond)
+  names = tuple(_name(joint, best, kind, ranked, beyond) for kind in sorted(best.names))
+  left = best.fit.held[0][0]
+  bare = next(s for s in ranked if not s.names)
+  share = _share(left, bare.fit.held[0][0] if without is None else without)
+  return Explanation(best, names, left, *share)
+
+
+def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
+  """Returns the most usual of the hypotheses that predict what the best one does."""
+  order = {kind: index for index, kind in enumerate(USUAL)}
+  alike = [
+    s
+    for s in ranked
+    if len(s.names) == len(best.names) and clear(best, s) < beyond and _same(joint, best, s)
+  ]
+  return min([best, *alike], key=lambda s: sorted(order.get(k, len(order)) for k in s.names))
+
+
+def _name(
+  joint: JointLikelihood, best: Scored, kind: str, ranked: Sequence[Scored], beyond: float
+) -> Name:
+  rivals = [s for s in ranked if kind not in s.names]
+  behind = [(clear(best, s), s) for s in rivals]
+  near = [s for z, s in behind if z < beyond]
+  alike = tuple(s for s in near if _same(joint, best, s))
+  told = [z for z, s in behind if not any(s is a for a in alike)]
+  least = min(told, default=float("inf"))
+  return Name(kind, least, least >= beyond, alike)
+
+
+def _same(joint: JointLikelihood, one: Scored, other: Scored) -> bool:
+  """Tells whether two hypotheses predict the same but for a part of what remains."""
+  apart = one.fit.residuals[0] - other.fit.residuals[0]
+  mean = np.median(joint.squares(apart), axis=1)
+  return bool(np.all(mean < joint.settings.alike**2 * joint.scale**2))
+
+
+def _share(with_it: Array, without: Array, draws: int = 400) -> tuple[float, float]:
+  """Returns the share of squares explained and the low end of its 95 % interval (bootstrap)."""
+  random = np.random.default_rng(0)
+  pick = random.integers(len(with_it), size=(draws, len(with_it)))
+  drawn = 1.0 - with_it[pick].sum(axis=1) / np.maximum(without[pick].sum(axis=1), 1e-300)
+  share = 1.0 - float(with_it.sum()) / max(float(without.sum()), 1e-300)
+  return share, float(np.quantile(drawn, 0.025))

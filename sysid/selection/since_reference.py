@@ -1,0 +1,174 @@
+"""Analyses a machine against reference logs: every joint's changes, in the form of a report."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.data.audit import audit
+from nerf2real.sysid.fit.fitting import Fit as JointFit
+from nerf2real.sysid.fit.fitting import Problem
+from nerf2real.sysid.fit.posterior import CONSTANTS
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.plant import actuator_of
+from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.selection import changes, claims, race
+from nerf2real.sysid.selection.changes import Changed
+from nerf2real.sysid.selection.common import WHOLE
+from nerf2real.sysid.selection.decision import Finding, Thresholds
+from nerf2real.sysid.selection.explain import Scored, clear
+from nerf2real.sysid.selection.explanation import Ladder
+from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.selection.joint import Found
+from nerf2real.sysid.selection.screening import Screened
+from nerf2real.sysid.settings import SETTINGS, Settings
+
+_GRADES = ("none", "effects", "partly", "unexplained")
+
+
+def analyse(
+  model: mujoco.MjModel,
+  logs: Sequence[Log],
+  reference: Sequence[Log],
+  *,
+  settings: Settings = SETTINGS,
+) -> Identified:
+  """Returns what has changed since the reference logs were recorded.
+
+  Raises:
+    ValueError: no joint has an actuator and commands in all logs.
+  """
+  joints = [
+    name
+    for name in logs[0].commands.joints
+    if actuator_of(model, name) >= 0
+    and all(name in log.commands.joints for log in (*logs, *reference))
+  ]
+  if not joints:
+    raise ValueError(
+      "Found no joint with an actuator that all logs command, expected at least one."
+    )
+  reductions = [Reduction(model, log) for log in logs], [Reduction(model, log) for log in reference]
+  changed = [
+    changes.find(
+      model, joint, logs, reference, reductions=reductions, tried=len(joints), settings=settings
+    )
+    for joint in joints
+  ]
+  changed.sort(key=lambda c: (-_GRADES.index(c.verdict), -c.left / max(c.reference_left, 1e-12)))
+  found = [_found(item) for item in changed]
+  result = Identified(
+    model,
+    list(logs),
+    [f.screened for f in found],
+    [f for f, c in zip(found, changed, strict=True) if c.verdict != "none"] or found[:1],
+    audits=[audit(log) for log in logs],
+  )
+  for item, finding in zip(changed, found, strict=True):
+    _write_down(result, item, finding)
+  result.verdict = _verdict([c.verdict for c in changed])
+  return result
+
+
+def _verdict(verdicts: Sequence[str]) -> str:
+  """Returns the machine's verdict: names stand where any joint has them, and say what is left."""
+  kinds = set(verdicts)
+  if kinds <= {"none"}:
+    return "none"
+  if kinds <= {"none", "effects"}:
+    return "effects"
+  return "partly" if kinds & {"effects", "partly"} else "unexplained"
+
+
+def _found(item: Changed) -> Found:
+  """Returns a joint's hypotheses as the report shows them."""
+  problem = item.problem
+  best = item.found.best
+  entries = {s.terms: entry(problem, s) for s in item.ranked}  # one of each: they are compared
+  null, chosen = entries[item.null.terms], entries[best.terms]
+  others = [e for t, e in entries.items() if t != best.terms and _changed(t)]
+  singles = [e for e in [chosen, *others] if len(_changed(e.fit.terms)) == 1]
+  longer = [e for e in [chosen, *others] if len(_changed(e.fit.terms)) > 1]
+  declared = race.entry(problem, problem.fit([]))
+  alike = [entries[s.terms] for n in item.found.names for s in n.confounded if s.names]
+  alike = list({id(e): e for e in alike}.values())
+  ladder = Ladder(problem, item.known[0], declared, null, singles, longer)
+  verdict = "unexplained" if item.verdict in ("partly", "unexplained") else item.verdict
+  finding = Finding(verdict, chosen, bool(item.named), False, others, alike)
+  screened = Screened(item.joint, problem, item.known[0], declared, null)
+  return Found(screened, ladder, finding, {"q95": 0.0, "median": 0.0}, Thresholds())
+
+
+def entry(problem: Problem, scored: Scored) -> race.Entry:
+  """Returns a hypothesis as an entry of the evidence ladder."""
+  return race.entry(problem, JointFit(scored.terms, scored.fit.x, scored.fit.cost, 1.0, 0))
+
+
+def _changed(terms: Sequence[Term]) -> list[Term]:
+  return [t for t in terms if t.name is not None]
+
+
+def _write_down(result: Identified, item: Changed, found: Found) -> None:
+  """Adds a joint's effects, constants and latencies."""
+  best, chosen = item.found.best, found.finding.chosen
+  names = {n.kind: n for n in item.found.names}
+  offset = 0.0
+  for term in best.terms:
+    if term.kind == CONSTANTS:
+      values = best.fit.values(term)
+      result.clocks[item.joint] = Clocks(values.get("skew", 0.0), values.get("latency", 0.0))
+      effect = term.effect(np.array(list(values.values())))
+      result.calibration.append(dataclasses.replace(effect, target=item.joint))
+      offset += values.get("zero", 0.0)
+      if term.freed:
+        row = claims.constants(found.screened, chosen)
+        row["evidence"] |= _evidence(item, names["parameter_error"])
+        _list(result, item, "parameter_error", row)
+      continue
+    effect, row = claims.effect(found, chosen, term, 0.0)
+    if term.kind == "encoder_offset":
+      offset += float(effect.parameters["offset"])  # type: ignore[arg-type]
+    else:
+      result.objects.append(effect)
+    if term.known:
+      result.in_reference.append(row)
+      continue
+    row["evidence"] |= _evidence(item, names[term.kind])
+    _list(result, item, term.kind, row)
+  if offset:
+    result.objects.append(Effect("encoder_offset", item.joint, {"offset": offset}))
+  result.objects[:] = _once(result.objects)
+
+
+def _list(result: Identified, item: Changed, kind: str, row: dict[str, Any]) -> None:
+  """Adds an entry to what is claimed, or to what is only in the extended model."""
+  stands = kind in item.named and item.verdict in ("effects", "partly")
+  (result.effects if stands else result.nearest).append(row)
+
+
+def _evidence(item: Changed, name: Any) -> dict[str, Any]:
+  return {
+    "clear_by_standard_errors": round(min(name.clear, 999.0), 2),
+    "clear_of_the_baseline": round(clear(item.found.best, item.null), 2),
+    "share_explained": round(item.found.share, 4),
+    "share_explained_low": round(item.found.share_low, 4),
+    "left_over_reference": round(item.left / max(item.reference_left, 1e-12), 3),
+    "held_out_gain_nats": round(item.found.best.evidence - item.null.evidence, 2),
+  }
+
+
+def _once(effects: Sequence[Effect]) -> list[Effect]:
+  """Returns effects without repetitions of those that concern the whole machine."""
+  seen: set[tuple[str, str | None]] = set()
+  result = []
+  for effect in effects:
+    key = (effect.kind, None if effect.kind in WHOLE else effect.target)
+    if key not in seen:
+      seen.add(key)
+      result.append(effect)
+  return result

@@ -1,0 +1,73 @@
+"""Every constant of the analyser, each with its source or the calibration that set it."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """How an identification is done."""
+
+  block_s: float = 1.0
+  """s of a block of the likelihood: several times the memory of a servo loop."""
+  folds: int = 3
+  """Of the cross-validation where there is one log only."""
+  window_s: float = 0.5
+  """s of the windows that restart from the measured state where an actuator holds no position."""
+  jump: float = 0.5
+  """Of the torque's deviation: efforts near larger jumps do not count for their scale."""
+  effort_scale: float = 2.0
+  """Share that a measured effort may be off: torque constants are guesses."""
+  duty_scale: float = 0.03
+  """Share that full duty may be off the model's torque limit: both are of one data sheet."""
+  tolerances: tuple[tuple[str, float], ...] = (
+    ("damping", 0.06),
+    ("armature", 0.06),
+    ("friction", 0.2),
+    ("gain", 0.02),
+    ("mass", 0.03),
+    ("zero", 0.003),
+    ("skew", 0.0012),
+    ("latency", 0.002),
+  )
+  """Standard deviations of nominal constants: shares, rad (m), s."""
+  repeat: tuple[tuple[str, float], ...] = (
+    ("damping", 0.015),
+    ("armature", 0.01),
+    ("friction", 0.05),
+    ("gain", 0.005),
+    ("mass", 0.005),
+    ("zero", 0.0007),
+    ("skew", 0.0003),
+    ("latency", 0.0003),
+  )
+  """The same between two recordings of one machine."""
+  repeat_effect: float = 0.05
+  """Share by which an effect that a machine always had differs between two recordings."""
+  starts: int = 2
+  """Descents from the best of an effect's starts."""
+  rounds: int = 15
+  """Of fitting constants and setting the residual's scale in turn."""
+  depth: int = 3
+  """Effects of one joint at most."""
+  kept: int = 6
+  """Hypotheses that are fitted to the end, of those that add one effect to a parent."""
+  parents: int = 2
+  """Hypotheses that are grown further."""
+  worth: float = 2.8
+  """Standard errors by which a further effect must be better for the search to go on."""
+  reference_depth: int = 1
+  """Effects of a joint at most that are looked for in reference logs."""
+  structured: float = 0.5
+  """Of the readings' noise: a residual beside a reference that goes together is that large."""
+  alike: float = 0.5
+  """Of the residual's scale: hypotheses whose predictions differ by less are not told apart."""
+  more: float = 2.0
+  """Times what the machine leaves anyway: more than that remains to be explained (as a blind set's
+  effect counts as seen from twice the healthy machine's error on)."""
+  most: float = 0.75
+  """Share of a squared residual that names must explain where more remains: half the error."""
+  level: float = 0.05
+  """Family-wise significance of all names together."""
+
+
+SETTINGS = Settings()

@@ -1,0 +1,93 @@
+"""The likelihood by blocks and its mode, against hand computation and made logs."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.likelihood import JointLikelihood, _correlation_time, _same_commands
+from nerf2real.sysid.fit.posterior import Fitter, Layout
+from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.model.joint import JointModel
+from tests.sysid.synthetic import PENDULUM, log_of
+
+
+def _joint(kinds=("sweep", "slow"), effects=()):
+  logs = [log_of(PENDULUM, kind, effects, duration=5.0, seed=i) for i, kind in enumerate(kinds)]
+  plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
+  return plant, JointLikelihood(plant)
+
+
+@pytest.fixture(scope="module")
+def viscous():
+  """A joint with viscous friction that its model lacks."""
+  return _joint(effects=[Effect("viscous_friction", "joint", {"coefficient": 0.5})])
+
+
+def test_nats_of_a_block_are_those_of_the_formula(viscous):
+  _, joint = viscous
+  residuals = np.zeros((1, joint.size))
+  chosen = joint.block_of == 2
+  residuals[0, chosen] = 3.0 * joint.scale[0]
+  squares = joint.squares(residuals)
+  nats = joint.loglik(squares)
+  expected = (
+    -joint.independent[0] * joint.counts[0, 2] * np.log1p(squares[0, 2] / joint.scale[0] ** 2)
+  )
+  assert nats[2] == pytest.approx(expected)
+  assert np.all(np.delete(nats, 2) == 0.0)
+
+
+def test_logs_are_folds_and_blocks_are_a_second(viscous):
+  _, joint = viscous
+  assert set(joint.fold) == {0, 1}
+  assert np.median(np.diff(joint.starts)) == pytest.approx(100, abs=2)
+
+
+def test_correlation_time_of_an_autoregression():
+  random, rho = np.random.default_rng(0), 0.8
+  row = np.zeros(40_000)
+  for n in range(1, len(row)):
+    row[n] = rho * row[n - 1] + random.normal()
+  starts = np.arange(0, len(row), 100)
+  assert _correlation_time(row, starts) == pytest.approx((1 + rho) / (1 - rho), rel=0.25)
+  assert _correlation_time(random.normal(size=40_000), starts) < 1.2
+
+
+def test_the_mode_is_the_effect_that_is_there(viscous):
+  plant, joint = viscous
+  term = next(t for t in candidates.library(plant) if t.kind == "viscous_friction")
+  fixed = constants(plant)
+  layout = Layout([(fixed, term)])
+  joint.rescale(joint.residuals((), np.zeros((1, 0)))[0])
+  fitter = Fitter([joint], layout)
+  start = np.concatenate([np.zeros(len(fixed.names)), term.starts[0]])
+  for _ in range(4):
+    fit = fitter.fit(start, iterations=4)
+    joint.rescale(fit.residuals[0])
+    start = fit.x
+  assert fit.values(term)["coefficient"] == pytest.approx(0.5, rel=0.1)
+  fitter.leave_out(fit)
+  held = np.sqrt(fit.held[0][0].mean())
+  assert held < 3.0 * joint.floor[0]
+
+
+def test_only_the_very_same_commands_are_the_same(viscous):
+  plant, _ = viscous
+  sweep, slow = plant.logs
+  assert _same_commands(sweep, sweep)
+  assert not _same_commands(sweep, slow)
+
+
+def test_what_a_reference_leaves_cancels_beside_the_same_commands():
+  effect = [Effect("cogging", "joint", {"amplitude": 0.1, "periods": 9.0, "phase": 0.3})]
+  _, before = _joint(effects=effect)
+  _, now = _joint(effects=effect)
+  left = before.residuals((), np.zeros((1, 0)))[0]
+  alone = np.sqrt(np.mean(now.residuals((), np.zeros((1, 0)))[0, 0] ** 2))
+  assert now.expect(before, left)
+  beside = np.sqrt(np.mean(now.residuals((), np.zeros((1, 0)))[0, 0] ** 2))
+  assert beside < 1e-9 < 1e-3 < alone
+  _, other = _joint(kinds=("steps", "slow"), effects=effect)
+  assert not other.expect(before, left)

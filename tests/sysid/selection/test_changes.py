@@ -1,0 +1,132 @@
+"""Names of what changed since a reference: one rule, and a machine that had something before."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.posterior import Fit, Layout
+from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.plausible import plausible
+from nerf2real.sysid.selection import changes, naming, since_reference
+from nerf2real.sysid.selection.explain import Scored, standardised
+from tests.sysid.synthetic import PENDULUM, log_of
+
+KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
+BEFORE = [Effect("coulomb_friction", "joint", {"torque": 0.15})]
+
+
+class _Joint:
+  """A joint whose predictions are given."""
+
+  class settings:
+    alike = 0.5
+
+  scale = np.array([1.0])
+
+  @staticmethod
+  def squares(residuals):
+    return residuals.reshape(1, -1, 10).var(axis=2)
+
+
+def _scored(kinds, nats, prediction=0.0):
+  layout = Layout([()])
+  residuals = [np.tile([1.0, -1.0], 100)[None] * prediction]
+  fit = Fit(layout, np.zeros(0), 0.0, residuals, np.zeros((1, 0, 0)), np.zeros((1, 0)), [])
+  fit.held = [np.exp(-np.asarray(nats))[None]]
+  item = Scored((), fit, np.asarray(nats, float))
+  item.__class__ = type("Named", (Scored,), {"names": frozenset(kinds)})
+  return item
+
+
+def test_a_name_needs_all_that_lack_it_to_be_clearly_worse():
+  random = np.random.default_rng(0)
+  noise = random.normal(0, 0.1, 20)
+  null = _scored((), noise - 3.0)
+  right = _scored(("a",), noise + random.normal(0, 0.1, 20))
+  worse = _scored(("b",), noise - 1.0 + random.normal(0, 0.1, 20), prediction=5.0)
+  as_good = _scored(("c",), noise - 0.001 + random.normal(0, 0.1, 20), prediction=5.0)
+  assert naming.conclude(_Joint, [null, right, worse], 3.0).named == ("a",)
+  assert naming.conclude(_Joint, [null, right, worse, as_good], 3.0).named == ()
+
+
+def test_a_rival_that_predicts_the_same_is_said_beside_the_name():
+  null = _scored((), np.linspace(-4, -3, 20))
+  right, twin = _scored(("a",), np.linspace(0, 0.1, 20)), _scored(("b",), np.linspace(0, 0.09, 20))
+  (name,) = naming.conclude(_Joint, [null, right, twin], 3.0).names
+  assert name.certain
+  assert [sorted(s.names) for s in name.confounded] == [["b"]]
+
+
+def test_one_block_is_no_evidence():
+  differences = np.zeros(30)
+  differences[4] = 50.0
+  assert standardised(differences) < 1.5
+  assert standardised(np.full(30, 1.0) + np.linspace(-0.1, 0.1, 30)) > 20
+
+
+def test_the_threshold_grows_with_what_was_tried():
+  assert naming.threshold(1) == pytest.approx(1.645, abs=1e-3)
+  assert naming.threshold(400) > naming.threshold(20) > 2.8
+
+
+@pytest.fixture(scope="module")
+def found():
+  """Reports of a machine with friction of old: unchanged, and with commands late since."""
+  patch = pytest.MonkeyPatch()
+  library = candidates.library
+  few = lambda plant: [t for t in library(plant) if t.kind in KINDS]  # noqa: E731
+  patch.setattr(changes, "_library", few)
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  late = Effect("command_delay", "joint", {"delay": 0.02})
+
+  def logs(effects):
+    return [
+      log_of(PENDULUM, kind, effects, duration=5.0, seed=i)
+      for i, kind in enumerate(("sweep", "steps"))
+    ]
+
+  before = logs(BEFORE)
+  result = {
+    "same": since_reference.analyse(model, logs(BEFORE), before),
+    "late": since_reference.analyse(model, logs([*BEFORE, late]), before),
+  }
+  patch.undo()
+  return result
+
+
+def test_what_was_there_before_is_no_change(found):
+  assert found["same"].verdict == "none"
+  assert found["same"].effects == []
+
+
+def test_what_changed_is_named_with_its_size(found):
+  result = found["late"]
+  assert result.verdict == "effects"
+  (row,) = result.effects
+  assert (row["kind"], row["joint"]) == ("command_delay", "joint")
+  assert row["parameters"]["delay"]["value"] == pytest.approx(0.02, abs=0.002)
+  assert row["evidence"]["clear_by_standard_errors"] > naming.threshold(len(KINDS))
+
+
+def test_the_report_lists_what_was_there_before(found):
+  # Dry friction of 0.15 N m is in both: it is in the extended model, and no change.
+  result = found["late"]
+  kinds = {row["kind"] for row in result.in_reference}
+  assert kinds <= {"coulomb_friction", "viscous_friction", "payload"}
+  assert {e.kind for e in result.objects} >= {"command_delay", *kinds}
+
+
+def test_values_stay_within_what_is_plausible():
+  waves = candidates.Term(
+    "cogging",
+    "joint",
+    ("amplitude", "periods", "phase"),
+    (0.0, 3.0, -10.0),
+    (5.0, 300.0, 10.0),
+    (0.1, 0.05, 0.3),
+    ((0.1, 216.0, 0.0), (0.1, 40.0, 0.0)),
+  )
+  term = plausible(waves)
+  assert term.high == (0.625, 125.0, 10.0)
+  assert term.starts == ((0.1, 125.0, 0.0), (0.1, 40.0, 0.0))
