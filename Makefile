@@ -9,7 +9,7 @@ BIN := .venv/bin
 
 .PHONY: see demo loop test lint install clean
 see: install
-	$(BIN)/python launch/view.py --task nerf_nav --policy walker
+	$(BIN)/python launch/view.py --task nerf_nav --policy shipped
 
 demo: install
 	$(BIN)/python launch/make_scene.py --capture builtin --preset demo --out out/demo
