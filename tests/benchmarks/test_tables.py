@@ -27,6 +27,7 @@ RECORDS = {
   )
 }
 BLOCKS = {
+  "root": "The most important ones.\n",
   "speed": "| a | b | c |\n{row x.speed}\n| d | {x.speed/share.count} / {x.speed/share:.0f} |\n"
 }
 GOOD = """# A
@@ -108,7 +109,7 @@ def test_what_is_recorded_or_allowed_or_no_figure_passes(root, sentence):
 
 
 def test_a_figure_typed_into_a_template_is_found(root):
-  blocks = {"speed": BLOCKS["speed"] + "| e | 77 ms |\n"}
+  blocks = BLOCKS | {"speed": BLOCKS["speed"] + "| e | 77 ms |\n"}
   found = tables.check(root, RECORDS, blocks, {})
   assert any('benchmarks/ledger/tables.md: "77 ms" has no record' in line for line in found)
 
