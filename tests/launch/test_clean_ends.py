@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import av
@@ -44,7 +45,10 @@ def test_virtual_robot_frees_its_camera(number):
 def test_an_interrupted_rollout_leaves_a_video_that_plays(tmp_path):
   video = tmp_path / "out.mp4"
   process = _start("rollout", "--seconds", "600", "--video", video)
-  assert process.stderr.readline().startswith("filming")
+  deadline = time.monotonic() + 120.0
+  while not any(path.stat().st_size > 10_000 for path in tmp_path.iterdir()):  # some frames
+    assert time.monotonic() < deadline and process.poll() is None
+    time.sleep(0.2)
   _, err = _end(process, signal.SIGINT)
   assert process.returncode == 128 + signal.SIGINT and err.splitlines()[-1] == "interrupted"
   with av.open(str(video)) as container:
