@@ -87,7 +87,7 @@ def test_a_shadow_lies_on_the_floor_under_the_robot(environment):
   view = _stand(environment, 0.0, 0.0)
   pose = third_person.look_at(np.array([0.0, -0.5, 1.2]), np.array([0.0, 0.0, 0.0]))
   depth = -pose[2, 3] / (view._rays @ pose[:3, :3].T)[:, 2]  # the plane z = 0
-  shape = (_HEIGHT // 2, _WIDTH // 2)
+  shape = (view._lens.height, view._lens.width)  # smaller than the picture
   lit = np.full((*shape, 3), 200, np.uint8)
   shaded = view._shadow(lit, depth.reshape(shape), pose)[..., 0]
   middle = shaded[shape[0] // 2, shape[1] // 2]
