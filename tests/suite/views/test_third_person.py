@@ -90,7 +90,7 @@ def test_a_shadow_lies_on_the_floor_under_the_robot(environment):
   shape = (view._lens.height, view._lens.width)  # smaller than the picture
   lit = np.full((*shape, 3), 200, np.uint8)
   shaded = view._shadow(lit, depth.reshape(shape), pose)[..., 0]
-  middle = shaded[shape[0] // 2, shape[1] // 2]
+  middle = int(shaded[shape[0] // 2, shape[1] // 2])
   assert middle == pytest.approx(100, abs=3)  # half of the light directly below
   assert shaded[0, 0] == 200
   raised = view._shadow(lit, 0.8 * depth.reshape(shape), pose)  # 24 cm above the floor
