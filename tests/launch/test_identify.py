@@ -101,7 +101,7 @@ def test_missing_files_and_options_are_one_line(identify, tmp_path):
     ((*model, *out), "Found no --model, --logs or --out"),
     ((*model, "--logs", tmp_path / "none.mcap", *out), "Found no file"),
     ((*model, "--logs", log, "--held", tmp_path / "none.mcap", *out), "Found no file"),
-    ((*model, "--logs", log, "--out", tmp_path / "file"), "File exists"),
+    ((*model, "--logs", log, "--out", tmp_path / "file"), "is a file, expected a folder"),
     (("--evaluate", tmp_path, "--held", log), "expected a folder that identify.py wrote"),
     (("--evaluate", tmp_path), "Found no --held log"),
   ):
