@@ -28,7 +28,7 @@ RECORDS = {
 }
 BLOCKS = {
   "root": "The most important ones.\n",
-  "speed": "| a | b | c |\n{row x.speed}\n| d | {x.speed/share.count} / {x.speed/share:.0f} |\n"
+  "speed": "| a | b | c |\n{row x.speed}\n| d | {x.speed/share.count} / {x.speed/share:.0f} |\n",
 }
 GOOD = """# A
 
