@@ -31,6 +31,9 @@ _SHOW_STEPS, _PICTURE_STEPS = 2, 4  # control steps between showings of the moti
 _HANDLE_HEIGHT = 0.28  # m of the handle above the torso, so that it does not hide the robot
 _SETBACK = 0.02  # m by which the field's floor is lowered, so that it does not swallow the feet
 _LINE_WIDTH = 0.015  # m of the lines on the floor
+_STRAYED = (
+  0.8  # m that the robot walks before the cameras turn to it; chosen: it stays in the picture
+)
 _TIME_LIMIT = 120.0  # s; chosen: several goals before the robot starts anew
 _DIRECTIONS = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}
 
@@ -63,6 +66,7 @@ class TaskViewer:
     self._push_until, self._push = 0.0, np.zeros(3)
     self._dragging = False
     self._reset_asked = False
+    self._faced = np.full(3, np.inf)  # where the page's cameras were turned to last
     self._timestep = environment.reset()
     self._geoms = self._add_geoms()
     self._add_controls()
@@ -165,7 +169,7 @@ class TaskViewer:
     gui = self.server.gui
     self._running = gui.add_checkbox("run", True)
     self._policy = gui.add_dropdown("policy", tuple(self._makers))
-    self._follow = gui.add_checkbox("find the robot when it starts anew", True)
+    self._follow = gui.add_checkbox("keep the robot in view", True)
     gui.add_button("reset").on_click(lambda _: setattr(self, "_reset_asked", True))
     camera = self._environment.task.robot_camera
     self._picture = None
@@ -230,6 +234,7 @@ class TaskViewer:
     if timestep.first():
       self._start_episode()
     self._steps += 1
+    self._keep_in_view(within=_STRAYED)
     if self._steps % _SHOW_STEPS == 0:
       self._show(timestep.observation.get("camera"))
 
@@ -246,9 +251,15 @@ class TaskViewer:
   def _start_episode(self) -> None:
     """Forgets a push and shows the robot where it stands now."""
     self._push_until = 0.0
-    if self._follow.value:
+    self._keep_in_view(within=0.0)
+
+  def _keep_in_view(self, *, within: float) -> None:
+    """Turns the cameras to a robot farther than `within` [m] from where they were turned to."""
+    position = self._environment.task.state.position
+    if self._follow.value and np.linalg.norm(position[:2] - self._faced[:2]) >= within:
       for client in self.server.get_clients().values():
         self._face(client.camera)
+      self._faced = position.copy()
 
   def _show(self, picture: np.ndarray | None = None) -> None:
     environment = self._environment
