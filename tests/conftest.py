@@ -1,8 +1,13 @@
 """Set-up of all tests: MuJoCo draws through EGL where there is no screen, as on a server."""
 
 import os
+import signal
 
 from hypothesis import settings
+
+# A shell has commands in the background ignore Ctrl-C, and what the tests start would inherit it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+  signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if "DISPLAY" not in os.environ:
   os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported, so before anything else

@@ -20,13 +20,7 @@ def _start(script, *arguments):
     stdout=subprocess.PIPE,
     stderr=subprocess.PIPE,
     text=True,
-    preexec_fn=_heed_ctrl_c,
   )
-
-
-def _heed_ctrl_c():
-  """Undoes what a shell does to a command in the background, which ignores Ctrl-C."""
-  signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _end(process, number):
