@@ -1,4 +1,7 @@
-"""Every constant of the analyser, each with its source or the calibration that set it."""
+"""Constants of the analysis beside references (`selection/since_reference.py`), all of them chosen.
+
+Most were set on development sets, not calibrated; the older path (`selection/decision.py`) has its own.
+"""
 
 import dataclasses
 
