@@ -1,4 +1,4 @@
-"""Constants of the analysis beside references (`selection/since_reference.py`), all of them chosen.
+"""Constants of the analysis beside references (`since_reference.py`), all of them chosen.
 
 Most were set on development sets, not calibrated; the older path (`selection/decision.py`) has its own.
 """
