@@ -1,6 +1,6 @@
 """Constants of the analysis beside references (`since_reference.py`), all of them chosen.
 
-Most were set on development sets, not calibrated; the older path (`selection/decision.py`) has its own.
+Most were set on development sets, not calibrated; the older path (`decision.py`) has its own.
 """
 
 import dataclasses
