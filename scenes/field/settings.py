@@ -83,9 +83,10 @@ class TrainSettings:
   transmittance_threshold: float = 1e-3
   """Samples behind this much light take no part. Chosen: a quarter of one of 255 levels; Mueller et
   al. 2022: 1e-4."""
-  depth_limit: float = 10.0
-  """A march ends where the occupancy grid's optical depth passes this. Chosen: exp(-10) is below
-  the threshold above, so that a grid that is too dense ends no ray early."""
+  depth_limit: float = 16.0
+  """A ray's first march ends where the occupancy grid's optical depth passes this. The grid holds
+  each cell's largest density, so that light may be left: then the ray is marched again, four times
+  as far. Chosen: 9 to 11 samples a ray in two trained fields; with 8 or 32 a quarter more."""
   refine_samples: float = 24.0
   """The march starts coarse and its step is halved when a ray has fewer samples than this. Chosen,
   not tuned."""

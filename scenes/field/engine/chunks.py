@@ -28,6 +28,9 @@ from nerf2real.scenes.field.engine.losses import squareplus
 from nerf2real.scenes.field.engine.native.vectors import PADDING
 from nerf2real.scenes.field.engine.rays import draw_ray, largest, squash
 
+_MARCH = 1 << 24  # a ray's number: its place in the step's order, and this for every march before
+_LIMIT_RATIO = 4.0  # of the depth limits of a ray's marches
+
 
 class Chunks(NamedTuple):
   """Kernels of one shape of field."""
@@ -61,6 +64,8 @@ def build(f: Functions) -> Chunks:
   ):
     """Adds the gradient of as many random rays as fit into a budget of samples.
 
+    A ray that the depth limit ended before opaque matter is marched again: every ray that is drawn
+    counts once, whatever the grid holds.
     Writes figures [6]: rays, kept samples, marched samples, sums over the rays of squared error,
     Charbonnier loss and distortion loss.
     """
@@ -68,36 +73,53 @@ def build(f: Functions) -> Chunks:
     w = workers[number]
     first_ray = wp.int64(number) << wp.int64(32)
     rays_done = wp.int32(0)
+    drawn = wp.int32(0)
+    waiting = wp.int32(0)  # rays to march again
     total = wp.int32(0)
     marched = wp.int32(0)
     sums = wp.vec3d()
     for i in range(parameters):
       w.gradient[i] = 0.0
-    while marched < budget:
+    while marched < budget or waiting > 0:
       rays = wp.int32(0)
       count = wp.int32(0)
-      while rays < ray_columns and count + s.ray_samples <= CHUNK_SAMPLES:
-        index = first_ray + wp.int64(rays_done + rays)
+      while (
+        rays < ray_columns
+        and count + s.ray_samples <= CHUNK_SAMPLES
+        and (waiting > 0 or marched < budget)
+      ):
+        number = drawn
+        if waiting > 0:
+          waiting -= 1
+          number = w.again[waiting] + _MARCH
+        else:
+          drawn += 1
+        index = first_ray + wp.int64(number % _MARCH)
+        limit = s.depth_limit * wp.pow(_LIMIT_RATIO, wp.float32(number // _MARCH))
         draw_ray(p, s, seed, index, w.rays, ray_columns, rays)
         w.first[rays] = count
-        found = f.march_ray(grids, s, w, seed, index, rays, count)
+        found, cut = f.march_ray(grids, s, w, seed, index, rays, limit, count)
+        w.number[rays] = wp.where(cut, ~number, number)
         for n in range(count, count + found):
           w.ray_of[n] = rays
         count += found
         rays += 1
       w.first[rays] = count
-      rays_done += rays
       marched += wp.max(count, 1)
       f.place(w, s, 0, count)
       f.encode(w, m, 0, count)
       f.base_forward(w, m, 0, count)
       f.opacity(w, s, 0, count)
-      count = f.keep_visible(w, rays, threshold)
+      count = f.keep_visible(w, rays, waiting, threshold)
       f.view_forward(w, m, s, 0, count)
       for r in range(rays):
         w.last[r] = w.first[r + 1]
-        losses = ray_losses(w, s, r)
-        sums += wp.vec3d(wp.float64(losses[0]), wp.float64(losses[1]), wp.float64(losses[2]))
+        if w.number[r] < 0 and w.last[r] == w.first[r]:
+          waiting += 1
+        else:
+          rays_done += 1
+          losses = ray_losses(w, s, r)
+          sums += wp.vec3d(wp.float64(losses[0]), wp.float64(losses[1]), wp.float64(losses[2]))
       clear(w.work, count, count + PADDING)
       f.view_backward(w, m, 0, count)
       f.base_backward(w, m, 0, count, total)

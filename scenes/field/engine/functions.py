@@ -90,7 +90,7 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Functions:
 
   # Written out: Warp looks for this decorator in the source where something is returned.
   @wp.func_native(snippet(native_grid.KEEP_VISIBLE, **constants))
-  def keep_visible(worker: Worker, rays: int, threshold: float) -> wp.int32: ...
+  def keep_visible(worker: Worker, rays: int, waiting: int, threshold: float) -> wp.int32: ...
 
   @native(native_network.VIEW_FORWARD)
   def view_forward(worker: Worker, model: Model, settings: Settings, begin: int, end: int): ...
@@ -116,14 +116,22 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Functions:
 
   @wp.func
   def march_ray(
-    grids: Occupancy, s: Settings, w: Worker, seed: wp.uint64, index: wp.int64, r: int, at: int
-  ) -> wp.int32:
+    grids: Occupancy,
+    s: Settings,
+    w: Worker,
+    seed: wp.uint64,
+    index: wp.int64,
+    r: int,
+    limit: float,
+    at: int,
+  ):
     """Marches column r of the rays, see march."""
     origin = wp.vec3(w.rays[r], w.rays[ray_columns + r], w.rays[2 * ray_columns + r])
     direction = wp.vec3(
       w.rays[3 * ray_columns + r], w.rays[4 * ray_columns + r], w.rays[5 * ray_columns + r]
     )
-    return march(grids, s, origin, direction, uniform(seed, index, 5), w.work, stride, at)
+    jitter = uniform(seed, index, 5)
+    return march(grids, s, origin, direction, jitter, limit, w.work, stride, at)
 
   return Functions(
     shape=shape,

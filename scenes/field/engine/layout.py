@@ -147,7 +147,7 @@ class Settings:
   step: wp.float32
   variance_step: wp.float32  # interval of the variance, inside the unit cube
   near: wp.float32
-  depth_limit: wp.float32  # a ray's march ends where the grid's optical depth passes this
+  depth_limit: wp.float32  # a first march ends where the grid's optical depth passes this
   ray_samples: wp.int32  # most samples of a ray
   charbonnier: wp.float32
   distortion: wp.float32
@@ -194,6 +194,8 @@ class Worker:
   ray_of: Ints  # [samples]
   first: Ints  # [rays + 1]: a ray's first sample
   last: Ints  # [rays]: behind a ray's last visible sample
+  number: Ints  # [rays]: a ray's number, see chunks; negative where the limit ended its march
+  again: Ints  # [rays]: numbers of the rays that are to be marched again
   gradient: Floats  # of both networks
   kept: Floats  # [3 + 2 L, S]: coordinates and features' gradients of a step
   kept_stride: wp.int32  # S

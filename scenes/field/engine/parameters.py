@@ -68,6 +68,8 @@ def make_worker(
   worker.ray_of = device.zeros(stride, np.int32)
   worker.first = device.zeros(columns + 1, np.int32)
   worker.last = device.zeros(columns, np.int32)
+  worker.number = device.zeros(columns, np.int32)
+  worker.again = device.zeros(columns, np.int32)
   worker.gradient = device.zeros(shape.parameters + -shape.parameters % LINE)
   worker.kept = device.zeros((3 + 2 * shape.levels) * kept)
   worker.kept_stride = kept

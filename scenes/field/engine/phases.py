@@ -24,7 +24,7 @@ from nerf2real.scenes.field.engine.layout import (
   Workers,
 )
 from nerf2real.scenes.field.engine.native.vectors import PADDING
-from nerf2real.scenes.field.engine.rays import draw_ray
+from nerf2real.scenes.field.engine.rays import NO_LIMIT, draw_ray
 
 
 class Phases(NamedTuple):
@@ -64,12 +64,12 @@ def build(f: Functions) -> Phases:
     r = wp.tid()
     w = workers[0]
     draw_ray(p, s, seed, wp.int64(r), w.rays, ray_columns, r)
-    found = f.march_ray(grids, s, w, seed, wp.int64(r), r, -1)
+    found, _cut = f.march_ray(grids, s, w, seed, wp.int64(r), r, NO_LIMIT, -1)
     at = wp.atomic_add(used, 0, found)
     if at + found > stride - PADDING:
       found = 0
     else:
-      f.march_ray(grids, s, w, seed, wp.int64(r), r, at)
+      f.march_ray(grids, s, w, seed, wp.int64(r), r, NO_LIMIT, at)
     w.first[r] = at
     w.last[r] = at + found
     for n in range(at, at + found):

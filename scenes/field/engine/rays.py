@@ -13,6 +13,7 @@ from nerf2real.scenes.field.engine.native import grid as native_grid
 from nerf2real.scenes.field.engine.native import vectors as native
 
 FAR = 16.0  # chosen: rays end here [unit]; squashed to 1.94 of 2
+NO_LIMIT = 1e9  # an optical depth that no ray reaches
 OUTER_STEP = 2.0  # chosen: outside, intervals are this many steps times |x|_max
 
 
@@ -108,13 +109,18 @@ def march(
   origin: wp.vec3,
   direction: wp.vec3,
   jitter: float,
+  limit: float,
   work: Floats,
   stride: int,
   at: int,
-) -> wp.int32:
+):
   """Writes the middles and lengths (rows 0 and 1) of a ray's intervals in occupied cells.
 
-  Returns their number. Nothing is written where `at` is negative.
+  Nothing is written where `at` is negative. The march ends where the grid's optical depth passes
+  `limit`. A cell's density is the largest that was seen in it, so that the ray may have met less.
+
+  Returns:
+    The number of intervals, and whether the limit ended the march.
   """
   count = wp.int32(0)
   step = s.step
@@ -126,7 +132,7 @@ def march(
   outer_cell = 2.0 / outer_scale
   depth = wp.float32(0.0)
   stride_per_cell = 1.0 / half_size / (largest(direction) * step)
-  while t < FAR and count < s.ray_samples and depth <= s.depth_limit:
+  while t < FAR and count < s.ray_samples and depth <= limit:
     middle = t + 0.5 * step
     p = origin + middle * direction
     norm = largest(p)
@@ -162,4 +168,4 @@ def march(
       else:
         # Squashing shrinks lengths by norm / 2 at least.
         t += wp.max(wp.float32(away - 1) * outer_cell * norm, length)
-  return count
+  return count, depth > limit

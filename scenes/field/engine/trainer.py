@@ -63,7 +63,10 @@ class FusedTrainer:
     # In phases the points known to be empty are the first samples.
     self._spare = -(-settings.empty_samples // PADDING) * PADDING
     stride, columns = layout.STRIDE, layout.CHUNK_RAYS
+    # A step ends with the chunk that fills the budget, the rays of it that are marched again, and
+    # the points known to be empty.
     kept = self._budget + 2 * layout.CHUNK_SAMPLES + PADDING
+    kept += layout.CHUNK_RAYS * settings.ray_samples
     if self._phased:
       samples = self._spare + int(_ROOM * self._budget)
       stride = kept = -(-samples // PADDING) * PADDING

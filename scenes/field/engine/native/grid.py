@@ -127,7 +127,8 @@ OPACITY = r"""
   }
 """
 
-# Drops the samples of every ray behind opaque matter; returns how many are left.
+# Drops the samples of every ray behind opaque matter; returns how many are left. A ray whose march
+# the depth limit ended before opaque matter has none: its number comes behind those that wait.
 KEEP_VISIBLE = r"""
   float* w = worker.work.data;
   int* first = worker.first.data;
@@ -143,6 +144,10 @@ KEEP_VISIBLE = r"""
       w[THROUGH * stride + kept] = through;
       ++kept;
       if (through < threshold) break;
+    }
+    if (worker.number.data[r] < 0 && through >= threshold) {
+      worker.again.data[waiting++] = ~worker.number.data[r];
+      kept = begin;
     }
     first[r] = begin;
     from[r] = start;

@@ -62,11 +62,12 @@ def _rough_field(pixel_angle=0.05):
   return Field(SETTINGS.field, params, pixel_angle)
 
 
-def _backward(*, phased=False, with_empty=False, rays=0):
+def _backward(*, phased=False, with_empty=False, rays=0, depth_limit=1e9):
   """A trainer after one gradient, its worker's figures and the gradient by name."""
+  settings = dataclasses.replace(SETTINGS, depth_limit=depth_limit, batch_samples=1 << 13)
   views = box_views.make_views(3, width=16, height=16, anchors=40)
   initial = _rough_field(views.camera.pixel_angle)
-  trainer = FusedTrainer(views, SETTINGS, seed=1, initial=initial, phased=phased)
+  trainer = FusedTrainer(views, settings, seed=1, initial=initial, phased=phased)
   assert trainer.pictures.empty.size > 100
   if not with_empty:
     trainer.pictures.empty = wp.zeros(0, dtype=wp.int32, device="cpu")
@@ -141,6 +142,19 @@ def test_gradients_agree_with_autodiff(backward):
   for name, value in expected.items():
     error = np.linalg.norm(gradient[name] - value) / np.linalg.norm(value)
     assert error < 1e-4, (name, error)
+
+
+@pytest.mark.parametrize("depth_limit", [0.5, 3.0])
+def test_a_grid_that_is_too_dense_ends_no_ray(depth_limit):
+  """The rays that were drawn, in phases without a limit, have the same losses and gradient."""
+  limited = _backward(depth_limit=depth_limit)
+  rays, kept, marched = limited[1][:3].astype(int)
+  assert marched > kept + rays / 2  # rays were marched again
+  whole = _backward(phased=True, rays=int(rays))
+  np.testing.assert_allclose(limited[1][3:], whole[1][3:], rtol=1e-6)
+  for name, value in whole[2].items():
+    error = np.linalg.norm(limited[2][name] - value) / np.linalg.norm(value)
+    assert error < 1e-5, (name, error)
 
 
 @pytest.mark.parametrize("with_empty", [False, True])
@@ -232,9 +246,10 @@ def _march(
   counts: wp.array(dtype=wp.int32),
 ):
   ray = wp.tid()
-  counts[ray] = march(
-    grids, settings, origins[ray], directions[ray], 0.0, samples, stride, ray * 512
+  count, _cut = march(
+    grids, settings, origins[ray], directions[ray], 0.0, 1e9, samples, stride, ray * 512
   )
+  counts[ray] = count
 
 
 def test_march_visits_every_occupied_cell_on_its_way():
@@ -248,7 +263,7 @@ def test_march_visits_every_occupied_cell_on_its_way():
   grids.inner_density = device.zeros(size**3)
   grids.outer_distance = device.put(np.full(64, 6, np.uint8))
   grids.outer_density = device.zeros(64)
-  settings.step, settings.depth_limit, settings.ray_samples = step, 1e9, 512
+  settings.step, settings.ray_samples = step, 512
   origins = rng.uniform(-0.5, 0.5, (rays, 3)).astype(np.float32)
   directions = rng.normal(size=(rays, 3))
   directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
