@@ -135,6 +135,11 @@ class Camera:
     plane = self.distort(points[..., :2] / points[..., 2:])
     return plane * [self.fx, self.fy] + [self.cx, self.cy]
 
+  def pixel_centres(self) -> np.ndarray:
+    """Returns the coordinates of all pixels' centres [H, W, 2]."""
+    u, v = np.meshgrid(*(np.arange(n) + PIXEL_CENTRE for n in (self.width, self.height)))
+    return np.stack([u, v], axis=-1)
+
   def rays(self, pixels: np.ndarray | None = None) -> np.ndarray:
     """Returns viewing directions with z = 1 in the camera frame.
 
@@ -144,9 +149,7 @@ class Camera:
     Returns:
       Directions [..., 3], not normalised: a sample at parameter t has depth t.
     """
-    if pixels is None:
-      u, v = np.meshgrid(*(np.arange(n) + PIXEL_CENTRE for n in (self.width, self.height)))
-      pixels = np.stack([u, v], axis=-1)
+    pixels = self.pixel_centres() if pixels is None else pixels
     plane = (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
     ideal = self.undistort(plane)
     return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)

@@ -4,6 +4,7 @@ Each runs, or finds done, one stage of the cache: a function of earlier results 
 """
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from nerf2real.core.progress import Progress, part
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.scenes.alignment import markers, world_frame
 from nerf2real.scenes.alignment.evidence import Evidence
+from nerf2real.scenes.alignment.floor import FloorError
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.geometry import collision, convex, floor_plan, fusion, map_server, mesh
@@ -20,7 +22,18 @@ from nerf2real.scenes.quality import collision_error
 from nerf2real.scenes.results import Contact
 from nerf2real.scenes.stages import Made, StageResult, Stages
 
+_OUTLOOK_VERSION = 2  # 2: no floor among the localised points is warned of
 _WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
+_NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
+
+
+@dataclasses.dataclass(frozen=True)
+class Outlook:
+  """What is known of the world frame before the training."""
+
+  scale: markers.MarkerScale | None
+  """The scale that markers give; None without one."""
+  warnings: tuple[str, ...] = ()
 
 
 def outlook(
@@ -33,11 +46,12 @@ def outlook(
   marker_side: float | None,
   override: Overrides,
   override_key: str,
-) -> Made[markers.MarkerScale | None]:
+) -> Made[Outlook]:
   """Finds markers, and refuses before the training what it could not help.
 
-  A world frame is found from the sparse points alone: where they show no floor, or the scale makes
-  the cameras' walk larger than a grid of voxels may be, the stages after the training would fail.
+  A world frame is found from the sparse points alone: where the scale makes the cameras' walk
+  larger than a grid of voxels may be, the stages after the training would fail. A floor that shows
+  in no localised point may show in the field's depth: it is warned of, at once and in the report.
 
   Args:
     cache: The stages of the job.
@@ -49,11 +63,8 @@ def outlook(
     override: What a person fixed.
     override_key: Hash of the file that says so.
 
-  Returns:
-    The scale that markers give; None without one.
-
   Raises:
-    ValueError: No floor was found, or the room is too large for its voxels.
+    ValueError: No direction is up, or the room is too large for its voxels.
   """
   found = poses.value
 
@@ -73,9 +84,13 @@ def outlook(
       marker=marker,
       sensor_scale=_sensed_scale(capture.value, found),
     )
-    frame = world_frame.align(
-      evidence, settings=settings, override=override, progress=part(progress, 0.8, 1.0)
-    )
+    try:
+      frame = world_frame.align(
+        evidence, settings=settings, override=override, progress=part(progress, 0.8, 1.0)
+      )
+    except FloorError as error:
+      write_json(folder / "outlook.json", Outlook(marker, (f"{_NO_FLOOR} {error}",)))
+      return
     # Sparse points stray; but the extent will hold every camera, and the floor below it.
     cameras = frame.world_from_unit.apply(evidence.positions)
     top = min(frame.camera_height, settings.max_height)
@@ -86,19 +101,18 @@ def outlook(
         f"{error} That box holds the cameras alone; its scale is from {frame.scale_source}: give "
         "lengths in metres."
       ) from error
-    write_json(folder / "marker.json", _FoundMarker(marker))
+    write_json(folder / "outlook.json", Outlook(marker))
 
   everything = {"align": settings, "marker_side": marker_side, "override": override_key}
   everything["voxel"] = voxel
-  stage = cache.run("outlook", write, settings=everything, inputs={"poses": poses.stamp})
-  return Made(read_json(stage.folder / "marker.json", _FoundMarker).scale, stage)
-
-
-@dataclasses.dataclass(frozen=True)
-class _FoundMarker:
-  """What the file of a stage holds."""
-
-  scale: markers.MarkerScale | None
+  inputs = {"poses": poses.stamp}
+  stage = cache.run(
+    "outlook", write, settings=everything, inputs=inputs, version=_OUTLOOK_VERSION
+  )
+  found_out = read_json(stage.folder / "outlook.json", Outlook)
+  for text in found_out.warnings:
+    warnings.warn(text, stacklevel=2)
+  return Made(found_out, stage)
 
 
 def _sensed_scale(capture: Capture, poses: Localisation) -> float | None:
@@ -111,7 +125,7 @@ def world(
   cache: Stages,
   capture: Made[Capture],
   poses: Made[Localisation],
-  marker: Made[markers.MarkerScale | None],
+  outlook: Made[Outlook],
   depth: Made[fusion.DepthViews],
   settings: world_frame.AlignSettings,
   *,
@@ -125,7 +139,7 @@ def world(
     cache: The stages of the job.
     capture: The keyframes, which may have come with metric poses.
     poses: Cameras and sparse points, unit frame.
-    marker: The scale that markers give.
+    outlook: The scale that markers give, and warnings.
     depth: Rendered depth, unit frame.
     settings: Of the alignment.
     marker_side: Side of the black square of a marker in the room [m], or None.
@@ -138,21 +152,22 @@ def world(
     points, normals = depth.value.surface_points(stride=2)
     sensed = _sensed_scale(capture.value, found)
     result = world_frame.align(
-      Evidence(found.points, found.world_from_camera, points, normals, marker.value, sensed),
+      Evidence(found.points, found.world_from_camera, points, normals, outlook.value.scale, sensed),
       settings=settings,
       override=override,
       progress=progress,
     )
-    if marker_side is not None and marker.value is None:
+    if marker_side is not None and outlook.value.scale is None:
       missing = (
         f"No marker of side {marker_side} m was read consistently in three pictures or more: "
         "print it larger, lay it flat, film it from nearer."
       )
       result = dataclasses.replace(result, warnings=(*result.warnings, missing))
+    result = dataclasses.replace(result, warnings=(*outlook.value.warnings, *result.warnings))
     write_json(folder / "alignment.json", result)
 
   everything = {"align": settings, "marker_side": marker_side, "override": override_key}
-  inputs = {"depth": depth.stamp, "outlook": marker.stamp}
+  inputs = {"depth": depth.stamp, "outlook": outlook.stamp}
   stage = cache.run("world", write, settings=everything, inputs=inputs, version=_WORLD_VERSION)
   return Made(read_json(stage.folder / "alignment.json", world_frame.Alignment), stage)
 

@@ -25,6 +25,7 @@ from nerf2real.scenes.results import Source, TrainedField
 from nerf2real.scenes.stages import Made, Stages
 
 _POSES_VERSION = 2  # 2: the unit frame's yaw follows from the first camera
+_FIELD_VERSION = 2  # 2: the lens's falloff is taken out of the pictures
 
 
 def keyframes(cache: Stages, source: Source, settings: CaptureSettings) -> Made[Capture]:
@@ -73,7 +74,7 @@ def field(cache: Stages, pictures: PosedPictures, settings: TrainSettings) -> Ma
     "train_width": pictures.width,
   }
   inputs = {"poses": pictures.poses.stamp}
-  stage = cache.run("field", write, settings=everything, inputs=inputs)
+  stage = cache.run("field", write, settings=everything, inputs=inputs, version=_FIELD_VERSION)
   return Made(TrainedField(stage.folder / "field.safetensors"), stage)
 
 
@@ -124,7 +125,9 @@ def figures(
   def write(folder: Path, progress: Progress) -> None:
     views = pictures.held_out()
     scores, found = held_out.evaluate(field.value.renderer, views, progress=progress)
-    found["exposure_ratio"] = photometry.exposure_ratio(views.gains)
+    if views.exposure is not None:
+      found["exposure_ratio"] = views.exposure.ratio
+      found["corner_light"] = views.exposure.corner
     held_out.save_scores(scores, folder)
     write_json(folder / "figures.json", found)
 
@@ -147,8 +150,8 @@ def baseline(cache: Stages, pictures: PosedPictures) -> Made[dict[str, float]]:
     for index, name in enumerate(views.names):
       pose = views.world_from_camera[index]
       picture = poisson_meshes.render_mesh(surface, views.camera, pose)[0]
-      if views.gains is not None:
-        picture = photometry.expose(picture, views.gains[index])
+      if views.exposure is not None:
+        picture = photometry.expose(picture, views.exposure.factors(index, views.camera))
       drawn[name] = picture
       progress((index + 1) / (len(views) + 1), f"view {index + 1} of {len(views)}")
     np.savez(folder / "views.npz", **drawn)

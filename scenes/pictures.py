@@ -46,11 +46,11 @@ class PosedPictures:
       images.append(image[..., ::-1])
     model = pycolmap.Reconstruction(str(self.poses.stage.folder / "sfm"))
     pictures = np.stack(images)
-    seen = photometry.point_colors(model, found.names, pictures)
-    gains = photometry.picture_gains(*seen, count=len(images))
+    seen = photometry.sightings(model, found.names, pictures, camera)
+    exposure = photometry.fit_exposure(seen, count=len(images)).for_range(pictures, camera)
     known = anchors.known_points(model, found.names, found.world_from_camera, camera=camera)
     known = np.concatenate([known, self._measured(camera)])
-    return Views(camera, pictures, found.world_from_camera, found.names, gains, anchors=known)
+    return Views(camera, pictures, found.world_from_camera, found.names, exposure, anchors=known)
 
   def _measured(self, camera: Camera) -> np.ndarray:
     """Depth that a sensor measured, as anchors float32 [A, 4] of pictures of a camera's size."""

@@ -77,7 +77,7 @@ def _run_stages(
   poses = image_stages.poses(cache, capture, settings.localise)
   if override.floor_points is None:
     surroundings.require_room(poses.value.world_from_camera, poses.value.points)
-  marker = geometry_stages.outlook(
+  outlook = geometry_stages.outlook(
     cache,
     capture,
     poses,
@@ -97,7 +97,7 @@ def _run_stages(
     cache,
     capture,
     poses,
-    marker,
+    outlook,
     depth,
     settings.align,
     marker_side=settings.marker_side,

@@ -60,13 +60,18 @@ class SceneSettings:
       raise ValueError(f"Unknown baseline {self.baseline!r}; expected 'none' or 'colmap'.")
 
 
-PRESETS = ("fast", "demo", "paper")
+PRESETS = ("fast", "quality", "demo", "paper")
 
 
 def preset(name: str) -> SceneSettings:
-  """Returns settings: "fast" for two CPU cores, "demo" quicker, "paper" the paper's tables."""
-  if name == "fast":
-    return SceneSettings()
+  """Returns settings.
+
+  Args:
+    name: "fast" for two CPU cores, "quality" with an hour of training, "demo" quicker, "paper" the
+      paper's tables.
+  """
+  if name in ("fast", "quality"):
+    return SceneSettings(train=training.preset(name))
   if name == "demo":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=110),

@@ -37,6 +37,10 @@ class FloorSettings:
   """Subsample for speed."""
 
 
+class FloorError(ValueError):
+  """The points show no floor; the message is one line with what to do."""
+
+
 class Floor(NamedTuple):
   """A plane normal . x = offset, with the normal up."""
 
@@ -136,13 +140,13 @@ def find_floor(
     seed: Of the random triples.
 
   Raises:
-    ValueError: too few points, or no plane that qualifies.
+    FloorError: too few points, or no plane that qualifies.
   """
   settings = settings or FloorSettings()
   points = np.asarray(points, np.float64)
   points = points[np.isfinite(points).all(-1)]
   if len(points) < _MIN_POINTS:
-    raise ValueError(
+    raise FloorError(
       f"Found {len(points)} points to look for the floor in, need at least {_MIN_POINTS}: film "
       'more of the floor, or give "floor_points" in the override file.'
     )
@@ -169,7 +173,7 @@ def find_floor(
       candidates.append(floor)
     rest = rest[np.abs(rest @ normal - offset) > _PEEL * tolerance]
   if not candidates:
-    raise ValueError(
+    raise FloorError(
       f"No plane within {settings.max_tilt_deg:g} degrees of the cameras' up direction lies below "
       'the cameras: film the floor, or give "floor_points" in the override file.'
     )
@@ -237,7 +241,7 @@ def choose_floor(
       points are not trusted.
 
   Raises:
-    ValueError: No floor was found.
+    FloorError: No floor was found.
   """
   camera_up = rough_up(evidence, override)
   if override.floor_points is not None:
@@ -277,11 +281,11 @@ def _search(
     return FoundFloor(search(evidence.points), True)
   try:
     dense = search(_thin(evidence.surface_points))
-  except ValueError:
+  except FloorError:
     return FoundFloor(search(evidence.points), False)
   try:
     sparse = search(evidence.points)
-  except ValueError:
+  except FloorError:
     return FoundFloor(dense, True)
   centre = positions.mean(0)
   above = 1 - float(dense.heights(centre)) / float(sparse.heights(centre))

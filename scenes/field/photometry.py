@@ -1,15 +1,22 @@
-"""Exposure and white balance of every picture, from the points that several pictures see.
+"""Exposure and white balance of every picture and the lens's falloff, from points that pictures share.
 
-A phone changes its exposure while it films. The colour of a scene point in picture k is modelled as
-gain_k * colour, a channel; gains and colours are fitted together, robustly, in the logarithm.
+A phone changes its exposure while it films, and its pictures darken towards their corners. The colour
+of a scene point in picture k at radius r is modelled as gain_k * falloff(r) * colour, a channel; all
+are fitted together, robustly, in the logarithm.
 
-Shapes: N pictures, P points, M observations.
+Source of the model: Goldman 2010, "Vignette and exposure calibration and compensation", an even
+polynomial of sixth degree; here it is the logarithm's, so that all is linear.
+Shapes: N pictures, P points, M observations, H height, W width.
 """
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pycolmap
 import scipy.sparse
+
+from nerf2real.core.cameras import PIXEL_CENTRE, Camera
 
 _SMOOTHING = (
   2.0  # deviation of a colour's Gaussian [pixel]; chosen: hides a pixel's reprojection error
@@ -17,37 +24,106 @@ _SMOOTHING = (
 _DARKEST, _BRIGHTEST = 12.0, 243.0  # chosen: 5 % off the ends, where a value is noise or clipped
 _ROUNDS = 12  # of reweighting; chosen: the gains move by less than 1e-3 after 8
 _CORE = 0.03  # log residuals below this count quadratically; chosen: 7 levels of noise at 243
-_PRIOR = 0.1  # a gain is pulled to 1 as by so many observations; chosen: matters without any only
-_NOTICEABLE = 0.02  # spread of the log gains of a fixed exposure; chosen: less than can be seen
+_PRIOR = 0.1  # a logarithm is pulled to 0 as by so many observations; chosen: matters without any only
+_NOTICEABLE = 0.02  # log gains' spread, log light in a corner; chosen: less than can be seen
 _CLIPPING = (235.0, 255.0)  # a value stays bright from here on; chosen: beyond the fit's range
 
+_IN_RANGE = 98.0  # per cent of a picture's values, and of the pictures, that 255 holds when evened
+_RANGE_STRIDE = 8  # pixels looked at for that
 
-def point_colors(
-  model: pycolmap.Reconstruction, names: tuple[str, ...], images: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+
+class Sightings(NamedTuple):
+  """What pictures show of localised points."""
+
+  pictures: np.ndarray  # [M] index of the picture
+  points: np.ndarray  # [M] identity of the point
+  colors: np.ndarray  # [M, 3] in [0, 255]
+  radii: np.ndarray  # [M] from the principal point, see `radii`
+
+
+class Exposure(NamedTuple):
+  """How bright pictures show what they show."""
+
+  gains: np.ndarray  # float64 [N, 3]
+  falloff: np.ndarray  # float64 [3, 3]: of a channel's logarithm, by r^2, r^4, r^6
+
+  def factors(self, index: int, camera: Camera) -> np.ndarray:
+    """What a picture's colours are multiplied with, float32 [H, W, 3] for pictures of `camera`."""
+    pixels = camera.pixel_centres()
+    light = np.exp(_powers(radii(camera, pixels)) @ self.falloff.T)
+    factors: np.ndarray = (light * self.gains[index]).astype(np.float32)
+    return factors
+
+  def select(self, indices: np.ndarray) -> "Exposure":
+    """Returns that of the chosen pictures."""
+    return self._replace(gains=self.gains[indices])
+
+  @property
+  def changes(self) -> bool:
+    """Whether the pictures have more than one exposure."""
+    return bool(np.any(self.gains != self.gains[:1]))
+
+  @property
+  def is_even(self) -> bool:
+    """Whether all pictures have one exposure, and no falloff."""
+    return not self.changes and not self.falloff.any()
+
+  def for_range(self, images: np.ndarray, camera: Camera) -> "Exposure":
+    """Raises all gains by one factor, so that evened pictures [N, H, W, 3] hardly exceed 255."""
+    if self.is_even:
+      return self
+    step = slice(None, None, _RANGE_STRIDE)
+    brightest = [
+      np.percentile(image[step, step] / self.factors(index, camera)[step, step], _IN_RANGE)
+      for index, image in enumerate(images)
+    ]
+    return self._replace(gains=self.gains * max(1.0, np.percentile(brightest, _IN_RANGE) / 255))
+
+  @property
+  def ratio(self) -> float:
+    """How many times as bright the brightest pictures are as the darkest: 95th to 5th percentile."""
+    low, high = np.percentile(self.gains.mean(-1), [5, 95])
+    return float(high / low)
+
+  @property
+  def corner(self) -> float:
+    """Light in a picture's corner, as a share of its middle's."""
+    return float(np.exp(self.falloff.sum(-1)).mean())
+
+
+def radii(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+  """Distances [...] of pixels [..., 2] from the principal point, in halves of the diagonal."""
+  away: np.ndarray = np.asarray(pixels, np.float64) - [camera.cx, camera.cy]
+  return np.hypot(away[..., 0], away[..., 1]) / (0.5 * np.hypot(camera.width, camera.height))
+
+
+def _powers(radius: np.ndarray) -> np.ndarray:
+  """r^2, r^4, r^6 [..., 3]."""
+  return np.square(radius)[..., None] ** np.arange(1, 4)
+
+
+def sightings(
+  model: pycolmap.Reconstruction, names: tuple[str, ...], images: np.ndarray, camera: Camera
+) -> Sightings:
   """Looks the model's points up in the pictures that see them.
 
   Args:
     model: Points with the pictures that see them.
     names: The pictures' names [N].
-    images: uint8 [N, H, W, 3], of the camera's size or smaller.
-
-  Returns:
-    picture [M], point [M] and colour float32 [M, 3] of every observation.
+    images: uint8 [N, H, W, 3], of the model's size or smaller.
+    camera: The pictures' camera.
   """
-  camera = next(iter(model.cameras.values()))
-  height, width = images.shape[1:3]
-  scale = np.array([width / camera.width, height / camera.height])
+  source = next(iter(model.cameras.values()))
+  scale = np.array([camera.width / source.width, camera.height / source.height])
   index = {name: k for k, name in enumerate(names)}
-  pictures, points, colors = [], [], []
+  found = []
   for image in model.images.values():
     k = index.get(image.name)
-    if k is None:
-      continue
     seen = [(p.point3D_id, p.xy) for p in image.points2D if p.has_point3D()]
-    if not seen:
+    if k is None or not seen:
       continue
-    place = (np.stack([xy for _, xy in seen]) * scale - 0.5).astype(np.float32)
+    pixels = np.stack([xy for _, xy in seen]) * scale
+    place = (pixels - PIXEL_CENTRE).astype(np.float32)
     smooth = cv2.GaussianBlur(images[k], (0, 0), _SMOOTHING)
     looked = cv2.remap(
       smooth.astype(np.float32),
@@ -56,77 +132,77 @@ def point_colors(
       cv2.INTER_LINEAR,
       borderMode=cv2.BORDER_REPLICATE,
     )
-    colors.append(looked[:, 0])
-    pictures.append(np.full(len(seen), k))
-    points.append(np.array([identity for identity, _ in seen]))
-  if not pictures:
-    return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3), np.float32)
-  return np.concatenate(pictures), np.concatenate(points), np.concatenate(colors)
+    points = np.array([identity for identity, _ in seen])
+    found.append(
+      Sightings(np.full(len(seen), k), points, looked[:, 0], radii(camera, pixels))
+    )
+  if not found:
+    return Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3), np.float32), np.zeros(0))
+  return Sightings(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
-def picture_gains(
-  pictures: np.ndarray, points: np.ndarray, colors: np.ndarray, *, count: int
-) -> np.ndarray:
-  """Fits a gain a picture and channel.
+def fit_exposure(seen: Sightings, *, count: int) -> Exposure:
+  """Fits a gain a picture and channel, and a falloff a channel.
 
   Args:
-    pictures, points: Index of the picture and identity of the point of every observation [M].
-    colors: What the picture shows there [M, 3], in [0, 255].
+    seen: What the pictures show of the points.
     count: Number of pictures, N.
 
   Returns:
-    Gains float64 [N, 3], their geometric mean 1; all exactly 1 where the exposure is fixed.
+    The exposure; gains are exactly 1 where it was fixed, the falloff exactly 0 where there is none.
   """
-  usable = (colors.min(-1, initial=255.0) > _DARKEST) & (colors.max(-1, initial=0.0) < _BRIGHTEST)
-  pictures, values = pictures[usable], np.log(colors[usable].astype(np.float64))
-  if not len(pictures):
-    return np.ones((count, 3))
-  _, points = np.unique(points[usable], return_inverse=True)
-  logs = np.stack(
-    [_fit(pictures, points, values[:, channel], count) for channel in range(3)], axis=-1
+  usable = (seen.colors.min(-1, initial=255.0) > _DARKEST) & (
+    seen.colors.max(-1, initial=0.0) < _BRIGHTEST
   )
-  logs -= logs.mean(0)
-  return np.ones((count, 3)) if logs.std(0).max() < _NOTICEABLE else np.exp(logs)
+  even = Exposure(np.ones((count, 3)), np.zeros((3, 3)))
+  if not usable.any():
+    return even
+  _, points = np.unique(seen.points[usable], return_inverse=True)
+  rows = np.arange(len(points))
+  pictures = scipy.sparse.csr_matrix(
+    (np.ones(len(points)), (rows, seen.pictures[usable])), shape=(len(points), count)
+  )
+  design = scipy.sparse.hstack([pictures, _powers(seen.radii[usable])]).tocsr()
+  values = np.log(seen.colors[usable].astype(np.float64))
+  found = np.stack([_fit(design, points, values[:, channel]) for channel in range(3)])
+  logs, falloff = found[:, :count].T, found[:, count:]
+  logs = logs - logs.mean(0)
+  return Exposure(
+    gains=even.gains if logs.std(0).max() < _NOTICEABLE else np.exp(logs),
+    falloff=even.falloff if np.abs(falloff.sum(-1)).max() < _NOTICEABLE else falloff,
+  )
 
 
-def _fit(pictures: np.ndarray, points: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-  """Log gains [N] that minimise sum |value - gain - point's mean|, by reweighted least squares."""
+def _fit(design: scipy.sparse.csr_matrix, points: np.ndarray, values: np.ndarray) -> np.ndarray:
+  """Solves values = design @ x + point's mean for x, the sum of absolute residuals least."""
   weights = np.ones(len(values))
-  num_points = points.max() + 1
-  gains = np.zeros(count)
+  of_point = scipy.sparse.csr_matrix((np.ones(len(values)), (points, np.arange(len(values)))))
   for _ in range(_ROUNDS):
-    table = scipy.sparse.csr_matrix((weights, (points, pictures)), shape=(num_points, count))
-    total = np.asarray(table.sum(1)).ravel()
-    weighted = np.bincount(points, weights * values, num_points)
-    # The points' means are eliminated (Schur complement); what is left is one row a picture.
+    weighted = scipy.sparse.diags(weights) @ design
+    # The points' means are eliminated (Schur complement).
+    total = of_point @ weights
+    table = of_point @ weighted
     share = scipy.sparse.diags(1 / total) @ table
-    matrix = np.diag(np.asarray(table.sum(0)).ravel() + _PRIOR) - (table.T @ share).toarray()
-    right = np.bincount(pictures, weights * values, count) - share.T @ weighted
-    gains = np.linalg.solve(matrix, right)
-    means = (weighted - table @ gains) / total
-    residuals = values - gains[pictures] - means[points]
-    weights = 1 / np.maximum(np.abs(residuals), _CORE) * _CORE
-  return gains
+    matrix = (design.T @ weighted - table.T @ share).toarray() + _PRIOR * np.eye(design.shape[1])
+    mean = of_point @ (weights * values)
+    solution = np.linalg.solve(matrix, weighted.T @ values - share.T @ mean)
+    means = (mean - table @ solution) / total
+    residuals = values - design @ solution - means[points]
+    weights = _CORE / np.maximum(np.abs(residuals), _CORE)
+  return solution
 
 
-def exposure_ratio(gains: np.ndarray | None) -> float:
-  """How many times as bright the brightest pictures are as the darkest: 95th to 5th percentile."""
-  if gains is None:
-    return 1.0
-  low, high = np.percentile(gains.mean(-1), [5, 95])
-  return float(high / low)
+def even_out(image: np.ndarray, factors: np.ndarray) -> np.ndarray:
+  """Returns a picture uint8 [H, W, 3] as it would be with factors [H, W, 3] of 1.
 
-
-def even_out(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
-  """Returns a picture uint8 [H, W, 3] as it would be with gain 1; clipped values stay bright."""
+  Clipped values stay bright.
+  """
   values = image.astype(np.float32)
   low, high = _CLIPPING
   clipped = np.clip((values - low) / (high - low), 0, 1) * 255
-  return np.clip(np.rint(np.maximum(values / gain.astype(np.float32), clipped)), 0, 255).astype(
-    np.uint8
-  )
+  return np.clip(np.rint(np.maximum(values / factors, clipped)), 0, 255).astype(np.uint8)
 
 
-def expose(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
-  """Returns a picture uint8 [H, W, 3] of gain 1 as a camera with this gain shows it."""
-  return np.clip(np.rint(image.astype(np.float32) * gain), 0, 255).astype(np.uint8)
+def expose(image: np.ndarray, factors: np.ndarray) -> np.ndarray:
+  """Returns an evened picture uint8 [H, W, 3] as a camera with factors [H, W, 3] shows it."""
+  return np.clip(np.rint(image.astype(np.float32) * factors), 0, 255).astype(np.uint8)

@@ -143,9 +143,7 @@ def train(
   last_record = -math.inf
   while True:
     seconds = spent + time.monotonic() - start
-    fraction = trainer.steps_done / settings.max_steps
-    if settings.max_seconds is not None:
-      fraction = max(fraction, seconds / settings.max_seconds)
+    fraction = settings.fraction_done(trainer.steps_done, seconds)
     if fraction >= 1.0 and trainer.steps_done > 0:
       break
     rate = learning_rate(settings, fraction, trainer.steps_done)

@@ -34,8 +34,8 @@ class Views:
   world_from_camera: np.ndarray
   """float64 [N, 4, 4], OpenCV camera axes."""
   names: tuple[str, ...]
-  gains: np.ndarray | None = None
-  """float64 [N, 3]: exposure of each picture; None: all 1."""
+  exposure: photometry.Exposure | None = None
+  """Gains of the pictures and falloff of the lens; None where all have one exposure."""
   uneven: bool = False
   """Whether the exposure changed, also where it was evened out since."""
   anchors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4), np.float32))
@@ -54,8 +54,10 @@ class Views:
         f"Found {count} pictures, poses {self.world_from_camera.shape}, {len(self.names)} names; "
         "expected one pose [4, 4] and one name a picture."
       )
-    if self.gains is not None and self.gains.shape != (count, 3):
-      raise ValueError(f"Found gains {self.gains.shape}; expected [{count}, 3], a channel each.")
+    if self.exposure is not None and self.exposure.gains.shape != (count, 3):
+      raise ValueError(
+        f"Found gains {self.exposure.gains.shape}; expected [{count}, 3], a channel each."
+      )
     if not np.isfinite(self.world_from_camera).all():
       raise ValueError("A camera pose is not finite; drop the pictures that were not localised.")
 
@@ -72,17 +74,23 @@ class Views:
     anchors[:, 0] = row[anchors[:, 0].astype(np.int64)]
     anchors = anchors[anchors[:, 0] >= 0]
     poses = self.world_from_camera[indices]
-    gains = None if self.gains is None else self.gains[indices]
-    return Views(self.camera, self.images[indices], poses, names, gains, self.uneven, anchors)
+    exposure = None if self.exposure is None else self.exposure.select(indices)
+    return Views(self.camera, self.images[indices], poses, names, exposure, self.uneven, anchors)
 
   def evened(self) -> "Views":
-    """Returns the pictures as they would be with one exposure, see `scenes.field.photometry`."""
-    if self.gains is None:
+    """Returns the pictures as they would be with one exposure and no falloff, see `photometry`."""
+    exposure = self.exposure
+    if exposure is None:
       return self
-    pairs = zip(self.images, self.gains, strict=True)
-    images = np.stack([photometry.even_out(image, gain) for image, gain in pairs])
-    uneven = bool(np.any(self.gains != 1))
-    return dataclasses.replace(self, images=images, gains=None, uneven=uneven)
+    if exposure.is_even:
+      return dataclasses.replace(self, exposure=None)
+    images = np.stack(
+      [
+        photometry.even_out(image, exposure.factors(index, self.camera))
+        for index, image in enumerate(self.images)
+      ]
+    )
+    return dataclasses.replace(self, images=images, exposure=None, uneven=exposure.changes)
 
   def split(self, every: int = 8) -> tuple["Views", "Views"]:
     """Returns (training, held out): one of `every` pictures is held out, as LLFF does."""

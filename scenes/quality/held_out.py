@@ -39,16 +39,16 @@ class ViewScore:
 def compare(renderer: Renderer, views: Views, index: int, height: int, width: int) -> ViewScore:
   """Renders one view at a size and compares it with the picture averaged over its pixels.
 
-  Where the exposure changed, the field's picture gets the exposure of the view, which was found
-  from the points that it shares with other pictures.
+  The field's picture gets the exposure of the view and the lens's falloff, which were found from the
+  points that it shares with other pictures.
   """
   truth = views.images[index]
   if truth.shape[:2] != (height, width):
     truth = cv2.resize(truth, (width, height), interpolation=cv2.INTER_AREA)
   camera = views.camera.resized(width, height)
   image, depth = renderer.render(camera, views.world_from_camera[index])
-  if views.gains is not None:
-    image = photometry.expose(image, views.gains[index])
+  if views.exposure is not None:
+    image = photometry.expose(image, views.exposure.factors(index, camera))
   return ViewScore(
     views.names[index],
     truth,

@@ -42,15 +42,18 @@ def _outlook(tmp_path, points, **changes) -> Made:
 def test_a_room_with_a_floor_passes_and_is_done_once(tmp_path):
   points = _floor(np.random.default_rng(0))
   made = _outlook(tmp_path, points, camera_height=1.4)
-  assert made.value is None and not made.stage.cached
+  assert made.value == geometry_stages.Outlook(None) and not made.stage.cached
   assert _outlook(tmp_path, points, camera_height=1.4).stage.cached
 
 
-def test_a_capture_without_a_floor_is_refused_and_leaves_nothing(tmp_path):
+def test_points_without_a_floor_are_warned_of_by_every_run(tmp_path):
+  """The field's depth may show a floor that has no texture for localised points."""
   ceiling = _floor(np.random.default_rng(0), height=3.0)
-  with pytest.raises(ValueError, match="film the floor"):
-    _outlook(tmp_path, ceiling)
-  assert list(tmp_path.iterdir()) == []
+  for cached in (False, True):
+    with pytest.warns(UserWarning, match="film the floor"):
+      made = _outlook(tmp_path, ceiling)
+    assert made.stage.cached == cached
+    assert len(made.value.warnings) == 1 and "field's depth" in made.value.warnings[0]
 
 
 def test_centimetres_for_metres_are_refused(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes.field.field import Field, FieldSettings, init_params, query, query_density
-from nerf2real.scenes.field.settings import preset
+from nerf2real.scenes.field.settings import TrainSettings, preset
 
 SETTINGS = FieldSettings(levels=2, log2_table_size=6, base_resolution=4, growth=2.0, width=16)
 
@@ -88,6 +88,22 @@ def test_files_with_the_former_footprint_rule(tmp_path, monkeypatch, rule):
 def test_settings_refuse_nonsense():
   with pytest.raises(ValueError, match="levels=0"):
     FieldSettings(levels=0)
+
+
+def test_training_ends_by_whichever_limit_comes_first():
+  settings = TrainSettings(max_steps=100, max_seconds=10.0)
+  assert settings.fraction_done(50, 2.0) == 0.5
+  assert settings.fraction_done(50, 8.0) == 0.8
+  assert TrainSettings(max_seconds=10.0).fraction_done(10**6, 5.0) == 0.5
+  for wrong in ({"max_seconds": None}, {"max_seconds": -5.0}, {"max_steps": 0}):
+    with pytest.raises(ValueError, match="expected at least one step or a positive time"):
+      TrainSettings(**wrong)
+
+
+def test_quality_is_fast_with_more_time():
+  fast, quality = preset("fast"), preset("quality")
+  assert quality.max_seconds == 3600.0
+  assert dataclasses.replace(quality, max_seconds=fast.max_seconds) == fast
 
 
 def test_paper_preset_holds_the_papers_table():

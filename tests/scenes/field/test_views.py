@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core.cameras import Camera
+from nerf2real.scenes.field.photometry import Exposure
 from nerf2real.scenes.field.views import BlurPyramid, Views
 from tests.scenes import box_views
 
@@ -61,9 +62,10 @@ def test_blur_levels_have_the_variance_they_claim():
 
 def test_selecting_keeps_gains_and_anchors_of_the_chosen_pictures():
   views = box_views.make_views(4, anchors=5)
-  views = dataclasses.replace(views, gains=np.arange(12.0).reshape(4, 3) + 1)
+  gains = np.arange(12.0).reshape(4, 3) + 1
+  views = dataclasses.replace(views, exposure=Exposure(gains, np.zeros((3, 3))))
   chosen = views.select([3, 1])
-  np.testing.assert_array_equal(chosen.gains, views.gains[[3, 1]])
+  np.testing.assert_array_equal(chosen.exposure.gains, gains[[3, 1]])
   of_three = views.anchors[views.anchors[:, 0] == 3]
   np.testing.assert_array_equal(chosen.anchors[chosen.anchors[:, 0] == 0, 1:], of_three[:, 1:])
   assert set(chosen.anchors[:, 0]) == {0, 1}
@@ -71,10 +73,9 @@ def test_selecting_keeps_gains_and_anchors_of_the_chosen_pictures():
 
 def test_evening_out_divides_by_the_gain():
   views = box_views.make_views(2)
-  doubled = dataclasses.replace(
-    views, images=(views.images // 4) * 2, gains=np.array([[2.0] * 3, [1.0] * 3])
-  )
+  exposure = Exposure(np.array([[2.0] * 3, [1.0] * 3]), np.zeros((3, 3)))
+  doubled = dataclasses.replace(views, images=(views.images // 4) * 2, exposure=exposure)
   evened = doubled.evened()
   np.testing.assert_array_equal(evened.images[0], views.images[0] // 4)
   np.testing.assert_array_equal(evened.images[1], (views.images[1] // 4) * 2)
-  assert evened.gains is None and evened.uneven and evened.select([0]).uneven
+  assert evened.exposure is None and evened.uneven and evened.select([0]).uneven
