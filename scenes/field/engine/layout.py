@@ -147,6 +147,7 @@ class Settings:
   step: wp.float32
   variance_step: wp.float32  # interval of the variance, inside the unit cube
   near: wp.float32
+  near_scale: wp.float32  # a sample's gradient is scaled by min(1, this * squared distance)
   depth_limit: wp.float32  # a first march ends where the grid's optical depth passes this
   ray_samples: wp.int32  # most samples of a ray
   charbonnier: wp.float32

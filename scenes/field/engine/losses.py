@@ -60,6 +60,10 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
 
     Gradients: dC/dsigma_i = length_i (T_{i+1} c_i - sum_{j>i} w_j c_j), and likewise for the
     distortion loss, whose derivative by w_i is 2 sum_j w_j |m_i - m_j| + 2/3 w_i l_i in O(n).
+
+    Gradients at a sample are scaled by min(1, (t / near)^2): the nearer a place is, the more pixels
+    look at it, and their many gradients build floaters before the cameras. Source: Philip and
+    Deschaintre 2023, "Floaters no more: radiance field gradient scaling".
     """
     work = w.work
     start, stop = w.first[r], w.last[r]
@@ -107,11 +111,12 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
         + anchored * (wp.abs(m - goal) - (1.0 - goal))
         - behind
       )
+      share = wp.min(1.0, t * t * s.near_scale)
       for c in range(3):
         d_weight += slope[c] * (
           work[at_color + c * stride + n] + work[at_specular + c * stride + n]
         )
-        work[at_d_color + c * stride + n] = slope[c] * weight
+        work[at_d_color + c * stride + n] = slope[c] * weight * share
       work[at_d_weight + n] = d_weight
       below += weight
       moment_below += weight * m
@@ -123,7 +128,8 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
       later += work[at_weight + n] * d_weight
       z = s.density_gain * work[at_out + n] + s.density_bias
       slope_of_density = s.density_gain * s.density_scale * squareplus_slope(z)
-      work[at_d_out + n] = d_density * slope_of_density
+      t = work[at_distance + n]
+      work[at_d_out + n] = d_density * slope_of_density * wp.min(1.0, t * t * s.near_scale)
     return wp.vec3(square, photometric, distortion)
 
   @wp.func

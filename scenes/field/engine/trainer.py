@@ -103,6 +103,7 @@ class FusedTrainer:
     numbers.pixel_angle = self._pixel_angle
     numbers.step = train.field.march_step
     numbers.near = train.near
+    numbers.near_scale = 1 / train.near_gradient**2 if train.near_gradient > 0 else 1e9
     numbers.depth_limit = train.depth_limit
     numbers.ray_samples = train.ray_samples
     numbers.charbonnier = train.charbonnier_padding

@@ -31,6 +31,7 @@ SETTINGS = TrainSettings(
   batch_samples=1 << 10,
   ray_samples=64,
   distortion_weight=0.3,
+  near_gradient=0.8,
   depth_limit=1e9,
   blur_max=2.0,
   inner_cells=16,
@@ -87,6 +88,11 @@ def backward():
   return _backward()
 
 
+def _with_gradient(values, share):
+  """The same values, with a share of their gradient."""
+  return share * values + jax.lax.stop_gradient((1 - share) * values)
+
+
 def _reference_losses(params, trainer, count):
   """The same rays and samples in JAX: sums of the Charbonnier and the distortion loss."""
   worker = trainer.engine.workers[0]
@@ -111,6 +117,9 @@ def _reference_losses(params, trainer, count):
     footprint=rays[:, 9, None],
   )
   density, color = query(SETTINGS.field, params, positions, variance, along)
+  share = jnp.minimum(1.0, jnp.square(distance / SETTINGS.near_gradient))
+  assert 0 < share.min() < 0.5 and share.max() == 1
+  density, color = _with_gradient(density, share), _with_gradient(color, share[..., None])
   weights = sampling.interval_weights(density, length)
   rest = 1 - weights.sum(1)
   total = (weights[..., None] * color).sum(1) + rest[:, None] * rays[:, 10:13]
