@@ -1,4 +1,4 @@
-"""Where a walker that pushes a ball to a target has to walk: behind the ball first, then through it.
+"""Where a walker that pushes a ball to a target has to walk: behind the ball, then through it.
 
 The ball is pushed from the side opposite to the target where a robot fits there, and else, as at a
 wall, from the place nearest to it around the ball.
@@ -21,7 +21,7 @@ class PushSettings:
   lane: float = 0.06
   """m beside the line of the push within which a push begins; it ends at twice that."""
   clearance: float = 0.30
-  """m from the ball's centre that a way around it keeps: a ball's radius of 0.12 m and a robot's."""
+  """m from the ball's centre that a way around it keeps: the radii of ball (0.12 m) and robot."""
   overshoot: float = 0.4
   """m beyond the ball at which a pushing robot aims."""
   headings: int = 24
