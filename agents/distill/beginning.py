@@ -13,7 +13,7 @@ from nerf2real.agents.distill.learning import TrainingState
 from nerf2real.agents.dmpo.config import DmpoConfig
 from nerf2real.core.serialization import from_plain
 
-_FRESH = ("encoder/pose", "policy/heads", "policy/stddev")  # heads that no export holds
+_FRESH = ("encoder/pose", "encoder/ball", "policy/heads", "policy/stddev")  # heads that no export holds
 
 
 def agent_of(folder: Path) -> DmpoConfig:
