@@ -106,9 +106,7 @@ def outlook(
   everything = {"align": settings, "marker_side": marker_side, "override": override_key}
   everything["voxel"] = voxel
   inputs = {"poses": poses.stamp}
-  stage = cache.run(
-    "outlook", write, settings=everything, inputs=inputs, version=_OUTLOOK_VERSION
-  )
+  stage = cache.run("outlook", write, settings=everything, inputs=inputs, version=_OUTLOOK_VERSION)
   found_out = read_json(stage.folder / "outlook.json", Outlook)
   for text in found_out.warnings:
     warnings.warn(text, stacklevel=2)

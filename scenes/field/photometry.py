@@ -24,7 +24,9 @@ _SMOOTHING = (
 _DARKEST, _BRIGHTEST = 12.0, 243.0  # chosen: 5 % off the ends, where a value is noise or clipped
 _ROUNDS = 12  # of reweighting; chosen: the gains move by less than 1e-3 after 8
 _CORE = 0.03  # log residuals below this count quadratically; chosen: 7 levels of noise at 243
-_PRIOR = 0.1  # a logarithm is pulled to 0 as by so many observations; chosen: matters without any only
+_PRIOR = (
+  0.1  # a logarithm is pulled to 0 as by so many observations; chosen: matters without any only
+)
 _NOTICEABLE = 0.02  # log gains' spread, log light in a corner; chosen: less than can be seen
 _CLIPPING = (235.0, 255.0)  # a value stays bright from here on; chosen: beyond the fit's range
 
@@ -133,9 +135,7 @@ def sightings(
       borderMode=cv2.BORDER_REPLICATE,
     )
     points = np.array([identity for identity, _ in seen])
-    found.append(
-      Sightings(np.full(len(seen), k), points, looked[:, 0], radii(camera, pixels))
-    )
+    found.append(Sightings(np.full(len(seen), k), points, looked[:, 0], radii(camera, pixels)))
   if not found:
     return Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3), np.float32), np.zeros(0))
   return Sightings(*(np.concatenate(columns) for columns in zip(*found, strict=True)))

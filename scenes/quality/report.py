@@ -61,7 +61,9 @@ FIGURES: Mapping[str, Meaning] = {
     "", "brightest to darkest exposure of the capture; it was evened out", "near 1"
   ),
   "corner_light": Meaning(
-    "", "light in a picture's corner, share of its middle's (vignetting); it was evened out", "near 1"
+    "",
+    "light in a picture's corner, share of its middle's (vignetting); it was evened out",
+    "near 1",
   ),
   "held_out_psnr_60x80_db": Meaning("dB", "the same views at 60x80", "higher"),
   "held_out_ssim_30x40": Meaning("", "the same views at 30x40", "near 1"),

@@ -66,9 +66,7 @@ def test_a_fixed_exposure_stays_exactly_one():
 
 
 def test_no_observations_give_no_exposure():
-  nothing = photometry.Sightings(
-    np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
-  )
+  nothing = photometry.Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0))
   found = photometry.fit_exposure(nothing, count=5)
   assert found.is_even and found.gains.shape == (5, 3)
 
