@@ -1,8 +1,8 @@
-"""Exposure and white balance of every picture and the lens's falloff, from points that pictures share.
+"""Exposure and white balance of every picture, and the lens's falloff (vignetting).
 
-A phone changes its exposure while it films, and its pictures darken towards their corners. The colour
-of a scene point in picture k at radius r is modelled as gain_k * falloff(r) * colour, a channel; all
-are fitted together, robustly, in the logarithm.
+A phone changes its exposure while it films, and its pictures darken towards their corners. The
+colour of a scene point in picture k at radius r is modelled as gain_k * falloff(r) * colour, a
+channel; all are fitted together to points that pictures share, robustly, in the logarithm.
 
 Source of the model: Goldman 2010, "Vignette and exposure calibration and compensation", an even
 polynomial of sixth degree; here it is the logarithm's, so that all is linear.
@@ -83,7 +83,7 @@ class Exposure(NamedTuple):
 
   @property
   def ratio(self) -> float:
-    """How many times as bright the brightest pictures are as the darkest: 95th to 5th percentile."""
+    """How many times as bright as the darkest the brightest are: 95th to 5th percentile."""
     low, high = np.percentile(self.gains.mean(-1), [5, 95])
     return float(high / low)
 

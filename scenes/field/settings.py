@@ -163,7 +163,7 @@ class TrainSettings:
 
 
 def preset(name: str) -> TrainSettings:
-  """Returns settings: "fast" (two CPU cores, 5 minutes), "quality" (an hour) or "paper" (its table).
+  """Returns "fast" (5 minutes on two CPU cores), "quality" (an hour) or "paper" (its NeRF table).
 
   "quality" trains the same field as "fast", so that policies draw it in the same time.
   """

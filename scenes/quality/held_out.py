@@ -39,8 +39,8 @@ class ViewScore:
 def compare(renderer: Renderer, views: Views, index: int, height: int, width: int) -> ViewScore:
   """Renders one view at a size and compares it with the picture averaged over its pixels.
 
-  The field's picture gets the exposure of the view and the lens's falloff, which were found from the
-  points that it shares with other pictures.
+  The field's picture gets the exposure of the view and the lens's falloff, which were found from
+  the points that it shares with other pictures.
   """
   truth = views.images[index]
   if truth.shape[:2] != (height, width):
