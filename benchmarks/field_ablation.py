@@ -1,0 +1,105 @@
+"""Trains the field of a scene without one part of its training each, and scores held-out views.
+
+Keyframes and poses are those of a scene that `launch/make_scene.py` made or began (`--check` is
+enough); all runs get the same steps and seed.
+
+  python benchmarks/field_ablation.py --scene out/living --steps 2500
+  python benchmarks/field_ablation.py --scene out/living --off falloff near_gradient
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from benchmarks import harness
+from nerf2real.scenes.bundle import STAGES
+from nerf2real.scenes.capture import keyframes
+from nerf2real.scenes.field import training as train
+from nerf2real.scenes.field.engine.device import num_threads
+from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.field.views import Views
+from nerf2real.scenes.pictures import PosedPictures
+from nerf2real.scenes.poses import localise
+from nerf2real.scenes.quality import held_out
+from nerf2real.scenes.settings import SceneSettings
+from nerf2real.scenes.stages import Made, StageResult
+
+Part = Literal["falloff", "near_gradient", "points", "distortion", "blur"]
+CHANGES: dict[str, dict[str, float]] = {
+  "falloff": {},
+  "near_gradient": {"near_gradient": 0.0},
+  "points": {"anchor_fraction": 0.0, "empty_samples": 0},
+  "distortion": {"distortion_weight": 0.0},
+  "blur": {"blur_max": 0.0},
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """Settings of the ablation."""
+
+  scene: Path
+  """Folder of a scene, with its keyframes and poses."""
+  steps: int = 2500
+  """Training steps of each run."""
+  off: tuple[Part, ...] = ("falloff", "near_gradient")
+  """Parts of the training that are turned off, one a run; the first run has all."""
+  width: int = 640
+  """Width at which held-out views are scored [pixel]."""
+  seed: int = 0
+  """Seed of the training."""
+
+
+def read_views(scene: Path) -> Views:
+  """Reads the localised keyframes of a scene."""
+
+  def stage(name: str) -> StageResult:
+    return StageResult(scene / STAGES / name, "", "", 0.0, cached=True)
+
+  taken, poses = stage("keyframes"), stage("poses")
+  capture = keyframes.load(taken.folder, taken.folder / "images")
+  settings = SceneSettings()
+  return PosedPictures(
+    Made(capture, taken),
+    Made(localise.load(poses.folder / "sfm"), poses),
+    settings.train_width,
+    settings.held_out_every,
+  ).views()
+
+
+def without_falloff(views: Views) -> Views:
+  """Returns the pictures with the gains that they have, and none for the lens."""
+  assert views.exposure is not None
+  flat = views.exposure._replace(falloff=np.zeros_like(views.exposure.falloff))
+  return dataclasses.replace(views, exposure=flat)
+
+
+def main(settings: Settings) -> None:
+  """Trains and prints the table."""
+  everything = read_views(settings.scene)
+  figures: dict[str, dict[str, harness.Value]] = {}
+  for part in ("", *settings.off):
+    views = without_falloff(everything) if part == "falloff" else everything
+    training, held = views.split(SceneSettings().held_out_every)
+    chosen = dataclasses.replace(
+      train.preset("fast"), max_steps=settings.steps, max_seconds=None, **CHANGES.get(part, {})
+    )
+    field, report = train.train(training.evened(), chosen, seed=settings.seed)
+    renderer = Renderer(field, threads=num_threads())
+    height = round(held.camera.height * settings.width / held.camera.width)
+    scores = [
+      held_out.compare(renderer, held, index, height, settings.width) for index in range(len(held))
+    ]
+    figures[f"without {part}" if part else "all"] = {
+      "psnr_db": float(np.mean([score.psnr_db for score in scores])),
+      "ssim": float(np.mean([score.ssim for score in scores])),
+      "samples_per_ray": report.samples / report.rays,
+      "training_s": report.seconds,
+    }
+  harness.finish("field_ablation", figures, settings, seed=settings.seed)
+
+
+if __name__ == "__main__":
+  harness.run(main, Settings, __doc__)
