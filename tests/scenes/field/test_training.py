@@ -167,7 +167,7 @@ def test_learning_rate_warms_up_and_decays():
 
 
 def test_unknown_presets_and_engines_are_refused():
-  with pytest.raises(ValueError, match="expected 'fast' or 'paper'"):
+  with pytest.raises(ValueError, match="expected 'fast', 'quality' or 'paper'"):
     train.preset("slow")
   with pytest.raises(ValueError, match="expected 'fused' or 'jax'"):
     train.TrainSettings(engine="torch")
