@@ -9,7 +9,7 @@ enough); all runs get the same steps and seed.
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import Made, StageResult
 
 Part = Literal["falloff", "near_gradient", "points", "distortion", "blur"]
-CHANGES: dict[str, dict[str, float]] = {  # all turn a part off but near_gradient, which is off
+CHANGES: dict[str, dict[str, Any]] = {  # all turn a part off but near_gradient, which is off
   "falloff": {},
   "near_gradient": {"near_gradient": 1.0},
   "points": {"anchor_fraction": 0.0, "empty_samples": 0},
