@@ -8,8 +8,9 @@ Shapes: N pictures, P points, M observations.
 
 import cv2
 import numpy as np
-import pycolmap
 import scipy.sparse
+
+from nerf2real.scenes.colmap import pycolmap
 
 _SMOOTHING = (
   2.0  # deviation of a colour's Gaussian [pixel]; chosen: hides a pixel's reprojection error
