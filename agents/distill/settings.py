@@ -181,6 +181,17 @@ def ball_push() -> DistillSettings:
     # The goal is the ball's: the robot's distance from it takes nothing from a label.
     blind_radius=0.0,
     push_forces=((0, 0.0, 0.0), (80_000, 1.0, 3.0)),
+    # Pictures hold two things to find here, the robot's place and the ball's; no part is trained
+    # end to end, which made the student of navigation no better.
+    stages=(
+      Stage(kind=ENCODER, share=0.25),
+      Stage(kind=POLICY, share=0.2),
+      Stage(kind=ENCODER, share=0.2),
+      Stage(kind=POLICY, share=0.35),
+    ),
+    # A trial takes up to a minute of the robot's time.
+    evaluation_period=1_500.0,
+    evaluation_trials=12,
   )
 
 

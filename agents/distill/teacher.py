@@ -98,10 +98,10 @@ def _quick() -> WalkerSettings:
 
 
 def _ball() -> WalkerSettings:
-  """The steady walker, pushing the ball; its head looks for the ball and follows it."""
+  """The quick gait, pushing the ball; the head looks for the ball and follows it."""
   steering = SteeringSettings(head_tilt=_HEAD_TILT, watches_ball=True)
   return WalkerSettings(
-    gait=GaitSettings(), steering=steering, head_pan_limit=constants.BALL_PUSHING_HEAD_PAN
+    gait=_quick().gait, steering=steering, head_pan_limit=constants.BALL_PUSHING_HEAD_PAN
   )
 
 
