@@ -60,11 +60,11 @@ class SceneSettings:
       raise ValueError(f"Unknown baseline {self.baseline!r}; expected 'none' or 'colmap'.")
 
 
-PRESETS = ("fast", "demo", "paper")
+PRESETS = ("fast", "demo", "tiny", "paper")
 
 
 def preset(name: str) -> SceneSettings:
-  """Returns settings: "fast" for two CPU cores, "demo" quicker, "paper" the paper's tables."""
+  """Returns settings: "fast" for two CPU cores, "demo" and "tiny" quicker, "paper" the paper's."""
   if name == "fast":
     return SceneSettings()
   if name == "demo":
@@ -72,6 +72,11 @@ def preset(name: str) -> SceneSettings:
       capture=CaptureSettings(num_keyframes=110),
       train=dataclasses.replace(training.preset("fast"), max_seconds=150.0),
       baseline="colmap",
+    )
+  if name == "tiny":
+    return SceneSettings(
+      capture=CaptureSettings(num_keyframes=60),
+      train=dataclasses.replace(training.preset("fast"), max_seconds=60.0),
     )
   if name == "paper":
     return SceneSettings(
