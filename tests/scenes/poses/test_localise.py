@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import fountain
+from benchmarks.rooms import fountain
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
