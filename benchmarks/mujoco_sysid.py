@@ -132,7 +132,7 @@ def main(settings: Settings) -> int:
     values |= {name: float(value), f"{name}_half_width": float(width)}
   values["held_declared_mrad"] = 1e3 * rmse(held, declared)
   values["held_fitted_mrad"] = 1e3 * rmse(held, chosen)
-  harness.finish("mujoco_sysid", {"mujoco_sysid.servo": values}, settings)
+  harness.finish("mujoco_sysid", {"servo": values}, settings)
   return 0
 
 
