@@ -10,12 +10,13 @@ their 95 % intervals, and the error on the logs that were not fitted, declared a
 """
 
 import dataclasses
+import importlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco import sysid
 
 from benchmarks import harness
 from nerf2real.core.robot_logs.reading import Log, read_log
@@ -23,6 +24,8 @@ from nerf2real.core.robot_logs.reading import Log, read_log
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "examples" / "servo"
 _JOINT = "joint"
+# by name: its types would make mypy read mujoco itself, which has none
+sysid: Any = importlib.import_module("mujoco.sysid")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,7 +59,7 @@ def on_steps(log: Log, timestep: float) -> tuple[np.ndarray, np.ndarray, np.ndar
   return times - begin, commands.position[held, 0], measured
 
 
-def sequences(logs: list[Log]) -> sysid.ModelSequences:
+def sequences(logs: list[Log]) -> Any:
   """Returns logs as `mujoco.sysid` reads them; the first reading is the initial state."""
   spec = model_spec()
   model = spec.compile()
@@ -69,15 +72,15 @@ def sequences(logs: list[Log]) -> sysid.ModelSequences:
   return sysid.ModelSequences("servo", spec, [log.name for log in logs], starts, controls, readings)
 
 
-def parameters() -> sysid.ParameterDict:
+def parameters() -> Any:
   """Returns the model's own parameters of joint and servo, free within wide bounds."""
   declared = model_spec().compile()
   joint, actuator = declared.joint(_JOINT), declared.actuator(_JOINT)
 
-  def of_joint(name: str) -> Callable[[mujoco.MjSpec, sysid.Parameter], None]:
+  def of_joint(name: str) -> Callable[[mujoco.MjSpec, Any], None]:
     return lambda spec, p: setattr(spec.joint(_JOINT), name, _like(spec.joint(_JOINT), name, p))
 
-  def gain(spec: mujoco.MjSpec, p: sysid.Parameter) -> None:
+  def gain(spec: mujoco.MjSpec, p: Any) -> None:
     spec.actuator(_JOINT).gainprm[0], spec.actuator(_JOINT).biasprm[1] = p.value[0], -p.value[0]
 
   found = sysid.ParameterDict()
@@ -93,7 +96,7 @@ def parameters() -> sysid.ParameterDict:
   return found
 
 
-def _like(element: object, name: str, p: sysid.Parameter) -> object:
+def _like(element: object, name: str, p: Any) -> object:
   """Returns an element's attribute with the value; of coefficients the first, the linear one."""
   before = np.array(getattr(element, name), np.float64)
   if before.ndim == 0:
@@ -102,7 +105,7 @@ def _like(element: object, name: str, p: sysid.Parameter) -> object:
   return before
 
 
-def rmse(logs: list[Log], chosen: sysid.ParameterDict) -> float:
+def rmse(logs: list[Log], chosen: Any) -> float:
   """Returns the RMSE of the position over whole logs, simulated from their first reading [rad]."""
   model = sysid.apply_param_modifiers(chosen, model_spec())
   squares = []
