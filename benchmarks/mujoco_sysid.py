@@ -130,7 +130,7 @@ def main(settings: Settings) -> int:
   chosen, result = sysid.optimize(declared, residual, verbose=False, max_iters=settings.iterations)
   residuals, *_ = residual(chosen.as_vector(), chosen)
   _, widths = sysid.calculate_intervals(residuals, result.jac)
-  values = {}
+  values: dict[str, float] = {}
   for name, value, width in zip(chosen.parameters, chosen.as_vector(), widths, strict=True):
     values |= {name: float(value), f"{name}_half_width": float(width)}
   values["held_declared_mrad"] = 1e3 * rmse(held, declared)

@@ -113,9 +113,10 @@ class Environment(composer.Environment):
     self._action_spec = task.action_spec(self.physics)
 
   def _recompile_physics(self) -> None:
-    if getattr(self, "_physics", None):
-      self._physics.free()
-    self._physics = Physics.from_mjcf_model(self._task.root_entity.mjcf_model)
+    before = getattr(self, "_physics", None)
+    if before is not None:
+      before.free()
+    self._physics: Any = Physics.from_mjcf_model(self._task.root_entity.mjcf_model)
     self._physics.legacy_step = self._legacy_step
 
   def _make_observation_updater(self) -> StepObserver:

@@ -31,7 +31,7 @@ def add_surface(root: Any, path: Path) -> None:
   Raises:
     ValueError: The bundle has no such file.
   """
-  shown = load_glb(path)
+  shown: Any = load_glb(path)
   colors = np.asarray(shown.visual.vertex_colors)[:, :3]
   vertices, faces = np.asarray(shown.vertices), np.asarray(shown.faces)
   baked = bake_vertex_colors(Mesh(vertices, faces, colors))
