@@ -122,8 +122,14 @@ def run(command: str, entry: dict[str, Any]) -> Ended:
     return Ended(FAILED, _TIMEOUT, f"not over after {_TIMEOUT:g} s")
   seconds = time.monotonic() - begin
   good = process.returncode == entry.get("status", 0) and "Traceback" not in output
-  last = (output.strip().splitlines() or [""])[-1]
+  last = _last_words(output)
   return Ended(OK if good else FAILED, seconds, last if good else output[-600:])
+
+
+def _last_words(output: str) -> str:
+  """Returns the last line that holds words, without a frame's sides."""
+  lines = [line.strip(" │") for line in output.splitlines() if re.search(r"\w", line)]
+  return lines[-1] if lines else ""
 
 
 def row(command: str, entry: dict[str, Any], ended: Ended) -> str:
