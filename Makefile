@@ -6,14 +6,16 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
   $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 \
   && { echo $$p; break; }; done)
 BIN := .venv/bin
+# of make demo: demo, or tiny for a first look with fewer pictures and a minute of training
+PRESET ?= demo
 
 .PHONY: see demo loop test lint install clean
 see: install
 	$(BIN)/python launch/view.py --task nerf_nav --policy shipped
 
 demo: install
-	$(BIN)/python launch/make_scene.py --capture builtin --preset demo --out out/demo
-	@echo "open out/demo/report.html"
+	$(BIN)/python launch/make_scene.py --capture builtin --preset $(PRESET) --out out/$(PRESET)
+	@echo "open out/$(PRESET)/report.html"
 
 # the closed loop, first case, at reduced size: 6 trials, 5 minutes of training
 loop: install

@@ -1,7 +1,7 @@
 """Runs one benchmark command in two checkouts in turn; prints medians, p95 and ratios.
 
-  python benchmarks/env.py --other ../before --rounds 4
-  python benchmarks/compare.py --other ../before --command "benchmarks/link.py --out {out}"
+  python benchmarks/simulation/env.py --other ../before --rounds 4
+  python benchmarks/compare.py --other ../before --command "benchmarks/learning/link.py --out {out}"
 
 Each run is a process of its own in its checkout, with PYTHONPATH set to it, and runs that
 checkout's own script. Compared is the time of the whole command and every number of the JSON that
@@ -76,6 +76,15 @@ def key(path: tuple[str, ...]) -> tuple[str, ...]:
   return tuple(sorted({_SYNONYMS.get(word, word) for word in words} - _CONTAINERS))
 
 
+def moved(checkout: Path, words: list[str]) -> list[str]:
+  """Returns a command with its script where a checkout has it: folders change between commits."""
+  script, *rest = words
+  if (checkout / script).is_file():
+    return words
+  places = sorted((checkout / "benchmarks").rglob(Path(script).name))
+  return [str(places[0].relative_to(checkout)), *rest] if len(places) == 1 else words
+
+
 def last_error(done: subprocess.CompletedProcess[str]) -> str:
   """Returns the line of a failed program's output that holds the reason."""
   lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
@@ -94,7 +103,7 @@ def run_once(checkout: Path, command: list[str]) -> dict[tuple[str, ...], tuple[
     words = [word.replace("{out}", str(out)) for word in command]
     begin = time.perf_counter()
     done = subprocess.run(
-      [sys.executable, *words],
+      [sys.executable, *moved(checkout, words)],
       cwd=checkout,
       env=os.environ | {"PYTHONPATH": str(checkout)},
       capture_output=True,
@@ -158,7 +167,7 @@ def own_command(arguments: list[str], other: Path) -> str:
   name = str(Path(arguments[0]).resolve().relative_to(ROOT))
   line = " ".join(shlex.quote(word) for word in arguments[1:])
   line = re.sub(r"--(other|turns)(=| +)\S+", "", line)
-  script = other / name
+  script = other / moved(other, [name])[0]
   old = script.is_file() and re.search(r"^  output: ", script.read_text(), re.M)
   return f"{name} {line.strip()} {'--output' if old else '--out'} {{out}}"
 

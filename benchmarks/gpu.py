@@ -116,8 +116,8 @@ def check_field(settings: Settings) -> Figures:
   """Trains a field in JAX at preset "paper" on keyframes of the built-in room."""
   import jax
 
-  from benchmarks import blur_ablation, field
-  from benchmarks.field_worker import save_views
+  from benchmarks.rooms import blur_ablation, field
+  from benchmarks.rooms.field_worker import save_views
 
   if settings.device == "cuda" and jax.default_backend() != "gpu":
     raise RuntimeError(f"JAX found {jax.default_backend()}, expected a GPU: install the extra gpu.")
@@ -146,7 +146,7 @@ def commands(settings: Settings, out: Path) -> dict[str, list[str]]:
   sizes = [f"{height}x{width}" for height, width in SIZES[: 1 if settings.tiny else None]]
   changes = [word for change in _TINY_AGENT for word in ("--set", change)] if settings.tiny else []
   seconds = "0.1" if settings.tiny else "30"
-  script = str(ROOT / "benchmarks" / "learner.py")
+  script = str(ROOT / "benchmarks" / "learning" / "learner.py")
   found["learner"] = [script, "--seconds", seconds, *changes]
   found["learner"] += ["--out", str(out / "learner.json"), "--pictures", *sizes]
   return {name: found[name] for name in LIMITS if not settings.only or name in settings.only}

@@ -1,5 +1,6 @@
 """Messages for bad input: what was found, what was expected, what to do."""
 
+import os
 from collections.abc import Iterable
 from typing import Any
 
@@ -18,6 +19,16 @@ def not_compiled(error: ValueError, scene: Any) -> str:
     return str(error)
   reason = [line for line in str(error).splitlines() if line.startswith(("Error", "Element"))]
   return f"MuJoCo cannot build {scene} ({'; '.join(reason)}): make the scene's bundle again."
+
+
+def no_opengl(error: Exception) -> str:
+  """Returns the message where MuJoCo cannot draw; its backends fail with traces of their own."""
+  chosen = os.environ.get("MUJOCO_GL", "not set")
+  reason = " ".join(str(error).split()) or type(error).__name__
+  return (
+    f"MuJoCo cannot draw here (MUJOCO_GL is {chosen}: {reason}): set MUJOCO_GL=egl (package "
+    "libegl1) or MUJOCO_GL=osmesa (package libosmesa6) before the program starts."
+  )
 
 
 def bad_action(action: np.ndarray, spec: specs.BoundedArray) -> str:

@@ -23,6 +23,7 @@ WRONG_ARGUMENTS = 2  # exit status, as of argparse and tyro: the same command ca
 _LEARNER = ".learner.lock"  # beside the lock of the run's supervisor
 _PATIENCE = 20.0  # s for a learner whose supervisor was killed to save what it has
 _LAST_PORT = 65535
+_IMPORT_PERIOD = 0.05  # s between interruptions of an import
 _SIGNALLED = 128  # plus the signal's number: the shell's convention
 
 DRAWING = {"MUJOCO_GL": "egl"}
@@ -130,17 +131,42 @@ def _say(text: str) -> None:
 
 @contextlib.contextmanager
 def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]:
-  """Raises KeyboardInterrupt at SIGTERM, and appends the signal to `received`."""
+  """Raises KeyboardInterrupt at Ctrl-C and SIGTERM, and appends the signal to `received`.
 
-  def interrupt(number: int, _: FrameType | None) -> None:
+  Where it comes during an import, it is raised until it is heeded: libraries that import others on
+  trial (trimesh for one) take every exception there for a missing library, and go on.
+  """
+
+  def interrupt(number: int, frame: FrameType | None) -> None:
     received.append(signal.Signals(number))
+    if _imports(frame):
+      signal.setitimer(signal.ITIMER_REAL, _IMPORT_PERIOD, _IMPORT_PERIOD)
     raise KeyboardInterrupt
 
-  before = signal.signal(signal.SIGTERM, interrupt)
+  def interrupt_again(number: int, frame: FrameType | None) -> None:
+    if not isinstance(sys.exc_info()[1], KeyboardInterrupt):  # else it is being handled
+      raise KeyboardInterrupt
+
+  numbers = [signal.SIGTERM]
+  if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell may have it ignored
+    numbers.append(signal.SIGINT)
+  before = {number: signal.signal(number, interrupt) for number in numbers}
+  before[signal.SIGALRM] = signal.signal(signal.SIGALRM, interrupt_again)
   try:
     yield
   finally:
-    signal.signal(signal.SIGTERM, before)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    for number, handler in before.items():
+      signal.signal(number, handler)
+
+
+def _imports(frame: FrameType | None) -> bool:
+  """Returns whether a frame or one of its callers is that of an import."""
+  while frame is not None:
+    if frame.f_code.co_filename.startswith("<frozen importlib"):
+      return True
+    frame = frame.f_back
+  return False
 
 
 @contextlib.contextmanager

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import trimesh
 
 from nerf2real.core import files
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.field.views import held_out_rows
 from nerf2real.scenes.geometry import collision, convex, floor_picture, map_server, mesh
 from nerf2real.scenes.quality import held_out, report, sight_lines

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-import pycolmap
-
 from nerf2real.core import files
 from nerf2real.scenes import image_stages
 from nerf2real.scenes.bundle import STAGES
 from nerf2real.scenes.capture.capture import source_kind
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.localise import LocalisationError
 from nerf2real.scenes.quality import advice
 from nerf2real.scenes.results import Source

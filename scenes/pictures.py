@@ -4,10 +4,10 @@ import dataclasses
 
 import cv2
 import numpy as np
-import pycolmap
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.field import anchors, photometry
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.poses.localise import Localisation

@@ -60,6 +60,7 @@ class SceneSettings:
       raise ValueError(f"Unknown baseline {self.baseline!r}; expected 'none' or 'colmap'.")
 
 
+<<<<<<< HEAD
 PRESETS = ("fast", "quality", "demo", "paper")
 
 
@@ -72,11 +73,25 @@ def preset(name: str) -> SceneSettings:
   """
   if name in ("fast", "quality"):
     return SceneSettings(train=training.preset(name))
+=======
+PRESETS = ("fast", "demo", "tiny", "paper")
+
+
+def preset(name: str) -> SceneSettings:
+  """Returns settings: "fast" for two CPU cores, "demo" and "tiny" quicker, "paper" the paper's."""
+  if name == "fast":
+    return SceneSettings()
+>>>>>>> main
   if name == "demo":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=110),
       train=dataclasses.replace(training.preset("fast"), max_seconds=150.0),
       baseline="colmap",
+    )
+  if name == "tiny":
+    return SceneSettings(
+      capture=CaptureSettings(num_keyframes=60),
+      train=dataclasses.replace(training.preset("fast"), max_seconds=60.0),
     )
   if name == "paper":
     return SceneSettings(

@@ -15,6 +15,7 @@ from nerf2real.scenes.export.views import capture_cameras, overlooking_pose, ren
 from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 from nerf2real.scenes.geometry.mesh import load_glb
+from nerf2real.scenes.override_panel import OverridePanel
 
 _CAMERA_STEP = 3  # every third camera is drawn
 _FLOOR_LIFT = 0.02  # of the free floor above the floor, or it would flicker with it [m]
@@ -149,8 +150,10 @@ def view_bundle(
   pose = overlooking_pose(bundle)
   server.initial_camera.position = tuple(pose[:3, 3])
   server.initial_camera.look_at = tuple(pose[:3, 3] + pose[:3, 2])
-  view = field_view.FieldView(renderer_of(bundle), bundle.world_from_unit)
+  renderer = renderer_of(bundle)
+  view = field_view.FieldView(renderer, bundle.world_from_unit)
   field_view.serve_field(server, view, setback=_SETBACK, shown=splats is None)
   _add_switches(server, _layers(server, bundle, splats))
   _add_figures(server, bundle)
+  OverridePanel(server, bundle, renderer)
   return server

@@ -13,7 +13,7 @@ from typing import Any
 import dm_env
 import mujoco
 import numpy as np
-from dm_control import composer
+from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_control.rl import control
 from dm_env import specs
@@ -76,6 +76,21 @@ class StepObserver:
     )
 
 
+class Physics(mjcf.Physics):
+  """MuJoCo's model and state, with an error in one line where nothing can be drawn."""
+
+  def _make_rendering_contexts(self) -> None:
+    """Creates the OpenGL context of `render`.
+
+    Raises:
+      RuntimeError: There is no OpenGL.
+    """
+    try:
+      super()._make_rendering_contexts()
+    except Exception as error:  # each backend fails in its own way
+      raise RuntimeError(errors.no_opengl(error)) from error
+
+
 class Environment(composer.Environment):
   """A task in its scene; see `suite.load`."""
 
@@ -96,6 +111,13 @@ class Environment(composer.Environment):
     )
     self._mjcf_never_compiled = False  # the constructor has compiled it
     self._action_spec = task.action_spec(self.physics)
+
+  def _recompile_physics(self) -> None:
+    before = getattr(self, "_physics", None)
+    if before is not None:
+      before.free()
+    self._physics: Any = Physics.from_mjcf_model(self._task.root_entity.mjcf_model)
+    self._physics.legacy_step = self._legacy_step
 
   def _make_observation_updater(self) -> StepObserver:
     return StepObserver(self._task)

@@ -32,6 +32,7 @@ def load(
   physics_timestep: float = PHYSICS_TIMESTEP,
   renderer: FieldRenderer | None = None,
   furnish: Callable[[Any], None] | None = None,
+  surface: bool = False,
 ) -> Environment:
   """Loads a task in a scene.
 
@@ -49,6 +50,8 @@ def load(
     physics_timestep: s.
     renderer: Renders the scene instead of the bundle's field, in the bundle's unit frame.
     furnish: Called with the arena's MJCF model before it is compiled, to put things into it.
+    surface: Whether the model holds the room's coloured surface mesh, so that `physics.render()`
+      and MuJoCo's own viewers show the room; see suite/README.md for what it costs.
 
   Returns:
     The environment, a `composer.Environment`.
@@ -77,6 +80,10 @@ def load(
     draw_effects=draw_effects,
   )
   built = found.task(bundle, camera=robot_camera, settings=settings)
+  if surface:
+    from nerf2real.suite.surface import add_surface
+
+    add_surface(built.root_entity.mjcf_model, Path(bundle.visual_path))
   if furnish is not None:
     furnish(built.root_entity.mjcf_model)
   try:

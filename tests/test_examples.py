@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
     ("any_robot", ("--seconds", "0.5", "--out", "{}/seen.png"), "160 x 120"),
     ("own_task", (), "known: nerf_nav, ball_push, face_goal"),
     ("plain_mujoco", (), "the ball lies at a height of 0.1"),
+    ("render_room", ("--out", "{}/drawn.png"), "drawn.png"),
     ("gymnasium_env", (), "camera (30, 40, 3)"),
     ("watch_policy", ("--seconds", "0.2", "--out", "{}/walk.mp4"), "walk.mp4"),
     pytest.param("identify_log", (), "truth: coulomb_friction at joint", marks=pytest.mark.slow),

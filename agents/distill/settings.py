@@ -164,9 +164,13 @@ def adapt() -> DistillSettings:
   return DistillSettings(
     environment="suite:nerf_nav",
     mixture=MixtureSettings(first_share=0.5, anneal_frames=20_000),
-    # The encoder has learned; what the change asks of it, the last part gives.
-    stages=(Stage(kind=POLICY, share=0.4), Stage(kind=END_TO_END, share=0.6)),
-    settling=0,
+    # What the change asks of the encoder, the middle part gives: its data are the new student's.
+    stages=(
+      Stage(kind=POLICY, share=0.3),
+      Stage(kind=ENCODER, share=0.25),
+      Stage(kind=POLICY, share=0.45),
+    ),
+    settling=300,
     first_frames=4_000,
     learning_rate=3e-4,
     evaluation_period=3_600.0,

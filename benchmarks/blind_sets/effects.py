@@ -6,15 +6,12 @@ Parameters have the names and units of `suite.effects`; magnitudes are drawn fro
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from .machine import Machine, turn_gravity
-from .plant import FULL_DUTY
-from .rigid_body import attach_point_mass
-
-Parameters = dict[str, float]
+from . import changes, finishing
+from .changes import Apply, Parameters
+from .machine import Machine
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,9 +37,6 @@ class Range:
     return float(np.copysign(min(abs(value) * factor, self.high), value))
 
 
-Apply = Callable[[Machine, Any, Parameters], None]
-
-
 @dataclasses.dataclass(frozen=True)
 class Maker:
   """One kind: ranges of its parameters, what to scale for a stronger effect, what it changes."""
@@ -57,209 +51,81 @@ class Maker:
   """Turns what was drawn into what is applied and written down."""
 
 
-def _adds(**fields: str) -> Apply:
-  """Returns an `apply` that adds parameters to fields of the servo: field=parameter."""
-
-  def apply(machine: Machine, joint: Any, parameters: Parameters) -> None:
-    for field, parameter in fields.items():
-      getattr(machine.servo, field)[joint] += parameters[parameter]
-
-  return apply
-
-
-def _sets(**fields: str) -> Apply:
-  """Returns an `apply` that replaces fields of the servo by parameters."""
-
-  def apply(machine: Machine, joint: Any, parameters: Parameters) -> None:
-    for field, parameter in fields.items():
-      getattr(machine.servo, field)[joint] = parameters[parameter]
-
-  return apply
-
-
-def _stribeck(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  machine.servo.breakaway[joint] = parameters["breakaway"]
-  machine.servo.stribeck_velocity[joint] = parameters["velocity"]
-
-
-def _measurement_delay(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  machine.measurement_delay[joint] = parameters["delay"]
-
-
-def _clock_drift(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  machine.clock_rate = parameters["rate"]
-  machine.stamps_only = bool(parameters["stamps_only"])
-
-
-def _motor_gain(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  gain = parameters["gain"]
-  if parameters["limit_scales"]:  # a weaker magnet or winding
-    machine.servo.stall[joint] *= gain
-    if not parameters["effort_sees_it"]:
-      machine.effort_scale[joint] = 1 / gain
-  else:  # a gain register that is not the documented one
-    machine.servo.register[joint] = np.round(machine.servo.register[joint] * gain)
-
-
-def _supply_sag(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  machine.world = machine.world._replace(droop=parameters["droop"], fade=parameters["fade"])
-
-
-def _torque_limit(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  share = parameters["limit"] / machine.servo.stall[joint]
-  machine.servo.duty_limit[joint] = np.floor(FULL_DUTY * share)
-
-
-def _payload(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  place = machine.tree.center[joint] + np.array([parameters[f"off_{axis}"] for axis in "xyz"])
-  machine.tree = attach_point_mass(machine.tree, joint, parameters["mass"], place)
-
-
-def _gravity_tilt(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  turn_gravity(machine, parameters["x"], parameters["y"])
-
-
-def _parameter_error(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  servo = machine.servo
-  servo.viscous[:] *= parameters["damping"]
-  servo.coulomb[:] *= parameters["friction"]
-  servo.motor_inertia[:] *= parameters["armature"]
-  servo.output_inertia[:] *= parameters["armature"]
-
-
-def _off_by(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  """Turns shares by which constants are off into factors."""
-  return {name: 1 + value for name, value in drawn.items()}
-
-
-def _one_sided(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  """Puts the larger friction on either side."""
-  if rng.random() < 0.5:
-    return {"positive": drawn["negative"], "negative": drawn["positive"]}
-  return drawn
-
-
-def _gain(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  weaker = rng.random() < 0.6
-  gain = 1 - drawn["change"] if weaker else 1 + drawn["change"]
-  return {
-    "gain": gain,
-    "limit_scales": float(rng.random() < 0.5),
-    "effort_sees_it": float(rng.random() < 0.5),
-  }
-
-
-def _sag(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  """Leaves a cause out in two of three draws: load alone, time alone, or both."""
-  cause = rng.integers(3)
-  return {
-    "droop": 0.0 if cause == 1 else drawn["droop"],
-    "fade": 0.0 if cause == 0 else drawn["fade"],
-  }
-
-
-def _drift(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  return {"rate": drawn["rate"], "stamps_only": float(rng.random() < 0.5)}
-
-
-def _load(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  return {**drawn, "of_motor": float(rng.random() < 0.5)}
-
-
-def _motor_side(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  return {"gap": drawn["gap"], "encoder_on_motor": float(rng.random() < 0.3)}
-
-
-def _limit(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  return {"limit": 4.1 * (1 - drawn["lost"])}
-
-
-def _dropout(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  rng = np.random.default_rng(int(parameters["seed"]))
-  time = rng.exponential(parameters["every"])
-  while time < 60:
-    machine.dropouts.append((joint, time, time + parameters["lasting"]))
-    time += parameters["lasting"] + rng.exponential(parameters["every"])
-
-
-def _with_seed(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  return {**drawn, "seed": float(rng.integers(1 << 30))}
-
-
-def _with_side(rng: np.random.Generator, drawn: Parameters) -> Parameters:
-  return {**drawn, "side": 1.0 if rng.random() < 0.5 else -1.0}
-
-
-def _soft_stop(machine: Machine, joint: Any, parameters: Parameters) -> None:
-  servo, side = machine.servo, parameters["side"]
-  servo.stop_side[joint], servo.stop_stiffness[joint] = side, parameters["stiffness"]
-  servo.stop_angle[joint] = parameters["place"] * side + parameters["center"]
-
-
 _MULTI = ("arm", "op3")
 
 LIBRARY: dict[str, Maker] = {
-  "command_delay": Maker({"delay": Range(0.008, 0.06)}, ("delay",), _adds(latency="delay")),
-  "measurement_delay": Maker({"delay": Range(0.008, 0.06)}, ("delay",), _measurement_delay),
+  "command_delay": Maker({"delay": Range(0.008, 0.06)}, ("delay",), changes.adds(latency="delay")),
+  "measurement_delay": Maker({"delay": Range(0.008, 0.06)}, ("delay",), changes.measurement_delay),
   "clock_drift": Maker(
-    {"rate": Range(0.0015, 0.008, signed=True)}, ("rate",), _clock_drift, True, finish=_drift
+    {"rate": Range(0.0015, 0.008, signed=True)},
+    ("rate",),
+    changes.clock_drift,
+    True,
+    finish=finishing.drift,
   ),
-  "coulomb_friction": Maker({"torque": Range(0.06, 0.45)}, ("torque",), _adds(coulomb="torque")),
+  "coulomb_friction": Maker(
+    {"torque": Range(0.06, 0.45)}, ("torque",), changes.adds(coulomb="torque")
+  ),
   "viscous_friction": Maker(
-    {"coefficient": Range(0.2, 1.2)}, ("coefficient",), _adds(viscous="coefficient")
+    {"coefficient": Range(0.2, 1.2)}, ("coefficient",), changes.adds(viscous="coefficient")
   ),
   "stribeck_friction": Maker(
-    {"breakaway": Range(0.08, 0.5), "velocity": Range(0.05, 0.4)}, ("breakaway",), _stribeck
+    {"breakaway": Range(0.08, 0.5), "velocity": Range(0.05, 0.4)}, ("breakaway",), changes.stribeck
   ),
   "load_friction": Maker(
     {"coefficient": Range(0.08, 0.4)},
     ("coefficient",),
-    _sets(load="coefficient", load_of_motor="of_motor"),
-    finish=_load,
+    changes.sets(load="coefficient", load_of_motor="of_motor"),
+    finish=finishing.load,
   ),
   "asymmetric_friction": Maker(
     {"positive": Range(0.02, 0.08), "negative": Range(0.12, 0.5)},
     ("positive", "negative"),
-    _adds(positive="positive", negative="negative"),
-    finish=_one_sided,
+    changes.adds(positive="positive", negative="negative"),
+    finish=finishing.one_sided,
   ),
   "quadratic_drag": Maker(
-    {"coefficient": Range(0.06, 0.6)}, ("coefficient",), _adds(quadratic="coefficient")
+    {"coefficient": Range(0.06, 0.6)}, ("coefficient",), changes.adds(quadratic="coefficient")
   ),
   "backlash": Maker(
     {"gap": Range(0.006, 0.05)},
     ("gap",),
-    _adds(gap="gap", encoder_on_motor="encoder_on_motor"),
-    finish=_motor_side,
+    changes.adds(gap="gap", encoder_on_motor="encoder_on_motor"),
+    finish=finishing.motor_side,
   ),
   "encoder_offset": Maker(
-    {"offset": Range(0.012, 0.12, signed=True)}, ("offset",), _adds(encoder_offset="offset")
+    {"offset": Range(0.012, 0.12, signed=True)}, ("offset",), changes.adds(encoder_offset="offset")
   ),
-  "motor_gain": Maker({"change": Range(0.1, 0.4)}, ("gain",), _motor_gain, finish=_gain),
+  "motor_gain": Maker(
+    {"change": Range(0.1, 0.4)}, ("gain",), changes.motor_gain, finish=finishing.gain
+  ),
   "supply_sag": Maker(
     {"droop": Range(0.01, 0.08), "fade": Range(0.003, 0.012)},
     ("droop", "fade"),
-    _supply_sag,
+    changes.supply_sag,
     True,
-    finish=_sag,
+    finish=finishing.sag,
   ),
   "torque_limit": Maker(
-    {"lost": Range(0.3, 0.8, logarithmic=False)}, ("limit",), _torque_limit, finish=_limit
+    {"lost": Range(0.3, 0.8, logarithmic=False)},
+    ("limit",),
+    changes.torque_limit,
+    finish=finishing.limit,
   ),
   "thermal_derating": Maker(
     {"heating": Range(0.3, 3.0), "time_constant": Range(60, 400), "derating": Range(0.003, 0.01)},
     ("heating",),
-    _sets(heating="heating", cooling_time="time_constant", derating="derating"),
+    changes.sets(heating="heating", cooling_time="time_constant", derating="derating"),
   ),
   "payload": Maker(
     {"mass": Range(0.04, 0.35), **{f"off_{a}": Range(0.005, 0.05, signed=True) for a in "xyz"}},
     ("mass",),
-    _payload,
+    changes.payload,
   ),
   "spring": Maker(
     {"stiffness": Range(0.4, 4.0), "reference": Range(0.02, 0.8, signed=True)},
     ("stiffness",),
-    _sets(spring_stiffness="stiffness", spring_reference="reference"),
+    changes.sets(spring_stiffness="stiffness", spring_reference="reference"),
   ),
   "cogging": Maker(
     {
@@ -268,13 +134,13 @@ LIBRARY: dict[str, Maker] = {
       "phase": Range(-3.1, 3.1, logarithmic=False),
     },
     ("amplitude",),
-    _sets(cogging_amplitude="amplitude", cogging_periods="periods", cogging_phase="phase"),
+    changes.sets(cogging_amplitude="amplitude", cogging_periods="periods", cogging_phase="phase"),
   ),
   # On one joint alone tilted gravity equals an offset encoder: not drawn for the pendulum.
   "gravity_tilt": Maker(
     {"x": Range(0.04, 0.2, signed=True), "y": Range(0.04, 0.2, signed=True)},
     ("x", "y"),
-    _gravity_tilt,
+    changes.gravity_tilt,
     True,
     _MULTI,
   ),
@@ -285,9 +151,9 @@ LIBRARY: dict[str, Maker] = {
       "friction": Range(0.08, 0.3, signed=True),
     },
     ("damping", "armature", "friction"),
-    _parameter_error,
+    changes.parameter_error,
     True,
-    finish=_off_by,
+    finish=finishing.off_by,
   ),
 }
 
@@ -299,7 +165,7 @@ OUTSIDE: dict[str, Maker] = {
       "width": Range(0.03, 0.12),
     },
     ("depth",),
-    _sets(stick_depth="depth", stick_center="center", stick_width="width"),
+    changes.sets(stick_depth="depth", stick_center="center", stick_width="width"),
   ),
   "time_varying_stiffness": Maker(
     {
@@ -308,18 +174,20 @@ OUTSIDE: dict[str, Maker] = {
       "reference": Range(0.05, 0.6, signed=True),
     },
     ("stiffness",),
-    _sets(varying_stiffness="stiffness", varying_period="period", varying_reference="reference"),
+    changes.sets(
+      varying_stiffness="stiffness", varying_period="period", varying_reference="reference"
+    ),
   ),
   "flexible_link": Maker(
     {"inertia": Range(0.008, 0.03), "rate": Range(12.0, 30.0), "damping": Range(0.02, 0.1)},
     ("inertia",),
-    _sets(flexible_inertia="inertia", flexible_rate="rate", flexible_damping="damping"),
+    changes.sets(flexible_inertia="inertia", flexible_rate="rate", flexible_damping="damping"),
   ),
   "torque_dropout": Maker(
     {"every": Range(0.6, 2.0), "lasting": Range(0.06, 0.25)},
     ("lasting",),
-    _dropout,
-    finish=_with_seed,
+    changes.dropout,
+    finish=finishing.with_seed,
   ),
   "magnetic_detent": Maker(
     {
@@ -328,12 +196,12 @@ OUTSIDE: dict[str, Maker] = {
       "width": Range(0.03, 0.1),
     },
     ("torque",),
-    _sets(detent_torque="torque", detent_center="center", detent_width="width"),
+    changes.sets(detent_torque="torque", detent_center="center", detent_width="width"),
   ),
   "rubber_damper": Maker(
     {"stiffness": Range(1.5, 6.0), "time": Range(0.15, 0.8)},
     ("stiffness",),
-    _sets(rubber_stiffness="stiffness", rubber_time="time"),
+    changes.sets(rubber_stiffness="stiffness", rubber_time="time"),
   ),
   "soft_stop": Maker(
     {
@@ -342,17 +210,21 @@ OUTSIDE: dict[str, Maker] = {
       "center": Range(0.01, 0.1, signed=True),
     },
     ("stiffness",),
-    _soft_stop,
-    finish=_with_side,
+    changes.soft_stop,
+    finish=finishing.with_side,
   ),
-  "growing_friction": Maker({"rate": Range(0.02, 0.06)}, ("rate",), _adds(growing_friction="rate")),
+  "growing_friction": Maker(
+    {"rate": Range(0.02, 0.06)}, ("rate",), changes.adds(growing_friction="rate")
+  ),
   "outside_disturbance": Maker(
     {"torque": Range(0.15, 0.6), "rate": Range(4.0, 25.0)},
     ("torque",),
-    _sets(disturbance="torque", disturbance_rate="rate"),
+    changes.sets(disturbance="torque", disturbance_rate="rate"),
   ),
-  "weak_in_one_direction": Maker({"share": Range(0.2, 0.5)}, ("share",), _sets(weak_side="share")),
-  "dead_band": Maker({"counts": Range(12.0, 45.0)}, ("counts",), _sets(dead_band="counts")),
+  "weak_in_one_direction": Maker(
+    {"share": Range(0.2, 0.5)}, ("share",), changes.sets(weak_side="share")
+  ),
+  "dead_band": Maker({"counts": Range(12.0, 45.0)}, ("counts",), changes.sets(dead_band="counts")),
 }
 
 MAKERS = {**LIBRARY, **OUTSIDE}

@@ -101,7 +101,11 @@ class Figure:
 
 @dataclasses.dataclass(frozen=True)
 class Figures(Block):
-  """A table of figures with unit and meaning, and with what is good where any row has that."""
+  """A table of figures with unit and meaning, and with what is good where any row has that.
+
+  Figures whose values stand elsewhere, such as in the columns of a table or in a chart, have None:
+  where all do, the table has no column of values.
+  """
 
   kind = "figures"
   figures: Sequence[Figure]
@@ -109,7 +113,8 @@ class Figures(Block):
   @property
   def table(self) -> Table:
     """The same as a table."""
-    columns = ["name", "value", "unit", "meaning"]
+    valued = any(figure.value is not None for figure in self.figures)
+    columns = ["name", *(["value"] if valued else []), "unit", "meaning"]
     header = ["figure", *columns[1:]]
     if any(figure.good for figure in self.figures):
       columns, header = [*columns, "good"], [*header, "good is"]

@@ -84,19 +84,24 @@ def five_numbers(story: Story) -> list[Figure]:
   tallies = story.tallies
   share = loop.recovered(story)
   wanted = (
-    (loop.HEALTHY, "without what was hidden"),
-    (loop.BEFORE, "with it"),
-    (loop.WITH_EFFECTS, "the same trials with what was named: as close as the name is right"),
-    (loop.AFTER, "trained on with what was named"),
+    (loop.HEALTHY, "without what was hidden", "higher"),
+    (loop.BEFORE, "with it", "higher: little was lost"),
+    (loop.WITH_EFFECTS, "the same trials with what was named", "near before: the name is right"),
+    (loop.AFTER, "trained on with what was named", "near the robot's without what was hidden"),
   )
   figures = [
     Figure(
-      f"success, {name}", _percent(tallies.get(name)), "", meaning, "95 % interval in brackets"
+      f"success, {name}",
+      _percent(tallies.get(name)),
+      "% of trials",
+      f"{meaning}; count and exact 95 % interval in brackets",
+      good,
     )
-    for name, meaning in wanted
+    for name, meaning, good in wanted
   ]
   value = _NOTHING if share is None else f"{100 * share:.0f} %"
-  return [*figures, Figure("lost success that came back", value, "", "after against before")]
+  lost = "of what was lost"
+  return [*figures, Figure("lost success that came back", value, lost, "after, less before", "100")]
 
 
 def as_text(story: Story) -> str:
@@ -166,8 +171,9 @@ def _training(story: Story) -> Section:
     Figure(
       "success in the simulation with the effects",
       _percent(story.tallies.get(loop.TRAINED)),
-      "",
+      "% of trials",
       "of the policy that was trained on",
+      "near that of the robot without what was hidden",
     ),
   ]
   return Section("Trained on", "Distillation, effects drawn every episode.", [Figures(figures)])

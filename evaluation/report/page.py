@@ -25,7 +25,7 @@ from nerf2real.core.pages.blocks import (
 )
 from nerf2real.core.pages.page import Section
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Moment
-from nerf2real.evaluation.report import maps, tables
+from nerf2real.evaluation.report import maps, meanings, tables
 
 _MOMENTS = 5  # shown of an episode's belief
 _BELIEF_EPISODES = 4  # shown of a setting
@@ -50,6 +50,7 @@ def write(
   """
   sections = [_table(table) for table in tables.paper_tables(found)]
   sections.append(_table(tables.outcome_table(found), _OUTCOME_TEXT))
+  sections.append(meanings.section())
   sections += _paths(found, maps.draw_floor(scene, height=_PATHS_HEIGHT))
   sections += _beliefs(found, maps.draw_floor(scene, height=_BELIEF_HEIGHT))
   sections.append(_episodes(found))

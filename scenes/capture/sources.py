@@ -11,13 +11,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from nerf2real.core.cameras import Camera, focal_length
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture import rgbd
 from nerf2real.scenes.capture.video import CaptureError
+from nerf2real.scenes.colmap import pycolmap
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera

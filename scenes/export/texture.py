@@ -1,4 +1,4 @@
-"""Bakes a texture for a triangle mesh from posed pictures.
+"""Bakes a texture for a triangle mesh from posed pictures, or from its vertices' colours.
 
 Two triangles share a square cell of the atlas; cells follow a Morton curve through the room, so
 that the averages that a renderer's mipmaps take over neighbouring cells are of neighbouring places.
@@ -6,6 +6,8 @@ Shapes: V vertices, F faces, K texels along a cell's edge.
 """
 
 import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from nerf2real.scenes.geometry.mesh import Mesh, point_colors
 _BORDER = 1.0  # texels between a triangle and its cell's edge: bilinear reads stay inside the cell
 _MORTON_BITS = 10  # an axis of the room is cut into 2^10 steps
 _MAX_SIZE = 8192  # texels along the atlas; older GPUs take no more
+_MIN_CELL = 6  # texels along a cell: two triangles with their borders
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +69,57 @@ def _cell_texels(size: int) -> tuple[np.ndarray, np.ndarray]:
   return second.astype(int), weights / weights.sum(-1, keepdims=True)
 
 
+class _Atlas(NamedTuple):
+  """Where the faces of a mesh lie in a texture."""
+
+  size: int  # texels along a cell's edge
+  cells: int  # cells along the texture's edge
+  place: np.ndarray  # [F] half a cell of every face, along the Morton curve
+  cell: np.ndarray  # [F, 2] column and row of its cell
+
+  @property
+  def uv(self) -> np.ndarray:
+    """Texture coordinates of the faces' corners [F, 3, 2]."""
+    corners = self.cell[:, None] * self.size + _cell_corners(self.size)[self.place % 2]
+    uv = corners / (self.cells * self.size)
+    uv[..., 1] = 1 - uv[..., 1]
+    return uv
+
+  def fill(self, color: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Returns the texture, uint8 [S, S, 3].
+
+    Args:
+      color: Returns colours [T P, 3] of T points on each of P faces, given the points' barycentric
+        weights [T, 3] and the faces' indices [P]; face by face.
+    """
+    triangle, weights = _cell_texels(self.size)
+    by_place = np.argsort(self.place)
+    edge = self.cells * self.size
+    texture = np.zeros((edge, edge, 3), np.uint8)
+    for half in range(2):
+      rows, columns = np.nonzero(triangle == half)
+      faces = by_place[half::2]
+      where = self.cell[faces][:, None] * self.size + np.stack([columns, rows], -1)  # [P, T, 2]
+      colors = color(weights[rows, columns], faces)
+      texture[where[..., 1].ravel(), where[..., 0].ravel()] = colors
+    return texture
+
+
+def _atlas(mesh: Mesh, *, texel: float) -> _Atlas:
+  """Lays the faces out for texels of this edge on the mean face [m]."""
+  corners = mesh.vertices[mesh.faces]  # [F, 3, 3]
+  areas = 0.5 * np.linalg.norm(
+    np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+  )
+  across = -(-len(mesh.faces) // 2)
+  cells = int(np.ceil(np.sqrt(across)))
+  inner = min(np.ceil(np.sqrt(2 * areas.mean()) / texel), _MAX_SIZE)
+  size = int(np.clip(inner + 4 * _BORDER, _MIN_CELL, max(_MAX_SIZE // cells, _MIN_CELL)))
+  place = np.empty(len(mesh.faces), np.int64)
+  place[_morton_order(corners.mean(1))] = np.arange(len(mesh.faces))
+  return _Atlas(size, cells, place, _morton_grid(cells)[place // 2])
+
+
 def bake(mesh: Mesh, views: fusion.DepthViews, *, texel: float = 0.012) -> TexturedMesh:
   """Bakes colours of the views into a texture.
 
@@ -77,35 +131,33 @@ def bake(mesh: Mesh, views: fusion.DepthViews, *, texel: float = 0.012) -> Textu
   Raises:
     ValueError: The views have no colour pictures.
   """
-  corners = mesh.vertices[mesh.faces]  # [F, 3, 3]
-  areas = 0.5 * np.linalg.norm(
-    np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
-  )
-  across = -(-len(mesh.faces) // 2)
-  cells = int(np.ceil(np.sqrt(across)))
-  inner = int(np.ceil(np.sqrt(2 * areas.mean()) / texel))
-  size = int(np.clip(inner + 4 * _BORDER, 6, max(_MAX_SIZE // cells, 6)))
-  place = np.empty(len(mesh.faces), np.int64)
-  place[_morton_order(corners.mean(1))] = np.arange(len(mesh.faces))
-  cell = _morton_grid(cells)[place // 2]  # [F, 2] column, row
-  uv = (cell[:, None] * size + _cell_corners(size)[place % 2]) / (cells * size)
-  uv[..., 1] = 1 - uv[..., 1]
+  corners, normals = mesh.vertices[mesh.faces], mesh.normals
 
-  triangle, weights = _cell_texels(size)
-  by_place = np.argsort(place)
-  texture = np.zeros((cells * size, cells * size, 3), np.uint8)
-  normals = mesh.normals
-  for half in range(2):
-    rows, columns = np.nonzero(triangle == half)
-    blend = weights[rows, columns]  # [T, 3]
-    faces = by_place[half::2]
-    points = np.einsum("tk,fki->fti", blend, corners[faces])
-    facing = np.einsum("tk,fki->fti", blend, normals[mesh.faces[faces]])
+  def color(weights: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    points = np.einsum("tk,fki->fti", weights, corners[faces])
+    facing = np.einsum("tk,fki->fti", weights, normals[mesh.faces[faces]])
     facing /= np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-12)
-    colors = point_colors(points.reshape(-1, 3), facing.reshape(-1, 3), views)
-    where = cell[faces][:, None] * size + np.stack([columns, rows], -1)  # [F/2, T, 2]
-    texture[where[..., 1].ravel(), where[..., 0].ravel()] = colors
-  return TexturedMesh(mesh.vertices, mesh.faces, uv, texture)
+    return point_colors(points.reshape(-1, 3), facing.reshape(-1, 3), views)
+
+  atlas = _atlas(mesh, texel=texel)
+  return TexturedMesh(mesh.vertices, mesh.faces, atlas.uv, atlas.fill(color))
+
+
+def bake_vertex_colors(mesh: Mesh) -> TexturedMesh:
+  """Bakes the vertices' colours into a texture, interpolated over each face.
+
+  Raises:
+    ValueError: The mesh has no colours.
+  """
+  if mesh.colors is None:
+    raise ValueError("Baking needs a mesh with vertex colours, found none.")
+  corners = mesh.colors[mesh.faces].astype(np.float64)
+
+  def color(weights: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    return np.einsum("tk,fki->fti", weights, corners[faces]).reshape(-1, 3).round()
+
+  atlas = _atlas(mesh, texel=np.inf)
+  return TexturedMesh(mesh.vertices, mesh.faces, atlas.uv, atlas.fill(color))
 
 
 def _morton_grid(cells: int) -> np.ndarray:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 from scipy import ndimage
 
 from nerf2real.core.cameras import Camera
+from nerf2real.scenes.colmap import pycolmap
 
 if TYPE_CHECKING:
   from nerf2real.scenes.field.views import Views

@@ -13,10 +13,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import pycolmap
 import scipy.sparse
 
+<<<<<<< HEAD
 from nerf2real.core.cameras import PIXEL_CENTRE, Camera
+=======
+from nerf2real.scenes.colmap import pycolmap
+>>>>>>> main
 
 _SMOOTHING = (
   2.0  # deviation of a colour's Gaussian [pixel]; chosen: hides a pixel's reprojection error

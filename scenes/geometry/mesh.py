@@ -10,7 +10,6 @@ import dataclasses
 import pathlib
 from typing import NamedTuple
 
-import fast_simplification
 import numpy as np
 import trimesh
 from scipy import ndimage, sparse
@@ -115,6 +114,8 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
   """Decimates to about this many faces (quadric error); colours are lost, paint afterwards."""
   if len(mesh.faces) <= faces:
     return mesh
+  import fast_simplification  # only where scenes are made
+
   vertices, triangles = fast_simplification.simplify(
     mesh.vertices.astype(np.float32),
     mesh.faces.astype(np.int32),

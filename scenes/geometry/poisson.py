@@ -13,11 +13,11 @@ import tempfile
 
 import numba
 import numpy as np
-import pycolmap
 import trimesh
 from scipy import spatial
 
 from nerf2real.core import cameras
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.geometry.mesh import Mesh
 
 _NEIGHBOURS = 16  # points that a normal is estimated from

@@ -13,11 +13,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, matching
 from nerf2real.scenes.poses.localisation import (
   Localisation,

@@ -6,11 +6,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.matching import image_ids, quiet
 
 MIN_OBSERVATIONS = 20  # points a picture must see to count as registered

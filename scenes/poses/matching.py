@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.pairs import Pair, PairSettings, choose_pairs, overlap_scores
 
 _EXTRACTION_CHUNK = 8  # pictures between two progress reports

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
+
+from nerf2real.scenes.colmap import pycolmap
 
 MIN_MATCHES = 50  # of a pair that is judged
 MIN_DISPLACEMENT = 0.05  # median movement of the matches, times the picture's width

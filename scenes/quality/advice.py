@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import pycolmap
 
 from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
 from nerf2real.scenes.alignment import surroundings, world_frame
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.localise import Localisation
 from nerf2real.scenes.quality.coverage import Coverage, coverage
 

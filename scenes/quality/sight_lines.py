@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-import pycolmap
 from scipy import spatial
 
 from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.geometry import collision, convex
 from nerf2real.scenes.quality.collision_error import sample_parts
 

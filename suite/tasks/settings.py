@@ -7,7 +7,7 @@ from nerf2real.suite.effects import Effect
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 
-PHYSICS_TIMESTEP = 0.0025  # s: benchmarks/physics_step.py, results in suite/README.md
+PHYSICS_TIMESTEP = 0.0025  # s: benchmarks/simulation/physics_step.py, results in suite/README.md
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.report import residual_plots
+from nerf2real.sysid.report import meanings, residual_plots
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
 from nerf2real.sysid.selection import decision, race
 from nerf2real.sysid.selection.findings import Identified
@@ -61,7 +61,7 @@ def page(
   ]
   if held:
     sections.append(residual_plots.held_out(found, held, effects, items[:_SHOWN], window_s))
-  sections += [_joints(found), _next(content), _audit(details)]
+  sections += [_joints(found), _next(content), _audit(details), meanings.section()]
   names = _summary(content["effects"])
   return Page(
     "What the model lacks",

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def _run(script, out, *arguments):
   subprocess.run(
-    [sys.executable, ROOT / "benchmarks" / script, "--out", out, *arguments],
+    [sys.executable, ROOT / "benchmarks" / "learning" / script, "--out", out, *arguments],
     check=True,
     capture_output=True,
     timeout=120,
@@ -64,7 +64,7 @@ def test_curves(tmp_path):
   subprocess.run(
     [
       sys.executable,
-      ROOT / "benchmarks/curves.py",
+      ROOT / "benchmarks/learning/curves.py",
       "--name",
       "x",
       "--out",

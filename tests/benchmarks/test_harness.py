@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import compare, field, harness
+from benchmarks import compare, harness
 from benchmarks.ledger import records as ledger
+from benchmarks.rooms import field
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -125,6 +126,16 @@ def test_two_checkouts_are_compared_by_the_words_of_the_names(tmp_path):
   assert "| 2 (2) | 4 (4) | 0.500 |" in compare.markdown([row])
 
 
+def test_a_script_that_has_moved_is_found_in_the_other_checkout(tmp_path):
+  checkout = _checkout(tmp_path / "old", 1.0, "v")
+  words = ["benchmarks/topic/b.py", "--rounds", "2"]
+  assert compare.moved(checkout, words) == ["benchmarks/b.py", "--rounds", "2"]
+  assert compare.moved(checkout, ["benchmarks/none.py"]) == ["benchmarks/none.py"]
+  (checkout / "benchmarks" / "other").mkdir()
+  (checkout / "benchmarks" / "other" / "b.py").write_text("")
+  assert compare.moved(checkout, words) == words  # which one is meant is not known
+
+
 def test_a_command_that_fails_is_said_in_a_line(tmp_path, capsys):
   checkout = _checkout(tmp_path / "old", 1.0, "v")
   settings = compare.Settings(other=checkout, command="benchmarks/none.py", turns=1)
@@ -133,8 +144,10 @@ def test_a_command_that_fails_is_said_in_a_line(tmp_path, capsys):
 
 
 def test_a_script_s_command_loses_other_and_gains_out(tmp_path):
-  words = [str(ROOT / "benchmarks/env.py"), "--rounds", "2", "--other", "x", "--turns=4"]
-  assert compare.own_command(words, tmp_path) == "benchmarks/env.py --rounds 2 --out {out}"
+  words = [str(ROOT / "benchmarks/simulation/env.py"), "--rounds", "2", "--other", "x", "--turns=4"]
+  assert (
+    compare.own_command(words, tmp_path) == "benchmarks/simulation/env.py --rounds 2 --out {out}"
+  )
 
 
 def test_the_field_s_trainer_is_found_in_both_layouts(tmp_path):

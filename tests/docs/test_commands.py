@@ -44,6 +44,12 @@ def test_a_command_is_run_as_its_entry_says(checker):
   assert ended.state == checker.FAILED and "KeyboardInterrupt" in ended.detail
 
 
+def test_the_page_of_results_is_of_these_commands_and_none_failed(checker):
+  rows = checker.recorded()
+  assert rows and set(rows) <= {command for _, command in checker.commands()}
+  assert [row for row in rows.values() if checker.FAILED in row] == []
+
+
 def test_misuses_are_many_and_each_names_a_script():
   cases = tomllib.loads((_ROOT / "docs/misuse.toml").read_text())["case"]
   assert len(cases) >= 60

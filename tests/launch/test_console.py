@@ -97,6 +97,13 @@ def run(arguments):
   if arguments.kind == "environment":
     print(os.environ["A_TEST"], os.environ["SET_BEFORE"])
     return 5
+  if arguments.kind == "import":
+    try:
+      import imported_on_trial
+      time.sleep(60)
+    finally:
+      time.sleep(0.3)  # to close what is open; nothing interrupts this
+      print("closed", flush=True)
   try:
     print("ready", flush=True)
     time.sleep(60)
@@ -145,3 +152,23 @@ def test_signals_end_in_one_line_and_close_what_is_open(script, number):
   output, error = process.communicate(timeout=30)
   assert process.returncode == 128 + number
   assert output == "closed\n" and error == "\nstopped: go on with the same command\n"
+
+
+_IMPORTED_ON_TRIAL = """
+import os, signal
+try:
+  os.kill(os.getpid(), signal.{name})
+  os.getpid()  # handlers run between two instructions
+except BaseException:
+  print("taken for missing", flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_an_import_swallows_ends_the_command_all_the_same(script, number):
+  library = script.with_name("imported_on_trial.py")
+  library.write_text(_IMPORTED_ON_TRIAL.format(name=number.name))
+  ended = _run(sys.executable, script, "--kind", "import")
+  assert ended.returncode == 128 + number
+  assert ended.stdout == "taken for missing\nclosed\n"
+  assert ended.stderr == "\nstopped: go on with the same command\n"

@@ -1,7 +1,6 @@
-"""Tests of localisation: pairs, unit frame, and a small reconstruction against the truth."""
+"""Tests of localisation: a small reconstruction against the truth."""
 
 import dataclasses
-import itertools
 import json
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import fountain
+from benchmarks.rooms import fountain
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
@@ -17,210 +16,12 @@ from nerf2real.scenes.poses import localise as localise_module
 from nerf2real.scenes.poses import mapping, matching
 from nerf2real.scenes.poses.localise import LocalisationError, LocaliseSettings, load, localise
 from nerf2real.scenes.poses.matching import FeatureSettings
-from nerf2real.scenes.poses.pairs import (
-  PairSettings,
-  choose_pairs,
-  exhaustive_pairs,
-  loop_pairs,
-  overlap_scores,
-  repair_pairs,
-  sequential_pairs,
-  sparse_keyframes,
-)
-from nerf2real.scenes.poses.unit_frame import mean_up, unit_from_source
+from nerf2real.scenes.poses.unit_frame import mean_up
 from tests.scenes import synthetic_capture as synthetic
 from tests.scenes.capture.test_capture import write_transforms
 
 FOUNTAIN = Path(__file__).parents[4] / "shared" / "data" / "captures" / "fountain-P11"
 FEW = LocaliseSettings(features=FeatureSettings(few_num_features=800))
-
-
-def components(count, pairs):
-  """Number of connected components of an undirected graph, by union-find."""
-  parent = list(range(count))
-
-  def root(node):
-    while parent[node] != node:
-      node = parent[node]
-    return node
-
-  for a, b in pairs:
-    parent[root(a)] = root(b)
-  return len({root(node) for node in range(count)})
-
-
-def scores_of_a_loop(keyframes, count):
-  """Overlap of keyframes on two rounds through one room: near in phase means many matches."""
-  phase = (keyframes[:, None] - keyframes[None]) % (count // 2)
-  phase = np.minimum(phase, count // 2 - phase)
-  return np.maximum(0, 60 - phase)
-
-
-@pytest.mark.parametrize("count", [250, 500, 1000])
-def test_pairs_grow_linearly_and_connect_everything(count):
-  settings = PairSettings()
-  pairs, words = choose_pairs(
-    np.full(count, 2000), settings, score=lambda keyframes: scores_of_a_loop(keyframes, count)
-  )
-  assert "sequential" in words
-  assert "loop closures" in words
-  assert len(set(pairs)) == len(pairs)
-  assert all(0 <= a < b < count for a, b in pairs)
-  assert components(count, pairs) == 1
-  most = count * (settings.overlap + 3) + settings.loop_keyframes * settings.loop_closures
-  assert len(pairs) <= most
-  assert len(pairs) < 0.25 * count * (count - 1) / 2 or count < 500
-  second_round = [(a, b) for a, b in pairs if abs(b - a - count // 2) < 10]
-  assert len(second_round) > 50  # the second round is tied to the first
-
-
-def test_few_keyframes_are_matched_exhaustively():
-  def never(_):
-    raise AssertionError("no scores are needed")
-
-  pairs, words = choose_pairs(np.full(30, 4000), PairSettings(), score=never)
-  assert words.startswith("exhaustive")
-  assert sorted(pairs) == list(itertools.combinations(range(30), 2))
-
-
-def test_the_bound_is_the_cost_not_the_number():
-  few = choose_pairs(np.full(150, 1000), PairSettings(), score=None)
-  assert few[1].startswith("exhaustive")
-  many = choose_pairs(
-    np.full(150, 3000), PairSettings(), score=lambda k: np.zeros((len(k), len(k)), int)
-  )
-  assert many[1].startswith("sequential")
-
-
-def test_sequential_pairs_by_hand():
-  assert sorted(sequential_pairs(5, 1)) == [
-    (0, 1),
-    (0, 2),
-    (0, 4),
-    (1, 2),
-    (1, 3),
-    (2, 3),
-    (2, 4),
-    (3, 4),
-  ]
-  assert exhaustive_pairs(3) == [(0, 1), (0, 2), (1, 2)]
-  np.testing.assert_array_equal(sparse_keyframes(10, 4), [0, 3, 6, 9])
-  assert len(sparse_keyframes(1000, 300)) <= 300
-
-
-def test_loop_pairs_by_hand():
-  keyframes = np.array([0, 10, 20, 30])
-  scores = np.array([[0, 9, 8, 2], [9, 0, 7, 6], [8, 7, 0, 5], [2, 6, 5, 0]])
-  chosen = loop_pairs(keyframes, scores, min_distance=10, per_keyframe=1, min_score=3)
-  assert chosen == [(0, 20), (10, 30)]
-
-
-def test_repair_pairs_reach_the_whole_capture_and_stay_bounded():
-  pairs = repair_pairs([100], 1000, overlap=10, loop_keyframes=300)
-  others = {a + b - 100 for a, b in pairs}
-  assert set(range(70, 131)) - {100} <= others
-  assert min(others) < 10
-  assert max(others) > 990
-  assert len(repair_pairs(range(500), 1000, overlap=10, loop_keyframes=300)) < 1000 * 45
-
-
-def test_overlap_scores_against_brute_force():
-  generator = np.random.default_rng(0)
-  base = generator.normal(size=(40, 16))
-  descriptors = np.stack(
-    [
-      base[generator.permutation(40)[:20]] + 0.05 * generator.normal(size=(20, 16))
-      for _ in range(5)
-    ]
-  ).astype(np.float32)
-  descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True)
-  descriptors[4, 12:] = 0
-  scores = overlap_scores(descriptors, ratio=0.85)
-  for i, j in itertools.permutations(range(5), 2):
-    a, b = (i, j) if i > j else (j, i)
-    first = descriptors[a][np.abs(descriptors[a]).sum(1) > 0]
-    second = descriptors[b][np.abs(descriptors[b]).sum(1) > 0]
-    forward = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
-    back = {m.queryIdx: m.trainIdx for m in cv2.BFMatcher(cv2.NORM_L2).match(second, first)}
-    expected = sum(
-      m.distance < 0.85 * n.distance and back[m.trainIdx] == m.queryIdx for m, n in forward
-    )
-    assert abs(scores[i, j] - expected) <= (1 if 4 in (i, j) else 0)
-  np.testing.assert_array_equal(scores, scores.T)
-
-
-def test_unit_frame_is_upright_and_holds_points_and_cameras():
-  generator = np.random.default_rng(1)
-  turn = cv2.Rodrigues(np.array([0.7, -0.4, 1.1]))[0]
-  move = Similarity(3.7, turn, np.array([5.0, -2.0, 9.0]))
-  poses = synthetic.walk(20)
-  points = generator.uniform([0, 0, 0], [3, 3, 3], (5000, 3))
-  points[:50] *= 40  # outliers
-  unit = unit_from_source(move.apply_pose(poses), move.apply(points))
-  cameras = unit.apply_pose(move.apply_pose(poses))
-  np.testing.assert_allclose(mean_up(cameras), [0, 0, 1], atol=1e-9)
-  inside = np.abs(unit.apply(move.apply(points))).max(axis=1) <= 1
-  assert 0.975 <= inside.mean() <= 1
-  assert np.abs(cameras[:, :3, 3]).max() < 1
-  # It does not depend on the source's frame.
-  same_frame(unit @ move, unit_from_source(poses, points))
-
-
-def same_frame(found, expected, *, tolerance=1e-8):
-  assert found.scale == pytest.approx(expected.scale, rel=tolerance)
-  np.testing.assert_allclose(found.rotation, expected.rotation, atol=tolerance)
-  np.testing.assert_allclose(found.translation, expected.translation, atol=tolerance)
-
-
-def square_rooms():
-  """Points and poses whose box is as small in every quarter turn, in frames of all directions."""
-  generator = np.random.default_rng(3)
-  quarter = generator.uniform([-2, -2, 0], [2, 2, 2.5], (1000, 3))
-  turns = [cv2.Rodrigues(np.array([0, 0, k * np.pi / 2]))[0] for k in range(4)]
-  points = np.concatenate([quarter @ turn.T for turn in turns])
-  for target in ([2, 0, 1.0], [2, 2, 1.0], [0.3, 1.9, 0.5]):  # along a wall, into a corner, else
-    views = [synthetic.look_at(np.array([x, 0.1, 1.0]), np.array(target)) for x in (0, 0.3, 0.9)]
-    yield np.stack(views), points
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_unit_frame_is_unique(seed):
-  """Noise of a billionth, another order of the points and another source frame change nothing."""
-  generator = np.random.default_rng(seed)
-  for poses, points in square_rooms():
-    expected = unit_from_source(poses, points)
-    noise = 1e-9 * generator.standard_normal(points.shape)
-    shaken = (points + noise)[generator.permutation(len(points))]
-    same_frame(unit_from_source(poses, shaken), expected)
-    turn = cv2.Rodrigues(generator.uniform(-3, 3, 3))[0]
-    source = Similarity(generator.uniform(0.1, 9), turn, generator.uniform(-5, 5, 3))
-    same_frame(unit_from_source(source.apply_pose(poses), source.apply(shaken)) @ source, expected)
-
-
-def test_a_frame_found_again_in_its_own_frame_is_the_same():
-  for poses, points in square_rooms():
-    unit = unit_from_source(poses, points)
-    again = unit_from_source(unit.apply_pose(poses), unit.apply(points))
-    same_frame(again, Similarity(1.0, np.eye(3), np.zeros(3)))
-
-
-def test_walls_end_up_along_the_axes():
-  generator = np.random.default_rng(2)
-  points = generator.uniform([-2.5, -2, 0], [2.5, 2, 2.5], (4000, 3))
-  poses = np.stack(
-    [synthetic.look_at(np.array([0.5, y, 1.0]), np.array([2, 1, 1.0])) for y in (0, 0.5)]
-  )
-  unit = unit_from_source(poses, points @ cv2.Rodrigues(np.array([0, 0, 0.6]))[0].T)
-  extent = np.ptp(unit.apply(points @ cv2.Rodrigues(np.array([0, 0, 0.6]))[0].T), axis=0)
-  assert sorted(extent / unit.scale) == pytest.approx([2.5, 4, 5], rel=0.03)
-
-
-def test_mean_up_of_a_camera_that_rolls_over():
-  poses = np.tile(np.eye(4), (40, 1, 1))
-  angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-  poses[:, :3, :3] = [cv2.Rodrigues(np.array([0, 0, a]))[0] for a in angles]
-  poses[:, 0, 3], poses[:, 1, 3] = np.cos(angles), np.sin(angles)
-  assert abs(mean_up(poses)[2]) == pytest.approx(1)
 
 
 @pytest.fixture(scope="module")

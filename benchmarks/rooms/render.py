@@ -4,9 +4,9 @@ All of them draw the same views of the built-in room, taking turns on one core, 
 with the true picture (each pixel the mean over its area). MuJoCo draws the true geometry with the
 true textures: what it lacks in PSNR is aliasing, what the field lacks is reconstruction.
 
-  python benchmarks/render.py                       # the scene that is shipped
-  python benchmarks/render.py --bundle out/demo     # a bundle of the built-in room
-  python benchmarks/render.py --field F --room-from-unit S.json
+  python benchmarks/rooms/render.py                       # the scene that is shipped
+  python benchmarks/rooms/render.py --bundle out/demo     # a bundle of the built-in room
+  python benchmarks/rooms/render.py --field F --room-from-unit S.json
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)

@@ -6,9 +6,9 @@ uses some time for a policy. Where it may, the loop has real-time priority; else
 scheduler's delays dominate on a busy machine. `--stepped` shows what the wire alone costs, with
 time that jumps from event to event.
 
-  python benchmarks/robot_loop.py                            # 10 minutes
-  python benchmarks/robot_loop.py --seconds 60 --loss 0.05
-  python benchmarks/robot_loop.py --stepped --loss 0.05      # the machine's speed does not matter
+  python benchmarks/robot/robot_loop.py                        # 10 minutes
+  python benchmarks/robot/robot_loop.py --seconds 60 --loss 0.05
+  python benchmarks/robot/robot_loop.py --stepped --loss 0.05  # the machine's speed does not matter
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)

@@ -4,7 +4,7 @@ The gait walks straight ahead on virtual robots and in simulation; the policy's 
 compared with the truth. On the virtual robots three ways: as it is, without the gyroscope's zero
 that is measured while the robot stands, and with an accelerometer whose range never ends.
 
-  python benchmarks/gravity.py
+  python benchmarks/robot/gravity.py
 """
 
 # ruff: noqa: E402  (threads are chosen before numpy is imported)

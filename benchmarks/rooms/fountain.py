@@ -1,6 +1,6 @@
 """Localisation against surveyed poses: fountain-P11.
 
-  python benchmarks/fountain.py --data ../shared/data/captures/fountain-P11
+  python benchmarks/rooms/fountain.py --data ../shared/data/captures/fountain-P11
 
 Source of the data: Strecha et al. 2008, On benchmarking camera calibration and multi-view stereo
 for high resolution imagery. Exit code 1 if a figure is missed.

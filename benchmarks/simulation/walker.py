@@ -4,7 +4,7 @@ Straight ahead only the gait acts, without a pose. The goals are reached one aft
 another, steered by the true pose. Simulation: episodes as in training, without pushes. Virtual
 robots: what is hidden in each is drawn from its seed; "data sheet" has nothing hidden.
 
-  python benchmarks/walker.py --out benchmarks/results/walker.md
+  python benchmarks/simulation/walker.py --out benchmarks/results/walker.md
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)

@@ -1,4 +1,6 @@
-"""Updates a second of this learner beside a plain reference update: `python benchmarks/learner.py`.
+"""Updates a second of this learner beside a plain reference update.
+
+  python benchmarks/learning/learner.py
 
 State-only settings (preset "state") on cartpole's sizes. The reference is DMPO as the public one is
 written, with rlax (the test extra): single transitions with n-step rewards summed beforehand, in a

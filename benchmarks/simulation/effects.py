@@ -1,4 +1,4 @@
-"""What effects cost a physics step, on 20 joints: `python benchmarks/effects.py`.
+"""What effects cost a physics step, on 20 joints: `python benchmarks/simulation/effects.py`.
 
 Prints the median time of `EffectStack.before_step` for each kind that acts at the physics rate, for
 all of them together, and of mj_step beside them. The model is a chain of 20 joints with position

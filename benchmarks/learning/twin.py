@@ -1,6 +1,6 @@
 """Success in simulation against success on virtual robots, over several policies.
 
-  python benchmarks/twin.py --policies runs/x/policy/newest kept/1 kept/2 --trials 18
+  python benchmarks/learning/twin.py --policies runs/x/policy/newest kept/1 kept/2 --trials 18
 
 Every policy is evaluated as by `launch/evaluate.py --plant both` into one folder; what is there
 already is not run again. Reported are the rates, their correlation over the policies and the mean

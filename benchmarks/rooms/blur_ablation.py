@@ -5,8 +5,8 @@ runs get the same pictures, time and seed. A field without the augmentation has 
 coarser pixel than the training camera's; it is scored twice, given the robot's true pixel and given
 the training pixel, and the better of the two is what the augmentation is compared with.
 
-  python benchmarks/blur_ablation.py                # twice 4 minutes on 2 cores
-  python benchmarks/blur_ablation.py --seconds 60
+  python benchmarks/rooms/blur_ablation.py                # twice 4 minutes on 2 cores
+  python benchmarks/rooms/blur_ablation.py --seconds 60
 
 Source: NeRF2Real, section NeRF training (31.5 against 35.4 dB) and the figure of the blur ablation.
 """

@@ -1,9 +1,9 @@
 """Trains a radiance field in the checkout that PYTHONPATH names, and prints figures as JSON.
 
-The process that `benchmarks/field.py` and `benchmarks/gpu.py` start. It imports nothing of this
-folder, so that it measures older commits too: where a checkout keeps its trainer is an argument.
+The process that `field.py` beside this and `benchmarks/gpu.py` start. It imports nothing of these
+folders, so that it measures older commits too: where a checkout keeps its trainer is an argument.
 
-  PYTHONPATH=/checkout python benchmarks/field_worker.py --views views.npz --seconds 20
+  PYTHONPATH=/checkout python benchmarks/rooms/field_worker.py --views views.npz --seconds 20
     --training nerf2real.scenes.field.training --views-module nerf2real.scenes.field.views
     --cameras nerf2real.core.cameras
 """

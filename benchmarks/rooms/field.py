@@ -1,10 +1,10 @@
 """Steps and rays a second of the field's training, here and in another checkout in turn.
 
 Keyframes of the built-in room's film at their true poses, preset "fast". Every turn is a process of
-its own (`benchmarks/field_worker.py`), so that two commits can be measured side by side whatever
+its own (`field_worker.py` beside this), so that two commits can be measured side by side whatever
 they call their modules.
 
-  python benchmarks/field.py --other ../before --turns 3
+  python benchmarks/rooms/field.py --other ../before --turns 3
 """
 
 import dataclasses
@@ -15,9 +15,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks import blur_ablation, compare, harness
-from benchmarks.field_worker import save_views
+from benchmarks import compare, harness
 from benchmarks.ledger.records import ROOT
+from benchmarks.rooms import blur_ablation
+from benchmarks.rooms.field_worker import save_views
 
 WORKER = Path(__file__).with_name("field_worker.py")
 # Where a checkout keeps its trainer: a file that shows the layout, then the worker's arguments.

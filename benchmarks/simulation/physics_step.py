@@ -6,7 +6,7 @@ compared with the end state at 0.125 ms. As a yardstick the last rows show what 
 within the paper's randomisation (0 to 0.5 kg) does to the same motion at the fine step: an error
 far below it cannot matter to a policy. The results are in suite/README.md.
 
-  python benchmarks/physics_step.py
+  python benchmarks/simulation/physics_step.py
 """
 
 import dataclasses

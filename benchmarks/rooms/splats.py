@@ -1,7 +1,7 @@
 """Judges splats of the built-in room with a foreign renderer: MuJoCo Warp on its CPU device.
 
   python launch/export_scene.py --to splat --out out/room.ply
-  python benchmarks/splats.py --splats out/room.ply
+  python benchmarks/rooms/splats.py --splats out/room.ply
 
 Needs `pip install mujoco-warp`. The pictures are the film's own from the robot's 24 places, 60x80.
 """

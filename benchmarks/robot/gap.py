@@ -7,7 +7,7 @@ gravity, pictures at 30x40. The simulation is the nominal one, without randomisa
 the virtual camera's, as a calibration would find it. `picture, same pose` shows the difference of
 field and sensor alone: the simulation's picture from where the virtual robot's camera was.
 
-  python benchmarks/gap.py --out benchmarks/results/gap.md
+  python benchmarks/robot/gap.py --out benchmarks/results/gap.md
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)

@@ -1,4 +1,6 @@
-"""Learning curves of runs: `python benchmarks/curves.py --name cartpole_swingup runs/x runs/y`.
+"""Learning curves of runs, as a picture and a table.
+
+  python benchmarks/learning/curves.py --name cartpole_swingup runs/x runs/y
 
 Reads the folders that `launch/local_distributed.py` writes, one a seed, and writes
 benchmarks/results/curves_<name>.jsonl and .png. The rows: one "run" row a run (command, seed,

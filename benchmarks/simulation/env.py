@@ -5,7 +5,7 @@ of episodes that end. Where other work shares the core, the figures by processor
 to read: steps/s by processor time is what a core does that is not shared. The humanoid is measured
 twice: as dm_control draws it, and with shadows and multisampling off, which software GL is slow at.
 
-  python benchmarks/env.py [--scene out/livingroom] [--output figures.json] [--other ../before]
+  python benchmarks/simulation/env.py [--scene out/livingroom] [--out figures.json] [--other DIR]
 """
 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and dm_control are imported)

@@ -1,4 +1,6 @@
-"""Time of a policy step on one core: `python benchmarks/policy.py [--policy runs/x/policy/best]`.
+"""Time of a policy step on one core.
+
+  python benchmarks/learning/policy.py [--policy runs/x/policy/best]
 
 Without --policy, a policy of the paper's shape with random parameters is exported and loaded, once
 for 30x40 and once for 60x80 pictures. Targets: p99 below 10 ms at 30x40, 25 ms at 60x80. Steps take

@@ -1,4 +1,4 @@
-"""The link beside raw zenoh, with a stalled receiver: `python benchmarks/link.py`.
+"""The link beside raw zenoh, with a stalled receiver: `python benchmarks/learning/link.py`.
 
 Sends 48-step trajectories with 30x40 pictures (173 KB) from one process to another; in the middle
 the receiver is stopped for 20 s (SIGSTOP), as a long compilation or a checkpoint on a starved

@@ -1,0 +1,1 @@
+"""Scenes: training and drawing of the field, exported splats, localisation."""

@@ -1,0 +1,1 @@
+"""The simulated world: environment steps, effects, the physics step, the scripted walker."""
