@@ -34,15 +34,9 @@ class Arguments:
   (TUM's or 7-Scenes' layout), or "builtin" for the project's own room."""
   out: Path
   """Folder of the bundle."""
-<<<<<<< HEAD
-  preset: Literal["fast", "quality", "demo", "paper"] = "fast"
-  """"fast": two CPU cores; "quality": the same with an hour of training; "demo": quicker; "paper":
-  the paper's tables, for a GPU."""
-=======
-  preset: Literal["fast", "demo", "tiny", "paper"] = "fast"
-  """"fast": two CPU cores; "demo": quicker; "tiny": a first look, 60 pictures and a minute of
-  training; "paper": the paper's tables, for a GPU."""
->>>>>>> main
+  preset: Literal["fast", "quality", "demo", "tiny", "paper"] = "fast"
+  """"fast": two CPU cores; "quality": the same with an hour of training; "demo": quicker; "tiny": a
+  first look, 60 pictures and a minute of training; "paper": the paper's tables, for a GPU."""
   keyframes: int | None = None
   """Pictures to take from the capture; the preset's number if not given."""
   train_seconds: float | None = None

@@ -60,28 +60,18 @@ class SceneSettings:
       raise ValueError(f"Unknown baseline {self.baseline!r}; expected 'none' or 'colmap'.")
 
 
-<<<<<<< HEAD
-PRESETS = ("fast", "quality", "demo", "paper")
+PRESETS = ("fast", "quality", "demo", "tiny", "paper")
 
 
 def preset(name: str) -> SceneSettings:
   """Returns settings.
 
   Args:
-    name: "fast" for two CPU cores, "quality" with an hour of training, "demo" quicker, "paper" the
-      paper's tables.
+    name: "fast" for two CPU cores, "quality" with an hour of training, "demo" and "tiny" quicker,
+      "paper" the paper's tables.
   """
   if name in ("fast", "quality"):
     return SceneSettings(train=training.preset(name))
-=======
-PRESETS = ("fast", "demo", "tiny", "paper")
-
-
-def preset(name: str) -> SceneSettings:
-  """Returns settings: "fast" for two CPU cores, "demo" and "tiny" quicker, "paper" the paper's."""
-  if name == "fast":
-    return SceneSettings()
->>>>>>> main
   if name == "demo":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=110),

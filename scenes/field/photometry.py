@@ -15,11 +15,8 @@ import cv2
 import numpy as np
 import scipy.sparse
 
-<<<<<<< HEAD
 from nerf2real.core.cameras import PIXEL_CENTRE, Camera
-=======
 from nerf2real.scenes.colmap import pycolmap
->>>>>>> main
 
 _SMOOTHING = (
   2.0  # deviation of a colour's Gaussian [pixel]; chosen: hides a pixel's reprojection error

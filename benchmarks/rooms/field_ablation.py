@@ -3,8 +3,8 @@
 Keyframes and poses are those of a scene that `launch/make_scene.py` made or began (`--check` is
 enough); all runs get the same steps and seed.
 
-  python benchmarks/field_ablation.py --scene out/living --steps 2500
-  python benchmarks/field_ablation.py --scene out/living --change falloff near_gradient
+  python benchmarks/rooms/field_ablation.py --scene out/living --steps 2500
+  python benchmarks/rooms/field_ablation.py --scene out/living --change falloff near_gradient
 """
 
 import dataclasses
