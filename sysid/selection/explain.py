@@ -1,7 +1,7 @@
 """Explains one joint: sets of effects grown forward, scored by left-out likelihood."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -21,6 +21,8 @@ class Scored:
   fit: Fit
   nats: Array
   """[B] log-likelihood of the left-out blocks."""
+  neutral: bool = False
+  """Whether an effect stands at the values that do nothing: a rival, never an explanation."""
 
   @property
   def names(self) -> frozenset[str]:
@@ -57,6 +59,11 @@ def standardised(differences: Array, total: float | None = None, least: float = 
   return total / max(np.sqrt(variance), least)
 
 
+def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
+  """Returns the explanations with a number of effects."""
+  return [item for item in items if len(item.names) == size and not item.neutral]
+
+
 class Explainer:
   """Grows hypotheses of one joint."""
 
@@ -85,7 +92,7 @@ class Explainer:
     self.joint, self.constants, self.settings = joint, constants, settings
     self.library, self.freed = list(library), freed
     self.scored: dict[tuple[Term, ...], Scored] = {}
-    base = (constants, *known)
+    self.base = base = (constants, *known)
     x = np.concatenate([t.starts[0] for t in base]) if start is None else start
     declared = joint.residuals((), np.zeros((1, 0)))[0]
     joint.rescale(declared)
@@ -111,10 +118,10 @@ class Explainer:
     best = int(np.argmin(costs))
     return fitter.fit(tried[best], iterations=1) if costs[best] < fit.cost - 1.0 else fit
 
-  def _score(self, terms: tuple[Term, ...], fit: Fit) -> Scored:
+  def _score(self, terms: tuple[Term, ...], fit: Fit, *, neutral: bool = False) -> Scored:
     fitter = Fitter([self.joint], Layout([terms]))
     fitter.leave_out(fit)
-    result = Scored(terms, fit, self.joint.loglik(fit.held[0]))
+    result = Scored(terms, fit, self.joint.loglik(fit.held[0]), neutral)
     self.scored[terms] = result
     return result
 
@@ -215,7 +222,29 @@ class Explainer:
         break
       best = grown[0]
       parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
+    for size in {len(item.names) for item in self.scored.values()}:
+      self._neutralise(max(of_size(self.scored.values(), size), key=lambda item: item.evidence))
     return self.ranked()
+
+  def _neutralise(self, item: Scored) -> None:
+    """Scores an item with each of its effects at the values that do nothing, all else fitted.
+
+    What an effect brings along (a friction constraint without creep, a better place from which the
+    constants were fitted) is no evidence for it.
+    """
+    for term in (t for t in item.terms if t.name is not None):
+      before = next((t for t in self.base if t.kind == term.kind), None)
+      instead = before or term.at_rest(item.fit.values(term))
+      terms = tuple(instead if t is term else t for t in item.terms)
+      x = np.concatenate(
+        [
+          [v for n, v in item.fit.values(t).items() if t is not term or n in instead.names]
+          for t in item.terms
+        ]
+      )
+      fit = Fitter([self.joint], Layout([terms])).fit(x, iterations=4)
+      if terms not in self.scored or self.scored[terms].fit.cost > fit.cost:
+        self._score(terms, fit, neutral=before is None)
 
   def ranked(self) -> list[Scored]:
     """Returns all scored hypotheses, the best first."""
