@@ -1,4 +1,4 @@
-"""Constants of the analysis beside references (`since_reference.py`), all of them chosen.
+"""Constants of the analysis beside references (`analysis.py`), all of them chosen.
 
 Most were set on development sets, not calibrated; the older path (`decision.py`) has its own.
 """
@@ -58,6 +58,8 @@ class Settings:
   """Hypotheses that are grown further."""
   worth: float = 2.8
   """Standard errors by which a further effect must be better for the search to go on."""
+  suspects: int = 3
+  """Joints on which effects of wider scope are looked for, those that leave most."""
   reference_depth: int = 1
   """Effects of a joint at most that are looked for in reference logs."""
   structured: float = 0.5

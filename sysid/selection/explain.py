@@ -1,7 +1,7 @@
 """Explains one joint: sets of effects grown forward, scored by left-out likelihood."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
+
+_SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
 
 
 @dataclasses.dataclass
@@ -135,10 +137,9 @@ class Explainer:
     quick: list[tuple[float, tuple[Term, ...], Fit]] = []
     for terms, starts, stale, fresh in self._candidates(parent):
       fitter = Fitter([self.joint], Layout([terms]))
-      costs = fitter.costs(starts)
       best = None
-      for k in np.argsort(costs)[: 1 if parent.names else self.settings.starts]:
-        fit = fitter.fit(starts[k], iterations=2, known=stale, fresh=fresh, quick=True)
+      for start in self._begin(parent, fitter, starts):
+        fit = fitter.fit(start, iterations=2, known=stale, fresh=fresh, quick=True)
         if best is None or fit.cost < best.cost:
           best = fit
       assert best is not None
@@ -152,6 +153,17 @@ class Explainer:
       done = Fitter([self.joint], Layout([terms])).fit(fit.x, iterations=4)
       results.append((terms, done if done.cost < fit.cost + 1.0 else fit))
     return [self._score(terms, fit) for terms, fit in results]
+
+  def _begin(self, parent: Scored, fitter: Fitter, starts: Array) -> list[Array]:
+    """Returns where descents begin: the best start, and without a first effect the best one with
+    the constants as they were declared, which what is missing may have bent."""
+    begin = [starts[int(np.argmin(fitter.costs(starts)))]]
+    if not parent.names:
+      declared = starts.copy()
+      count = len(parent.fit.x)
+      declared[:, :count] = np.concatenate([t.centre for t in self.base])
+      begin.append(declared[int(np.argmin(fitter.costs(declared)))])
+    return begin
 
   def _candidates(self, parent: Scored):
     """Yields terms, starts [S, n], a Jacobian to take over and which values are new [n]."""
@@ -186,21 +198,32 @@ class Explainer:
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
-  def adopt(self, best: Scored) -> None:
-    """Sets the scale by the best hypothesis; all are scored anew."""
-    self.joint.rescale(best.fit.residuals[0])
+  def adopt(self, best: Scored) -> Scored:
+    """Sets the scale by the best hypothesis as it improves; returns it, all are scored anew."""
+    fitter = Fitter([self.joint], Layout([best.terms]))
+    for _ in range(self.settings.rounds):
+      self.joint.rescale(best.fit.residuals[0])
+      before = float(fitter.costs(best.fit.x[None])[0])
+      best = self.refit(best, 4)
+      if best.fit.cost > before - _SETTLED:
+        break
     self._rescore()
+    return best
 
   def refit(self, item: Scored, iterations: int = 6) -> Scored:
     """Returns a hypothesis fitted on under the present scale."""
     fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit.x, iterations=iterations)
     return self._score(item.terms, fit)
 
-  def explain(self, depth: int | None = None) -> list[Scored]:
+  def explain(
+    self, depth: int | None = None, leaves: Callable[[Scored], bool] = lambda _: False
+  ) -> list[Scored]:
     """Grows sets of effects until one more is not clear; returns all scored, the best first.
 
     Args:
       depth: effects at most; those of the settings for None.
+      leaves: whether a hypothesis leaves more than a machine does anyway: then one more is tried as
+        long as it predicts what was left out better, too.
     """
     s, limit = self.settings, depth or self.settings.depth
     parents, best = [self.null], self.null
@@ -210,15 +233,17 @@ class Explainer:
         break
       top = max(grown, key=lambda g: g.evidence)
       if top.evidence > best.evidence:
-        self.adopt(top)
+        top = self.adopt(top)
         if depth == 0:
           self.null = self.refit(self.null)
         for item in sorted(grown, key=lambda g: -g.evidence)[: s.kept]:
-          self.refit(item, 3)
+          if item.terms != top.terms:
+            self.refit(item, 3)
       grown = sorted(
         (g for g in self.scored.values() if len(g.names) == depth + 1), key=lambda g: -g.evidence
       )
-      if clear(grown[0], best) < s.worth:
+      better = grown[0].evidence > best.evidence and leaves(best)
+      if clear(grown[0], best) < s.worth and not better:
         break
       best = grown[0]
       parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]

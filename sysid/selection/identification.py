@@ -19,6 +19,7 @@ from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.opening import named, read_log
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import (
+  analysis,
   chain,
   claims,
   common,
@@ -27,7 +28,6 @@ from nerf2real.sysid.selection import (
   learned,
   race,
   screening,
-  since_reference,
 )
 from nerf2real.sysid.selection.common import WHOLE
 from nerf2real.sysid.selection.decision import Thresholds
@@ -102,9 +102,9 @@ def analyse(
 ) -> Identified:
   """Finds what a model lacks."""
   settings = settings or Settings()
-  if reference and len(logs[0].commands.joints) == 1:
-    progress(0.0, "comparing with the reference")
-    return since_reference.analyse(model, logs, reference)
+  if reference or len(logs[0].commands.joints) > 1:
+    progress(0.0, "comparing with the reference" if reference else "explaining every joint")
+    return analysis.analyse(model, logs, reference)
   progress(0.0, "looking for joints whose residual stands out")
   screened = screening.screen(model, logs, reference=reference, window_s=settings.window_s)
   if not screened:
