@@ -11,6 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nerf2real.suite.effects import kind_of
+from nerf2real.sysid.fit import intervals
+from nerf2real.sysid.fit.fitting import Fit as JointFit
 from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter, Layout
@@ -74,7 +77,8 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   if subject.alone or leaves(subject, explainer.null, settings):
     ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
-  named = found.named
+  problem = Problem(now.plant)
+  named = tuple(k for k in found.named if _is_something(problem, found.best, k))
   if before is not None and usual is not None and not subject.paired:
     named = tuple(k for k in named if _is_new(before, usual, found.best, k, subject.beyond))
   anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
@@ -84,7 +88,7 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   over = float(np.sqrt(left / max(anyway, 1e-300)))
   return Changed(
     subject,
-    Problem(now.plant),
+    problem,
     ranked,
     found,
     named,
@@ -106,6 +110,21 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
     return grown(item, subject.usual, subject.beyond, settings)
   left = float(np.sqrt(np.median(item.fit.held[0][0])))
   return left > settings.more * subject.now.position_noise
+
+
+def _is_something(problem: Problem, best: Scored, kind: str) -> bool:
+  """Tells whether an effect's values differ from those that do nothing, by their intervals.
+
+  Of effects that have sizes only: where a shape is fitted, too, a size may be open that is surely
+  not nothing, as a payload's mass is where its moment is sure.
+  """
+  term = next(t for t in best.terms if t.name == kind)
+  sizes = {} if term.freed else {p.name: p for p in kind_of(kind).parameters if not p.shape}
+  if not term.names or any(n not in sizes for n in term.names):
+    return True
+  fit = JointFit(best.terms, best.fit.x, best.fit.cost, 1.0, 0)
+  bounds = intervals.intervals(problem, fit, kind)
+  return any(not low <= sizes[n].nominal <= high for n, (low, high) in bounds.items())
 
 
 def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:
