@@ -32,6 +32,7 @@ from nerf2real.sysid.selection.subject import WHOLE, prepare
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 _GRADES = ("none", "effects", "partly", "unexplained")
+_ALL_OFF = 0.6  # share of joints with constants that are off that stands for all
 
 
 def analyse(
@@ -85,6 +86,10 @@ def analyse(
     _write_shared(result, effect, own_latency=not reference)
   for item, finding in zip(changed, found, strict=True):
     _write_down(result, item, finding)
+  off = [row for row in result.effects if row["kind"] == "parameter_error"]
+  if len(off) > _ALL_OFF * len(joints) and len(off) > 1:
+    result.effects = [row for row in result.effects if row not in off]
+    result.effects.append(claims.constants_of_all(off))
   result.verdict = _verdict([c.verdict for c in changed] + ["effects"] * bool(shared))
   return result
 

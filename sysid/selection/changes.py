@@ -73,9 +73,10 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   now, before, usual = subject.now, subject.before, subject.usual
   known, explainer = subject.known, subject.explainer
   as_it_was = now.residuals(known, np.concatenate([t.centre for t in known])[None])[0]
-  ranked = [explainer.null]
   if subject.alone or leaves(subject, explainer.null, settings):
     ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
+  else:
+    ranked = explainer.constants_alone()
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
   problem = Problem(now.plant)
   named = tuple(k for k in found.named if _is_something(problem, found.best, k))

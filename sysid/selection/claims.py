@@ -8,10 +8,10 @@ from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import decision
-from nerf2real.sysid.selection.common import WHOLE, Shared
 from nerf2real.sysid.selection.joint import Found
 from nerf2real.sysid.selection.race import Entry
 from nerf2real.sysid.selection.screening import Screened
+from nerf2real.sysid.selection.subject import WHOLE
 
 Claim = tuple[Effect, dict[str, Any]]
 """An effect and its entry in the report."""
@@ -53,12 +53,6 @@ def is_idle(entry: Entry, term: Term) -> bool:
   sizes = [p for p in kind_of(term.kind).parameters if p.name in term.names and not p.shape]
   values = entry.fit.values(term.kind)
   return bool(sizes) and all(abs(values[p.name] - p.nominal) < _NOTHING for p in sizes)
-
-
-def whole(found: Shared) -> Claim:
-  """Returns an effect of the whole machine."""
-  evidence = {**found.evidence, "other_joints_gain_nats": round(found.gain, 4)}
-  return shared(found.term, found.x, found.bounds, evidence)
 
 
 def shared(

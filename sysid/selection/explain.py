@@ -198,6 +198,13 @@ class Explainer:
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
+  def constants_alone(self) -> list[Scored]:
+    """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
+    if self.freed is not None:
+      terms = (self.freed, *self.null.terms[1:])
+      self._score(terms, Fitter([self.joint], Layout([terms])).fit(self.null.fit.x, iterations=4))
+    return self.ranked()
+
   def adopt(self, best: Scored) -> Scored:
     """Sets the scale by the best hypothesis as it improves; returns it, all are scored anew."""
     fitter = Fitter([self.joint], Layout([best.terms]))
