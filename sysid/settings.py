@@ -57,7 +57,8 @@ class Settings:
   worth: float = 2.8
   """Standard errors by which a further effect must be better for the search to go on."""
   suspects: int = 3
-  """Joints on which effects of wider scope are looked for, those that leave most."""
+  """Joints on which effects of wider scope are looked for, and without references any: those that
+  leave most."""
   reference_depth: int = 1
   """Effects of a joint at most that are looked for in reference logs."""
   structured: float = 0.5

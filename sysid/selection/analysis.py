@@ -28,7 +28,7 @@ from nerf2real.sysid.selection.joint import Found
 from nerf2real.sysid.selection.naming import Name
 from nerf2real.sysid.selection.scopes import Shared
 from nerf2real.sysid.selection.screening import Screened
-from nerf2real.sysid.selection.subject import WHOLE, prepare
+from nerf2real.sysid.selection.subject import WHOLE, explain_reference, prepare
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 _GRADES = ("none", "effects", "partly", "unexplained")
@@ -65,7 +65,14 @@ def analyse(
     for joint in joints
   ]
   shared = scopes.shared_effects(model, subjects, settings) if len(subjects) > 1 else []
-  changed = [changes.explain(subject, settings) for subject in subjects]
+  most = sorted(subjects, key=lambda s: -s.left)[: settings.suspects]
+  for subject in subjects:
+    if subject.alone or changes.leaves(subject, subject.explainer.null, settings):
+      explain_reference(subject, settings)
+  changed = [
+    changes.explain(subject, settings, thorough=bool(reference) or subject in most)
+    for subject in subjects
+  ]
   origins = [s.origin.joint for s in shared]
   changed.sort(
     key=lambda c: (

@@ -68,12 +68,18 @@ class Changed:
     return self.subject.explainer.null
 
 
-def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
-  """Explains what is new at a joint."""
+def explain(subject: Subject, settings: Settings = SETTINGS, *, thorough: bool = True) -> Changed:
+  """Explains what is new at a joint.
+
+  Args:
+    subject: the joint.
+    settings: tolerances and effort.
+    thorough: whether effects are tried; of many joints without references on a few alone.
+  """
   now, before, usual = subject.now, subject.before, subject.usual
   known, explainer = subject.known, subject.explainer
   as_it_was = now.residuals(known, np.concatenate([t.centre for t in known])[None])[0]
-  if subject.alone or leaves(subject, explainer.null, settings):
+  if thorough and (subject.alone or leaves(subject, explainer.null, settings)):
     ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()

@@ -98,16 +98,29 @@ def prepare(
     explainer = _explainer(now, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
   before = _likelihood(model, joint, reference, reductions[1], settings)
-  own = constants(before.plant, settings)
-  first = Explainer(before, own, own_library(before.plant, alone=alone), settings=settings)
-  usual = first.null
-  if alone or structured(before, usual, settings):
-    usual = conclude(before, first.explain(settings.reference_depth), beyond).best
+  usual = Explainer(before, constants(before.plant, settings), (), settings=settings).null
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0])
   freed = freed_constants(known[0], settings)
   explainer = _explainer(now, known, library, freed)
   return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
+
+
+def explain_reference(subject: Subject, settings: Settings) -> None:
+  """Finds the effects that a joint has anyway, where its reference leaves what is no noise."""
+  before = subject.before
+  if before is None or subject.usual is None:
+    return
+  if not subject.alone and not structured(before, subject.usual, settings):
+    return
+  own = constants(before.plant, settings)
+  first = Explainer(before, own, own_library(before.plant, alone=subject.alone), settings=settings)
+  usual = conclude(before, first.explain(settings.reference_depth), subject.beyond).best
+  shared = [t for t in subject.known if not t.names]
+  subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
+  subject.paired = subject.now.expect(before, usual.fit.residuals[0])
+  subject.freed = freed_constants(subject.known[0], settings)
+  subject.explainer = _explainer(subject.now, subject.known, subject.library, subject.freed)
 
 
 def _likelihood(
