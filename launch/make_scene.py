@@ -2,13 +2,16 @@
 
   python launch/make_scene.py --capture room.mp4 --out out/room --marker-side 0.2
   python launch/make_scene.py --capture builtin --out out/demo --preset demo
+  python launch/make_scene.py --capture builtin --out out/demo --preset demo --viewer
   python launch/make_scene.py --capture room.mp4 --out out/room --check
 
 A second run with the same --out continues where the first one stopped.
 """
 
+import contextlib
 import dataclasses
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,6 +19,7 @@ from nerf2real.launch import command
 
 if TYPE_CHECKING:
   from nerf2real.scenes.bundle import Bundle
+  from nerf2real.scenes.results import Watcher
   from nerf2real.scenes.settings import SceneSettings
 
 FILM_AGAIN = 3  # exit status of --check
@@ -49,6 +53,12 @@ class Arguments:
   check: bool = False
   """Stops after keyframes and poses with a verdict: what to film again, and where (check.png in
   --out). Exit status 3 where something should be filmed again. The scene continues from there."""
+  viewer: bool = False
+  """Shows poses and field in a browser while they are made, with PSNR and time left."""
+  host: str = "127.0.0.1"
+  """Address of that page."""
+  port: int = 8080
+  """Port of that page."""
 
 
 def settings_of(arguments: Arguments) -> "SceneSettings":
@@ -100,6 +110,22 @@ def _check(arguments: Arguments, source: Path, settings: "SceneSettings") -> int
   return 0 if verdict.good else FILM_AGAIN
 
 
+@contextlib.contextmanager
+def _watched(arguments: Arguments) -> Iterator["Watcher | None"]:
+  """Gives the page of --viewer while the scene is made; None without it."""
+  if not arguments.viewer:
+    yield None
+    return
+  from nerf2real.scenes.training_viewer import TrainingViewer
+
+  viewer = TrainingViewer(host=arguments.host, port=arguments.port)
+  print(f"watch it grow: {viewer.address}")
+  try:
+    yield viewer
+  finally:
+    viewer.close()
+
+
 def run(arguments: Arguments) -> int:
   """Makes the scene and prints its figures; returns the exit status."""
   from nerf2real.scenes import pipeline
@@ -113,14 +139,16 @@ def run(arguments: Arguments) -> int:
       settings = dataclasses.replace(settings, marker_side=yardstick.MARKER_SIDE)
   if arguments.check:
     return _check(arguments, source, settings)
-  scene = pipeline.make_scene(
-    source,
-    arguments.out,
-    settings=settings,
-    override=arguments.override,
-    name=arguments.name,
-    measure=measure,
-  )
+  with _watched(arguments) as watcher:
+    scene = pipeline.make_scene(
+      source,
+      arguments.out,
+      settings=settings,
+      override=arguments.override,
+      name=arguments.name,
+      measure=measure,
+      watcher=watcher,
+    )
   _print_figures(scene)
   print(f"report: {arguments.out / 'report.html'}")
   return 0

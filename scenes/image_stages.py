@@ -5,6 +5,7 @@ Each runs, or finds done, one stage of the cache: a function of earlier results 
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,14 @@ def poses(
   return Made(localise.load(stage.folder / "sfm"), stage)
 
 
-def field(cache: Stages, pictures: PosedPictures, settings: TrainSettings) -> Made[TrainedField]:
-  """Trains the radiance field on all pictures that are not held out."""
+def field(
+  cache: Stages,
+  pictures: PosedPictures,
+  settings: TrainSettings,
+  *,
+  show: Callable[[training.Snapshot], None] | None = None,
+) -> Made[TrainedField]:
+  """Trains the radiance field on all pictures that are not held out; `show` sees it grow."""
 
   def write(folder: Path, progress: Progress) -> None:
     trained, outcome = training.train(
@@ -62,6 +69,7 @@ def field(cache: Stages, pictures: PosedPictures, settings: TrainSettings) -> Ma
       settings,
       progress=progress,
       checkpoint_dir=folder / "checkpoints",
+      show=show,
     )
     trained.save(folder / "field.safetensors")
     write_json(folder / "training.json", outcome)

@@ -11,7 +11,7 @@ from nerf2real.core.folder_lock import lock_folder
 from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages
 from nerf2real.scenes.alignment import overrides, surroundings
 from nerf2real.scenes.capture.capture import source_kind
-from nerf2real.scenes.results import Measure, SceneResults, Source
+from nerf2real.scenes.results import Measure, SceneResults, Source, Watcher
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import Stages
 
@@ -27,6 +27,7 @@ def make_scene(
   name: str | None = None,
   measure: Measure | None = None,
   show_progress: bool = True,
+  watcher: Watcher | None = None,
 ) -> bundle.Bundle:
   """Makes a scene bundle from a capture.
 
@@ -38,6 +39,7 @@ def make_scene(
     name: The scene's name; that of the output folder if None.
     measure: Adds figures against a known truth.
     show_progress: Whether to draw progress bars.
+    watcher: Is shown poses and field while they are made, such as `training_viewer`'s.
 
   Returns:
     The finished bundle.
@@ -59,6 +61,7 @@ def make_scene(
       override_key=files.hash_path(override) if override else "",
       name=name or out.name,
       measure=measure,
+      watcher=watcher,
     )
 
 
@@ -72,9 +75,12 @@ def _run_stages(
   override_key: str,
   name: str,
   measure: Measure | None,
+  watcher: Watcher | None,
 ) -> bundle.Bundle:
   capture = image_stages.keyframes(cache, film, settings.capture)
   poses = image_stages.poses(cache, capture, settings.localise)
+  if watcher is not None:
+    watcher.poses(poses.value)
   if override.floor_points is None:
     surroundings.require_room(poses.value.world_from_camera, poses.value.points)
   marker = geometry_stages.outlook(
@@ -90,7 +96,8 @@ def _run_stages(
   pictures = image_stages.PosedPictures(
     capture, poses, settings.train_width, settings.held_out_every
   )
-  field = image_stages.field(cache, pictures, settings.train)
+  show = None if watcher is None else watcher.field
+  field = image_stages.field(cache, pictures, settings.train, show=show)
   depth = image_stages.depth(cache, field, poses, width=settings.depth_width)
   figures = image_stages.figures(cache, field, pictures)
   world = geometry_stages.world(

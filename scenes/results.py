@@ -5,7 +5,7 @@ import functools
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render.renderer import Renderer
+from nerf2real.scenes.field.training import Snapshot
 from nerf2real.scenes.geometry.convex import Part
 from nerf2real.scenes.geometry.fusion import DepthViews
 from nerf2real.scenes.pictures import PosedPictures
@@ -27,6 +28,16 @@ class Source(NamedTuple):
 
   path: Path
   sha256: str
+
+
+class Watcher(Protocol):
+  """Is shown what is made while it is made."""
+
+  def poses(self, found: Localisation) -> None:
+    """The keyframes are localised."""
+
+  def field(self, snapshot: Snapshot) -> None:
+    """The field has learned more; called in the training's thread, which waits."""
 
 
 @dataclasses.dataclass(frozen=True)

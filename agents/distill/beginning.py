@@ -13,7 +13,8 @@ from nerf2real.agents.distill.learning import TrainingState
 from nerf2real.agents.dmpo.config import DmpoConfig
 from nerf2real.core.serialization import from_plain
 
-_FRESH = ("encoder/pose", "policy/heads", "policy/stddev")  # heads that no export holds
+# No export holds these heads.
+_FRESH = ("encoder/pose", "encoder/ball", "policy/heads", "policy/stddev")
 
 
 def agent_of(folder: Path) -> DmpoConfig:

@@ -164,9 +164,13 @@ def adapt() -> DistillSettings:
   return DistillSettings(
     environment="suite:nerf_nav",
     mixture=MixtureSettings(first_share=0.5, anneal_frames=20_000),
-    # The encoder has learned; what the change asks of it, the last part gives.
-    stages=(Stage(kind=POLICY, share=0.4), Stage(kind=END_TO_END, share=0.6)),
-    settling=0,
+    # What the change asks of the encoder, the middle part gives: its data are the new student's.
+    stages=(
+      Stage(kind=POLICY, share=0.3),
+      Stage(kind=ENCODER, share=0.25),
+      Stage(kind=POLICY, share=0.45),
+    ),
+    settling=300,
     first_frames=4_000,
     learning_rate=3e-4,
     evaluation_period=3_600.0,
@@ -181,6 +185,17 @@ def ball_push() -> DistillSettings:
     # The goal is the ball's: the robot's distance from it takes nothing from a label.
     blind_radius=0.0,
     push_forces=((0, 0.0, 0.0), (80_000, 1.0, 3.0)),
+    # Pictures hold two things to find here, the robot's place and the ball's; no part is trained
+    # end to end, which made the student of navigation no better.
+    stages=(
+      Stage(kind=ENCODER, share=0.25),
+      Stage(kind=POLICY, share=0.2),
+      Stage(kind=ENCODER, share=0.2),
+      Stage(kind=POLICY, share=0.35),
+    ),
+    # A trial takes up to a minute of the robot's time.
+    evaluation_period=1_500.0,
+    evaluation_trials=12,
   )
 
 

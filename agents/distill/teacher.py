@@ -97,15 +97,46 @@ def _quick() -> WalkerSettings:
   return WalkerSettings(gait=gait, steering=steering)
 
 
+def _swift() -> WalkerSettings:
+  """Shorter and longer steps still, and curves in place of turns on the spot.
+
+  Searched for by CMA-ES from `quick` on trials that are not the protocol's: the way from quick's
+  parameters to what was found is taken by 85 %, which loses 0.2 s and falls no more than quick.
+  """
+  gait = GaitSettings(
+    stop_time=0.3727,
+    max_turn=0.282,
+    period=0.4293,
+    spread=0.0413,
+    sway=0.0167,
+    sway_lead=1.2475,
+    lift=0.0281,
+    swing=0.5002,
+    stride=0.086,
+    backset=0.0297,
+    lean=0.0479,
+    tilt=0.0395,
+    lead=0.0201,
+    pitch_rate_gain=0.0032,
+    roll_rate_gain=-0.0268,
+    pitch_gain=0.0356,
+    roll_gain=-0.2577,
+  )
+  steering = SteeringSettings(
+    lookahead=0.2926, turn_gain=1.7207, turn_first=1.0907, head_tilt=_HEAD_TILT
+  )
+  return WalkerSettings(gait=gait, steering=steering)
+
+
 def _ball() -> WalkerSettings:
-  """The steady walker, pushing the ball; its head looks for the ball and follows it."""
+  """The quick gait, pushing the ball; the head looks for the ball and follows it."""
   steering = SteeringSettings(head_tilt=_HEAD_TILT, watches_ball=True)
   return WalkerSettings(
-    gait=GaitSettings(), steering=steering, head_pan_limit=constants.BALL_PUSHING_HEAD_PAN
+    gait=_quick().gait, steering=steering, head_pan_limit=constants.BALL_PUSHING_HEAD_PAN
   )
 
 
-TEACHERS = {"steady": _steady, "quick": _quick, "ball": _ball}
+TEACHERS = {"steady": _steady, "quick": _quick, "swift": _swift, "ball": _ball}
 
 
 class WalkerTeacher:

@@ -11,8 +11,9 @@ import json
 import math
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import safetensors.numpy
@@ -30,6 +31,7 @@ __all__ = ["TrainError", "TrainReport", "TrainSettings", "learning_rate", "prese
 
 CHECKPOINT_SECONDS = 60.0  # chosen: a checkpoint takes about 0.2 s
 _RECORD_SECONDS = 2.0  # chosen: distance of the points of the report's curve
+SNAPSHOT_SECONDS = 5.0  # chosen: often enough to see it grow
 _WARMUP_START = 0.01  # the warm-up starts at this fraction of the learning rate, as in multinerf
 _CHECKPOINT = "training.safetensors"
 _CHECKPOINT_FORMAT = "2"  # of the arrays; files that name none have format 1
@@ -59,6 +61,15 @@ class TrainReport:
   curve_samples_per_ray: list[float]
   resumed_at_step: int | None
   """Step of the checkpoint that the run continued, or None."""
+
+
+class Snapshot(NamedTuple):
+  """A field while it is trained."""
+
+  field: Field
+  step: int
+  psnr_db: float  # of training rays
+  seconds_left: float
 
 
 class Trainer(Protocol):
@@ -97,6 +108,8 @@ def train(
   seed: int = 0,
   checkpoint_dir: str | Path | None = None,
   initial: Field | None = None,
+  show: Callable[[Snapshot], None] | None = None,
+  show_period: float = SNAPSHOT_SECONDS,
 ) -> tuple[Field, TrainReport]:
   """Trains a field.
 
@@ -108,6 +121,8 @@ def train(
       engine repeats a run exactly; a limit in seconds makes the number of steps vary.
     checkpoint_dir: Folder for a checkpoint a minute; training continues from one that is there.
     initial: A field to start from.
+    show: Called with the field at times, such as to draw it.
+    show_period: Between these times [s].
 
   Returns:
     The trained field and a report.
@@ -140,7 +155,7 @@ def train(
 
   curve: list[tuple[float, float, float]] = []
   start = last_checkpoint = time.monotonic()
-  last_record = -math.inf
+  last_record, last_snapshot = -math.inf, start
   while True:
     seconds = spent + time.monotonic() - start
     fraction = trainer.steps_done / settings.max_steps
@@ -157,6 +172,10 @@ def train(
       per_ray = metrics["samples"] / max(metrics["rays"], 1)
       curve.append((spent + now - start, metrics["psnr_db"], per_ray))
       progress(fraction, f"step {trainer.steps_done}, {metrics['psnr_db']:.1f} dB on training rays")
+    if show is not None and now - last_snapshot >= show_period:
+      last_snapshot = now
+      left = (spent + now - start) * (1 / max(fraction, 1e-6) - 1)
+      show(Snapshot(trainer.field(), trainer.steps_done, metrics["psnr_db"], left))
     if checkpoint is not None and now - last_checkpoint >= CHECKPOINT_SECONDS:
       last_checkpoint = now
       _save_checkpoint(checkpoint, key, spent + now - start, trainer.state())

@@ -23,9 +23,31 @@ class Planner:
     near = _NEAR * np.maximum(0.0, 1.0 - self._floor.clearance / _COMFORT)
     self._cost = np.where(self._floor.free, 1.0 + near, _BLOCKED)
 
-  def path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Returns points [N, 2] from start [2] to goal [2], both included [m]."""
-    return self._floor.path(start, goal, self._cost)
+  def path(
+    self,
+    start: np.ndarray,
+    goal: np.ndarray,
+    *,
+    around: np.ndarray | None = None,
+    clearance: float = 0.0,
+  ) -> np.ndarray:
+    """Returns points [N, 2] from start [2] to goal [2], both included [m].
+
+    Args:
+      start: Where the path begins.
+      goal: Where it ends.
+      around: A place [2] to keep away from, such as a ball's; None: there is none.
+      clearance: The distance that is kept from it [m].
+    """
+    cost = self._cost
+    if around is not None:
+      near = np.linalg.norm(self._floor.centres - around, axis=-1) < clearance
+      cost = np.where(near, _BLOCKED, cost)
+    return self._floor.path(start, goal, cost)
+
+  def is_free(self, places: np.ndarray) -> np.ndarray:
+    """Returns whether the robot fits at places [..., 2], bool [...]."""
+    return self._floor.free[self._floor.index_of(places)]
 
   def is_clear(self, start: np.ndarray, end: np.ndarray) -> bool:
     """Returns whether the straight line between two places keeps the comfortable distance."""

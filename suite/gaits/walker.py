@@ -13,6 +13,7 @@ import numpy as np
 
 from nerf2real.suite.gaits.gaze import Gaze, view_of
 from nerf2real.suite.gaits.planner import Planner
+from nerf2real.suite.gaits.pushing import Push, PushSettings
 from nerf2real.suite.gaits.walk import Command, Gait, GaitSettings
 from nerf2real.suite.op3 import constants
 
@@ -49,12 +50,10 @@ class SteeringSettings:
   """m from the goal at which it stops."""
   replan: float = 1.0
   """s between paths."""
-  behind: float = 0.30
-  """m behind the ball from where it pushes."""
-  lane: float = 0.06
-  """m beside the line through ball and target within which it pushes."""
-  detour: float = 0.38
-  """m from the ball's centre at which it walks around it."""
+  circling: float = 0.15
+  """m along a path around the ball that it aims at: a path as narrow leaves less."""
+  push: PushSettings = PushSettings()
+  """Of a push."""
   head_tilt: float | None = None
   """rad of the head's tilt; None: as in the reference pose, which sees the floor ahead."""
   watches_ball: bool = False
@@ -84,6 +83,7 @@ class Walker:
     self._gait = Gait(gait, head_pan_limit=head_pan_limit)
     self.steering = steering or SteeringSettings()
     self._gaze = Gaze()
+    self._ball_push = Push(self._planner, self.steering.push)
     self.reset(Pose(0.0, 0.0, 0.0))
 
   def reset(self, start: Pose) -> None:
@@ -95,7 +95,7 @@ class Walker:
     self._path: np.ndarray | None = None
     self._planned = -np.inf
     self._time = 0.0
-    self._pushing = False
+    self._ball_push.reset()
 
   @property
   def command(self) -> Command:
@@ -159,16 +159,14 @@ class Walker:
       or (self._path[-1] != goal).any()
     ):
       self._path, self._planned = self._planner.path(self.pose.xy, goal), self._time
-    return self._aim(self._lookahead(self._path))
+    return self._aim(self._lookahead(self._path, self.steering.lookahead))
 
-  def _lookahead(self, path: np.ndarray) -> np.ndarray:
-    """Returns the point of a path [N, 2] to aim at: ahead, and in sight past every corner."""
+  def _lookahead(self, path: np.ndarray, ahead: float) -> np.ndarray:
+    """Returns the point [2] so far ahead [m] on a path [N, 2], from the path's nearest one."""
     distance = np.linalg.norm(path - self.pose.xy, axis=1)
     nearest = int(np.argmin(distance))
-    ahead = np.flatnonzero(distance[nearest:] >= self.steering.lookahead)
-    if not len(ahead):
-      return path[-1]
-    return path[nearest + int(ahead[0])]
+    further = np.flatnonzero(distance[nearest:] >= ahead)
+    return path[nearest + int(further[0])] if len(further) else path[-1]
 
   def _aim(self, point: np.ndarray, *, speed: float = 1.0) -> Command:
     """Returns the command that turns and walks to a point [2]."""
@@ -182,25 +180,8 @@ class Walker:
 
   def _push(self, ball: np.ndarray, target: np.ndarray) -> Command:
     """Returns the command that brings the ball to a target: around it first, then through it."""
-    steering = self.steering
-    to_target = target - ball
-    direction = to_target / max(float(np.linalg.norm(to_target)), 1e-6)
-    aside = np.array([-direction[1], direction[0]])
-    offset = self.pose.xy - ball
-    along, lateral = float(offset @ direction), float(offset @ aside)
-    lane = steering.lane * (2.0 if self._pushing else 1.0)
-    self._pushing = along < -0.05 and abs(lateral) < lane and along > -2 * steering.behind
-    if self._pushing:
-      # Aim beyond the ball and at the line: what is left of the offset is steered away.
-      return self._aim(ball + 0.4 * direction - lateral * aside)
-    place = ball - steering.behind * direction
-    if along > -0.6 * steering.behind:  # beside or before the ball: around it
-      side = np.sign(lateral) if abs(lateral) > 0.02 else 1.0
-      place = ball + side * steering.detour * aside - 0.5 * steering.behind * direction
-      if along > 0.1:
-        place = ball + side * steering.detour * aside
-    if np.linalg.norm(place - self.pose.xy) < 0.04:
-      return self._aim(ball)
-    if self._planner.is_clear(self.pose.xy, place):
-      return self._aim(place)
-    return self._aim(self._lookahead(self._planner.path(self.pose.xy, place)))
+    way = self._ball_push.way(self.pose.xy, ball, target)
+    if way.pushes:
+      return self._aim(way.point)
+    path = self._ball_push.path(self.pose.xy, ball, way.point)
+    return self._aim(self._lookahead(path, self.steering.circling))

@@ -1,6 +1,7 @@
 """The radiance field behind a scene in the browser, drawn from wherever a client looks."""
 
 import threading
+from collections.abc import Callable
 
 import numpy as np
 import viser
@@ -23,6 +24,18 @@ class FieldView:
     self._unit_from_world = world_from_unit.inverse()
     self._scale = world_from_unit.scale
     self._lock = threading.Lock()  # one picture at a time: the kernel takes a whole core
+    self._listeners: list[Callable[[], None]] = []
+
+  def on_replaced(self, listener: Callable[[], None]) -> None:
+    """Registers what is called when the field is replaced."""
+    self._listeners.append(listener)
+
+  def replace(self, renderer: Renderer) -> None:
+    """Goes on with another field, such as one that has been trained further."""
+    with self._lock:
+      self._renderer = renderer
+    for listener in self._listeners:
+      listener()
 
   def render(self, camera: viser.CameraHandle, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns colour [H, W, 3] (uint8) and depth [H, W] [m] as a client's camera sees them."""
@@ -92,7 +105,7 @@ def serve_field(
   enabled = server.gui.add_checkbox("radiance field", shown)
   loops: dict[int, ClientLoop] = {}
 
-  @server.on_client_connect
+  @server.on_client_connect  # those that are connected already included
   def _(client: viser.ClientHandle) -> None:
     loops[client.client_id] = ClientLoop(client, view, enabled, setback=setback)
 
@@ -100,9 +113,10 @@ def serve_field(
   def _(client: viser.ClientHandle) -> None:
     loops.pop(client.client_id).closed = True
 
-  @enabled.on_update
-  def _(event) -> None:
-    for loop in loops.values():
+  def refresh() -> None:
+    for loop in list(loops.values()):
       loop.refresh()
 
+  enabled.on_update(lambda _: refresh())
+  view.on_replaced(refresh)
   return enabled
