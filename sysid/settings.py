@@ -1,4 +1,4 @@
-"""Constants of the analysis beside references (`since_reference.py`), all of them chosen.
+"""Constants of the analysis by evidence that adds up (`analysis.py`), all of them chosen.
 
 Most were set on development sets, not calibrated; the older path (`decision.py`) has its own.
 """
@@ -46,8 +46,6 @@ class Settings:
   """The same between two recordings of one machine."""
   repeat_effect: float = 0.05
   """Share by which an effect that a machine always had differs between two recordings."""
-  starts: int = 2
-  """Descents from the best of an effect's starts."""
   rounds: int = 15
   """Of fitting constants and setting the residual's scale in turn."""
   depth: int = 3
@@ -58,6 +56,9 @@ class Settings:
   """Hypotheses that are grown further."""
   worth: float = 2.8
   """Standard errors by which a further effect must be better for the search to go on."""
+  suspects: int = 3
+  """Joints on which effects of wider scope are looked for, and without references any: those that
+  leave most."""
   reference_depth: int = 1
   """Effects of a joint at most that are looked for in reference logs."""
   structured: float = 0.5

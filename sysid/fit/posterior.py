@@ -254,3 +254,20 @@ def _bounded(
     block += damping * np.diag(np.diag(block))
     result[free] -= share * np.linalg.solve(block, (g * s)[free]) * s[free]
   return np.clip(result, layout.low, layout.high)
+
+
+def deviations(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
+  """Returns the standard deviations [n] of a fit's values, by the gradient's scatter over blocks.
+
+  H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
+  blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
+  """
+  scores = np.zeros((len(joints[0].starts), fit.layout.count))
+  for joint, index, residual, jacobian in zip(
+    joints, fit.layout.index, fit.residuals, fit.jacobian, strict=True
+  ):
+    weighted = 2.0 * joint.weights(joint.squares(residual)) * residual * jacobian
+    scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
+  inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
+  prior = np.diag(fit.layout.sigma**-2.0)
+  return np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores + prior) @ inverse), 0.0))

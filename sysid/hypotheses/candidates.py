@@ -198,7 +198,7 @@ def library(plant: JointPlant) -> list[Term]:
       ((0.9 * limit,), (0.7 * limit,), (0.45 * limit,)),
     )
   )
-  return [t for t in terms if t.kind not in plant.absorbed]
+  return terms
 
 
 def _weakenings(plant: JointPlant, term: Term) -> list[Term]:

@@ -36,6 +36,7 @@ class Term:
   centre: tuple[float, ...] = ()
   """Means of the prior; empty for zeros."""
   fixed: tuple[tuple[str, float], ...] = ()
+  """Parameters that are a choice between models and not fitted."""
   known: bool = False
   """Whether reference logs show it, too."""
   freed: bool = False
@@ -47,8 +48,6 @@ class Term:
     if self.kind == "calibration":
       return "parameter_error" if self.freed else None
     return None if self.known else self.kind
-
-  """Parameters that are a choice between models and not fitted."""
 
   def apply(self, plant: JointPlant, p: Array, x: Array) -> None:
     """Changes the kernel's parameters [P] in place."""
@@ -81,6 +80,16 @@ class Term:
       fixed=(*self.fixed, *values),
     )
 
+  def at_rest(self, values: Mapping[str, float]) -> "Term":
+    """Returns a term that does nothing, of which nothing is fitted.
+
+    Args:
+      values: of the parameters that alone do nothing: what shape an effect has.
+    """
+    sizes = {p.name: p.nominal for p in kind_of(self.kind).parameters if not p.shape}
+    held = self.held_at(np.array([sizes.get(n, values[n]) for n in self.names]))
+    return dataclasses.replace(held, known=True)
+
   def effect(self, x: Array, intervals: Mapping[str, tuple[float, float]] | None = None) -> Effect:
     """Returns the fitted effect."""
     values = {n: float(v) for n, v in zip(self.names, x, strict=True)} | dict(self.fixed)
@@ -105,8 +114,10 @@ _STIFF = 1e-3 / 0.999  # as suite.effects.friction: impedance 0.999 where an eff
 
 def _stick(plant: JointPlant, p: Array) -> None:
   """Makes a joint with added dry friction stick, as `suite.effects` does."""
-  p[I["softness"]] = _STIFF * plant.inverse_weight
-  p[I["stopping_rate"]] *= plant.impedance / 0.999
+  stiff = _STIFF * plant.inverse_weight
+  if p[I["softness"]] != stiff:  # once, whatever number of effects adds friction
+    p[I["softness"]] = stiff
+    p[I["stopping_rate"]] *= plant.impedance / 0.999
 
 
 def _nothing(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
@@ -156,24 +167,21 @@ def _spring(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
 
 
 def _gain(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
-  p[I["gain"]] *= v["gain"]
-  _weakened(plant, p, v)
+  scales_limit = v.get("scales_limit", 0.0) > 0
+  for name in ("gain", "lowest", "highest") if scales_limit else ("gain",):
+    p[I[name]] *= v["gain"]
 
 
-def _weakened(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
-  p[I["scales_limit"]] = v.get("scales_limit", 0.0)
-  p[I["effort_tells"]] = v.get("effort_tells", 1.0)
+def _weakening(name: str, slots: tuple[str, ...]):
+  """Returns what sets an actuator's weakening, with its choices between models."""
 
+  def apply(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+    for slot in slots:
+      p[I[slot]] = v[slot]
+    p[I[f"{name}_scales_limit"]] = v.get("scales_limit", 0.0)
+    p[I[f"{name}_tells"]] = v.get("effort_tells", 1.0)
 
-def _sag(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
-  p[I["droop"]], p[I["fade"]] = v["droop"], v["fade"]
-  _weakened(plant, p, v)
-
-
-def _heat(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
-  p[I["heating"]], p[I["time_constant"]] = v["heating"], v["time_constant"]
-  p[I["derating"]] = v["derating"]
-  _weakened(plant, p, v)
+  return apply
 
 
 def _limit(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
@@ -228,8 +236,8 @@ _APPLY = {
   "encoder_offset": _adder(("offset", "encoder_offset")),
   "motor_gain": _gain,
   "torque_limit": _limit,
-  "supply_sag": _sag,
-  "thermal_derating": _heat,
+  "supply_sag": _weakening("sag", ("droop", "fade")),
+  "thermal_derating": _weakening("heat", ("heating", "time_constant", "derating")),
   "spring": _spring,
   "cogging": _setter(("amplitude", "amplitude"), ("periods", "periods"), ("phase", "phase")),
 }

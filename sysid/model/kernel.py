@@ -43,19 +43,22 @@ NAMES = (
   *("load_kind",),
   # MuJoCo's friction constraint: R of its row, and the rate at which it takes speed away
   *("softness", "stopping_rate"),
-  # whether a weakened actuator saturates earlier too, and whether its measured effort tells
-  *("scales_limit", "effort_tells"),
+  # of heat: whether the actuator saturates earlier too, and whether its measured effort tells
+  *("heat_scales_limit", "heat_tells"),
   # load friction: its square, and how much larger it is at rest
   *("load_square", "load_at_rest", "load_velocity"),
   # where the teeth of a gear with play meet
   *("tooth_stiffness", "tooth_damping", "friction_on_link"),
   # how far the state follows the readings: share of a difference, and speed per difference
   *("follow", "follow_speed"),
+  # the same of the supply as of heat
+  *("sag_scales_limit", "sag_tells"),
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 
 NEUTRAL = {
-  "effort_tells": 1.0,
+  "heat_tells": 1.0,
+  "sag_tells": 1.0,
   "gain": 1.0,
   "stribeck_velocity": 0.1,
   "load_velocity": 0.1,
@@ -154,10 +157,11 @@ def simulate(
   amplitude, periods, phase = p[29], p[30], p[31]
   load_kind = int(p[32])
   softness, stopping_rate = p[33], p[34]
-  scales_limit, effort_tells = p[35] > 0.5, p[36] > 0.5
+  heat_limits, heat_tells = p[35] > 0.5, p[36] > 0.5
   load_square, load_at_rest, load_velocity = p[37], p[38], max(p[39], 1e-6)
   tooth_stiffness, tooth_damping, friction_on_link = p[40], p[41], p[42]
   follow, follow_speed = p[43], p[44]
+  sag_limits, sag_tells = p[45] > 0.5, p[46] > 0.5
   learned = weights.size > 0
   samples = sample_time.size
   windows = window_start.size
@@ -221,21 +225,24 @@ def simulate(
       seen_v = motor_speed if half > 0.0 else v
       seen_q = q + encoder + on_motor * gap_offset
       before = torque  # of the last step
-      strength = gain
+      inner, outer, untold = gain, 1.0, 1.0  # strength before the limits and after; not in efforts
       if heating > 0.0:
         heat = heat * keep_cool + heating * step * before * before
-        strength *= max(1.0 - derating * heat, _LEAST_STRENGTH)
+        weaker = max(1.0 - derating * heat, _LEAST_STRENGTH)
+        inner, outer = (inner, outer * weaker) if heat_limits else (inner * weaker, outer)
+        untold *= 1.0 if heat_tells else weaker
       if droop > 0.0 or fade != 0.0:
-        supply = 1.0 - droop * (abs(before) + load[i]) - fade * time
-        strength *= max(supply, _LEAST_STRENGTH)
+        weaker = max(1.0 - droop * (abs(before) + load[i]) - fade * time, _LEAST_STRENGTH)
+        inner, outer = (inner, outer * weaker) if sag_limits else (inner * weaker, outer)
+        untold *= 1.0 if sag_tells else weaker
+      strength = inner * outer
       rest = constant + per_q * seen_q + per_v * seen_v
-      inner, outer = (1.0, strength) if scales_limit else (strength, 1.0)
       torque = outer * min(max(inner * (slope * u + rest), lowest), highest)
       if share > 0.0:  # limits first: a mean of commands would lose the moment of a large jump
         other = outer * min(max(inner * (slope * later + rest), lowest), highest)
         torque += share * (other - torque)
       told_before = told
-      told = torque if effort_tells else torque / strength
+      told = torque / untold
       coming = 0.0
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + 3.0 * step:
         coming = abs(strength * slope * (command[pointer + 1] - command[pointer]))

@@ -157,7 +157,6 @@ class JointPlant:
     ]
     self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
     self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
-    self.absorbed: set[str] = set()
     self._moments: dict[str, list[list[Surroundings]]] = {}
     self._gravity: list[list[Surroundings]] | None = None
     self._pool = ThreadPoolExecutor(max_workers=len(os.sched_getaffinity(0)))
@@ -204,22 +203,6 @@ class JointPlant:
     before = self.model.opt.gravity
     after = matrix_from_rotvec([x, y, 0.0]) @ before
     return [_combine(parts, after - before) for parts in self._gravity]
-
-  def absorb(
-    self, kind: str, parameters: Array, surroundings: Sequence[Surroundings] | None
-  ) -> None:
-    """Declares what was found to hold for all joints, so that what is left can be looked at.
-
-    Args:
-      kind: of the effect; it is no candidate any more.
-      parameters: the kernel's [P].
-      surroundings: one a log; None where they stay.
-    """
-    self.absorbed.add(kind)
-    self.declared = parameters.copy()
-    if surroundings is not None:
-      self.surroundings = list(surroundings)
-      self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
 
   def following(self) -> "JointPlant":
     """Returns the same joint with its simulated state pulled towards the readings.

@@ -38,3 +38,9 @@ def freed_constants(known: Term, settings: Settings = SETTINGS) -> Term:
     tolerance[n] if n in _MAY_CHANGE else s for n, s in zip(known.names, known.prior, strict=True)
   )
   return dataclasses.replace(known, prior=sigma, freed=True)
+
+
+def widened(own: Term) -> Term:
+  """Returns declared constants that may be off by as much as their bounds allow."""
+  reach = tuple(max(abs(a), abs(b)) for a, b in zip(own.low, own.high, strict=True))
+  return dataclasses.replace(own, prior=reach, freed=True)

@@ -16,22 +16,13 @@ from nerf2real.sysid.selection import decision, race
 from nerf2real.sysid.selection.decision import Thresholds
 from nerf2real.sysid.selection.joint import Found, decide
 from nerf2real.sysid.selection.race import Entry
+from nerf2real.sysid.selection.scopes import ancestors
 from nerf2real.sysid.selection.screening import Screened
 
 Array = np.ndarray
 
 _REFUTED = 0.1  # nats by which a joint that carries a payload may get worse; ours
 _SUREST = 0.05  # of a value's typical size, that one joint's fit is sure of at most; ours
-
-
-def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
-  """Returns the joints that carry a body, the nearest first."""
-  result = []
-  while body > 0:
-    first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-    result += [model.joint(first + i).name for i in range(count)][::-1]
-    body = int(model.body_parentid[body])
-  return result
 
 
 class SharedProblem(Problem):

@@ -8,13 +8,15 @@ from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import decision
-from nerf2real.sysid.selection.common import WHOLE, Shared
 from nerf2real.sysid.selection.joint import Found
 from nerf2real.sysid.selection.race import Entry
 from nerf2real.sysid.selection.screening import Screened
+from nerf2real.sysid.selection.subject import WHOLE
 
 Claim = tuple[Effect, dict[str, Any]]
 """An effect and its entry in the report."""
+
+Array = np.ndarray
 
 _NOTHING = 1e-9  # of a size
 
@@ -53,16 +55,25 @@ def is_idle(entry: Entry, term: Term) -> bool:
   return bool(sizes) and all(abs(values[p.name] - p.nominal) < _NOTHING for p in sizes)
 
 
-def whole(shared: Shared) -> Claim:
-  """Returns an effect of the whole machine."""
-  found = shared.term.effect(shared.x, shared.bounds)
-  row = {
+def shared(
+  term: Term, x: Array, bounds: dict[str, tuple[float, float]], evidence: dict[str, Any]
+) -> Claim:
+  """Returns an effect of several joints.
+
+  Args:
+    term: the effect.
+    x: its values [n].
+    bounds: their intervals.
+    evidence: for the report.
+  """
+  found = term.effect(x, bounds)
+  parameters = _parameters(found, bounds, term, slide=False)
+  return found, {
     "kind": found.kind,
     "joint": None,
-    "parameters": _parameters(found, shared.bounds, shared.term, slide=False),
-    "evidence": {**shared.evidence, "other_joints_gain_nats": round(shared.gain, 4)},
+    "parameters": parameters,
+    "evidence": evidence,
   }
-  return found, row
 
 
 def constants(s: Screened, entry: Entry) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Explains one joint: sets of effects grown forward, scored by left-out likelihood."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
+_SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
+
 
 @dataclasses.dataclass
 class Scored:
@@ -21,6 +23,8 @@ class Scored:
   fit: Fit
   nats: Array
   """[B] log-likelihood of the left-out blocks."""
+  neutral: bool = False
+  """Whether an effect stands at the values that do nothing: a rival, never an explanation."""
 
   @property
   def names(self) -> frozenset[str]:
@@ -57,6 +61,11 @@ def standardised(differences: Array, total: float | None = None, least: float = 
   return total / max(np.sqrt(variance), least)
 
 
+def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
+  """Returns the explanations with a number of effects."""
+  return [item for item in items if len(item.names) == size and not item.neutral]
+
+
 class Explainer:
   """Grows hypotheses of one joint."""
 
@@ -85,7 +94,7 @@ class Explainer:
     self.joint, self.constants, self.settings = joint, constants, settings
     self.library, self.freed = list(library), freed
     self.scored: dict[tuple[Term, ...], Scored] = {}
-    base = (constants, *known)
+    self.base = base = (constants, *known)
     x = np.concatenate([t.starts[0] for t in base]) if start is None else start
     declared = joint.residuals((), np.zeros((1, 0)))[0]
     joint.rescale(declared)
@@ -111,10 +120,10 @@ class Explainer:
     best = int(np.argmin(costs))
     return fitter.fit(tried[best], iterations=1) if costs[best] < fit.cost - 1.0 else fit
 
-  def _score(self, terms: tuple[Term, ...], fit: Fit) -> Scored:
+  def _score(self, terms: tuple[Term, ...], fit: Fit, *, neutral: bool = False) -> Scored:
     fitter = Fitter([self.joint], Layout([terms]))
     fitter.leave_out(fit)
-    result = Scored(terms, fit, self.joint.loglik(fit.held[0]))
+    result = Scored(terms, fit, self.joint.loglik(fit.held[0]), neutral)
     self.scored[terms] = result
     return result
 
@@ -128,10 +137,9 @@ class Explainer:
     quick: list[tuple[float, tuple[Term, ...], Fit]] = []
     for terms, starts, stale, fresh in self._candidates(parent):
       fitter = Fitter([self.joint], Layout([terms]))
-      costs = fitter.costs(starts)
       best = None
-      for k in np.argsort(costs)[: 1 if parent.names else self.settings.starts]:
-        fit = fitter.fit(starts[k], iterations=2, known=stale, fresh=fresh, quick=True)
+      for start in self._begin(parent, fitter, starts):
+        fit = fitter.fit(start, iterations=2, known=stale, fresh=fresh, quick=True)
         if best is None or fit.cost < best.cost:
           best = fit
       assert best is not None
@@ -145,6 +153,17 @@ class Explainer:
       done = Fitter([self.joint], Layout([terms])).fit(fit.x, iterations=4)
       results.append((terms, done if done.cost < fit.cost + 1.0 else fit))
     return [self._score(terms, fit) for terms, fit in results]
+
+  def _begin(self, parent: Scored, fitter: Fitter, starts: Array) -> list[Array]:
+    """Returns where descents begin: the best start, and without a first effect the best one with
+    the constants as they were declared, which what is missing may have bent."""
+    begin = [starts[int(np.argmin(fitter.costs(starts)))]]
+    if not parent.names:
+      declared = starts.copy()
+      count = len(parent.fit.x)
+      declared[:, :count] = np.concatenate([t.centre for t in self.base])
+      begin.append(declared[int(np.argmin(fitter.costs(declared)))])
+    return begin
 
   def _candidates(self, parent: Scored):
     """Yields terms, starts [S, n], a Jacobian to take over and which values are new [n]."""
@@ -179,21 +198,39 @@ class Explainer:
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
-  def adopt(self, best: Scored) -> None:
-    """Sets the scale by the best hypothesis; all are scored anew."""
-    self.joint.rescale(best.fit.residuals[0])
+  def constants_alone(self) -> list[Scored]:
+    """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
+    if self.freed is not None:
+      terms = (self.freed, *self.null.terms[1:])
+      self._score(terms, Fitter([self.joint], Layout([terms])).fit(self.null.fit.x, iterations=4))
+    return self.ranked()
+
+  def adopt(self, best: Scored) -> Scored:
+    """Sets the scale by the best hypothesis as it improves; returns it, all are scored anew."""
+    fitter = Fitter([self.joint], Layout([best.terms]))
+    for _ in range(self.settings.rounds):
+      self.joint.rescale(best.fit.residuals[0])
+      before = float(fitter.costs(best.fit.x[None])[0])
+      best = self.refit(best, 4)
+      if best.fit.cost > before - _SETTLED:
+        break
     self._rescore()
+    return best
 
   def refit(self, item: Scored, iterations: int = 6) -> Scored:
     """Returns a hypothesis fitted on under the present scale."""
     fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit.x, iterations=iterations)
     return self._score(item.terms, fit)
 
-  def explain(self, depth: int | None = None) -> list[Scored]:
+  def explain(
+    self, depth: int | None = None, leaves: Callable[[Scored], bool] = lambda _: False
+  ) -> list[Scored]:
     """Grows sets of effects until one more is not clear; returns all scored, the best first.
 
     Args:
       depth: effects at most; those of the settings for None.
+      leaves: whether a hypothesis leaves more than a machine does anyway: then one more is tried as
+        long as it predicts what was left out better, too.
     """
     s, limit = self.settings, depth or self.settings.depth
     parents, best = [self.null], self.null
@@ -203,19 +240,43 @@ class Explainer:
         break
       top = max(grown, key=lambda g: g.evidence)
       if top.evidence > best.evidence:
-        self.adopt(top)
+        top = self.adopt(top)
         if depth == 0:
           self.null = self.refit(self.null)
         for item in sorted(grown, key=lambda g: -g.evidence)[: s.kept]:
-          self.refit(item, 3)
+          if item.terms != top.terms:
+            self.refit(item, 3)
       grown = sorted(
         (g for g in self.scored.values() if len(g.names) == depth + 1), key=lambda g: -g.evidence
       )
-      if clear(grown[0], best) < s.worth:
+      better = grown[0].evidence > best.evidence and leaves(best)
+      if clear(grown[0], best) < s.worth and not better:
         break
       best = grown[0]
       parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
+    for size in {len(item.names) for item in self.scored.values()}:
+      self._neutralise(max(of_size(self.scored.values(), size), key=lambda item: item.evidence))
     return self.ranked()
+
+  def _neutralise(self, item: Scored) -> None:
+    """Scores an item with each of its effects at the values that do nothing, all else fitted.
+
+    What an effect brings along (a friction constraint without creep, a better place from which the
+    constants were fitted) is no evidence for it.
+    """
+    for term in (t for t in item.terms if t.name is not None):
+      before = next((t for t in self.base if t.kind == term.kind), None)
+      instead = before or term.at_rest(item.fit.values(term))
+      terms = tuple(instead if t is term else t for t in item.terms)
+      x = np.concatenate(
+        [
+          [v for n, v in item.fit.values(t).items() if t is not term or n in instead.names]
+          for t in item.terms
+        ]
+      )
+      fit = Fitter([self.joint], Layout([terms])).fit(x, iterations=4)
+      if terms not in self.scored or self.scored[terms].fit.cost > fit.cost:
+        self._score(terms, fit, neutral=before is None)
 
   def ranked(self) -> list[Scored]:
     """Returns all scored hypotheses, the best first."""

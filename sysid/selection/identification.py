@@ -19,6 +19,7 @@ from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.opening import named, read_log
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import (
+  analysis,
   chain,
   claims,
   common,
@@ -27,9 +28,7 @@ from nerf2real.sysid.selection import (
   learned,
   race,
   screening,
-  since_reference,
 )
-from nerf2real.sysid.selection.common import WHOLE
 from nerf2real.sysid.selection.decision import Thresholds
 from nerf2real.sysid.selection.explanation import Effort, Ladder, even_out
 from nerf2real.sysid.selection.findings import Identified
@@ -43,13 +42,13 @@ from nerf2real.sysid.selection.joint import (
 )
 from nerf2real.sysid.selection.race import Entry
 from nerf2real.sysid.selection.screening import Screened
+from nerf2real.sysid.selection.subject import WHOLE
 
 Array = np.ndarray
 
 _HEALTHY = 0.7  # nats above the noise that joints without an effect leave at most; ours
 _FEW = 5  # joints of which half may have something
 _ALL_OFF = 0.6  # share of joints with constants that are off that stands for all
-_MOST_SHARED = 2  # effects of the whole machine that are looked for
 _MOSTLY = 2 / 3  # of what a machine's joints leave, in nats, that must be explained to be a verdict
 
 
@@ -100,34 +99,38 @@ def analyse(
   settings: Settings | None = None,
   progress: Progress = no_progress,
 ) -> Identified:
-  """Finds what a model lacks."""
+  """Finds what a model lacks.
+
+  Beside references by evidence that adds up (`analysis`); without, that decides on several joints
+  where what it names is all there is, and the ladder (`_by_ladder`) elsewhere: where more remains,
+  a name may be that of a force like it, which the ladder is stricter with.
+  """
   settings = settings or Settings()
-  if reference and len(logs[0].commands.joints) == 1:
-    progress(0.0, "comparing with the reference")
-    return since_reference.analyse(model, logs, reference)
+  if reference or len(logs[0].commands.joints) > 1:
+    progress(0.0, "comparing with the reference" if reference else "explaining every joint")
+    found = analysis.analyse(model, logs, reference)
+    if reference or found.verdict == "effects":
+      return found
+  return _by_ladder(model, logs, settings, progress)
+
+
+def _by_ladder(
+  model: mujoco.MjModel, logs: list[Log], settings: Settings, progress: Progress
+) -> Identified:
+  """Finds what a model lacks by a ladder of hypotheses and thresholds on it."""
   progress(0.0, "looking for joints whose residual stands out")
-  screened = screening.screen(model, logs, reference=reference, window_s=settings.window_s)
+  screened = screening.screen(model, logs, window_s=settings.window_s)
   if not screened:
     raise ValueError(
       "Found no joint with an actuator that all logs command, expected at least one."
     )
   common.expect_like_the_others(screened)
-  found = _race(screened, settings, part(progress, 0.1, 0.7))
-  shared: list[common.Shared] = []
-  while len(screened) > 1 and len(shared) < _MOST_SHARED:
-    effect = common.shared_effect(found, screened)
-    if effect is None:
-      break
-    shared.append(effect)
-    common.declare(effect, screened)
-    found = _race(screened, settings, part(progress, 0.7, 0.8))
+  found = _race(screened, settings, part(progress, 0.1, 0.8))
   progress(0.8, "comparing the joints")
   chain.without_refuted(model, found, screened, settings.thresholds)
   found = _without_contradictions(found, settings)
   found += _others(found, screened, settings)
   result = Identified(model, logs, screened, found, audits=[audit(log) for log in logs])
-  for effect in shared:
-    _claim(result, claims.whole(effect))
   _conclude(result, settings)
   return result
 

@@ -45,7 +45,6 @@ def race_joint(screened: Screened, thresholds: Thresholds, effort: Effort, *, se
   ladder = explanation.alone(
     screened.problem, screened.calibration, screened.declared, screened.null, effort=effort
   )
-  thresholds = dataclasses.replace(thresholds, adequate=thresholds.adequate + screened.background)
   suspected = _leads(ladder, thresholds)
   if suspected and (found := _with_play(screened, thresholds, effort, seed=seed)):
     return found

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.selection.decision import USUAL
-from nerf2real.sysid.selection.explain import Scored, clear
+from nerf2real.sysid.selection.explain import Scored, clear, of_size
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
@@ -71,17 +71,17 @@ def conclude(
     beyond: standard errors that count as clear.
     without: mean squares [B] that the baseline leaves as it was; those of the fitted one for None.
   """
-  best = next(s for s in ranked if not s.names)
+  bare = best = max(of_size(ranked, 0), key=lambda s: s.evidence)
   for size in range(1, max(len(s.names) for s in ranked) + 1):
-    same = [s for s in ranked if len(s.names) == size]
+    same = of_size(ranked, size)
     if same:
       top = max(same, key=lambda s: s.evidence)
-      if clear(top, best) > beyond:
+      idle = [s for s in ranked if s.neutral and s.names < top.names]
+      if all(clear(top, s) > beyond for s in (best, *idle)):
         best = top
   best = _usual(joint, best, ranked, beyond)
   names = tuple(_name(joint, best, kind, ranked, beyond) for kind in sorted(best.names))
   left = best.fit.held[0][0]
-  bare = next(s for s in ranked if not s.names)
   share = _share(left, bare.fit.held[0][0] if without is None else without)
   return Explanation(best, names, left, *share)
 
@@ -90,9 +90,7 @@ def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyon
   """Returns the most usual of the hypotheses that predict what the best one does."""
   order = {kind: index for index, kind in enumerate(USUAL)}
   alike = [
-    s
-    for s in ranked
-    if len(s.names) == len(best.names) and clear(best, s) < beyond and _same(joint, best, s)
+    s for s in of_size(ranked, len(best.names)) if clear(best, s) < beyond and _same(joint, best, s)
   ]
   return min([best, *alike], key=lambda s: sorted(order.get(k, len(order)) for k in s.names))
 

@@ -29,25 +29,20 @@ class Screened:
   calibration: Term
   declared: Entry
   null: Entry
-  background: float = 0.0
-  """nats above the noise that the same joint leaves on reference logs."""
-  alone: Term | None = None
-  """The calibration before it was centred on what the other joints have."""
 
   @property
   def excess(self) -> float:
-    """What the null model leaves, nats above the noise and the background.
+    """What the null model leaves, nats above the noise.
 
     Constants that are far from where they are expected count: a stronger motor passes for a gain.
     """
-    return race.above_floor(self.null) + race.deviation(self.null.fit) - self.background
+    return race.above_floor(self.null) + race.deviation(self.null.fit)
 
 
 def screen(
   model: mujoco.MjModel,
   logs: Sequence[Log],
   *,
-  reference: Sequence[Log] = (),
   window_s: float = 0.5,
 ) -> list[Screened]:
   """Returns all commanded joints, the least explained first.
@@ -55,7 +50,6 @@ def screen(
   Args:
     model: declared model.
     logs: logs to identify from.
-    reference: logs of the same apparatus without the effect: they fix the constants.
     window_s: length of windows where an actuator does not hold position.
   """
   joints = [
@@ -64,34 +58,13 @@ def screen(
     if actuator_of(model, name) >= 0 and all(name in log.commands.joints for log in logs)
   ]
   reductions = [Reduction(model, log) for log in logs]
-  healthy = [Reduction(model, log) for log in reference]
   result = []
   for joint in joints:
     plant = JointPlant(model, joint, logs, reductions=reductions, window_s=window_s)
     problem = Problem(plant)
-    calibration, background = candidates.calibration(plant), 0.0
-    if reference:
-      other = JointPlant(model, joint, reference, reductions=healthy, window_s=window_s)
-      calibration, _, null = explanation.bare(Problem(other), candidates.calibration(other))
-      background = max(race.above_floor(null), 0.0)
-      calibration = tightened(calibration, null.fit.x)
-    term, declared, null = explanation.bare(problem, calibration)
-    result.append(Screened(joint, problem, term, declared, null, background))
+    term, declared, null = explanation.bare(problem, candidates.calibration(plant))
+    result.append(Screened(joint, problem, term, declared, null))
   return sorted(result, key=lambda s: -s.excess)
-
-
-_SURE_FACTOR = 0.01  # standard deviation of a logarithm of a constant measured on the same machine
-_SURE_CLOCK = 3e-4  # s
-
-
-def tightened(term: Term, x: np.ndarray) -> Term:
-  """Returns the calibration with its prior narrowed to values measured on reference logs."""
-  sure = tuple(
-    _SURE_CLOCK if n in ("skew", "latency") else _SURE_FACTOR * (3 if n == "friction" else 1)
-    for n in term.names
-  )
-  values = tuple(float(v) for v in x)
-  return dataclasses.replace(term, prior=sure, centre=values, starts=(values, *term.starts))
 
 
 def shared_spread(screened: Sequence[Screened], entry: Entry | None = None) -> float:

@@ -1,5 +1,6 @@
 """The compiled joint against MuJoCo with `suite.effects`, kind by kind."""
 
+import dataclasses
 import itertools
 
 import mujoco
@@ -78,11 +79,48 @@ def test_kind_moves_the_joint_as_mujoco_does(kind: str, values: dict, tolerance:
 _COMMON = ("supply_sag", "gravity_tilt", "clock_drift")
 
 
+def test_every_weakening_keeps_its_own_choice_of_limits() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "steps", rounding=0.0, duration=4.0)
+  plant = JointPlant(model, "joint", [log])
+  effects = [
+    Effect("motor_gain", "joint", {"gain": 0.6, "scales_limit": 1.0}),
+    Effect("supply_sag", None, {"droop": 0.04, "fade": 0.0, "scales_limit": 0.0}),
+  ]
+  terms = [
+    Term(e.kind, e.target, (), (), (), (), ((),), fixed=tuple(e.parameters.items()))
+    for e in effects
+  ]
+  got = plant.simulate(compose(plant, terms, np.zeros(0))[0])[0][0].position
+  want = evaluation.simulate(model, log, effects)[:, 0]
+  assert np.sqrt(np.mean((got - want) ** 2)) < 3e-4
+  other = dataclasses.replace(terms[0], fixed=(("gain", 0.6), ("scales_limit", 0.0)))
+  unlike = plant.simulate(compose(plant, [other, terms[1]], np.zeros(0))[0])[0][0].position
+  assert np.sqrt(np.mean((unlike - want) ** 2)) > 3e-3
+
+
 def test_every_candidate_is_checked() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   plant = JointPlant(model, "joint", [log_of(PENDULUM, "sweep", duration=2.0)])
   kinds = {t.kind for t in candidates.library(plant)}
   assert kinds - {case[0] for case in CASES} == {"clock_drift"}  # checked below
+
+
+def test_every_candidate_at_rest_leaves_the_motion_as_it_was() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  plant = JointPlant(model, "joint", [log_of(PENDULUM, "steps", duration=2.0)])
+  weaker = Term(
+    "motor_gain", "joint", (), (), (), (), ((),), fixed=(("gain", 0.6), ("scales_limit", 1.0))
+  )
+  rough = Term("coulomb_friction", "joint", (), (), (), (), ((),), fixed=(("torque", 0.1),))
+  others = [weaker, rough]  # a choice between models, and a friction constraint without creep
+  want = plant.simulate(compose(plant, others, np.zeros(0))[0])[0][0].position
+  for term in candidates.library(plant):
+    idle = term.at_rest(dict(zip(term.names, term.starts[0], strict=True)))
+    p, changed = compose(plant, [*others, idle], np.zeros(0))
+    got = plant.simulate(p, surroundings=[changed])[0][0].position
+    assert idle.name is None
+    np.testing.assert_allclose(got, want, atol=1e-9, err_msg=f"{term.kind} {term.fixed}")
 
 
 def test_clock_drift_stretches_time() -> None:

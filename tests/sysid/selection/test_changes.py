@@ -8,11 +8,18 @@ from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.posterior import Fit, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
-from nerf2real.sysid.selection import changes, naming, since_reference
+from nerf2real.sysid.selection import analysis, naming, subject
 from nerf2real.sysid.selection.explain import Scored, standardised
 from tests.sysid.synthetic import PENDULUM, log_of
 
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
+
+
+def few(plant, **_):
+  """Returns a library that a test has the time for."""
+  return [t for t in candidates.library(plant) if t.kind in KINDS]
+
+
 BEFORE = [Effect("coulomb_friction", "joint", {"torque": 0.15})]
 
 
@@ -74,9 +81,7 @@ def test_the_threshold_grows_with_what_was_tried():
 def found():
   """Reports of a machine with friction of old: unchanged, and with commands late since."""
   patch = pytest.MonkeyPatch()
-  library = candidates.library
-  few = lambda plant: [t for t in library(plant) if t.kind in KINDS]  # noqa: E731
-  patch.setattr(changes, "_library", few)
+  patch.setattr(subject, "own_library", few)
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   late = Effect("command_delay", "joint", {"delay": 0.02})
 
@@ -88,8 +93,8 @@ def found():
 
   before = logs(BEFORE)
   result = {
-    "same": since_reference.analyse(model, logs(BEFORE), before),
-    "late": since_reference.analyse(model, logs([*BEFORE, late]), before),
+    "same": analysis.analyse(model, logs(BEFORE), before),
+    "late": analysis.analyse(model, logs([*BEFORE, late]), before),
   }
   patch.undo()
   return result

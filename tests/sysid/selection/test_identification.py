@@ -19,8 +19,8 @@ from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.plant import JointPlant
 from nerf2real.sysid.selection import decision, elaboration, explanation, learned, race
-from nerf2real.sysid.selection.chain import ancestors
 from nerf2real.sysid.selection.identification import analyse
+from nerf2real.sysid.selection.scopes import ancestors
 from tests.sysid.synthetic import ARM, PENDULUM, log_of, logs_of
 
 SAMPLES = Path(__file__).parents[3] / "../shared/data/sysid_samples"

@@ -1,4 +1,4 @@
-"""Analyses a machine against reference logs: every joint's changes, in the form of a report."""
+"""Analyses a machine: effects of its scopes, joint by joint, in the form of a report."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
+from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.fitting import Fit as JointFit
 from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.fit.posterior import CONSTANTS
@@ -17,28 +18,31 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
-from nerf2real.sysid.selection import changes, claims, race
+from nerf2real.sysid.selection import changes, claims, race, scopes
 from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.common import WHOLE
 from nerf2real.sysid.selection.decision import Finding, Thresholds
 from nerf2real.sysid.selection.explain import Scored, clear
 from nerf2real.sysid.selection.explanation import Ladder
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.joint import Found
+from nerf2real.sysid.selection.naming import Name
+from nerf2real.sysid.selection.scopes import Shared
 from nerf2real.sysid.selection.screening import Screened
+from nerf2real.sysid.selection.subject import WHOLE, explain_reference, prepare
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 _GRADES = ("none", "effects", "partly", "unexplained")
+_ALL_OFF = 0.6  # share of joints with constants that are off that stands for all
 
 
 def analyse(
   model: mujoco.MjModel,
   logs: Sequence[Log],
-  reference: Sequence[Log],
+  reference: Sequence[Log] = (),
   *,
   settings: Settings = SETTINGS,
 ) -> Identified:
-  """Returns what has changed since the reference logs were recorded.
+  """Returns what a machine has that its model, or reference logs, have not.
 
   Raises:
     ValueError: no joint has an actuator and commands in all logs.
@@ -54,13 +58,29 @@ def analyse(
       "Found no joint with an actuator that all logs command, expected at least one."
     )
   reductions = [Reduction(model, log) for log in logs], [Reduction(model, log) for log in reference]
-  changed = [
-    changes.find(
+  subjects = [
+    prepare(
       model, joint, logs, reference, reductions=reductions, tried=len(joints), settings=settings
     )
     for joint in joints
   ]
-  changed.sort(key=lambda c: (-_GRADES.index(c.verdict), -c.left / max(c.reference_left, 1e-12)))
+  shared = scopes.shared_effects(model, subjects, settings) if len(subjects) > 1 else []
+  most = sorted(subjects, key=lambda s: -s.left)[: settings.suspects]
+  for subject in subjects:
+    if subject.alone or changes.leaves(subject, subject.explainer.null, settings):
+      explain_reference(subject, settings)
+  changed = [
+    changes.explain(subject, settings, thorough=bool(reference) or subject in most)
+    for subject in subjects
+  ]
+  origins = [s.origin.joint for s in shared]
+  changed.sort(
+    key=lambda c: (
+      -_GRADES.index(c.verdict),
+      c.joint not in origins,
+      -c.left / max(c.reference_left, 1e-12),
+    )
+  )
   found = [_found(item) for item in changed]
   result = Identified(
     model,
@@ -69,10 +89,31 @@ def analyse(
     [f for f, c in zip(found, changed, strict=True) if c.verdict != "none"] or found[:1],
     audits=[audit(log) for log in logs],
   )
+  for effect in shared:
+    _write_shared(result, effect, own_latency=not reference)
   for item, finding in zip(changed, found, strict=True):
     _write_down(result, item, finding)
-  result.verdict = _verdict([c.verdict for c in changed])
+  off = [row for row in result.effects if row["kind"] == "parameter_error"]
+  if len(off) > _ALL_OFF * len(joints) and len(off) > 1:
+    result.effects = [row for row in result.effects if row not in off]
+    result.effects.append(claims.constants_of_all(off))
+  result.verdict = _verdict([c.verdict for c in changed] + ["effects"] * bool(shared))
   return result
+
+
+def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:
+  """Adds an effect of a body or of the machine."""
+  bounds = intervals.around(shared.term, shared.x, shared.spread, own_latency=own_latency)
+  evidence = {
+    "clear_by_standard_errors": round(shared.clear, 2),
+    "held_out_gain_nats": round(shared.nats, 2),
+    "joints": [m.joint for m in shared.members],
+  }
+  effect, row = claims.shared(shared.term, shared.x, bounds, evidence)
+  if shared.term.kind == "payload":
+    row |= {"joint": shared.origin.joint, "body": shared.term.target}
+  result.objects.append(effect)
+  result.effects.append(row)
 
 
 def _verdict(verdicts: Sequence[str]) -> str:
@@ -88,7 +129,7 @@ def _verdict(verdicts: Sequence[str]) -> str:
 def _found(item: Changed) -> Found:
   """Returns a joint's hypotheses as the report shows them."""
   problem = item.problem
-  best = item.found.best
+  best = item.extended
   entries = {s.terms: entry(problem, s) for s in item.ranked}  # one of each: they are compared
   null, chosen = entries[item.null.terms], entries[best.terms]
   others = [e for t, e in entries.items() if t != best.terms and _changed(t)]
@@ -115,7 +156,7 @@ def _changed(terms: Sequence[Term]) -> list[Term]:
 
 def _write_down(result: Identified, item: Changed, found: Found) -> None:
   """Adds a joint's effects, constants and latencies."""
-  best, chosen = item.found.best, found.finding.chosen
+  best, chosen = item.extended, found.finding.chosen
   names = {n.kind: n for n in item.found.names}
   offset = 0.0
   for term in best.terms:
@@ -127,8 +168,10 @@ def _write_down(result: Identified, item: Changed, found: Found) -> None:
       offset += values.get("zero", 0.0)
       if term.freed:
         row = claims.constants(found.screened, chosen)
-        row["evidence"] |= _evidence(item, names["parameter_error"])
+        row["evidence"] |= _evidence(item, names.get("parameter_error"))
         _list(result, item, "parameter_error", row)
+      continue
+    if not term.names:  # of a wider scope
       continue
     effect, row = claims.effect(found, chosen, term, 0.0)
     if term.kind == "encoder_offset":
@@ -138,7 +181,7 @@ def _write_down(result: Identified, item: Changed, found: Found) -> None:
     if term.known:
       result.in_reference.append(row)
       continue
-    row["evidence"] |= _evidence(item, names[term.kind])
+    row["evidence"] |= _evidence(item, names.get(term.kind))
     _list(result, item, term.kind, row)
   if offset:
     result.objects.append(Effect("encoder_offset", item.joint, {"offset": offset}))
@@ -151,9 +194,9 @@ def _list(result: Identified, item: Changed, kind: str, row: dict[str, Any]) -> 
   (result.effects if stands else result.nearest).append(row)
 
 
-def _evidence(item: Changed, name: Any) -> dict[str, Any]:
+def _evidence(item: Changed, name: Name | None) -> dict[str, Any]:
   return {
-    "clear_by_standard_errors": round(min(name.clear, 999.0), 2),
+    "clear_by_standard_errors": round(min(name.clear, 999.0), 2) if name else None,
     "clear_of_the_baseline": round(clear(item.found.best, item.null), 2),
     "share_explained": round(item.found.share, 4),
     "share_explained_low": round(item.found.share_low, 4),

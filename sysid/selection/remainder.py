@@ -1,0 +1,46 @@
+"""What remains of a joint's residual under its best hypothesis, against what it leaves anyway."""
+
+import numpy as np
+from scipy.stats import norm
+
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.selection.explain import Scored
+from nerf2real.sysid.settings import Settings
+
+Array = np.ndarray
+
+
+def structured(joint: JointLikelihood, item: Scored, settings: Settings) -> bool:
+  """Tells whether neighbouring readings' residuals go together in more than one block, which may
+  hold a knock."""
+  certain, size = _together(joint, item.fit.residuals[0][0])
+  # Two of B blocks exceed z by chance with a probability of (B p)^2 / 2 at most.
+  rare = float(norm.isf(np.sqrt(2.0 * settings.level) / len(certain)))
+  large = size > (settings.structured * joint.position_noise) ** 2
+  return int(np.sum((certain > rare) & large)) >= 2
+
+
+def grown(best: Scored, usual: Scored, beyond: float, settings: Settings) -> bool:
+  """Tells whether blocks leave more than a reference's do, on a logarithmic scale.
+
+  Args:
+    best: hypothesis of the logs.
+    usual: that of the reference.
+    beyond: standard errors that count as clear.
+    settings: limits.
+  """
+  mine, usually = (0.5 * np.log(s.fit.held[0][0] + 1e-30) for s in (best, usual))
+  error = np.sqrt(np.var(mine) / len(mine) + np.var(usually) / len(usually))
+  ratio = float(mine.mean() - usually.mean())
+  return ratio > beyond * error or ratio > float(np.log(settings.more))
+
+
+def _together(joint: JointLikelihood, residual: Array) -> tuple[Array, Array]:
+  """Returns how surely neighbouring readings' residuals go together in a block, and how much [B].
+
+  Sum of products over its standard error under independence, and the mean product.
+  """
+  products = np.append(residual[1:] * residual[:-1], 0.0)
+  total = np.add.reduceat(products, joint.starts)
+  error = np.sqrt(np.add.reduceat(products**2, joint.starts))
+  return total / np.maximum(error, 1e-300), total / joint.counts[0]

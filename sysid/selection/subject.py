@@ -1,0 +1,148 @@
+"""One joint of a machine under analysis: its logs, and what is known of it beforehand.
+
+With reference logs the joint's constants and the effects that it has anyway are found there first;
+without, the constants are the declared ones within their tolerances.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.sysid.fit import signatures
+from nerf2real.sysid.fit.fitting import Fit as OldFit
+from nerf2real.sysid.fit.fitting import Problem
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.hypotheses.plausible import plausible
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.selection.baseline import freed_constants, known_terms, widened
+from nerf2real.sysid.selection.explain import Explainer, Scored
+from nerf2real.sysid.selection.naming import conclude, threshold
+from nerf2real.sysid.selection.remainder import structured
+from nerf2real.sysid.settings import Settings
+
+WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
+"""Kinds that have no target: they concern all joints of a machine or none."""
+
+
+@dataclasses.dataclass
+class Subject:
+  """A joint under analysis."""
+
+  joint: str
+  now: JointLikelihood
+  known: tuple[Term, ...]
+  """Constants, effects that the reference shows and those of scopes beyond the joint."""
+  library: list[Term]
+  """Effects that may be the joint's own."""
+  freed: Term
+  """The constants, wider."""
+  explainer: Explainer
+  beyond: float
+  """Standard errors that count as clear."""
+  alone: bool
+  """Whether the machine has no other joint, so that effects of the machine are its own."""
+  before: JointLikelihood | None = None
+  """Of the reference."""
+  usual: Scored | None = None
+  """The reference's best hypothesis."""
+  paired: bool = False
+  """Whether every log was driven by the same commands as a reference."""
+
+  @property
+  def left(self) -> float:
+    """What the constants alone leave in the median block, over the readings' noise."""
+    squares = self.explainer.null.fit.held[0][0]
+    return float(np.sqrt(np.median(squares))) / self.now.position_noise
+
+  def take(self, term: Term) -> None:
+    """Adds an effect that has been found to hold, fits the constants anew."""
+    self.known = (*self.known, term)
+    self.explainer = _explainer(self.now, self.known, self.library, self.freed)
+
+
+def prepare(
+  model: mujoco.MjModel,
+  joint: str,
+  logs: Sequence[Log],
+  reference: Sequence[Log],
+  *,
+  reductions: tuple[Sequence[Reduction], Sequence[Reduction]],
+  tried: int,
+  settings: Settings,
+) -> Subject:
+  """Returns a joint with its constants fitted.
+
+  Args:
+    model: the declared one.
+    joint: its name.
+    logs: to explain.
+    reference: of the same joint before; none if there are none.
+    reductions: of the logs and of the reference.
+    tried: joints that are looked at, over which the level of significance is shared.
+    settings: tolerances and effort.
+  """
+  now = _likelihood(model, joint, logs, reductions[0], settings)
+  alone = tried == 1
+  library = own_library(now.plant, alone=alone)
+  beyond = threshold(len({t.kind for t in library} | set(WHOLE)) * tried, settings)
+  if not reference:
+    own = constants(now.plant, settings)
+    freed = widened(own)
+    explainer = _explainer(now, (own,), library, freed)
+    return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
+  before = _likelihood(model, joint, reference, reductions[1], settings)
+  usual = Explainer(before, constants(before.plant, settings), (), settings=settings).null
+  known = known_terms(usual, settings)
+  paired = now.expect(before, usual.fit.residuals[0])
+  freed = freed_constants(known[0], settings)
+  explainer = _explainer(now, known, library, freed)
+  return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
+
+
+def explain_reference(subject: Subject, settings: Settings) -> None:
+  """Finds the effects that a joint has anyway, where its reference leaves what is no noise."""
+  before = subject.before
+  if before is None or subject.usual is None:
+    return
+  if not subject.alone and not structured(before, subject.usual, settings):
+    return
+  own = constants(before.plant, settings)
+  first = Explainer(before, own, own_library(before.plant, alone=subject.alone), settings=settings)
+  usual = conclude(before, first.explain(settings.reference_depth), subject.beyond).best
+  shared = [t for t in subject.known if not t.names]
+  subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
+  subject.paired = subject.now.expect(before, usual.fit.residuals[0])
+  subject.freed = freed_constants(subject.known[0], settings)
+  subject.explainer = _explainer(subject.now, subject.known, subject.library, subject.freed)
+
+
+def _likelihood(
+  model: mujoco.MjModel,
+  joint: str,
+  logs: Sequence[Log],
+  reductions: Sequence[Reduction],
+  settings: Settings,
+) -> JointLikelihood:
+  plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)
+  return JointLikelihood(plant, settings=settings)
+
+
+def _explainer(
+  now: JointLikelihood, known: Sequence[Term], library: Sequence[Term], freed: Term
+) -> Explainer:
+  return Explainer(now, known[0], library, settings=now.settings, known=known[1:], freed=freed)
+
+
+def own_library(plant: JointModel, *, alone: bool) -> list[Term]:
+  """Returns the effects to try; where torque repeats with position is read off the residual."""
+  waves = signatures.waves(Problem(plant), OldFit((), np.zeros(0), 0.0, 1.0, 0))
+  terms = [*candidates.library(plant), candidates.cogging(plant, waves)]
+  terms = [t for t in terms if alone or t.kind not in WHOLE]
+  return [plausible(term) for term in terms] if plant.hinge else terms

@@ -1,0 +1,59 @@
+"""Effects of a body and of the machine: evidence summed over joints."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.selection import analysis, scopes, subject
+from tests.sysid.selection.test_changes import few
+from tests.sysid.synthetic import ARM, log_of
+
+LATE = Effect("command_delay", None, {"delay": 0.021})
+PAYLOAD = Effect("payload", "lower", {"mass": 0.25, "x": 0.0, "y": 0.02, "z": -0.12})
+
+
+def _logs(effects, seed=0):
+  return [
+    log_of(ARM, kind, effects, duration=5.0, seed=seed + i)
+    for i, kind in enumerate(("sweep", "slow", "steps"))
+  ]
+
+
+@pytest.fixture
+def model(monkeypatch):
+  monkeypatch.setattr(subject, "own_library", few)
+  return mujoco.MjModel.from_xml_string(ARM)
+
+
+def test_a_late_bus_is_one_effect_and_a_payload_is_its_body_s(model):
+  found = analysis.analyse(model, _logs([LATE, PAYLOAD]))
+  assert found.verdict == "effects"
+  assert {(e["kind"], e["joint"]) for e in found.effects} == {
+    ("command_delay", None),
+    ("payload", "elbow"),
+  }
+  values = {e["kind"]: e["parameters"] for e in found.effects}
+  assert values["command_delay"]["delay"]["value"] == pytest.approx(0.021, abs=0.002)
+  assert values["payload"]["mass"]["value"] == pytest.approx(0.25, rel=0.15)
+  assert {(e.kind, e.target) for e in found.objects if e.kind != "encoder_offset"} == {
+    ("command_delay", None),
+    ("payload", "lower"),
+  }
+
+
+def test_one_joint_s_friction_stays_its_own_beside_a_reference(model):
+  rough = Effect("coulomb_friction", "shoulder", {"torque": 0.25})
+  found = analysis.analyse(model, _logs([LATE, rough]), _logs([LATE], seed=10))
+  assert [(e["kind"], e["joint"]) for e in found.effects] == [("coulomb_friction", "shoulder")]
+
+
+def test_two_healthy_joints_have_nothing(model):
+  found = analysis.analyse(model, _logs([]))
+  assert (found.verdict, found.effects) == ("none", [])
+
+
+def test_a_body_is_carried_by_the_joints_on_its_way():
+  model = mujoco.MjModel.from_xml_string(ARM)
+  assert scopes.ancestors(model, model.body("lower").id) == ["elbow", "shoulder"]
+  assert np.all([j.startswith("s") for j in scopes.ancestors(model, model.body("upper").id)])
