@@ -11,31 +11,24 @@ _RECORD = "policy.json"
 _IN_A_RUN = ("policy/best", "policy/newest")
 
 
-def shipped_folder(task: str, variant: str = "") -> Path:
-  """Returns where the policy of a task is shipped, whether there is one or not.
-
-  Args:
-    task: The task.
-    variant: Of its policies; empty: the one for every day.
-  """
-  name = f"{task}_{variant}" if variant else task
-  return Path(agents.__path__[0]) / "policies" / name
+def shipped_folder(task: str) -> Path:
+  """Returns where the policy of a task is shipped, whether there is one or not."""
+  return Path(agents.__path__[0]) / "policies" / task
 
 
 def policy_folder(name: str, *, task: str) -> Path:
   """Returns the folder of an exported policy.
 
   Args:
-    name: "shipped", or "shipped:VARIANT" such as "shipped:swift"; a run's folder (its best policy,
-      or else its newest one is taken), or an exported policy's folder.
+    name: "shipped", a run's folder (its best policy, or else its newest one is taken), or an
+      exported policy's folder.
     task: The task, for the shipped one.
 
   Raises:
     ValueError: There is no such policy; the message is one line.
   """
-  shipped, _, variant = name.partition(":")
-  if shipped == SHIPPED:
-    folder = shipped_folder(task, variant)
+  if name == SHIPPED:
+    folder = shipped_folder(task)
     if not (folder / _RECORD).is_file():
       raise ValueError(
         f"No policy for {task} is shipped with this version (expected one in {folder}): use "

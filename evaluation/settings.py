@@ -12,7 +12,7 @@ class EvaluationSettings:
   """What is evaluated, where and how."""
 
   policy: str = WALKER
-  """"walker" (scripted), "shipped" or "shipped:swift", a run's folder, or that of an exported policy."""
+  """"walker" (scripted), "shipped", a run's folder, or that of an exported policy."""
   plant: Literal["sim", "virtual", "both", "robot"] = "sim"
   """Where: the training simulation, virtual robots in the true room, both after one another, or a
   robot."""

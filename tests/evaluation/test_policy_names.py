@@ -30,10 +30,6 @@ def test_shipped_policy_is_found_where_it_is_dropped(tmp_path, monkeypatch):
     policy_names.policy_folder("shipped", task="nerf_nav")
   folder = _put(tmp_path / "policies" / "nerf_nav")
   assert policy_names.policy_folder("shipped", task="nerf_nav") == folder
-  with pytest.raises(ValueError, match="expected one in .*nerf_nav_swift"):
-    policy_names.policy_folder("shipped:swift", task="nerf_nav")
-  variant = _put(tmp_path / "policies" / "nerf_nav_swift")
-  assert policy_names.policy_folder("shipped:swift", task="nerf_nav") == variant
 
 
 @pytest.mark.parametrize("name", ["walker", "gait"])
