@@ -7,7 +7,6 @@ import threading
 
 import numpy as np
 import viser
-from viser import transforms
 
 from nerf2real.core import palette
 from nerf2real.core.similarity import Similarity
@@ -16,7 +15,6 @@ from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.training import Snapshot
 from nerf2real.scenes.poses.localise import Localisation
 
-_CAMERA_STEP = 4  # every fourth keyframe is drawn
 _POINT_SIZE = 0.004  # [unit], 1 cm in a room of 5 m
 
 
@@ -54,17 +52,14 @@ class TrainingViewer:
       point_size=_POINT_SIZE,
       point_shape="circle",
     )
-    for name, pose in list(zip(found.names, found.world_from_camera, strict=True))[::_CAMERA_STEP]:
-      self._server.scene.add_camera_frustum(
-        f"/cameras/{name}",
-        fov=found.camera.vertical_fov,
-        aspect=found.camera.width / found.camera.height,
-        scale=0.03,
-        wxyz=transforms.SO3.from_matrix(pose[:3, :3]).wxyz,
-        position=pose[:3, 3],
-        color=palette.rgb(palette.VERMILION),
-      )
-    start = found.world_from_camera[0]
+    places = found.world_from_camera[:, :3, 3].astype(np.float32)
+    self._server.scene.add_point_cloud(
+      "/cameras", places, palette.rgb(palette.VERMILION), point_size=_POINT_SIZE
+    )
+    # The camera that has the most of the room before it.
+    ahead = np.median(found.points, axis=0) - places
+    depth = np.einsum("ni,ni->n", ahead, found.world_from_camera[:, :3, 2])
+    start = found.world_from_camera[int(np.argmax(depth))]
     self._server.initial_camera.position = tuple(start[:3, 3])
     self._server.initial_camera.look_at = tuple(start[:3, 3] + start[:3, 2])
     count, keyframes = len(found.points), len(found.names)
@@ -99,7 +94,8 @@ class TrainingViewer:
     if self._view is None:
       self._view = FieldView(renderer, Similarity())
       serve_field(self._server, self._view)
-      self._server.scene.remove_by_name("/points")
+      for name in ("/points", "/cameras"):
+        self._server.scene.remove_by_name(name)
     else:
       self._view.replace(renderer)
     minutes, seconds = divmod(round(snapshot.seconds_left), 60)
