@@ -48,9 +48,3 @@ class Planner:
   def is_free(self, places: np.ndarray) -> np.ndarray:
     """Returns whether the robot fits at places [..., 2], bool [...]."""
     return self._floor.free[self._floor.index_of(places)]
-
-  def is_clear(self, start: np.ndarray, end: np.ndarray) -> bool:
-    """Returns whether the straight line between two places keeps the comfortable distance."""
-    count = max(2, int(np.linalg.norm(np.subtract(end, start)) / (_CELL / 2)))
-    line = np.linspace(start, end, count)
-    return bool((self._cost[self._floor.index_of(line)] < 1.0 + 0.5 * _NEAR).all())

@@ -25,7 +25,7 @@ class PushSettings:
   overshoot: float = 0.4
   """m beyond the ball at which a pushing robot aims."""
   headings: int = 24
-  """Directions of a push that are tried around the ball."""
+  """Directions of a whole turn; those up to a quarter of it from the target's are tried."""
   stickiness: float = 0.5
   """Weight of the robot's bearing from the ball, beside the target's, in the choice of a direction:
   a smaller way around is worth a less direct push."""

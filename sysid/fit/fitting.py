@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nerf2real.sysid.fit.noise import position_noise
 from nerf2real.sysid.hypotheses.terms import Term, compose
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import quantum
@@ -33,12 +34,8 @@ _GENERATIONS, _DRAWN, _ELITE = 12, 40, 8  # of values that are drawn where costs
 _SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least; ours
 _SIZES = (0.4, 0.7, 1.4, 2.5)  # times a size that is looked at
 _MOVES = (-3.0, -1.0, 1.0, 3.0)  # scales about a value that may be negative
-_NINE_TENTHS = 0.79  # rms of the inner 90 % of a normal distribution over its own
 _SOFT = 4.0  # noise units; larger residuals count linearly
 PRIOR_COUNT = 25.0  # residuals that one independent observation is spread over; ours
-_TRIMMED = (
-  0.01  # share of the largest residuals that a score leaves out: stale reads, command edges
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,16 +313,3 @@ def _prior(terms: Sequence[Term], x: Array) -> Array:
       centre = np.array(term.centre) if term.centre else 0.0
       rows.append((part - centre) / np.array(term.prior) * np.sqrt(PRIOR_COUNT))
   return np.concatenate(rows) if rows else np.zeros(0)
-
-
-def position_noise(plant: JointPlant) -> float:
-  """Returns the noise of the position readings: scatter about a local cubic, at least the
-  rounding to the sensor's steps."""
-  scatter, steps = [], []
-  for log in plant.logs:
-    third = np.diff(log.position, n=3)
-    large = np.quantile(np.abs(third), 0.9)
-    kept = third[np.abs(third) <= max(large, 1e-300)]
-    scatter.append(float(np.sqrt(np.mean(kept**2))) / np.sqrt(20.0) / _NINE_TENTHS)
-    steps.append(quantum(log.position))
-  return max(float(np.median(scatter)), min(steps) / np.sqrt(12.0), 1e-9)

@@ -49,11 +49,6 @@ class Ladder:
   pairs: list[Entry]
   """Two effects, or longer chains."""
 
-  @property
-  def best_single(self) -> Entry:
-    """The single effect that explains most."""
-    return self.singles[0]
-
   def best(self) -> Entry:
     """The hypothesis of the lowest score."""
     return min([self.null, *self.singles, *self.pairs], key=lambda e: e.score)
