@@ -171,7 +171,9 @@ class Reduction:
       inertia[:], here[:], across[:] = inertia[0], here[0], across[0]
       return Surroundings(inertia, here, across, np.zeros(count), bias)
     at = motion.position[:, column].copy()
-    return _between(chosen, at, inertia[chosen], here[chosen], across[chosen], bias[chosen], hinge)
+    return _between(
+      chosen, at, inertia[chosen], here[chosen], across[chosen], bias[chosen], hinge=hinge
+    )
 
   def moments(self, joint: str, body: int) -> list[Surroundings]:
     """Returns what mass and its moments on a body add, per unit.
@@ -216,7 +218,7 @@ class Reduction:
         continue
       hinge = self._poses.hinge(carrying[i])
       at = np.zeros(count) if alone else motion.position[:, self.log.states.column(name)].copy()
-      result[name] = [_between(chosen, at, *part, hinge) for part in solved[:, i]]
+      result[name] = [_between(chosen, at, *part, hinge=hinge) for part in solved[:, i]]
     return result
 
   def _chosen(self) -> Array:
