@@ -82,7 +82,10 @@ def name(out: Path, logs: Path, reference: Path | None = None) -> Named:
     before = None if reference is None else _floor(reference / f"{FLOOR}.mcap")
     if before is not None:
       stood = stood.beside(before)
-    write_effects(out / "effects.json", [*read_effects(out / "effects.json"), *stood.effects])
+    effects = read_effects(out / "effects.json")
+    if any(effect.kind == "floor_slope" for effect in stood.effects):  # gravity is turned once
+      effects = [effect for effect in effects if effect.kind != "gravity_tilt"]
+    write_effects(out / "effects.json", [*effects, *stood.effects])
     if stood.rows and content["verdict"] == NONE:
       content["verdict"] = "effects"
     content["effects"] = [*content["effects"], *stood.rows]
