@@ -26,7 +26,7 @@ _LATE = ("command_delay", "measurement_delay")
 """Kinds that are a joint's or the bus's."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Wide:
   """An effect that several joints share, fitted."""
 
