@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nerf2real.agents.distill import settings as distillation
-from nerf2real.agents.distill.checkpoint import STATE
+from nerf2real.agents.distill.learning.checkpoint import STATE
 from nerf2real.agents.distill.teacher import TEACHERS
 from nerf2real.agents.supervision import training
 from nerf2real.core.serialization import to_plain, write_json
