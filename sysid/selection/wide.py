@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fit, Fitter, Layout
+from nerf2real.sysid.fit.posterior import CLOCKS, Fit, Fitter, Layout
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
@@ -24,6 +24,7 @@ Array = np.ndarray
 
 _LATE = ("command_delay", "measurement_delay")
 """Kinds that are a joint's or the bus's."""
+_NEAR = tuple(0.001 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))  # s from a delay to look about
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -129,7 +130,25 @@ def fitted(item: Wide) -> Wide:
   """Returns a screened effect fitted to the end, with its predictions of left-out blocks."""
   fitter = Fitter([m.now for m in item.members], item.fit.layout)
   fit = fitter.fit(item.fit.x, iterations=3)
+  near = [_replaced(fit.x, at, fit.x[at] + shift) for at in _late(item.term) for shift in _NEAR]
+  if near:
+    near = [np.clip(x, fit.layout.low, fit.layout.high) for x in near]
+    best = near[int(np.argmin(fitter.costs(np.array(near))))]
+    other = fitter.fit(best, iterations=3)
+    fit = min(fit, other, key=lambda f: f.cost)
   return dataclasses.replace(item, fit=fitter.leave_out(fit))
+
+
+def _late(term: Term) -> list[int]:
+  """Returns the indices of a term's delays."""
+  return [at for at, name in enumerate(term.names) if name in CLOCKS]
+
+
+def _replaced(x: Array, at: int, value: float) -> Array:
+  """Returns a copy of values [n] with one replaced."""
+  result = x.copy()
+  result[at] = value
+  return result
 
 
 def adopted(item: Wide, others: Sequence[Subject]) -> Wide:
@@ -145,17 +164,20 @@ def adopted(item: Wide, others: Sequence[Subject]) -> Wide:
 def _begin(term: Term, members: Sequence[Subject]) -> Array:
   """Returns the start that costs least over all joints, each with its constants as they are or as
   they were before they were bent by what is missing."""
-  totals, owns = np.zeros(len(term.starts)), []
+  starts = np.array(term.starts)
+  if _late(term):  # held commands make stairs of a delay, whose derivatives mislead
+    starts = np.arange(term.low[0], term.high[0], 0.5 * term.scale[0])[:, None]
+  totals, owns = np.zeros(len(starts)), []
   for m in members:
     null = m.explainer.null
     places = (null.fit.x, np.concatenate([t.centre for t in null.terms]))
-    tried = np.array([np.concatenate([own, s]) for s in term.starts for own in places])
+    tried = np.array([np.concatenate([own, s]) for s in starts for own in places])
     costs = Fitter([m.now], Layout([[*null.terms, term]])).costs(tried)
-    costs = costs.reshape(len(term.starts), len(places))
+    costs = costs.reshape(len(starts), len(places))
     totals += costs.min(axis=1)
     owns.append([places[k] for k in costs.argmin(axis=1)])
   best = int(np.argmin(totals))
-  return np.concatenate([term.starts[best], *[own[best] for own in owns]])
+  return np.concatenate([starts[best], *[own[best] for own in owns]])
 
 
 def alone(item: Wide, at: int) -> Evidence:
