@@ -171,9 +171,8 @@ class Reduction:
       inertia[:], here[:], across[:] = inertia[0], here[0], across[0]
       return Surroundings(inertia, here, across, np.zeros(count), bias)
     at = motion.position[:, column].copy()
-    return _between(
-      chosen, at, inertia[chosen], here[chosen], across[chosen], bias[chosen], hinge=hinge
-    )
+    fields = np.array([inertia, here, across, bias])[:, chosen]
+    return _between(chosen, at, fields, hinge=hinge)
 
   def moments(self, joint: str, body: int) -> list[Surroundings]:
     """Returns what mass and its moments on a body add, per unit.
@@ -218,7 +217,7 @@ class Reduction:
         continue
       hinge = self._poses.hinge(carrying[i])
       at = np.zeros(count) if alone else motion.position[:, self.log.states.column(name)].copy()
-      result[name] = [_between(chosen, at, *part, hinge=hinge) for part in solved[:, i]]
+      result[name] = [_between(chosen, at, part, hinge=hinge) for part in solved[:, i]]
     return result
 
   def _chosen(self) -> Array:
@@ -242,13 +241,18 @@ class Reduction:
       model.opt.gravity[:] = before
 
 
-def _between(
-  chosen: Array, at: Array, inertia: Array, here: Array, across: Array, bias: Array, hinge: bool
-) -> Surroundings:
+def _between(chosen: Array, at: Array, fields: Array, *, hinge: bool) -> Surroundings:
   """Returns surroundings at all samples from those at the chosen ones.
 
   Gravity is interpolated as a vector that turns with a hinge.
+
+  Args:
+    chosen: samples [M].
+    at: position of the joint at all samples [N].
+    fields: inertia, gravity here and across, and bias at the chosen ones [4, M].
+    hinge: whether the joint is one.
   """
+  inertia, here, across, bias = fields
   all_of = lambda values: np.interp(np.arange(len(at)), chosen, values)  # noqa: E731
   if hinge:
     cos, sin = np.cos(at), np.sin(at)
