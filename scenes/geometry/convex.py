@@ -3,8 +3,8 @@
 MuJoCo collides convex hulls only, and the hull of a room is a filled block. So the solid is cut
 into cells first; a cell whose hull covers no seen free space is a part as it is, the others are
 cut on by planes along the axes; then neighbours are merged for as long as their common hull still
-keeps out of free space. Space that no ray reached counts as solid, unless it borders on seen free
-space, as under a table: so furniture and walls have an inside.
+keeps out of free space. Space that no ray reached counts as solid behind seen matter, unless it
+borders on seen free space, as under a table: so furniture and walls have an inside.
 
 In place of the cuts, CoACD (Wei et al. 2022), which does not use what was seen, gave 119 parts
 of a room of boxes instead of 111, 95 % within 2.0 and 2.5 cm of the truth, both ways, not 2.8
@@ -34,6 +34,9 @@ class ConvexSettings:
   """a part may reach this far into seen free space."""
   doubt: float = 0.3
   """Unseen space this near to seen free space counts as free too."""
+  inside: float = 0.3
+  """Other unseen space counts as matter this near to seen matter. Chosen: half the depth of an
+  armchair; without a limit the space under the cameras, where nobody looked, was a block."""
   max_parts: int = 400
   """Tolerance grows until the merged parts are this few."""
   max_vertices: int = 48
@@ -262,7 +265,9 @@ def decompose(
   clearance = np.maximum(clearance - 0.5 * grid.voxel, 0)
   space = _Space(clearance, np.asarray(grid.lower, np.float64), grid.voxel)
   known = free | grid.solid
-  matter = _Matter(~free, np.where(known, grid.values, np.float32(-1)), space)
+  depth = ndimage.distance_transform_edt(~grid.solid) * grid.voxel
+  solid = ~free & (depth <= settings.inside)
+  matter = _Matter(solid, np.where(known, grid.values, np.float32(-1)), space)
   parts: list[Part] = []
   step = max(4, round(settings.cell / grid.voxel))
   starts = np.stack(
