@@ -16,7 +16,7 @@ from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import FloorError
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.capture.capture import Capture
-from nerf2real.scenes.geometry import collision, convex, floor_plan, fusion, map_server, mesh
+from nerf2real.scenes.geometry import collision, decomposition, floor_plan, fusion, map_server, mesh
 from nerf2real.scenes.poses.localise import Localisation
 from nerf2real.scenes.quality import collision_error
 from nerf2real.scenes.results import Contact
@@ -216,7 +216,7 @@ def contact(
       settings=shape,
       progress=part(progress, 0.0, 0.2),
     )
-    parts = convex.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
+    parts = decomposition.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
     collision.write_parts(parts, folder / "collision")
     progress(0.8, "free space")
     space = floor_plan.floor_plan(

@@ -40,7 +40,13 @@ __all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "loc
 
 
 _MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
-_STAGE_SHARES = {"features": 0.25, "matching": 0.4, "mapping": 0.2, "refining": 0.05, "shutter": 0.1}
+_STAGE_SHARES = {
+  "features": 0.25,
+  "matching": 0.4,
+  "mapping": 0.2,
+  "refining": 0.05,
+  "shutter": 0.1,
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -249,9 +255,7 @@ def _without_shutter(mapped: _Mapped, times: Mapping[str, float], steps: _Steps)
   """Takes the rolling shutter out of a model; the model itself where that spoils the lens."""
   lens = mapped.lens
   assert lens is not None  # for the type checker: only known poses have none
-  adjust = functools.partial(
-    mapping.adjust, principal=lens.principal, distortion=lens.distortion
-  )
+  adjust = functools.partial(mapping.adjust, principal=lens.principal, distortion=lens.distortion)
   steps.begin("shutter")
   model, found = shutter.correct(mapped.model, times, adjust, report=steps.report)
   mapping.drop_bad_observations(model)

@@ -116,9 +116,7 @@ def _local_points(
   return local
 
 
-def motion(
-  model: pycolmap.Reconstruction, times: Mapping[str, float], readout: float
-) -> Shutter:
+def motion(model: pycolmap.Reconstruction, times: Mapping[str, float], readout: float) -> Shutter:
   """Derives the motion during the readout from the poses of neighbouring keyframes.
 
   Args:
