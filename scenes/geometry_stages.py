@@ -24,6 +24,7 @@ from nerf2real.scenes.stages import Made, StageResult, Stages
 
 _OUTLOOK_VERSION = 2  # 2: no floor among the localised points is warned of
 _WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
+_CONTACT_VERSION = 2  # 2: unseen space is matter behind seen matter alone; no tolerance grows
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 
@@ -247,5 +248,6 @@ def contact(
     write_json(folder / "contact.json", figures)
 
   everything = [collision_settings, floor_settings]
-  stage = cache.run("contact", write, settings=everything, inputs={"world": world.stamp})
+  inputs = {"world": world.stamp}
+  stage = cache.run("contact", write, settings=everything, inputs=inputs, version=_CONTACT_VERSION)
   return Made(read_json(stage.folder / "contact.json", Contact), stage)
