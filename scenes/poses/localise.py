@@ -43,9 +43,9 @@ _MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
 _STAGE_SHARES = {
   "features": 0.25,
   "matching": 0.4,
-  "mapping": 0.2,
+  "mapping": 0.25,
   "refining": 0.05,
-  "shutter": 0.1,
+  "shutter": 0.05,
 }
 
 
