@@ -30,13 +30,14 @@ class ConvexSettings:
 
   cell: float = 1.0
   """The solid is cut into cubes of this size before anything else."""
-  tolerance: float = 0.035
-  """a part may reach this far into seen free space."""
+  tolerance: float = 0.025
+  """a part may reach this far into seen free space. From two rooms: 0.035 takes half the time and
+  blocks a fifth more sight lines."""
   doubt: float = 0.3
   """Unseen space this near to seen free space counts as free too."""
-  inside: float = 0.15
+  inside: float = 0.1
   """Other unseen space counts as matter this near to seen matter. Chosen: a wall as thick as a
-  hand is long; without a limit the space under the cameras, where nobody looked, was a block."""
+  hand is wide; without a limit the space under the cameras, where nobody looked, was a block."""
   max_parts: int = 1000
   """Parts are merged until they are this few, those first that reach least into free space."""
   max_vertices: int = 48
