@@ -24,6 +24,7 @@ Array = np.ndarray
 
 _LATE = ("command_delay", "measurement_delay")
 """Kinds that are a joint's or the bus's."""
+_ENOUGH = 20  # steps of a fit, which ends by itself: a bound on time
 _NEAR = tuple(0.001 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))  # s from a delay to look about
 
 
@@ -129,12 +130,12 @@ def screened(term: Term, members: Sequence[Subject]) -> Wide:
 def fitted(item: Wide) -> Wide:
   """Returns a screened effect fitted to the end, with its predictions of left-out blocks."""
   fitter = Fitter([m.now for m in item.members], item.fit.layout)
-  fit = fitter.fit(item.fit.x, iterations=3)
+  fit = fitter.fit(item.fit.x, iterations=_ENOUGH)
   near = [_replaced(fit.x, at, fit.x[at] + shift) for at in _late(item.term) for shift in _NEAR]
   if near:
     near = [np.clip(x, fit.layout.low, fit.layout.high) for x in near]
     best = near[int(np.argmin(fitter.costs(np.array(near))))]
-    other = fitter.fit(best, iterations=3)
+    other = fitter.fit(best, iterations=_ENOUGH)
     fit = min(fit, other, key=lambda f: f.cost)
   return dataclasses.replace(item, fit=fitter.leave_out(fit))
 
@@ -184,7 +185,7 @@ def alone(item: Wide, at: int) -> Evidence:
   """Returns the evidence of the same effect at one of its joints, fitted there alone."""
   member = item.members[at]
   fitter = Fitter([member.now], Layout([(*member.explainer.null.terms, item.term)]))
-  fit = fitter.fit(np.concatenate([item.own(at), item.x]), iterations=3)
+  fit = fitter.fit(np.concatenate([item.own(at), item.x]), iterations=_ENOUGH)
   return _evidence([member], fitter.leave_out(fit))
 
 
