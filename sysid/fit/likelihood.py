@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerf2real.sysid.fit.noise import effort_noise, timing
-from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.composition import Composed, compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
@@ -81,14 +81,15 @@ class JointLikelihood:
     chosen = range(len(self.plant.logs)) if logs is None else logs
     rows = []
     for x in np.atleast_2d(xs):
-      p, loads = compose(self.plant, terms, x)
-      rows.append([self._pair(p, loads, i) for i in chosen])
+      composed = compose(self.plant, terms, x)
+      rows.append([self._pair(composed, i) for i in chosen])
     return rows
 
-  def _pair(self, p, loads, index) -> tuple[Simulated, Simulated | None]:
-    open_loop = self.plant.run(p, loads, index)
-    along = self.plant.run(p, loads, index, follow=True) if self.effort is not None else None
-    return open_loop, along
+  def _pair(self, c: Composed, index: int) -> tuple[Simulated, Simulated | None]:
+    open_loop = self.plant.run(c.p, c.loads, index, table=c.table)
+    if self.effort is None:
+      return open_loop, None
+    return open_loop, self.plant.run(c.p, c.loads, index, table=c.table, follow=True)
 
   def residuals(self, terms: Sequence[Term], xs: Array) -> Array:
     """Returns measured minus simulated [X, C, N]; masked samples are 0."""

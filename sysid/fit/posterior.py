@@ -131,7 +131,7 @@ class Fitter:
     curvature, gradient = np.zeros((len(self.folds), n, n)), np.zeros((len(self.folds), n))
     cost, residuals, jacobians = float(self.prior(x[None])[0]), [], []
     steps = width * layout.scale
-    steps = np.where(x + steps > layout.high, -steps, steps)
+    steps = np.where((x + steps > layout.high) | (x + steps < layout.low), -steps, steps)
     for at, (joint, terms, index) in enumerate(
       zip(self.joints, layout.of_joint, layout.index, strict=True)
     ):
@@ -150,8 +150,8 @@ class Fitter:
       sample_fold = joint.fold[joint.block_of]
       for f, fold in enumerate(self.folds):
         chosen = sample_fold == fold
-        j = jacobian[:, :, chosen].reshape(len(index), -1)
         w, r = weight[:, chosen].ravel(), rows[0][:, chosen].ravel()
+        j = jacobian[:, :, chosen].reshape(len(index), len(r))
         wj = j * w
         curvature[f][np.ix_(index, index)] += 2.0 * wj @ j.T
         gradient[f][index] += 2.0 * wj @ r

@@ -12,8 +12,6 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.fit import signatures
-from nerf2real.sysid.fit.fitting import Fit as OldFit
-from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
@@ -142,7 +140,7 @@ def _explainer(
 
 def own_library(plant: JointModel, *, alone: bool) -> list[Term]:
   """Returns the effects to try; where torque repeats with position is read off the residual."""
-  waves = signatures.waves(Problem(plant), OldFit((), np.zeros(0), 0.0, 1.0, 0))
+  waves = signatures.waves(plant)
   terms = [*candidates.library(plant), candidates.cogging(plant, waves)]
   terms = [t for t in terms if alone or t.kind not in WHOLE]
   return [plausible(term) for term in terms] if plant.hinge else terms
