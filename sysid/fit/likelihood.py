@@ -21,7 +21,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured
-from nerf2real.sysid.settings import SETTINGS
+from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
@@ -29,8 +29,17 @@ Array = np.ndarray
 class JointLikelihood:
   """The logs of one joint, cut into blocks; turns hypotheses into residuals and nats."""
 
-  def __init__(self, plant: JointModel, *, settings=SETTINGS):
-    self.plant, self.settings = plant, settings
+  def __init__(self, plant: JointModel, *, settings: Settings = SETTINGS, follows: bool = False):
+    """Cuts the logs into blocks and notes the readings' noise.
+
+    Args:
+      plant: the joint.
+      settings: length of blocks, tolerances of efforts.
+      follows: whether the simulated state is pulled to the readings, so that positions are those
+        predicted from each reading on: a course with play does not repeat, as which way teeth
+        bounce depends on microradians.
+    """
+    self.plant, self.settings, self.follows = plant, settings, follows
     self.position_noise, self.stamp_noise = timing(plant)
     logs = plant.logs
     self.effort: list[Array] | None = None
@@ -86,7 +95,7 @@ class JointLikelihood:
     return rows
 
   def _pair(self, c: Composed, index: int) -> tuple[Simulated, Simulated | None]:
-    open_loop = self.plant.run(c.p, c.loads, index, table=c.table)
+    open_loop = self.plant.run(c.p, c.loads, index, table=c.table, follow=self.follows)
     if self.effort is None:
       return open_loop, None
     return open_loop, self.plant.run(c.p, c.loads, index, table=c.table, follow=True)

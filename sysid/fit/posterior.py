@@ -31,6 +31,8 @@ _DAMPINGS = (
 """Damping and share of the steps that are tried, and whether latencies move: held commands make
 stairs of them, whose derivatives mislead."""
 _WIDTH, _FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
+_GENERATIONS, _DRAWN, _ELITE = 12, 40, 8  # of values that are drawn where costs are rough, chosen
+_SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least, chosen
 _CONVERGED = 0.05  # nats that a step gains at which a fit ends
 
 
@@ -186,6 +188,21 @@ class Fitter:
       else:
         break
     return best
+
+  def draw(self, fit: Fit) -> Fit:
+    """Returns a better fit where costs are too rough for derivatives: values are drawn about the
+    best so far (cross-entropy method, Rubinstein 1999)."""
+    random, layout = np.random.default_rng(0), self.layout
+    mean, spread = fit.x.copy(), _SHAKEN * layout.scale
+    best, least = fit.x, fit.cost
+    for _ in range(_GENERATIONS):
+      tried = random.normal(mean, spread, (_DRAWN, len(mean)))
+      tried = np.clip(np.vstack([best, tried]), layout.low, layout.high)
+      costs = self.costs(tried)
+      elite = tried[np.argsort(costs)[:_ELITE]]
+      best, least = elite[0], float(costs.min())
+      mean, spread = elite.mean(axis=0), np.maximum(elite.std(axis=0), _LEAST_SHAKEN * layout.scale)
+    return self.linearise(best, _FINE) if least < fit.cost else fit
 
   def _step(self, fit: Fit, damping: float, share: float, clocks: bool) -> Array:
     layout = self.layout

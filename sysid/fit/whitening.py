@@ -23,9 +23,7 @@ def whiten(residual: Array, *, order: int = _ORDER) -> Array:
   return target - rows @ coefficients
 
 
-def tests(
-  joint: JointLikelihood, residual: Array, *, seed: int = 0
-) -> dict[str, dict[str, float]]:
+def tests(joint: JointLikelihood, residual: Array, *, seed: int = 0) -> dict[str, dict[str, float]]:
   """Returns, for each regressor, its correlation with the whitened residual and its p value.
 
   The p value is the share of block resamplings with random signs whose correlation is as large.

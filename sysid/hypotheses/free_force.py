@@ -7,6 +7,8 @@ normal about zero with a deviation that falls as those of a step do, 1 / (1 + k 
 it predicts left-out motion better than all named effects, something is there that they are not.
 """
 
+from typing import Any
+
 import numpy as np
 
 from nerf2real.suite.effects import Effect
@@ -63,5 +65,6 @@ def effect(term: Term, x: Array) -> Effect:
   """Returns the force as an effect, of which nothing is left to fit."""
   weights, _ = table(term, x)
   grid = {"num_positions": _GRID, "num_velocities": _GRID}
-  values = {"weights": [float(w) for w in weights.ravel()], **grid, **dict(term.fixed)}
+  values: dict[str, Any] = {"weights": [float(w) for w in weights.ravel()]}
+  values |= grid | dict(term.fixed)
   return Effect(FREE, term.target, values)

@@ -21,6 +21,10 @@ I = kernel.INDEX  # noqa: E741
 FREE = "residual_force"
 """The kind that is a force of any form: it explains without a name."""
 
+STICKING = "sticking"
+"""The kind of a baseline whose dry friction holds a joint at rest, as that of `suite.effects` does;
+MuJoCo's own lets it creep."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Term:
@@ -51,7 +55,7 @@ class Term:
     force of any form."""
     if self.kind == "calibration":
       return "parameter_error" if self.freed else None
-    return None if self.known or self.kind == FREE else self.kind
+    return None if self.known or self.kind in (FREE, STICKING) else self.kind
 
   def apply(self, plant: JointPlant, p: Array, x: Array) -> None:
     """Changes the kernel's parameters [P] in place."""
@@ -214,7 +218,12 @@ def _late(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["measurement_delay"]] += v["delay"]
 
 
+def _sticking(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+
+
 _APPLY = {
+  STICKING: _sticking,
   "calibration": _calibration,
   "command_delay": _adder(("delay", "command_delay")),
   "measurement_delay": _late,

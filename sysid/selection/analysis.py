@@ -12,7 +12,7 @@ from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.posterior import CONSTANTS
-from nerf2real.sysid.hypotheses.terms import FREE
+from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
@@ -116,9 +116,10 @@ def _verdict(verdicts: Sequence[str]) -> str:
 def _write_down(result: Identified, item: Changed) -> None:
   """Adds a joint's effects, constants and latencies."""
   best = item.extended
+  terms = sorted(best.terms, key=lambda t: t.kind == STICKING)  # a friction of its own holds, too
   names = {n.kind: n for n in item.found.names}
   offset = 0.0
-  for term in best.terms:
+  for term in terms:
     values = best.fit.values(term)
     if term.kind == CONSTANTS:
       result.clocks[item.joint] = Clocks(values.get("skew", 0.0), values.get("latency", 0.0))
@@ -128,6 +129,11 @@ def _write_down(result: Identified, item: Changed) -> None:
       if term.freed:
         evidence = _evidence(item, names.get("parameter_error"))
         _list(result, item, "parameter_error", claims.effect(item, term, evidence)[1])
+      continue
+    if term.kind == STICKING:
+      sticks = Effect("coulomb_friction", item.joint, {"torque": 0.0})
+      if not any(e.kind == sticks.kind and e.target == item.joint for e in result.objects):
+        result.objects.append(sticks)
       continue
     if not term.names:  # of a wider scope
       continue

@@ -16,10 +16,10 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter, Layout
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.explain import Explainer, Scored, clear, of_size
+from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear, of_size
 from nerf2real.sysid.selection.naming import Explanation, conclude
 from nerf2real.sysid.selection.remainder import grown, structured
-from nerf2real.sysid.selection.subject import Subject
+from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
@@ -92,6 +92,20 @@ class Changed:
 
 
 def explain(subject: Subject, settings: Settings = SETTINGS, *, thorough: bool = True) -> Changed:
+  """Explains what is new at a joint; one with play by a simulation that follows the readings.
+
+  A course through play does not repeat, so that no model of it is near a whole log; what it
+  predicts from each reading on is judged where play is in the best hypothesis of whole logs.
+  """
+  whole = _explained(subject, settings, thorough=thorough)
+  if whole.verdict in ("none", "effects") or not whole.found.best.names & set(UNREPEATED):
+    return whole
+  near = _explained(following(subject), settings, thorough=thorough)
+  stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
+  return near if stands else whole
+
+
+def _explained(subject: Subject, settings: Settings, *, thorough: bool) -> Changed:
   """Explains what is new at a joint.
 
   Args:
@@ -186,9 +200,7 @@ def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
   sizes = {} if term.freed else {p.name: p for p in kind_of(kind).parameters if not p.shape}
   if not term.names or any(n not in sizes for n in term.names):
     return True
-  bounds = intervals.intervals(
-    subject.now, best.fit, term, own_latency=subject.before is None
-  )
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=subject.before is None)
   return any(not low <= sizes[n].nominal <= high for n, (low, high) in bounds.items())
 
 

@@ -31,8 +31,8 @@ def effect(item: Changed, term: Term, evidence: dict[str, Any]) -> Claim:
   alone = item.subject.before is None
   bounds = intervals.intervals(item.likelihood, fit, term, own_latency=alone)
   found = term.effect(np.array(list(fit.values(term).values())), bounds)
-  if term.kind == CONSTANTS:
-    bounds = found.intervals
+  if term.kind == CONSTANTS:  # factors are told
+    bounds = dict(found.intervals)
   row = {
     "kind": found.kind,
     "joint": None if term.kind in WHOLE else item.joint,

@@ -18,6 +18,10 @@ _ITERATIONS = 10  # of its fit
 _SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
 
 
+UNREPEATED = ("backlash",)
+"""Kinds under which a course does not repeat: which way teeth bounce depends on microradians."""
+
+
 @dataclasses.dataclass
 class Scored:
   """A fitted hypothesis of one joint, with its evidence."""
@@ -248,6 +252,9 @@ class Explainer:
       best = self.refit(best, 4)
       if best.fit.cost > before - _SETTLED:
         break
+    if self.joint.follows and best.names & set(UNREPEATED):
+      best = self._score(best.terms, Fitter([self.joint], Layout([best.terms])).draw(best.fit))
+      self.joint.rescale(best.fit.residuals[0])
     self._rescore()
     return best
 
@@ -280,9 +287,7 @@ class Explainer:
         for item in sorted(grown, key=lambda g: -g.evidence)[: s.kept]:
           if item.terms != top.terms:
             self.refit(item, 3)
-      grown = sorted(
-        of_size(self.scored.values(), depth + 1), key=lambda g: -g.evidence
-      )
+      grown = sorted(of_size(self.scored.values(), depth + 1), key=lambda g: -g.evidence)
       better = grown[0].evidence > best.evidence and leaves(best)
       if clear(grown[0], best) < s.worth and not better:
         break
@@ -323,6 +328,11 @@ class Explainer:
       fit = Fitter([self.joint], Layout([terms])).fit(x, iterations=4)
       if terms not in self.scored or self.scored[terms].fit.cost > fit.cost:
         self._score(terms, fit, neutral=before is None)
+      plain = self.scored.get(tuple(t for t in item.terms if t is not term))
+      if plain is not None and before is None and fit.cost < plain.fit.cost - _SETTLED:
+        again = Fitter([self.joint], Layout([plain.terms])).fit(fit.x, iterations=4)
+        if again.cost < plain.fit.cost:
+          self._score(plain.terms, again)
 
   def ranked(self) -> list[Scored]:
     """Returns all scored hypotheses, the best first."""

@@ -44,6 +44,11 @@ class Identified:
     return [j for j in self.joints if j.verdict in ("partly", "unexplained")]
 
   @property
+  def followed(self) -> list[Changed]:
+    """The joints that were judged by a simulation whose state follows the readings."""
+    return [j for j in self.joints if j.likelihood.follows]
+
+  @property
   def least_explained(self) -> Changed:
     """The joint that is not explained to the end and leaves most, else the first."""
     return max(
