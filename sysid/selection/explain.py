@@ -253,7 +253,8 @@ class Explainer:
       if best.fit.cost > before - _SETTLED:
         break
     if self.joint.follows and best.names & set(UNREPEATED):
-      best = self._score(best.terms, Fitter([self.joint], Layout([best.terms])).draw(best.fit))
+      fitter = Fitter([self.joint], Layout([best.terms]))
+      best = self._score(best.terms, fitter.fit(fitter.draw(best.fit).x, iterations=8))
       self.joint.rescale(best.fit.residuals[0])
     self._rescore()
     return best
