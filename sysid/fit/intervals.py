@@ -29,14 +29,17 @@ _PLAY = {"gap": (0.85, 1.35), "stiffness": (0.4, 2.5), "damping": (0.4, 2.5)}
 """Times a value of play, the least of an interval: gears that give way take a part of the gap, and
 costs are too rough for derivatives to say how sure values are. Ours, on blind sets."""
 _Z = 1.96
-_WIDTH = 0.03  # of finite differences, of a value's scale
+_RESOLVED = 1e-4
+"""Of a curvature scaled to 1 for each value: twins whose derivatives agree to a hundredth have
+less."""
+_WIDTH = 0.004  # of finite differences, of a value's scale
 
 
 def intervals(
   joint: JointLikelihood, fit: Fit, term: Term, *, own_latency: bool
 ) -> dict[str, tuple[float, float]]:
   """Returns 95 % intervals of the values of a term of a fit; see `around`."""
-  spread = SYSTEMATIC * deviations(central(joint, fit), [joint])
+  spread = deviations(central(joint, fit), [joint], systematic=SYSTEMATIC)
   a, b = fit.layout.spans[fit.layout.terms.index(term)]
   return around(
     term,
@@ -58,8 +61,17 @@ def central(joint: JointLikelihood, fit: Fit) -> Fit:
   sides = [fitter.linearise(fit.x, width) for width in (_WIDTH, -_WIDTH)]
   (mean,) = np.mean([side.jacobian for side in sides], axis=0)
   weighted = 2.0 * joint.weights(joint.squares(sides[0].residuals[0])) * mean
-  curvature = np.einsum("icn,jcn->ij", weighted, mean)
+  curvature = _resolved(np.einsum("icn,jcn->ij", weighted, mean))
   return dataclasses.replace(sides[0], jacobian=[mean], curvature=curvature[None])
+
+
+def _resolved(curvature: Array) -> Array:
+  """Returns a curvature [n, n] without the directions that finite differences cannot tell from
+  flat ones."""
+  size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+  values, vectors = np.linalg.eigh(curvature / size / size[:, None])
+  kept = np.where(values > _RESOLVED, values, 0.0)
+  return (vectors * kept) @ vectors.T * size * size[:, None]
 
 
 def around(

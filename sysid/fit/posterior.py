@@ -273,11 +273,16 @@ def _bounded(
   return np.clip(result, layout.low, layout.high)
 
 
-def deviations(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
+def deviations(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float = 1.0) -> Array:
   """Returns the standard deviations [n] of a fit's values, by the gradient's scatter over blocks.
 
   H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
   blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
+
+  Args:
+    fit: at its mode.
+    joints: what was fitted.
+    systematic: factor on the scatter of blocks; priors count with the spread that they state.
   """
   scores = np.zeros((len(joints[0].starts), fit.layout.count))
   for joint, index, residual, jacobian in zip(
@@ -287,4 +292,6 @@ def deviations(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
     scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
   inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
   prior = np.diag(fit.layout.sigma**-2.0)
-  return np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores + prior) @ inverse), 0.0))
+  return np.sqrt(
+    np.maximum(np.diag(inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse), 0.0)
+  )

@@ -126,7 +126,7 @@ def _write_down(result: Identified, item: Changed) -> None:
       effect = term.effect(np.array(list(values.values())))
       result.calibration.append(dataclasses.replace(effect, target=item.joint))
       offset += values.get("zero", 0.0)
-      if term.freed:
+      if term.freed or item.constants_off:
         evidence = _evidence(item, names.get("parameter_error"))
         _list(result, item, "parameter_error", claims.effect(item, term, evidence)[1])
       continue
@@ -158,7 +158,8 @@ def _write_down(result: Identified, item: Changed) -> None:
 
 def _list(result: Identified, item: Changed, kind: str, row: dict[str, Any]) -> None:
   """Adds an entry to what is claimed, or to what is only in the extended model."""
-  stands = kind in item.named and item.verdict in ("effects", "partly")
+  named = kind in item.named or (kind == "parameter_error" and item.constants_off)
+  stands = named and item.verdict in ("effects", "partly")
   (result.effects if stands else result.nearest).append(row)
 
 

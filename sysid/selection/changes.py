@@ -14,7 +14,7 @@ import numpy as np
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fitter, Layout
+from nerf2real.sysid.fit.posterior import CLOCKS, Fitter, Layout
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear, of_size
 from nerf2real.sysid.selection.naming import Explanation, conclude
@@ -40,6 +40,8 @@ class Changed:
   """What the machine leaves anyway in the median block, rad (m)."""
   left: float
   """The same of the logs, under the best hypothesis."""
+  constants_off: bool
+  """Whether declared constants are off by more than machines of one kind differ."""
 
   @property
   def extended(self) -> Scored:
@@ -132,15 +134,32 @@ def _explained(subject: Subject, settings: Settings, *, thorough: bool) -> Chang
   if named and over > settings.more:
     named = _supported(explainer, found, named, settings)
     ranked = explainer.ranked()
+  verdict = _verdict(found, named, leaves(subject, found.best, settings), over, settings)
+  off = _constants_off(subject, found.best, settings)
   return Changed(
     subject,
     ranked,
     found,
     named,
-    _verdict(found, named, leaves(subject, found.best, settings), over, settings),
+    "effects" if off and verdict == "none" else verdict,
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
+    off,
   )
+
+
+def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
+  """Tells whether a declared constant is off by more than its tolerance, all of its interval.
+
+  Beside a reference the constants are those that it shows.
+  """
+  term = best.terms[0]
+  if subject.before is not None or term.freed:
+    return False
+  tolerance = dict(settings.tolerances)
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
+  shares = [n for n in term.names if n not in (*CLOCKS, "zero")]
+  return any(bounds[n][0] > tolerance[n] or bounds[n][1] < -tolerance[n] for n in shares)
 
 
 def _supported(
