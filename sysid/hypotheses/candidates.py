@@ -14,8 +14,9 @@ from nerf2real.sysid.model.plant import JointPlant
 
 _INF = float("inf")
 
-_FEWEST_WAVES = 3.0
-"""1/rad; ours: teeth and magnets repeat twenty times a turn or more."""
+_SEEN = 2.0
+"""Waves within the joint's motion that a torque must have to be known to repeat: chosen, the least
+number."""
 
 _WIND_UP = 0.004
 """rad; ours: about what a gear of metal gives way under the torque that it works at."""
@@ -171,14 +172,15 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
   """Returns the candidate of a torque that repeats with position, from (amplitude, periods, phase).
 
   Its error has a valley every fraction of a wave: the starts come from the residual torque's
-  spectrum over position (`signatures.waves`). Waves as long as a turn are gravity's or a spring's.
+  spectrum over position (`signatures.waves`). Waves that the motion does not show twice are not
+  known to repeat: with a spring they imitate any smooth force.
   """
   torque = typical_torque(plant)
   return Term(
     "cogging",
     plant.joint,
     ("amplitude", "periods", "phase"),
-    (0.0, _FEWEST_WAVES, -10.0),
+    (0.0, min(np.pi * _SEEN / _reach(plant), 299.0), -10.0),
     (0.5 * torque, 300.0, 10.0),
     (0.03 * torque, 0.05, 0.3),
     tuple(waves),
