@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
   from nerf2real.sysid.outputs import evaluate, identify
-  from nerf2real.sysid.selection.identification import Settings
+  from nerf2real.sysid.settings import Settings
 
 __all__ = ["Settings", "evaluate", "identify"]
 
 _HOMES = {
-  "Settings": "nerf2real.sysid.selection.identification",
+  "Settings": "nerf2real.sysid.settings",
   "evaluate": "nerf2real.sysid.outputs",
   "identify": "nerf2real.sysid.outputs",
 }

@@ -16,24 +16,23 @@ import numpy as np
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.core.pages import page
-from nerf2real.core.progress import Progress, no_progress, part
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.suite.effects.files import from_list, to_list
+from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import excitation
+from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.report import page as report
-from nerf2real.sysid.selection import decision, detection
+from nerf2real.sysid.selection.analysis import analyse
+from nerf2real.sysid.selection.changes import Changed
+from nerf2real.sysid.selection.explain import Scored, clear
 from nerf2real.sysid.selection.findings import Identified
-from nerf2real.sysid.selection.identification import (
-  Settings,
-  analyse,
-  load_model,
-  read_logs,
-)
 from nerf2real.sysid.sensors import sensing
+from nerf2real.sysid.settings import SETTINGS, Settings
 
 _ANALYSIS, _SENSORS, _ERRORS = 0.8, 0.85, 0.95  # shares of the work done after each, about
 _LISTED = 6  # alternatives in the report
@@ -46,7 +45,7 @@ def identify(
   held: Sequence[Path] = (),
   reference: Sequence[Path] = (),
   out: Path,
-  settings: Settings | None = None,
+  settings: Settings = SETTINGS,
   progress: Progress = no_progress,
 ) -> dict[str, Any]:
   """Finds the effect that a model lacks and writes down what it found.
@@ -57,9 +56,9 @@ def identify(
     model: declared MuJoCo model.
     train: logs to identify from.
     held: logs on which only errors are reported.
-    reference: logs of the same apparatus without the effect; they calibrate the constants first.
+    reference: logs of the same apparatus without the effect: what differs is looked for.
     out: folder to write.
-    settings: thresholds and effort.
+    settings: tolerances and effort.
     progress: called with the fraction done and a text.
 
   Returns:
@@ -72,7 +71,6 @@ def identify(
     LogError: a log cannot be used, or the held or reference logs lack a joint of the others.
     ValueError: the model cannot be read, or there is no log.
   """
-  settings = settings or Settings()
   if not train:
     raise ValueError("Found no log to identify from, expected at least one --logs file.")
   compiled = load_model(Path(model))
@@ -106,8 +104,8 @@ def _identify(
 ) -> dict[str, Any]:
   """Analyses logs that were read, and writes; see `identify`."""
   began = time.perf_counter()
-  analysing = part(progress, 0.0, _ANALYSIS)
-  found = analyse(compiled, logs, reference=reference, settings=settings, progress=analysing)
+  progress(0.0, "comparing with the reference" if reference else "explaining every joint")
+  found = analyse(compiled, logs, reference, settings=settings)
   progress(_ANALYSIS, "sensors and floor")
   sensed = sensing.find(compiled, logs, reference, tilt=_tilt(found))
   found.objects += sensed.effects
@@ -116,7 +114,7 @@ def _identify(
     found.effects += sensed.rows
     found.verdict = "effects" if found.verdict == "none" else found.verdict
   progress(_SENSORS, "errors on the logs")
-  whole = [*found.calibration, *found.objects, *found.learned]
+  whole = [*found.calibration, *found.objects]
   content: dict[str, Any] = {
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else found.effects,
@@ -126,7 +124,7 @@ def _identify(
     "error": {
       "train": _errors(found, logs, whole, settings),
       "held": _errors(found, held, whole, settings) if held else None,
-      "floor": _floor(held or logs, [s.joint for s in found.screened]),
+      "floor": _floor(held or logs, [j.joint for j in found.joints]),
     },
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
@@ -140,17 +138,7 @@ def _identify(
     claimed = [row for row in found.effects if row not in sensed.rows]
     content["alternatives"] = [*claimed, *content["alternatives"]]
     content["effects"] = list(sensed.rows)
-  content["effects"] = content["effects"] + [
-    {"kind": "residual_force", "joint": e.target, "parameters": {}, "evidence": {}}
-    for e in found.learned
-  ]
-  if found.verdict == "effects" and found.unexplained:
-    joints = ", ".join(item.joint for item in found.unexplained)
-    content["notes"] = [
-      *content["notes"],
-      f"Not explained: {joints}. The effects that are named are those of other joints.",
-    ]
-  if found.verdict == "effects" and found.followed:
+  if found.followed:
     joints = ", ".join(item.joint for item in found.followed)
     content["notes"] = [
       *content["notes"],
@@ -164,7 +152,7 @@ def _identify(
   if found.verdict == "partly":
     joints = ", ".join(item.joint for item in found.unexplained)
     text = (
-      f"More remains than the reference leaves, at {joints}: what is named is certain, not all."
+      f"At {joints} more remains than the machine leaves anyway: the names are certain, not all."
     )
     content["notes"] = [*content["notes"], text]
   content["alternatives"] += sensed.alternatives
@@ -214,9 +202,11 @@ def _details(
       for e in found.calibration
     },
     "tests": {
-      "joint": first.screened.joint,
-      "declared": detection.tests(first.screened.problem, first.ladder.declared.fit),
-      "extended": detection.tests(first.screened.problem, first.finding.chosen.fit),
+      "joint": first.joint,
+      **{
+        name: whitening.tests(first.likelihood, item.fit.residuals[0][0])
+        for name, item in (("declared", first.declared), ("extended", first.extended))
+      },
     },
     "audit": found.audits,
     "sensors": sensed.errors(),
@@ -261,11 +251,10 @@ def _claimed(found: Identified) -> list[Effect]:
   """
   if found.verdict == "none":
     return []
-  joints = {f.screened.joint for f in found.found if f.finding.named}
-  joints |= {e["joint"] for e in found.effects}
+  joints = {e["joint"] for e in (*found.effects, *found.nearest)}
   all_off = any(e["kind"] == "parameter_error" and e["joint"] is None for e in found.effects)
   constants = [c for c in found.calibration if all_off or c.target in joints]
-  return [*constants, *found.objects, *found.learned]
+  return [*constants, *found.objects]
 
 
 def _errors(
@@ -297,49 +286,51 @@ def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:
 
 
 def _holds(found: Identified) -> bool:
-  return all(s.problem.plant.holds for s in found.screened)
+  return all(j.likelihood.plant.holds for j in found.joints)
 
 
 def _alternatives(found: Identified) -> list[dict[str, Any]]:
-  rows = []
-  for item in found.found:
-    for entry in item.finding.alternatives[:_LISTED]:
-      rows.append(
-        {
-          "kinds": sorted(decision.names(entry)),
-          "kind": "+".join(sorted(decision.names(entry))),
-          "joint": item.screened.joint,
-          "confounded": entry in item.finding.confounded,
-          "parameters": {
-            k: {n: round(v, 5) for n, v in entry.fit.values(k).items()}
-            for k in sorted(decision.names(entry))
-          },
-          "evidence": decision.evidence(entry, item.ladder),
-        }
-      )
-  return rows
+  return [
+    {
+      "kinds": sorted(other.names),
+      "kind": "+".join(sorted(other.names)),
+      "joint": item.joint,
+      "confounded": any(other is c for c in item.confounded),
+      "parameters": {
+        k: {n: round(v, 5) for n, v in other.values(k).items()} for k in sorted(other.names)
+      },
+      "evidence": _evidence(item, other),
+    }
+    for item in found.found
+    for other in item.alternatives[:_LISTED]
+  ]
+
+
+def _evidence(item: Changed, other: Scored) -> dict[str, Any]:
+  """Returns how a hypothesis of a joint stands beside the best one, as numbers."""
+  return {
+    "behind_by_standard_errors": round(clear(item.found.best, other), 2),
+    "held_out_gain_nats": round(other.evidence - item.null.evidence, 2),
+    "median_block_left": float(np.sqrt(np.median(other.fit.held[0][0]))),
+  }
 
 
 def residual_at(found: Identified) -> dict[str, Any]:
-  """Returns where the residual of the chosen hypothesis sits: joint, position, velocity, time."""
+  """Returns where the residual of the extended model sits: joint, position, velocity, time."""
   item = found.least_explained
-  problem, fit = item.screened.problem, item.finding.chosen.fit
-  errors = problem.errors(problem.simulate(fit.terms, fit.x)[0])
-  logs = problem.plant.logs
+  logs = item.likelihood.plant.logs
   joined = {
     "position": np.concatenate([log.position for log in logs]),
     "velocity": np.concatenate([log.velocity for log in logs]),
     "time": np.concatenate([log.time - log.time[0] for log in logs]),
   }
-  squares = np.square(np.concatenate([along for along, _ in errors]))
-  result: dict[str, Any] = {
-    "joint": item.screened.joint,
-    "rms": float(np.sqrt(np.mean(squares))) * problem.position_noise,
-  }
+  squares = np.square(item.extended.fit.residuals[0][0])
+  result: dict[str, Any] = {"joint": item.joint, "rms": float(np.sqrt(np.mean(squares)))}
   for name, values in joined.items():
     low, high, share = _concentrated(values, squares)
     result[name] = {"low": low, "high": high, "share_of_square": share}
-  result["log"] = logs[int(np.argmax([np.mean(along**2) for along, _ in errors]))].name
+  ends = np.cumsum([len(log.time) for log in logs])[:-1]
+  result["log"] = logs[int(np.argmax([np.mean(part) for part in np.split(squares, ends)]))].name
   return result
 
 
@@ -356,5 +347,5 @@ def _concentrated(values: np.ndarray, squares: np.ndarray) -> tuple[float, float
 
 def _next(found: Identified) -> dict[str, Any]:
   item = found.least_explained
-  rivals = item.finding.confounded or item.finding.alternatives[:2]
-  return excitation.propose(item.screened.problem, item.finding.chosen, rivals[:3])
+  rivals = item.confounded or item.alternatives[:2]
+  return excitation.propose(item.likelihood, item.extended, rivals[:3])

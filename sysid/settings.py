@@ -1,6 +1,6 @@
 """Constants of the analysis by evidence that adds up (`analysis.py`), all of them chosen.
 
-Most were set on development sets, not calibrated; the older path (`decision.py`) has its own.
+Most were set on development sets, not calibrated.
 """
 
 import dataclasses
@@ -65,8 +65,6 @@ class Settings:
   more: float = 2.0
   """Times what the machine leaves anyway: more than that remains to be explained (as a blind set's
   effect counts as seen from twice the healthy machine's error on)."""
-  most: float = 0.75
-  """Share of a squared residual that names must explain where more remains: half the error."""
   level: float = 0.05
   """Family-wise significance of all names together."""
 

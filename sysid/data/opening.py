@@ -1,6 +1,7 @@
-"""Opens measured logs of any format that is read: MCAP, CSV, BAM's JSON."""
+"""Opens models, and measured logs of any format that is read: MCAP, CSV, BAM's JSON."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -10,6 +11,7 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.robot_logs.series import JointSeries
 from nerf2real.core.robot_logs.streaming import LogError
 from nerf2real.sysid.data.bam import UNNAMED, read_bam
+from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.tables import read_csv
 
 
@@ -52,3 +54,24 @@ def named(log: Log, model: mujoco.MjModel) -> Log:
   return dataclasses.replace(
     log, commands=commands, states=states, pwm=renamed(log.pwm), temperatures=heat
   )
+
+
+def load_model(path: Path) -> mujoco.MjModel:
+  """Reads a MuJoCo model; a file that is missing or wrong is one clear error."""
+  if not Path(path).is_file():
+    raise FileNotFoundError(f"Found no file {path}, expected a MuJoCo model (.xml).")
+  try:
+    return mujoco.MjModel.from_xml_path(str(path))
+  except ValueError as error:
+    first = str(error).strip().splitlines()[0]
+    raise ValueError(f"{path} is not a MuJoCo model: {first}") from error
+
+
+def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:
+  """Reads logs and checks them against the model."""
+  logs = []
+  for path in paths:
+    log = named(read_log(path), model)
+    check_against_model(log, model)
+    logs.append(log)
+  return logs

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.sysid.fit.fitting import Problem
-from nerf2real.sysid.hypotheses.terms import compose
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.measured import quantum
-from nerf2real.sysid.selection.race import Entry
+from nerf2real.sysid.selection.explain import Scored
 
 Array = np.ndarray
 
@@ -40,31 +41,31 @@ def designs(centre: float, reach: float, low: float, high: float) -> dict[str, A
   return {n: np.clip(centre + reach * ramp * s, low, high) for n, s in shapes.items()}
 
 
-def propose(problem: Problem, chosen: Entry, rivals: list[Entry]) -> dict[str, Any]:
+def propose(joint: JointLikelihood, chosen: Scored, rivals: list[Scored]) -> dict[str, Any]:
   """Returns the design that separates the chosen hypothesis from its rivals best.
 
   Args:
-    problem: the joint.
+    joint: its logs.
     chosen: hypothesis in the model.
     rivals: hypotheses that explain the logs nearly as well; empty: nothing to separate.
   """
-  plant = problem.plant
+  plant = joint.plant
   positions = np.concatenate([log.position for log in plant.logs])
   centre, reach = float(np.median(positions)), 0.5 * float(np.ptp(positions))
   if not plant.holds:
     return {
       "joint": plant.joint,
       "design": "a longer log with forces of both signs, several sizes and pauses",
-      "separates": [sorted(_names(r)) for r in rivals],
+      "separates": [sorted(r.names) for r in rivals],
     }
   best: tuple[float, str] = (-1.0, "")
-  noise = max(quantum(positions), problem.position_noise)
+  noise = max(quantum(positions), joint.position_noise)
   table = {}
   for name, command in designs(
     centre, reach, float(positions.min()), float(positions.max())
   ).items():
-    truth = _readings(problem, chosen, command)
-    gaps = [np.sqrt(np.mean((truth - _readings(problem, r, command)) ** 2)) for r in rivals]
+    truth = _readings(joint.plant, chosen, command)
+    gaps = [np.sqrt(np.mean((truth - _readings(joint.plant, r, command)) ** 2)) for r in rivals]
     worst = float(min(gaps)) / noise if gaps else 0.0
     table[name] = round(worst, 2)
     if worst > best[0]:
@@ -76,25 +77,18 @@ def propose(problem: Problem, chosen: Entry, rivals: list[Entry]) -> dict[str, A
     "amplitude_rad": round(reach, 3),
     "separation_in_noise": table[best[1]],
     "all_designs": table,
-    "separates": [sorted(_names(r)) for r in rivals],
+    "separates": [sorted(r.names) for r in rivals],
   }
 
 
-def _names(entry: Entry) -> set[str]:
-  return {t.kind for t in entry.fit.terms if t.kind != "calibration"}
-
-
-def _readings(problem: Problem, entry: Entry, command: Array) -> Array:
+def _readings(plant: JointModel, item: Scored, command: Array) -> Array:
   """Returns simulated readings under a design, surroundings at the joint's mean."""
-  plant = problem.plant
-  p, changed = compose(plant, entry.fit.terms, entry.fit.x)
-  around = (plant.surroundings if changed is None else changed)[0]
+  p, loads, table = compose(plant, item.terms, item.fit.x)
+  around = plant.fields(loads, 0)
+  weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
   samples = np.arange(0.0, _DURATION - 0.02, 1.0 / _SAMPLES)
   count = int(_DURATION / plant.step) + 100
-  fields = [
-    np.full(count, float(np.mean(f)))
-    for f in (around.inertia, around.here, around.across, around.at, 0 * around.bias)
-  ]
+  fields = [np.full(count, mean) for mean in (*around[:4].mean(axis=1), 0.0)]
   out = np.zeros((4, len(samples)))
   kernel.simulate(  # type: ignore[call-arg]
     p,
@@ -109,8 +103,8 @@ def _readings(problem: Problem, entry: Entry, command: Array) -> Array:
     command[:1].copy(),
     np.zeros(1),
     np.full(len(samples), np.nan),
-    np.zeros((0, 0)),
-    np.zeros(4),
+    weights,
+    bounds,
     out[0],
     out[1],
     out[2],

@@ -17,12 +17,12 @@ import numpy as np
 
 from nerf2real.sysid.fit.expectation import Expectation
 from nerf2real.sysid.fit.noise import effort_noise, timing
-from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.composition import Composed, compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured
-from nerf2real.sysid.settings import SETTINGS
+from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
@@ -32,8 +32,17 @@ _NOTHING = np.zeros(0)
 class JointLikelihood:
   """The logs of one joint, cut into blocks; turns hypotheses into residuals and nats."""
 
-  def __init__(self, plant: JointModel, *, settings=SETTINGS):
-    self.plant, self.settings = plant, settings
+  def __init__(self, plant: JointModel, *, settings: Settings = SETTINGS, follows: bool = False):
+    """Cuts the logs into blocks and notes the readings' noise.
+
+    Args:
+      plant: the joint.
+      settings: length of blocks, tolerances of efforts.
+      follows: whether the simulated state is pulled to the readings, so that positions are those
+        predicted from each reading on: a course with play does not repeat, as which way teeth
+        bounce depends on microradians.
+    """
+    self.plant, self.settings, self.follows = plant, settings, follows
     self.position_noise, self.stamp_noise = timing(plant)
     logs = plant.logs
     self.effort: list[Array] | None = None
@@ -84,14 +93,15 @@ class JointLikelihood:
     chosen = range(len(self.plant.logs)) if logs is None else logs
     rows = []
     for x in np.atleast_2d(xs):
-      p, loads = compose(self.plant, terms, x)
-      rows.append([self._pair(p, loads, i) for i in chosen])
+      composed = compose(self.plant, terms, x)
+      rows.append([self._pair(composed, i) for i in chosen])
     return rows
 
-  def _pair(self, p, loads, index) -> tuple[Simulated, Simulated | None]:
-    open_loop = self.plant.run(p, loads, index)
-    along = self.plant.run(p, loads, index, follow=True) if self.effort is not None else None
-    return open_loop, along
+  def _pair(self, c: Composed, index: int) -> tuple[Simulated, Simulated | None]:
+    open_loop = self.plant.run(c.p, c.loads, index, table=c.table, follow=self.follows)
+    if self.effort is None:
+      return open_loop, None
+    return open_loop, self.plant.run(c.p, c.loads, index, table=c.table, follow=True)
 
   def residuals(self, terms: Sequence[Term], xs: Array) -> Array:
     """Returns measured minus simulated [X, C, N]; masked samples are 0."""

@@ -12,19 +12,6 @@ Array = np.ndarray
 _NINE_TENTHS = 0.79  # rms of the inner 90 % of a normal distribution over its own
 
 
-def position_noise(plant: JointPlant) -> float:
-  """Returns the noise of the position readings: scatter about a local cubic, at least the
-  rounding to the sensor's steps."""
-  scatter, steps = [], []
-  for log in plant.logs:
-    third = np.diff(log.position, n=3)
-    large = np.quantile(np.abs(third), 0.9)
-    kept = third[np.abs(third) <= max(large, 1e-300)]
-    scatter.append(float(np.sqrt(np.mean(kept**2))) / np.sqrt(20.0) / _NINE_TENTHS)
-    steps.append(quantum(log.position))
-  return max(float(np.median(scatter)), min(steps) / np.sqrt(12.0), 1e-9)
-
-
 def effort_noise(efforts: Sequence[Array]) -> float:
   """Returns the noise of effort readings: the median of second differences, at least a step."""
   steps = [quantum(e) for e in efforts]

@@ -31,6 +31,8 @@ _DAMPINGS = (
 """Damping and share of the steps that are tried, and whether latencies move: held commands make
 stairs of them, whose derivatives mislead."""
 _WIDTH, _FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
+_GENERATIONS, _DRAWN, _ELITE = 12, 40, 8  # of values that are drawn where costs are rough, chosen
+_SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least, chosen
 _CONVERGED = 0.05  # nats that a step gains at which a fit ends
 
 
@@ -131,7 +133,7 @@ class Fitter:
     curvature, gradient = np.zeros((len(self.folds), n, n)), np.zeros((len(self.folds), n))
     cost, residuals, jacobians = float(self.prior(x[None])[0]), [], []
     steps = width * layout.scale
-    steps = np.where(x + steps > layout.high, -steps, steps)
+    steps = np.where((x + steps > layout.high) | (x + steps < layout.low), -steps, steps)
     for at, (joint, terms, index) in enumerate(
       zip(self.joints, layout.of_joint, layout.index, strict=True)
     ):
@@ -150,8 +152,8 @@ class Fitter:
       sample_fold = joint.fold[joint.block_of]
       for f, fold in enumerate(self.folds):
         chosen = sample_fold == fold
-        j = jacobian[:, :, chosen].reshape(len(index), -1)
         w, r = weight[:, chosen].ravel(), rows[0][:, chosen].ravel()
+        j = jacobian[:, :, chosen].reshape(len(index), len(r))
         wj = j * w
         curvature[f][np.ix_(index, index)] += 2.0 * wj @ j.T
         gradient[f][index] += 2.0 * wj @ r
@@ -186,6 +188,21 @@ class Fitter:
       else:
         break
     return best
+
+  def draw(self, fit: Fit) -> Fit:
+    """Returns a better fit where costs are too rough for derivatives: values are drawn about the
+    best so far (cross-entropy method, Rubinstein 1999)."""
+    random, layout = np.random.default_rng(0), self.layout
+    mean, spread = fit.x.copy(), _SHAKEN * layout.scale
+    best, least = fit.x, fit.cost
+    for _ in range(_GENERATIONS):
+      tried = random.normal(mean, spread, (_DRAWN, len(mean)))
+      tried = np.clip(np.vstack([best, tried]), layout.low, layout.high)
+      costs = self.costs(tried)
+      elite = tried[np.argsort(costs)[:_ELITE]]
+      best, least = elite[0], float(costs.min())
+      mean, spread = elite.mean(axis=0), np.maximum(elite.std(axis=0), _LEAST_SHAKEN * layout.scale)
+    return self.linearise(best, _FINE) if least < fit.cost else fit
 
   def _step(self, fit: Fit, damping: float, share: float, clocks: bool) -> Array:
     layout = self.layout
@@ -256,11 +273,16 @@ def _bounded(
   return np.clip(result, layout.low, layout.high)
 
 
-def deviations(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
+def deviations(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float = 1.0) -> Array:
   """Returns the standard deviations [n] of a fit's values, by the gradient's scatter over blocks.
 
   H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
   blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
+
+  Args:
+    fit: at its mode.
+    joints: what was fitted.
+    systematic: factor on the scatter of blocks; priors count with the spread that they state.
   """
   scores = np.zeros((len(joints[0].starts), fit.layout.count))
   for joint, index, residual, jacobian in zip(
@@ -270,4 +292,6 @@ def deviations(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
     scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
   inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
   prior = np.diag(fit.layout.sigma**-2.0)
-  return np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores + prior) @ inverse), 0.0))
+  return np.sqrt(
+    np.maximum(np.diag(inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse), 0.0)
+  )

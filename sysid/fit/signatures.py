@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.sysid.fit.fitting import Fit, Problem
-from nerf2real.sysid.hypotheses.terms import compose
-from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.hypotheses.composition import Composed, compose
+from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.kernel import INDEX, table_force
 
 Array = np.ndarray
 
@@ -32,16 +32,14 @@ class TorqueResidual(NamedTuple):
   residual: Array
 
 
-def torque_residual(problem: Problem, fit: Fit, index: int) -> TorqueResidual:
-  """Returns the residual torque of a log under a fitted hypothesis [N - 2 edges]."""
-  plant = problem.plant
-  p, changed = compose(plant, fit.terms, fit.x)
+def torque_residual(plant: JointModel, hypothesis: Composed, index: int) -> TorqueResidual:
+  """Returns the residual torque of a log under a hypothesis [N - 2 edges]."""
   log = plant.logs[index]
-  around = (plant.surroundings if changed is None else changed)[index]
-  value = dict(zip(INDEX, p, strict=True))
+  inertia, here, across, at, bias = plant.at_samples(hypothesis.loads, index)
+  value = dict(zip(INDEX, hypothesis.p, strict=True))
   delay = value["command_delay"] + value["measurement_delay"]
-  at = np.searchsorted(log.command_time, log.time - delay, side="right") - 1
-  command = log.command[np.clip(at, 0, len(log.command) - 1)]
+  last = np.searchsorted(log.command_time, log.time - delay, side="right") - 1
+  command = log.command[np.clip(last, 0, len(log.command) - 1)]
   torque = value["gain"] * (
     value["input"] * command
     + value["constant"]
@@ -50,26 +48,26 @@ def torque_residual(problem: Problem, fit: Fit, index: int) -> TorqueResidual:
   )
   torque = np.clip(torque, value["lowest"], value["highest"])
   q = log.position - value["encoder_offset"]
-  if plant.hinge:
-    gravity = around.here * np.cos(q - around.at) + around.across * np.sin(q - around.at)
-  else:
-    gravity = around.here
-  demand = (around.inertia + value["armature"]) * log.acceleration
-  demand = demand + value["damping"] * log.velocity + gravity + around.bias
+  gravity = here * np.cos(q - at) + across * np.sin(q - at) if plant.hinge else here
+  demand = (inertia + value["armature"]) * log.acceleration
+  demand = demand + value["damping"] * log.velocity + gravity + bias
   demand = demand + value["stiffness"] * (q - value["reference"]) - value["offset_force"]
+  if hypothesis.table is not None:
+    demand = demand - table_force(q, log.velocity, *hypothesis.table)
   inner = slice(EDGES, -EDGES)
   fields = (log.time, log.position, log.velocity, torque, torque - demand)
   return TorqueResidual(*(f[inner] for f in fields))
 
 
-def waves(problem: Problem, fit: Fit, *, count: int = 3) -> list[tuple[float, float, float]]:
-  """Returns the strongest periodic parts of the residual torque over position.
+def waves(plant: JointModel, *, count: int = 3) -> list[tuple[float, float, float]]:
+  """Returns the strongest periodic parts of the declared model's residual torque over position.
 
   Returns:
     (amplitude [N m], periods [1/rad], phase) of torque amplitude * sin(periods q + phase) that the
     model lacks, the strongest first.
   """
-  parts = [torque_residual(problem, fit, i) for i in range(len(problem.plant.logs))]
+  declared = compose(plant, (), np.zeros(0))
+  parts = [torque_residual(plant, declared, i) for i in range(len(plant.logs))]
   q = np.concatenate([p.position for p in parts])
   v = np.concatenate([p.velocity for p in parts])
   r = np.concatenate([p.residual for p in parts])

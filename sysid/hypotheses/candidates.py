@@ -1,4 +1,4 @@
-"""The candidates of a race: every kind of effect that one joint's logs can show.
+"""The library: every kind of effect that one joint's logs can show.
 
 Bounds are wide of the kinds' plausible ranges (`suite.effects`), so that a fit that ends on one is
 a sign of a wrong kind. Starts are several where the error has several valleys.
@@ -12,16 +12,11 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.plant import JointPlant
 
-_SKEW = 0.003
-"""s; ours: reading a bus of servos takes up to this, so stamps are off by it."""
-
-LATENCY = 0.004
-"""s; ours: a firmware cycle and a bus cycle take up to this, which is no effect."""
-
 _INF = float("inf")
 
-_FEWEST_WAVES = 3.0
-"""1/rad; ours: teeth and magnets repeat twenty times a turn or more."""
+_SEEN = 2.0
+"""Waves within the joint's motion that a torque must have to be known to repeat: chosen, the least
+number."""
 
 _WIND_UP = 0.004
 """rad; ours: about what a gear of metal gives way under the torque that it works at."""
@@ -29,55 +24,13 @@ _WIND_UP = 0.004
 _BOUNCY = 0.15
 """Damping ratio of teeth that meet; ours: they bounce."""
 
-_GAIN_SPREAD = 0.3
-"""Of the other constants' spread; ours: a servo's law is set by registers and a data sheet, while
-its friction and inertia are estimates."""
-
-
-def calibration(plant: JointPlant, *, prior: float = 0.06) -> Term:
-  """Returns the null model: declared constants off by factors, and small latencies.
-
-  Relative errors are fitted: within about 10-15 % constants are mis-declared, beyond
-  that something is missing.
-  """
-  p = plant.declared
-  inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
-  names: list[str] = []
-  bound: list[float] = []
-  sigma: list[float] = []
-  for name, present, limit, spread in (
-    ("damping", p[INDEX["damping"]] > 0, 0.2, prior),
-    ("armature", p[INDEX["armature"]] > 0.2 * inertia, 0.2, prior),
-    ("mass", p[INDEX["armature"]] <= 0.2 * inertia, 0.2, prior),
-    ("friction", p[INDEX["friction"]] > 0, 0.4, 2.5 * prior),
-    ("gain", True, 0.15, _GAIN_SPREAD * prior),
-  ):
-    if present:
-      names.append(name)
-      bound.append(limit)
-      sigma.append(spread)
-  names += ["skew", "latency"]
-  bound += [_SKEW, LATENCY]
-  sigma += [0.4 * _SKEW, 0.5 * LATENCY]
-  clocks = ("skew", "latency")
-  return Term(
-    "calibration",
-    plant.joint,
-    tuple(names),
-    tuple(0.0 if n == "latency" else -b for n, b in zip(names, bound, strict=True)),
-    tuple(bound),
-    tuple(1e-3 if n in clocks else 0.1 for n in names),
-    (tuple(0.0 for _ in names),),
-    tuple(sigma),
-  )
-
 
 def library(plant: JointPlant) -> list[Term]:
   """Returns the candidates for a joint."""
   joint = plant.joint
   top = plant.declared[INDEX["highest"]]
   reach = _reach(plant)
-  torque = _typical_torque(plant)
+  torque = typical_torque(plant)
   speed = _typical_speed(plant)
   terms = [
     _one("command_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)),
@@ -219,14 +172,15 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
   """Returns the candidate of a torque that repeats with position, from (amplitude, periods, phase).
 
   Its error has a valley every fraction of a wave: the starts come from the residual torque's
-  spectrum over position (`signatures.waves`). Waves as long as a turn are gravity's or a spring's.
+  spectrum over position (`signatures.waves`). Waves that the motion does not show twice are not
+  known to repeat: with a spring they imitate any smooth force.
   """
-  torque = _typical_torque(plant)
+  torque = typical_torque(plant)
   return Term(
     "cogging",
     plant.joint,
     ("amplitude", "periods", "phase"),
-    (0.0, _FEWEST_WAVES, -10.0),
+    (0.0, min(np.pi * _SEEN / _reach(plant), 299.0), -10.0),
     (0.5 * torque, 300.0, 10.0),
     (0.03 * torque, 0.05, 0.3),
     tuple(waves),
@@ -239,7 +193,7 @@ def _play(plant: JointPlant, *, encoder_on_motor: bool) -> Term:
   They are fitted beside the gap, which a soft gear widens.
   """
   reach = _reach(plant)
-  stiffness = _typical_torque(plant) / _WIND_UP
+  stiffness = typical_torque(plant) / _WIND_UP
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
   armature = plant.declared[INDEX["armature"]]
   smaller = 1.0 / (1.0 / armature + 1.0 / inertia) if armature > 0 else 0.05 * inertia
@@ -309,11 +263,9 @@ def _typical_speed(plant: JointPlant) -> float:
   return max(float(np.quantile(speeds, 0.98)), 1e-6)
 
 
-def _typical_torque(plant: JointPlant) -> float:
-  torques = np.abs(np.concatenate([o[2] for o in plant.simulate(plant.declared)[0]]))
-  return max(float(np.quantile(torques, 0.95)), 1e-6)
+def typical_torque(plant: JointPlant) -> float:
+  return max(float(np.quantile(plant.declared_torque(), 0.95)), 1e-6)
 
 
 def _strongest(plant: JointPlant) -> float:
-  torques = np.abs(np.concatenate([o[2] for o in plant.simulate(plant.declared)[0]]))
-  return max(float(torques.max()), 1e-6)
+  return max(float(plant.declared_torque().max()), 1e-6)

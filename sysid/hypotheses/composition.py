@@ -1,18 +1,31 @@
 """From the terms of a hypothesis to the kernel's parameters and loads of one joint."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.model.joint import JointModel, Load
+from nerf2real.sysid.hypotheses import free_force
+from nerf2real.sysid.hypotheses.terms import FREE, Term
+from nerf2real.sysid.model.joint import JointModel, Load, Table
 
 Array = np.ndarray
 
 
-def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> tuple[Array, list[Load]]:
-  """Returns kernel parameters [P] and loads of terms with values x [n]."""
-  p, loads, at = plant.declared.copy(), [], 0
+class Composed(NamedTuple):
+  """A hypothesis with its values, as the kernel takes it."""
+
+  p: Array
+  """Kernel parameters [P]."""
+  loads: list[Load]
+  """What changes of masses and gravity."""
+  table: Table | None
+  """A free force."""
+
+
+def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
+  """Returns terms with values x [n] composed."""
+  p, loads, at, table = plant.declared.copy(), [], 0, None
   for term in terms:
     part = x[at : at + len(term.names)]
     at += len(term.names)
@@ -26,4 +39,6 @@ def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> tuple[Array, 
       loads.append(plant.tilt_load(values["x"], values["y"]))
     elif term.kind == "calibration" and "mass" in values:
       loads.append(Load("mass", np.array([values["mass"]])))
-  return p, loads
+    elif term.kind == FREE:
+      table = free_force.table(term, part)
+  return Composed(p, loads, table)

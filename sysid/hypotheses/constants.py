@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import STICKING, Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -34,3 +34,8 @@ def constants(plant: JointModel, settings: Settings = SETTINGS) -> Term:
   zeros = (0.0,) * len(names)
   scale = tuple(0.005 if n in ("skew", "latency") else t for n, t in zip(names, sigma, strict=True))
   return Term(NAME, plant.joint, names, low, limit, scale, (zeros,), sigma, zeros)
+
+
+def sticking(plant: JointModel) -> Term:
+  """Returns a dry friction that holds at rest, of which nothing is fitted."""
+  return Term(STICKING, plant.joint, (), (), (), (), ((),), known=True)

@@ -6,17 +6,24 @@ and of the joint's surroundings; the names are those of `suite.effects`, so that
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.plant import JointPlant
-from nerf2real.sysid.model.reduction import Surroundings
 
 Array = np.ndarray
 I = kernel.INDEX  # noqa: E741
+
+
+FREE = "residual_force"
+"""The kind that is a force of any form: it explains without a name."""
+
+STICKING = "sticking"
+"""The kind of a baseline whose dry friction holds a joint at rest, as that of `suite.effects` does;
+MuJoCo's own lets it creep."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,26 +51,16 @@ class Term:
 
   @property
   def name(self) -> str | None:
-    """What is claimed with this term: a kind of effect; None for constants and known effects."""
+    """What is claimed with this term: a kind of effect; None for constants, known effects and a
+    force of any form."""
     if self.kind == "calibration":
       return "parameter_error" if self.freed else None
-    return None if self.known else self.kind
+    return None if self.known or self.kind in (FREE, STICKING) else self.kind
 
   def apply(self, plant: JointPlant, p: Array, x: Array) -> None:
     """Changes the kernel's parameters [P] in place."""
     values = dict(zip(self.names, x, strict=True)) | dict(self.fixed)
     _APPLY.get(self.kind, _nothing)(plant, p, values)
-
-  def surroundings(self, plant: JointPlant, x: Array) -> list[Surroundings] | None:
-    """Returns what is added to the surroundings, one a log; None for nothing."""
-    value = dict(zip(self.names, map(float, x), strict=True)) | dict(self.fixed)
-    if self.kind == "payload":
-      return plant.payload(str(self.target), *(value[n] for n in ("mass", "x", "y", "z")))
-    if self.kind == "gravity_tilt":
-      return plant.tilt(value["x"], value["y"])
-    if self.kind == "calibration" and "mass" in value:
-      return plant.scaled(value["mass"])
-    return None
 
   def held_at(self, x: Array) -> "Term":
     """Returns a term with these values, of which none is fitted."""
@@ -221,7 +218,12 @@ def _late(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["measurement_delay"]] += v["delay"]
 
 
+def _sticking(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
+  _stick(plant, p)
+
+
 _APPLY = {
+  STICKING: _sticking,
   "calibration": _calibration,
   "command_delay": _adder(("delay", "command_delay")),
   "measurement_delay": _late,
@@ -241,21 +243,3 @@ _APPLY = {
   "spring": _spring,
   "cogging": _setter(("amplitude", "amplitude"), ("periods", "periods"), ("phase", "phase")),
 }
-
-
-def compose(
-  plant: JointPlant, terms: Sequence[Term], x: Array
-) -> tuple[Array, list[Surroundings] | None]:
-  """Returns kernel parameters [P] and surroundings (None: declared) of terms with values [n]."""
-  p = plant.declared.copy()
-  changed: list[Surroundings] | None = None
-  at = 0
-  for term in terms:
-    part = x[at : at + len(term.names)]
-    at += len(term.names)
-    term.apply(plant, p, part)
-    added = term.surroundings(plant, part)
-    if added is not None:
-      base = plant.surroundings if changed is None else changed
-      changed = [b.plus(a, 1.0) for b, a in zip(base, added, strict=True)]
-  return p, changed

@@ -32,6 +32,10 @@ class Load(NamedTuple):
   factors: Array
 
 
+Table = tuple[Array, Array]
+"""Weights [Q, V] of a force over position and velocity, and its bounds [4]."""
+
+
 class Simulated(NamedTuple):
   """A log as simulated, at its samples [N]."""
 
@@ -87,23 +91,41 @@ class JointModel(JointPlant):
     before = self.model.opt.gravity
     return Load("gravity", matrix_from_rotvec([x, y, 0.0]) @ before - before)
 
-  def run(self, p: Array, loads: Sequence[Load], index: int, *, follow: bool = False) -> Simulated:
+  def fields(self, loads: Sequence[Load], index: int) -> Array:
+    """Returns a log's inertia, gravity here and across, its position, and bias [5, T]."""
+    fields = self._fields[index]
+    if loads:
+      fields = fields.copy()
+      for load in loads:
+        fields[[0, 1, 2, 4]] += np.tensordot(load.factors, self.basis(load.key)[index], 1)
+    return fields
+
+  def at_samples(self, loads: Sequence[Load], index: int) -> Array:
+    """Returns the same fields at the samples [5, N]."""
+    grid, time = self._grids[index], self.logs[index].time
+    return np.array([np.interp(time, grid, field) for field in self.fields(loads, index)])
+
+  def run(
+    self,
+    p: Array,
+    loads: Sequence[Load],
+    index: int,
+    *,
+    table: Table | None = None,
+    follow: bool = False,
+  ) -> Simulated:
     """Simulates one log.
 
     Args:
       p: kernel parameters [P].
       loads: what changes of masses and gravity.
       index: of the log.
+      table: a force over position and velocity.
       follow: whether the state is pulled to the readings.
     """
-    fields = self._fields[index]
-    if loads:
-      fields = fields.copy()
-      for load in loads:
-        change = np.tensordot(load.factors, self.basis(load.key)[index], 1)
-        fields[[0, 1, 2, 4]] += change
+    fields = self.fields(loads, index)
     if follow:
       p = p.copy()
       p[I["follow"]], p[I["follow_speed"]] = self._follow
-    out = self._run(p, index, tuple(fields), None)
+    out = self._run(p, index, tuple(fields), table)
     return Simulated(out.position, out.torque, out.jump)

@@ -74,24 +74,38 @@ _CACHE = discard_stale(Path(__file__).parent, ("kernel",), (Path(gear_train.__fi
 
 
 @numba.njit(cache=_CACHE, nogil=True, fastmath=False)
-def _table_force(q: float, v: float, weights: Array, bounds: Array) -> float:
+def force_at(q: float, v: float, weights: Array, bounds: Array) -> float:
   """Returns the force of `suite.effects.residual`; bounds: position low, high, velocity."""
   nq, nv = weights.shape
   pq = (q - bounds[0]) * (nq - 1) / (bounds[1] - bounds[0])
   pv = (v - bounds[2]) * (nv - 1) / (bounds[3] - bounds[2])
   pq = min(max(pq, 0.0), nq - 1.0)
   pv = min(max(pv, 0.0), nv - 1.0)
-  total = 0.0
-  norm_v = 0.0
-  norm_q = 0.0
-  for j in range(nv):
-    norm_v += math.exp(-0.5 * (pv - j) ** 2)
-  for i in range(nq):
-    along_q = math.exp(-0.5 * (pq - i) ** 2)
-    norm_q += along_q
-    for j in range(nv):
-      total += along_q * math.exp(-0.5 * (pv - j) ** 2) * weights[i, j]
-  return total / (norm_q * norm_v)
+  # Bumps of neighbours follow from each other: exp(-(p - j - 1)^2 / 2) is that of j times
+  # exp(p - j - 1/2); those beyond six spacings are nothing.
+  first_q, last_q = max(int(pq) - 6, 0), min(int(pq) + 7, nq - 1)
+  first_v, last_v = max(int(pv) - 6, 0), min(int(pv) + 7, nv - 1)
+  begin_v, begin_ratio = math.exp(-0.5 * (pv - first_v) ** 2), math.exp(pv - first_v - 0.5)
+  along_q, ratio_q = math.exp(-0.5 * (pq - first_q) ** 2), math.exp(pq - first_q - 0.5)
+  shrink = math.exp(-1.0)
+  total, norm = 0.0, 0.0
+  for i in range(first_q, last_q + 1):
+    row, row_norm, along_v, ratio_v = 0.0, 0.0, begin_v, begin_ratio
+    for j in range(first_v, last_v + 1):
+      row += along_v * weights[i, j]
+      row_norm += along_v
+      along_v *= ratio_v
+      ratio_v *= shrink
+    total += along_q * row
+    norm += along_q * row_norm
+    along_q *= ratio_q
+    ratio_q *= shrink
+  return total / norm
+
+
+def table_force(q: Array, v: Array, weights: Array, bounds: Array) -> Array:
+  """Returns the force [N] of a table at positions and velocities [N]."""
+  return np.array([force_at(a, b, weights, bounds) for a, b in zip(q, v, strict=True)])
 
 
 @numba.njit(cache=_CACHE, nogil=True, fastmath=False)
@@ -264,7 +278,7 @@ def simulate(
       if amplitude != 0.0:
         passive += amplitude * math.sin(periods * q + phase)
       if learned:
-        passive += _table_force(q, v, weights, bounds)
+        passive += force_at(q, v, weights, bounds)
       limit = friction
       if breakaway > 0.0:
         ratio = v / stribeck

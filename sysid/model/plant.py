@@ -3,18 +3,14 @@
 Shapes: N samples of a log, B parameter sets, P parameters (`kernel.NAMES`).
 """
 
-import copy
 import dataclasses
-import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.measured import Measured, measured
 from nerf2real.sysid.model.reduction import Reduction, Surroundings, start_velocity
@@ -23,10 +19,6 @@ Array = np.ndarray
 
 LONGEST_STEP = 2e-3
 """s; ours: a model with a longer step than this is simulated in parts of it."""
-
-
-FOLLOWED_S = 0.02
-"""s; ours: time in which a state that follows the readings makes up for a difference."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,9 +149,6 @@ class JointPlant:
     ]
     self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
     self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
-    self._moments: dict[str, list[list[Surroundings]]] = {}
-    self._gravity: list[list[Surroundings]] | None = None
-    self._pool = ThreadPoolExecutor(max_workers=len(os.sched_getaffinity(0)))
 
   def _windows(self, log: Measured, window_s: float, first_velocity: float) -> Windows:
     if self.holds:
@@ -173,92 +162,15 @@ class JointPlant:
     fields = (s.inertia, s.here, s.across, s.at, s.bias)
     return tuple(np.interp(grid, time, field) for field in fields)
 
-  def grids(self, surroundings: Sequence[Surroundings] | None) -> list[tuple[Array, ...]]:
-    """Returns surroundings on the step grid, the declared ones for None."""
-    if surroundings is None:
-      return self._nominal
-    return [self._on_grid(i, s) for i, s in enumerate(surroundings)]
-
-  def payload(self, body: str, mass: float, x: float, y: float, z: float) -> list[Surroundings]:
-    """Returns what a point mass on a body adds, one a log.
-
-    Everything is linear in the mass, its first and its second moments: ten passes with a unit mass
-    at ten places give the coefficients.
-    """
-    if body not in self._moments:
-      index = self._body(body)
-      self._moments[body] = [r.moments(self.joint, index) for r in self.reductions]
-    factors = mass * np.array([1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z])
-    return [_combine(parts, factors) for parts in self._moments[body]]
-
   def _body(self, name: str) -> int:
     """Returns a body by its name, or by that of its joint."""
     index = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
     return index if index >= 0 else int(self.model.jnt_bodyid[self.model.joint(name).id])
 
-  def tilt(self, x: float, y: float) -> list[Surroundings]:
-    """Returns what turning gravity by the rotation vector (x, y, 0) adds, one a log."""
-    if self._gravity is None:
-      self._gravity = [r.gravity(self.joint) for r in self.reductions]
-    before = self.model.opt.gravity
-    after = matrix_from_rotvec([x, y, 0.0]) @ before
-    return [_combine(parts, after - before) for parts in self._gravity]
-
-  def following(self) -> "JointPlant":
-    """Returns the same joint with its simulated state pulled towards the readings.
-
-    Which way teeth bounce depends on microradians: the course of a joint with play does not repeat,
-    and a right model strays from it as a wrong one does. A state that follows the readings shows
-    what a model predicts from each on, by an alpha-beta filter (Benedict and Bordner 1962).
-    """
-    period = float(np.median(np.concatenate([np.diff(log.time) for log in self.logs])))
-    share = 1.0 - float(np.exp(-period / FOLLOWED_S))
-    clone = copy.copy(self)
-    speed = share**2 / (2.0 - share) / period
-    clone.declared = with_values(self.declared, {"follow": share, "follow_speed": speed})
-    return clone
-
-  @property
-  def follows(self) -> bool:
-    """Whether the simulated state is pulled towards the readings."""
-    return bool(self.declared[kernel.INDEX["follow"]] > 0)
-
-  def scaled(self, factor: float) -> list[Surroundings]:
-    """Returns `factor` times the surroundings: all masses changed by that share."""
-    return [_combine([s], np.array([factor])) for s in self.surroundings]
-
-  def simulate(
-    self,
-    parameters: Array,
-    *,
-    surroundings: Sequence[Sequence[Surroundings] | None] | None = None,
-    table: tuple[Array, Array] | None = None,
-    logs: Sequence[int] | None = None,
-  ) -> list[list[Output]]:
-    """Simulates parameter sets along logs.
-
-    Args:
-      parameters: [B, P].
-      surroundings: for each set what replaces the declared surroundings (one a log), or None.
-      table: weights [Q, V] and bounds [4] of a learned force.
-      logs: indices of the logs, all for None.
-
-    Returns:
-      [B][logs] of outputs.
-    """
-    chosen = range(len(self.logs)) if logs is None else logs
-    parameters = np.atleast_2d(parameters)
-    grids = [self._nominal] * len(parameters)
-    if surroundings is not None:
-      grids = [self.grids(s) for s in surroundings]
-    jobs = [
-      self._pool.submit(self._run, p, index, grid[index], table)
-      for p, grid in zip(parameters, grids, strict=True)
-      for index in chosen
-    ]
-    results = [job.result() for job in jobs]
-    count = len(chosen)
-    return [results[i * count : (i + 1) * count] for i in range(len(parameters))]
+  def declared_torque(self) -> Array:
+    """Returns the size of the declared actuator's torque over all logs [N]."""
+    outputs = [self._run(self.declared, i, self._nominal[i], None) for i in range(len(self.logs))]
+    return np.abs(np.concatenate([o.torque for o in outputs]))
 
   def _run(
     self, p: Array, index: int, grid: tuple[Array, ...], table: tuple[Array, Array] | None
@@ -287,23 +199,6 @@ class JointPlant:
       out[3],
     )
     return Output(out[0], out[1], out[2], out[3])
-
-
-def _combine(parts: Sequence[Surroundings], factors: Array) -> Surroundings:
-  """Returns the linear combination of surroundings, at the position of the first."""
-  zero = np.zeros_like(parts[0].at)
-  total = Surroundings(zero, zero, zero, parts[0].at, zero)
-  for part, factor in zip(parts, factors, strict=True):
-    total = total.plus(part, float(factor))
-  return total
-
-
-def with_values(parameters: Array, values: Mapping[str, float]) -> Array:
-  """Returns a copy of the parameters [P] with some set by name."""
-  result = parameters.copy()
-  for name, value in values.items():
-    result[kernel.INDEX[name]] = value
-  return result
 
 
 def _other_load(log: Log, joint: str, time: Array) -> Array:

@@ -9,27 +9,28 @@ that is missing. Shapes: N samples.
 import numpy as np
 
 from nerf2real.sysid.fit import signatures
-from nerf2real.sysid.fit.fitting import Fit, Problem
 from nerf2real.sysid.fit.signatures import TorqueResidual
-from nerf2real.sysid.hypotheses.terms import compose
+from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.selection.explain import Scored
 
 Array = np.ndarray
 
 _AT_REST = 0.02  # of the usual highest speed, below which a joint may stick; ours
 
 
-def missing_torque(problem: Problem, fit: Fit, index: int) -> tuple[TorqueResidual, Array]:
+def missing_torque(plant: JointModel, item: Scored, index: int) -> tuple[TorqueResidual, Array]:
   """Returns a log's regressors and the missing torque [N] at the same samples.
 
   Args:
-    problem: the joint.
-    fit: a hypothesis.
+    plant: the joint.
+    item: a hypothesis.
     index: of the log.
   """
-  r = signatures.torque_residual(problem, fit, index)
-  p, _ = compose(problem.plant, fit.terms, fit.x)
-  value = dict(zip(INDEX, p, strict=True))
+  hypothesis = compose(plant, item.terms, item.fit.x)
+  r = signatures.torque_residual(plant, hypothesis, index)
+  value = dict(zip(INDEX, hypothesis.p, strict=True))
   needed = -r.residual + value["drag"] * np.abs(r.velocity) * r.velocity
   needed -= value["amplitude"] * np.sin(value["periods"] * r.position + value["phase"])
   limit = _friction(value, r, needed)

@@ -27,22 +27,18 @@ FIGURES = (
     "an interval that is narrow beside the value and holds no zero",
   ),
   Figure(
-    "score",
-    None,
-    "nats",
-    "logarithm of the error in units of the noise, averaged over the logs",
-    "lower; 0 is the noise itself",
-  ),
-  Figure(
     "gain",
     None,
     "nats",
-    "how much lower the score is; of one joint beside reference logs: how much more likely the "
-    "left-out blocks are",
-    "higher; a name needs a gain, and a margin over the runner-up",
+    "how much more likely left-out blocks are than with the constants alone",
+    "higher; a name needs all that lack it to be clearly behind",
   ),
-  Figure("runner-up behind", None, "nats", "margin of the chosen over the next", "higher"),
-  Figure("left", None, "nats", "score of the calibrated model above the noise", "near 0"),
+  Figure(
+    "behind", None, "standard errors", "difference of gains over its standard error", "above 3"
+  ),
+  Figure(
+    "left", None, "mrad or mm", "of positions, in the median left-out block", "near the noise"
+  ),
   Figure(
     "constants off by", None, "%", "fitted over declared value of a nominal constant", "near 0"
   ),

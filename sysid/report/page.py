@@ -11,10 +11,12 @@ from nerf2real.core.pages.charts import Bars, Interval
 from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
+from nerf2real.sysid.fit.posterior import CONSTANTS
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import meanings, residual_plots
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
-from nerf2real.sysid.selection import decision, race
+from nerf2real.sysid.selection.changes import Changed
+from nerf2real.sysid.selection.explain import clear
 from nerf2real.sysid.selection.findings import Identified
 
 Array = np.ndarray
@@ -25,11 +27,12 @@ _LADDER = 12  # hypotheses a joint
 _VERDICTS = {
   "none": "The declared model explains the logs as well as any candidate: nothing is named.",
   "effects": "These effects explain what the declared model leaves.",
-  "partly": "These effects are certain and explain most of what the declared model leaves; more"
-  " remains than reference logs leave, and no name for it is clear. What remains is said below.",
+  "partly": "These effects are certain, and each explains more than it leaves; more"
+  " remains than the machine leaves anyway, and no name for it is clear. What remains is said"
+  " below.",
   "unexplained": "There is something that no candidate explains well enough to be named. Where it"
-  " sits is said below; a learned force lowers the error meanwhile where that is possible, and the"
-  " ladder shows the candidates that came nearest.",
+  " sits is said below; a force of any form over position and velocity lowers the error meanwhile"
+  " where that is possible, and the evidence shows the candidates that came nearest.",
 }
 
 
@@ -51,7 +54,7 @@ def page(
     effects: calibration and effects of the extended model.
     window_s: window of restarts.
   """
-  items = [f for f in found.found if f.finding.named] or found.found[:1]
+  items = found.found
   sections = [
     _verdict(content),
     _errors(found, content),
@@ -115,10 +118,6 @@ def _verdict(content: dict[str, Any]) -> Section:
   return Section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], blocks)
 
 
-_FOLLOWED = (
-  "The simulated state follows the readings here: courses with play do not repeat. Errors are of"
-  " what a model predicts from each reading on, so all hypotheses are nearer to the noise."
-)
 _HEADER = ["effect", "where", "parameter", "value", "95 % interval", "unit", "gain [nats]"]
 
 
@@ -129,7 +128,7 @@ def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
   for effect in effects:
     where = _place(effect)
     evidence = effect["evidence"]
-    gain = evidence.get("gain_over_constants_nats", evidence.get("gain_nats", ""))
+    gain = evidence.get("held_out_gain_nats", evidence.get("gain_nats", ""))
     for name, value in effect["parameters"].items():
       choice = value["low"] is None and not kind_of(effect["kind"]).parameter(name).fitted
       if choice or isinstance(value["value"], list):
@@ -167,21 +166,18 @@ def _errors(found: Identified, content: dict[str, Any]) -> Section:
   if worse:
     text += f" On {' and '.join(worse)} the extended model is worse: do not use it."
   blocks: list[Block] = [Table(["logs", "declared", "extended", "lower by"], rows)]
-  if len(found.screened) > 1:
+  if len(found.joints) > 1:
     blocks.append(_by_joint(found))
   return Section("Error before and after", text, blocks)
 
 
 def _by_joint(found: Identified) -> Block:
-  chosen = {f.screened.joint: f.finding.chosen for f in found.found}
-  before, after, names = [], [], []
-  for s in found.screened:
-    noise = 1e3 * s.problem.position_noise
-    names.append(s.joint)
-    before.append(noise * float(np.sqrt(np.mean(s.declared.levels[:, 0] ** 2))))
-    levels = race.levels(s.problem, chosen.get(s.joint, s.null).fit)
-    after.append(noise * float(np.sqrt(np.mean(levels[:, 0] ** 2))))
+  before, after = (
+    [1e3 * float(np.sqrt(np.mean(h.fit.residuals[0][0] ** 2))) for h in hypotheses]
+    for hypotheses in ([j.declared for j in found.joints], [j.extended for j in found.joints])
+  )
   series = [Bars("declared", BEFORE, before), Bars("extended", AFTER, after)]
+  names = [j.joint for j in found.joints]
   return charts.bars(
     "fitted logs by joint, the others prescribed", "RMS of position [mrad or mm]", series, names
   )
@@ -189,51 +185,49 @@ def _by_joint(found: Identified) -> Block:
 
 def _ladder(found: Identified) -> Section:
   blocks: list[Block] = []
-  brief = []
-  for rank, item in enumerate(found.found):
-    ladder = item.ladder
-    if rank >= _SHOWN:
-      chosen = item.finding.chosen
-      gain = ladder.null.score - chosen.score
-      others = [e.score for e in item.finding.alternatives]
-      behind = round(min(others) - chosen.score, 3) if others else ""
-      named = " + ".join(sorted(decision.names(chosen))) or "constants calibrated"
-      brief.append([item.screened.joint, named, gain, behind])
-      continue
-    rows: list[list[Any]] = [
-      ["declared model", ladder.declared.score, 0.0, ""],
-      ["constants calibrated", ladder.null.score, ladder.declared.score - ladder.null.score, ""],
-    ]
-    entries = decision.unique(sorted([*ladder.singles, *ladder.pairs], key=lambda e: e.score))
-    own = decision.names(item.finding.chosen)
-    if not own:
-      rows[1][3] = "chosen"
-    else:
-      kept = [e for e in entries[:_LADDER] if decision.names(e) != own]
-      entries = sorted([*kept, item.finding.chosen], key=lambda e: e.score)
-    confounded = [decision.names(c) for c in item.finding.confounded]
-    for entry in entries[:_LADDER]:
-      names = decision.names(entry)
-      mark = "chosen" if names == own else ("as good" if names in confounded else "")
-      label = " + ".join(sorted(names))
-      rows.append([label, entry.score, ladder.declared.score - entry.score, mark])
-    blocks.append(Heading(item.screened.joint))
-    if ladder.problem.plant.follows:
-      blocks.append(Text(_FOLLOWED))
-    blocks.append(Table(["hypothesis", "score [nats]", "gain [nats]", ""], rows))
-    series = [Bars("gain", AFTER, [row[2] for row in rows])]
-    blocks.append(charts.bars("gain over the declared model", "nats", series, [r[0] for r in rows]))
+  for item in found.found[:_SHOWN]:
+    rows = _hypotheses(item)
+    blocks.append(Heading(item.joint))
+    header = ["hypothesis", "gain [nats]", "behind [standard errors]", f"left [{_unit(item)}]", ""]
+    blocks.append(Table(header, rows))
+    series = [Bars("gain", AFTER, [row[1] for row in rows])]
+    blocks.append(charts.bars("gain over the constants", "nats", series, [r[0] for r in rows]))
+  brief = [
+    [j.joint, _label(j.found.best.names), j.found.best.evidence - j.null.evidence]
+    for j in found.found[_SHOWN:]
+  ]
   if brief:
-    blocks.append(Heading("The other joints that were looked at closely"))
-    header = ["joint", "chosen", "gain over the constants [nats]", "runner-up behind [nats]"]
-    blocks.append(Table(header, brief))
+    blocks.append(Heading("The other joints"))
+    blocks.append(Table(["joint", "best", "gain over the constants [nats]"], brief))
   return Section(
-    "Evidence ladder",
-    "Score: the logarithm of the error in units of the noise, averaged over the logs; 0.69 nats"
-    " halve the error. A name needs a gain over the calibrated constants and a margin over the"
-    " runner-up.",
+    "Evidence",
+    "Gain: how much more likely left-out blocks are than with the constants alone. Behind: that"
+    " difference to the best hypothesis over its standard error; a name needs every hypothesis that"
+    " lacks it to be clearly behind. Left: what the median left-out block leaves.",
     blocks,
   )
+
+
+def _hypotheses(item: Changed) -> list[list[Any]]:
+  """Returns the rows of a joint's evidence: the best of every set of effects, the best first."""
+  best, null = item.found.best, item.null
+  forced = [s for s in item.ranked if s.beside_force]
+  listed = [best, *[s for s in item.alternatives if s is not best][:_LADDER], *forced, null]
+  rows = []
+  for s in sorted({id(s): s for s in listed}.values(), key=lambda s: -s.evidence):
+    alike = any(s is c for c in item.confounded)
+    mark = "in the extended model" if s is item.extended else ("as good" if alike else "")
+    label = _label(s.names) + (" + a force of any form" if s.beside_force else "")
+    left = 1e3 * float(np.sqrt(np.median(s.fit.held[0][0])))
+    rows.append([label, s.evidence - null.evidence, clear(best, s), left, mark])
+  return rows
+
+
+def _label(names: frozenset[str]) -> str:
+  return " + ".join(sorted(names)) or "constants within tolerances"
+
+
+_unit = residual_plots.unit_of
 
 
 def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> Section:
@@ -277,27 +271,29 @@ def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> Secti
 def _joints(found: Identified) -> Section:
   rows = [
     [
-      s.joint,
-      s.declared.score,
-      s.null.score,
-      s.excess,
+      j.joint,
+      j.verdict,
+      1e3 * float(np.sqrt(np.median(j.null.fit.held[0][0]))),
+      1e3 * j.left,
+      1e3 * j.reference_left,
       ", ".join(
         f"{n} {100 * v:+.1f} %"
-        for n, v in s.null.fit.values("calibration").items()
-        if n not in ("skew", "latency")
+        for n, v in j.extended.values(CONSTANTS).items()
+        if n not in ("skew", "latency", "zero")
       ),
-      1e3 * found.clocks[s.joint].skew,
-      1e3 * found.clocks[s.joint].latency,
+      1e3 * found.clocks[j.joint].skew,
+      1e3 * found.clocks[j.joint].latency,
     ]
-    for s in found.screened
+    for j in found.joints
   ]
-  header = ["joint", "declared", "calibrated", "left [nats]", "constants off by"]
+  header = ["joint", "verdict", "constants leave", "effects leave", "the machine leaves anyway"]
   return Section(
     "Joints",
-    "Scores of the declared and the calibrated model, what the latter leaves above the noise, the"
+    "What is left of positions in the median block [mrad or mm] by the constants alone and by the"
+    " effects found, beside what the machine leaves anyway (its reference, or the noise); the"
     " relative errors of the declared constants, and the latencies of readings and commands that"
     " are taken for the machine's own.",
-    [Table([*header, "reading late [ms]", "command late [ms]"], rows)],
+    [Table([*header, "constants off by", "reading late [ms]", "command late [ms]"], rows)],
   )
 
 

@@ -12,32 +12,29 @@ from nerf2real.core.pages.page import Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import signatures
-from nerf2real.sysid.fit.fitting import Fit
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import balance
+from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.findings import Identified
-from nerf2real.sysid.selection.joint import Found
 
 BEFORE, AFTER = palette.VERMILION, palette.BLUE  # declared and extended model
 _WARMER = 1.0  # K by which a joint's temperature must change to be drawn
-_NOTHING = Fit((), np.zeros(0), 0.0, 1.0, 0)
 
 
-def unit_of(item: Found) -> str:
+def unit_of(item: Changed) -> str:
   """Returns the unit of a joint's small errors."""
-  return "mrad" if item.screened.problem.plant.hinge else "mm"
+  return "mrad" if item.likelihood.plant.hinge else "mm"
 
 
-def residuals(item: Found) -> Section:
+def residuals(item: Changed) -> Section:
   """Returns residuals, before and after, against what they may depend on."""
-  problem, unit = item.screened.problem, unit_of(item)
-  after = item.finding.chosen.fit
-  hypotheses = ((_NOTHING, "declared", BEFORE), (after, "extended", AFTER))
+  joint, unit = item.likelihood, unit_of(item)
+  hypotheses = ((item.declared, "declared", BEFORE), (item.extended, "extended", AFTER))
   figures: list[Chart | None] = []
-  simulated = [problem.simulate(fit.terms, fit.x)[0] for fit, _, _ in hypotheses]
-  for index, log in enumerate(problem.plant.logs):
+  simulated = [joint.simulate(h.terms, h.fit.x[None])[0] for h, _, _ in hypotheses]
+  for index, log in enumerate(joint.plant.logs):
     curves = [
-      Curve(name, color, log.time, 1e3 * (log.position - outputs[index].position))
+      Curve(name, color, log.time, 1e3 * (log.position - outputs[index][0].position))
       for (_, name, color), outputs in zip(hypotheses, simulated, strict=True)
     ]
     title = f"{log.name}: residual against time"
@@ -48,7 +45,7 @@ def residuals(item: Found) -> Section:
     "" if figures[-1] is not None else " These logs hold no temperatures of this joint that change."
   )
   return Section(
-    f"Residual of {item.screened.joint}, before and after",
+    f"Residual of {item.joint}, before and after",
     "Against time: measured minus simulated position. Against the others: the torque that the"
     " model lacks (what the measured motion demands by inverse dynamics, less what actuator and"
     " friction give), medians and quartiles; a flat line at zero is a model that lacks nothing, a"
@@ -58,13 +55,13 @@ def residuals(item: Found) -> Section:
   )
 
 
-def _against(item: Found, hypotheses, name: str) -> Chart | None:
-  problem = item.screened.problem
+def _against(item: Changed, hypotheses, name: str) -> Chart | None:
+  plant = item.likelihood.plant
   curves = []
-  for fit, label, color in hypotheses:
+  for hypothesis, label, color in hypotheses:
     x, y = [], []
-    for index, log in enumerate(problem.plant.logs):
-      r, missing = balance.missing_torque(problem, fit, index)
+    for index, log in enumerate(plant.logs):
+      r, missing = balance.missing_torque(plant, hypothesis, index)
       if name == "temperature":
         if log.temperature is None:
           return None
@@ -76,7 +73,7 @@ def _against(item: Found, hypotheses, name: str) -> Chart | None:
     if name == "temperature" and np.ptp(np.concatenate(x)) < _WARMER:
       return None
     curves.append(Curve(label, color, np.concatenate(x), np.concatenate(y)))
-  hinge = problem.plant.hinge
+  hinge = plant.hinge
   torque = "N m" if hinge else "N"
   length = "rad" if hinge else "m"
   unit = {"position": length, "velocity": f"{length}/s", "load": torque, "temperature": "C"}[name]
@@ -91,7 +88,7 @@ def held_out(
   found: Identified,
   held: Sequence[Log],
   effects: Sequence[Effect],
-  items: Sequence[Found],
+  items: Sequence[Changed],
   window_s: float,
 ) -> Section:
   """Returns measured and simulated positions, and their residuals, of logs that were not fitted."""
@@ -102,7 +99,7 @@ def held_out(
     before = evaluation.simulate(found.model, log, window_s=window_s)
     after = evaluation.simulate(found.model, log, effects, clocks=found.clocks, window_s=window_s)
     for item in items:
-      joint, unit = item.screened.joint, unit_of(item)
+      joint, unit = item.joint, unit_of(item)
       column = log.states.column(joint)
       pair = (
         ("declared", BEFORE, before[:, column]),

@@ -11,23 +11,17 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.fitting import Fit as JointFit
-from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.fit.posterior import CONSTANTS
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
-from nerf2real.sysid.selection import changes, claims, race, scopes
+from nerf2real.sysid.selection import changes, claims, scopes
 from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.decision import Finding, Thresholds
-from nerf2real.sysid.selection.explain import Scored, clear
-from nerf2real.sysid.selection.explanation import Ladder
+from nerf2real.sysid.selection.explain import clear
 from nerf2real.sysid.selection.findings import Identified
-from nerf2real.sysid.selection.joint import Found
 from nerf2real.sysid.selection.naming import Name
 from nerf2real.sysid.selection.scopes import Shared
-from nerf2real.sysid.selection.screening import Screened
 from nerf2real.sysid.selection.subject import WHOLE, Subject, explain_reference, prepare
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -73,18 +67,11 @@ def analyse(
       -c.left / max(c.reference_left, 1e-12),
     )
   )
-  found = [_found(item) for item in changed]
-  result = Identified(
-    model,
-    list(logs),
-    [f.screened for f in found],
-    [f for f, c in zip(found, changed, strict=True) if c.verdict != "none"] or found[:1],
-    audits=[audit(log) for log in logs],
-  )
+  result = Identified(model, list(logs), changed, audits=[audit(log) for log in logs])
   for effect in shared:
     _write_shared(result, effect, own_latency=not reference)
-  for item, finding in zip(changed, found, strict=True):
-    _write_down(result, item, finding)
+  for item in changed:
+    _write_down(result, item)
   off = [row for row in result.effects if row["kind"] == "parameter_error"]
   if len(off) > _ALL_OFF * len(joints) and len(off) > 1:
     result.effects = [row for row in result.effects if row not in off]
@@ -140,63 +127,44 @@ def _verdict(verdicts: Sequence[str]) -> str:
   return "partly" if kinds & {"effects", "partly"} else "unexplained"
 
 
-def _found(item: Changed) -> Found:
-  """Returns a joint's hypotheses as the report shows them."""
-  problem = item.problem
-  best = item.extended
-  entries = {s.terms: entry(problem, s) for s in item.ranked}  # one of each: they are compared
-  null, chosen = entries[item.null.terms], entries[best.terms]
-  others = [e for t, e in entries.items() if t != best.terms and _changed(t)]
-  singles = [e for e in [chosen, *others] if len(_changed(e.fit.terms)) == 1]
-  longer = [e for e in [chosen, *others] if len(_changed(e.fit.terms)) > 1]
-  declared = race.entry(problem, problem.fit([]))
-  alike = [entries[s.terms] for n in item.found.names for s in n.confounded if s.names]
-  alike = list({id(e): e for e in alike}.values())
-  ladder = Ladder(problem, item.known[0], declared, null, singles, longer)
-  verdict = "unexplained" if item.verdict in ("partly", "unexplained") else item.verdict
-  finding = Finding(verdict, chosen, bool(item.named), False, others, alike)
-  screened = Screened(item.joint, problem, item.known[0], declared, null)
-  return Found(screened, ladder, finding, {"q95": 0.0, "median": 0.0}, Thresholds())
-
-
-def entry(problem: Problem, scored: Scored) -> race.Entry:
-  """Returns a hypothesis as an entry of the evidence ladder."""
-  return race.entry(problem, JointFit(scored.terms, scored.fit.x, scored.fit.cost, 1.0, 0))
-
-
-def _changed(terms: Sequence[Term]) -> list[Term]:
-  return [t for t in terms if t.name is not None]
-
-
-def _write_down(result: Identified, item: Changed, found: Found) -> None:
+def _write_down(result: Identified, item: Changed) -> None:
   """Adds a joint's effects, constants and latencies."""
-  best, chosen = item.extended, found.finding.chosen
+  best = item.extended
+  terms = sorted(best.terms, key=lambda t: t.kind == STICKING)  # a friction of its own holds, too
   names = {n.kind: n for n in item.found.names}
   offset = 0.0
-  for term in best.terms:
+  for term in terms:
+    values = best.fit.values(term)
     if term.kind == CONSTANTS:
-      values = best.fit.values(term)
       result.clocks[item.joint] = Clocks(values.get("skew", 0.0), values.get("latency", 0.0))
       effect = term.effect(np.array(list(values.values())))
       result.calibration.append(dataclasses.replace(effect, target=item.joint))
       offset += values.get("zero", 0.0)
-      if term.freed:
-        row = claims.constants(found.screened, chosen)
-        row["evidence"] |= _evidence(item, names.get("parameter_error"))
-        _list(result, item, "parameter_error", row)
+      if term.freed or item.constants_off:
+        evidence = _evidence(item, names.get("parameter_error"))
+        _list(result, item, "parameter_error", claims.effect(item, term, evidence)[1])
+      continue
+    if term.kind == STICKING:
+      sticks = Effect("coulomb_friction", item.joint, {"torque": 0.0})
+      if not any(e.kind == sticks.kind and e.target == item.joint for e in result.objects):
+        result.objects.append(sticks)
       continue
     if not term.names:  # of a wider scope
       continue
-    effect, row = claims.effect(found, chosen, term, 0.0)
+    if term.kind == FREE:
+      effect, row = claims.free(item, term)
+      result.objects.append(effect)
+      result.nearest.append(row)
+      continue
+    effect, row = claims.effect(item, term, _evidence(item, names.get(term.kind)))
     if term.kind == "encoder_offset":
       offset += float(effect.parameters["offset"])  # type: ignore[arg-type]
     else:
       result.objects.append(effect)
     if term.known:
       result.in_reference.append(row)
-      continue
-    row["evidence"] |= _evidence(item, names.get(term.kind))
-    _list(result, item, term.kind, row)
+    else:
+      _list(result, item, term.kind, row)
   if offset:
     result.objects.append(Effect("encoder_offset", item.joint, {"offset": offset}))
   result.objects[:] = _once(result.objects)
@@ -204,7 +172,8 @@ def _write_down(result: Identified, item: Changed, found: Found) -> None:
 
 def _list(result: Identified, item: Changed, kind: str, row: dict[str, Any]) -> None:
   """Adds an entry to what is claimed, or to what is only in the extended model."""
-  stands = kind in item.named and item.verdict in ("effects", "partly")
+  named = kind in item.named or (kind == "parameter_error" and item.constants_off)
+  stands = named and item.verdict in ("effects", "partly")
   (result.effects if stands else result.nearest).append(row)
 
 
@@ -215,6 +184,7 @@ def _evidence(item: Changed, name: Name | None) -> dict[str, Any]:
     "share_explained": round(item.found.share, 4),
     "share_explained_low": round(item.found.share_low, 4),
     "left_over_reference": round(item.left / max(item.reference_left, 1e-12), 3),
+    "constants_alone_left": round(float(np.sqrt(np.median(item.null.fit.held[0][0]))), 6),
     "held_out_gain_nats": round(item.found.best.evidence - item.null.evidence, 2),
   }
 

@@ -1,9 +1,9 @@
-"""What has changed since reference logs were recorded: names by evidence that adds up.
+"""What a joint has beyond its baseline: names by evidence that adds up, and a graded verdict.
 
-The reference logs give every joint a baseline: its constants, and the effects that it has anyway.
-The logs to explain start from that baseline; what a further effect explains of them has changed.
-An effect is named where every tried hypothesis without it is clearly worse (`naming`) and where the
-reference logs are clearly worse with it than without.
+The baseline is the declared model with its tolerances, or what reference logs show: constants, and
+the effects that the machine has anyway. An effect is named where every tried hypothesis without it
+is clearly worse (`naming`), and where the reference logs are clearly worse with it than without.
+Where more remains, a name must also explain more than it leaves to a force of any form.
 """
 
 import dataclasses
@@ -13,15 +13,13 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.fitting import Fit as JointFit
-from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fitter, Layout
+from nerf2real.sysid.fit.posterior import CLOCKS, Fitter, Layout
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.explain import Scored, clear
+from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear, of_size
 from nerf2real.sysid.selection.naming import Explanation, conclude
 from nerf2real.sysid.selection.remainder import grown, structured
-from nerf2real.sysid.selection.subject import Subject
+from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
@@ -32,7 +30,6 @@ class Changed:
   """What is new at a joint."""
 
   subject: Subject
-  problem: Problem
   ranked: list[Scored]
   found: Explanation
   named: tuple[str, ...]
@@ -43,6 +40,8 @@ class Changed:
   """What the machine leaves anyway in the median block, rad (m)."""
   left: float
   """The same of the logs, under the best hypothesis."""
+  constants_off: bool
+  """Whether declared constants are off by more than machines of one kind differ."""
 
   @property
   def extended(self) -> Scored:
@@ -51,6 +50,32 @@ class Changed:
       return self.found.best
     fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
     return max(fitting, key=lambda s: s.evidence, default=self.found.best)
+
+  @property
+  def likelihood(self) -> JointLikelihood:
+    """The logs."""
+    return self.subject.now
+
+  @property
+  def declared(self) -> Scored:
+    """The model as it is declared."""
+    return self.subject.explainer.declared
+
+  @property
+  def alternatives(self) -> list[Scored]:
+    """The best hypothesis of every other set of effects, the best first."""
+    best: dict[frozenset[str], Scored] = {}
+    for item in self.ranked:
+      if item.names and not item.neutral and not item.beside_force:
+        best.setdefault(item.names, item)
+    best.pop(self.extended.names, None)
+    return list(best.values())
+
+  @property
+  def confounded(self) -> list[Scored]:
+    """Hypotheses without a named effect that predict the same."""
+    alike = {id(s): s for n in self.found.names for s in n.confounded if s.names}
+    return list(alike.values())
 
   @property
   def joint(self) -> str:
@@ -69,7 +94,22 @@ class Changed:
 
 
 def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
-  """Explains what is new at a joint, beyond the effects of wider scope that it has."""
+  """Explains what is new at a joint, beyond the effects of wider scope that it has.
+
+  One with play is explained by a simulation that follows the readings.
+
+  A course through play does not repeat, so that no model of it is near a whole log; what it
+  predicts from each reading on is judged where play is in the best hypothesis of whole logs.
+  """
+  whole = _explained(subject, settings)
+  if whole.verdict in ("none", "effects") or not whole.found.best.names & set(UNREPEATED):
+    return whole
+  near = _explained(following(subject), settings)
+  stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
+  return near if stands else whole
+
+
+def _explained(subject: Subject, settings: Settings) -> Changed:
   now, before, usual = subject.now, subject.before, subject.usual
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
@@ -79,8 +119,7 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   else:
     ranked = explainer.constants_alone()
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
-  problem = Problem(now.plant)
-  named = tuple(k for k in found.named if _is_something(problem, found.best, k))
+  named = tuple(k for k in found.named if _is_something(subject, found.best, k))
   if before is not None and usual is not None and not subject.paired:
     named = tuple(k for k in named if _is_new(before, usual, found.best, k, subject.beyond))
   anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
@@ -88,18 +127,70 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
     anyway = float(np.median(usual.fit.held[0][0]))
   left = float(np.median(found.left))
   over = float(np.sqrt(left / max(anyway, 1e-300)))
+  if named and over > settings.more:
+    named = _supported(explainer, found, named, settings)
+    ranked = explainer.ranked()
+  verdict = _verdict(
+    found, named, len(own) < len(known), leaves(subject, found.best, settings), over, settings
+  )
+  off = _constants_off(subject, found.best, settings)
   return Changed(
     subject,
-    problem,
     ranked,
     found,
     named,
-    _verdict(
-      found, named, len(own) < len(known), leaves(subject, found.best, settings), over, settings
-    ),
+    "effects" if off and verdict == "none" else verdict,
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
+    off,
   )
+
+
+def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
+  """Tells whether a declared constant is off by more than its tolerance, all of its interval.
+
+  Beside a reference the constants are those that it shows.
+  """
+  term = best.terms[0]
+  if subject.before is not None or term.freed:
+    return False
+  tolerance = dict(settings.tolerances)
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
+  shares = [n for n in term.names if n not in (*CLOCKS, "zero")]
+  return any(bounds[n][0] > tolerance[n] or bounds[n][1] < -tolerance[n] for n in shares)
+
+
+def _supported(
+  explainer: Explainer, found: Explanation, named: Sequence[str], settings: Settings
+) -> tuple[str, ...]:
+  """Returns the names that explain more than they leave to a force of any form, one by one.
+
+  Effects that together imitate what no library has each explain the smaller part of what a smooth
+  force over position and velocity explains of left-out motion; one that is there does not.
+
+  Args:
+    explainer: scores what has not been scored.
+    found: the best hypothesis, of which more remains than the machine leaves anyway.
+    named: kinds that are clear.
+    settings: limits.
+  """
+  kept: tuple[str, ...] = ()
+  base = explainer.null
+  while len(kept) < len(named):
+    wider = [
+      item
+      for item in of_size(explainer.scored.values(), len(kept) + 1)
+      if set(kept) < item.names <= set(named)
+    ]
+    if not wider:
+      break
+    best = max(wider, key=lambda item: item.evidence)
+    force = explainer.with_force(base)
+    gained, possible = (item.evidence - base.evidence for item in (best, force))
+    if gained < possible - gained:
+      break
+    base, kept = best, tuple(k for k in named if k in best.names)
+  return kept
 
 
 def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
@@ -116,7 +207,7 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   return left > settings.more * subject.now.position_noise
 
 
-def _is_something(problem: Problem, best: Scored, kind: str) -> bool:
+def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
   """Tells whether an effect's values differ from those that do nothing, by their intervals.
 
   Of effects that have sizes only: where a shape is fitted, too, a size may be open that is surely
@@ -126,8 +217,7 @@ def _is_something(problem: Problem, best: Scored, kind: str) -> bool:
   sizes = {} if term.freed else {p.name: p for p in kind_of(kind).parameters if not p.shape}
   if not term.names or any(n not in sizes for n in term.names):
     return True
-  fit = JointFit(best.terms, best.fit.x, best.fit.cost, 1.0, 0)
-  bounds = intervals.intervals(problem, fit, kind)
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=subject.before is None)
   return any(not low <= sizes[n].nominal <= high for n, (low, high) in bounds.items())
 
 
@@ -167,6 +257,4 @@ def _verdict(
     return "unexplained" if remains or found.best.names else "none"
   if not named and not remains:
     return "none"
-  if over <= settings.more:
-    return "effects"
-  return "partly" if found.share_low > settings.most else "unexplained"
+  return "effects" if over <= settings.more else "partly"

@@ -7,12 +7,19 @@ import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fit, Fitter, Layout
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.free_force import free_force
+from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
+_PUSH = 0.2  # step of finite differences of a free force, of its values' deviations
+_ITERATIONS = 10  # of its fit
 _SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
+
+
+UNREPEATED = ("backlash",)
+"""Kinds under which a course does not repeat: which way teeth bounce depends on microradians."""
 
 
 @dataclasses.dataclass
@@ -30,6 +37,16 @@ class Scored:
   def names(self) -> frozenset[str]:
     """Kinds of its effects."""
     return named(self.terms)
+
+  @property
+  def beside_force(self) -> bool:
+    """Whether a force of any form is among its terms."""
+    return any(t.kind == FREE for t in self.terms)
+
+  def values(self, kind: str) -> dict[str, float]:
+    """Returns the values of the term of a kind by name; empty if it has none."""
+    term = next((t for t in self.terms if t.kind == kind), None)
+    return {} if term is None else self.fit.values(term)
 
   @property
   def evidence(self) -> float:
@@ -71,8 +88,9 @@ def variance(differences: Array) -> float:
 
 
 def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
-  """Returns the explanations with a number of effects."""
-  return [item for item in items if len(item.names) == size and not item.neutral]
+  """Returns the explanations by a number of effects alone."""
+  alone = (item for item in items if not (item.neutral or item.beside_force))
+  return [item for item in alone if len(item.names) == size]
 
 
 class Explainer:
@@ -116,6 +134,9 @@ class Explainer:
       if left > before - 0.01:
         break
     self.null = self._score(base, fitter.fit(x, iterations=4))
+    bare = Fitter([joint], Layout([()])).linearise(np.zeros(0), 0.0)
+    self.declared = self._score((), bare, neutral=True)
+    self._pushes: Array | None = None
 
   def _look_about(self, fitter: Fitter, fit: Fit) -> Fit:
     """Returns a fit from a better place if there is one: held commands make stairs of latencies."""
@@ -207,6 +228,23 @@ class Explainer:
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
+  def with_force(self, parent: Scored) -> Scored:
+    """Returns a hypothesis with a force of any form beside it, whose derivatives are taken once."""
+    force = free_force(self.joint.plant)
+    terms = (*parent.terms, force)
+    if terms in self.scored:
+      return self.scored[terms]
+    fitter = Fitter([self.joint], Layout([terms]))
+    count = len(parent.fit.x)
+    x = np.concatenate([parent.fit.x, force.starts[0]])
+    if self._pushes is None:
+      self._pushes = fitter.linearise(x, _PUSH).jacobian[0][count:]
+    blank = np.zeros((count, *self._pushes.shape[1:]))
+    fresh = np.arange(len(x)) < count
+    known = [np.concatenate([blank, self._pushes])]
+    fit = fitter.fit(x, iterations=_ITERATIONS, known=known, fresh=fresh)
+    return self._score(terms, fit)
+
   def constants_alone(self) -> list[Scored]:
     """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
     if self.freed is not None:
@@ -223,6 +261,10 @@ class Explainer:
       best = self.refit(best, 4)
       if best.fit.cost > before - _SETTLED:
         break
+    if self.joint.follows and best.names & set(UNREPEATED):
+      fitter = Fitter([self.joint], Layout([best.terms]))
+      best = self._score(best.terms, fitter.fit(fitter.draw(best.fit).x, iterations=8))
+      self.joint.rescale(best.fit.residuals[0])
     self._rescore()
     return best
 
@@ -255,17 +297,27 @@ class Explainer:
         for item in sorted(grown, key=lambda g: -g.evidence)[: s.kept]:
           if item.terms != top.terms:
             self.refit(item, 3)
-      grown = sorted(
-        (g for g in self.scored.values() if len(g.names) == depth + 1), key=lambda g: -g.evidence
-      )
+      grown = sorted(of_size(self.scored.values(), depth + 1), key=lambda g: -g.evidence)
       better = grown[0].evidence > best.evidence and leaves(best)
       if clear(grown[0], best) < s.worth and not better:
         break
       best = grown[0]
       parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
     for size in {len(item.names) for item in self.scored.values()}:
-      self._neutralise(max(of_size(self.scored.values(), size), key=lambda item: item.evidence))
+      same = of_size(self.scored.values(), size)
+      if same:
+        self._neutralise(max(same, key=lambda item: item.evidence))
+    if leaves(best):
+      self._beside_force(best)
     return self.ranked()
+
+  def _beside_force(self, best: Scored) -> None:
+    """Scores a force of any form alone and beside the best set of effects, and the scale anew."""
+    forced = [self.with_force(parent) for parent in {id(i): i for i in (self.null, best)}.values()]
+    top = max(forced, key=lambda item: item.evidence)
+    if top.evidence > best.evidence:
+      self.joint.rescale(top.fit.residuals[0])
+      self._rescore()
 
   def _neutralise(self, item: Scored) -> None:
     """Scores an item with each of its effects at the values that do nothing, all else fitted.
@@ -286,6 +338,11 @@ class Explainer:
       fit = Fitter([self.joint], Layout([terms])).fit(x, iterations=4)
       if terms not in self.scored or self.scored[terms].fit.cost > fit.cost:
         self._score(terms, fit, neutral=before is None)
+      plain = self.scored.get(tuple(t for t in item.terms if t is not term))
+      if plain is not None and before is None and fit.cost < plain.fit.cost - _SETTLED:
+        again = Fitter([self.joint], Layout([plain.terms])).fit(fit.x, iterations=4)
+        if again.cost < plain.fit.cost:
+          self._score(plain.terms, again)
 
   def ranked(self) -> list[Scored]:
     """Returns all scored hypotheses, the best first."""

@@ -13,11 +13,17 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.selection.decision import USUAL
 from nerf2real.sysid.selection.explain import Scored, clear, of_size
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
+
+USUAL = (
+  *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
+  *("gravity_tilt", "encoder_offset", "spring"),
+)
+"""Kinds in the order in which they are named where logs cannot tell them apart, chosen: a late
+command is more usual than a late reading."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +104,7 @@ def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyon
 def _name(
   joint: JointLikelihood, best: Scored, kind: str, ranked: Sequence[Scored], beyond: float
 ) -> Name:
-  rivals = [s for s in ranked if kind not in s.names]
+  rivals = [s for s in ranked if kind not in s.names and not s.beside_force]
   behind = [(clear(best, s), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
   alike = tuple(s for s in near if _same(joint, best, s))

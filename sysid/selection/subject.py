@@ -13,11 +13,9 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.fit import signatures
-from nerf2real.sysid.fit.fitting import Fit as OldFit
-from nerf2real.sysid.fit.fitting import Problem
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
-from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.hypotheses.constants import constants, sticking
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
@@ -103,21 +101,51 @@ def prepare(
     settings: tolerances and effort.
   """
   now = _likelihood(model, joint, logs, reductions[0], settings)
-  alone = tried == 1
-  library = own_library(now.plant, alone=alone)
+  before = _likelihood(model, joint, reference, reductions[1], settings) if reference else None
+  library = own_library(now.plant, alone=tried == 1)
   beyond = threshold(len({t.kind for t in library} | set(WHOLE)) * tried, settings)
-  if not reference:
+  return _subject(now, before, library, beyond, alone=tried == 1)
+
+
+def following(subject: Subject) -> Subject:
+  """Returns a joint judged by a simulation whose state follows the readings."""
+  now, before = (
+    None if j is None else JointLikelihood(j.plant, settings=j.settings, follows=True)
+    for j in (subject.now, subject.before)
+  )
+  assert now is not None
+  return _subject(now, before, subject.library, subject.beyond, alone=subject.alone)
+
+
+def _subject(
+  now: JointLikelihood,
+  before: JointLikelihood | None,
+  library: list[Term],
+  beyond: float,
+  *,
+  alone: bool,
+) -> Subject:
+  joint, settings = now.plant.joint, now.settings
+  if before is None:
     own = constants(now.plant, settings)
     freed = widened(own)
     explainer = _explainer(now, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
-  before = _likelihood(model, joint, reference, reductions[1], settings)
-  usual = Explainer(before, constants(before.plant, settings), (), settings=settings).null
+  usual = _bare(before, settings)
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   freed = freed_constants(known[0], settings)
   explainer = _explainer(now, known, library, freed)
   return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
+
+
+def _bare(before: JointLikelihood, settings: Settings) -> Scored:
+  """Returns the constants that a reference shows, with a dry friction that holds at rest.
+
+  An effect of friction holds, too: it must not be judged by the difference to one that creeps.
+  """
+  own = constants(before.plant, settings)
+  return Explainer(before, own, (), settings=settings, known=[sticking(before.plant)]).null
 
 
 def explain_reference(subject: Subject, settings: Settings) -> None:
@@ -128,7 +156,9 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   if not subject.alone and not structured(before, subject.usual, settings):
     return
   own = constants(before.plant, settings)
-  first = Explainer(before, own, own_library(before.plant, alone=subject.alone), settings=settings)
+  library = own_library(before.plant, alone=subject.alone)
+  known = [sticking(before.plant)]
+  first = Explainer(before, own, library, settings=settings, known=known)
   usual = conclude(before, first.explain(settings.reference_depth), subject.beyond).best
   shared = [t for t in subject.known if not t.names]
   subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
@@ -156,7 +186,7 @@ def _explainer(
 
 def own_library(plant: JointModel, *, alone: bool) -> list[Term]:
   """Returns the effects to try; where torque repeats with position is read off the residual."""
-  waves = signatures.waves(Problem(plant), OldFit((), np.zeros(0), 0.0, 1.0, 0))
+  waves = signatures.waves(plant)
   terms = [*candidates.library(plant), candidates.cogging(plant, waves)]
   terms = [t for t in terms if alone or t.kind not in WHOLE]
   return [plausible(term) for term in terms] if plant.hinge else terms

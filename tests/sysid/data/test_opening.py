@@ -9,8 +9,7 @@ import pytest
 
 from nerf2real.core.robot_logs.reading import LogError
 from nerf2real.sysid.data.bam import UNNAMED
-from nerf2real.sysid.data.opening import named, read_log
-from nerf2real.sysid.selection.identification import read_logs
+from nerf2real.sysid.data.opening import named, read_log, read_logs
 from tests.sysid.synthetic import ARM, PENDULUM
 
 MEASURED = Path(__file__).parents[4] / "shared/data/measured"

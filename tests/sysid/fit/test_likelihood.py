@@ -15,7 +15,7 @@ from nerf2real.sysid.model.plant import with_values
 from tests.sysid.synthetic import PENDULUM, log_of
 
 
-def _joint(kinds=("sweep", "slow"), effects=()):
+def joint_of(kinds=("sweep", "slow"), effects=()):
   logs = [log_of(PENDULUM, kind, effects, duration=5.0, seed=i) for i, kind in enumerate(kinds)]
   plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
   return plant, JointLikelihood(plant)
@@ -24,7 +24,7 @@ def _joint(kinds=("sweep", "slow"), effects=()):
 @pytest.fixture(scope="module")
 def viscous():
   """A joint with viscous friction that its model lacks."""
-  return _joint(effects=[Effect("viscous_friction", "joint", {"coefficient": 0.5})])
+  return joint_of(effects=[Effect("viscous_friction", "joint", {"coefficient": 0.5})])
 
 
 def test_nats_of_a_block_are_those_of_the_formula(viscous):
@@ -84,14 +84,14 @@ def test_only_the_very_same_commands_are_the_same(viscous):
 
 def test_what_a_reference_leaves_cancels_beside_the_same_commands():
   effect = [Effect("cogging", "joint", {"amplitude": 0.1, "periods": 9.0, "phase": 0.3})]
-  _, before = _joint(effects=effect)
-  _, now = _joint(effects=effect)
+  _, before = joint_of(effects=effect)
+  _, now = joint_of(effects=effect)
   left = before.residuals((), np.zeros((1, 0)))[0]
   alone = np.sqrt(np.mean(now.residuals((), np.zeros((1, 0)))[0, 0] ** 2))
   assert now.expect(before, left)
   beside = np.sqrt(np.mean(now.residuals((), np.zeros((1, 0)))[0, 0] ** 2))
   assert beside < 1e-9 < 1e-3 < alone
-  _, other = _joint(kinds=("steps", "slow"), effects=effect)
+  _, other = joint_of(kinds=("steps", "slow"), effects=effect)
   assert not other.expect(before, left)
 
 

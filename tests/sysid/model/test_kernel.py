@@ -9,9 +9,11 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.hypotheses import candidates
-from nerf2real.sysid.hypotheses.terms import Term, compose
+from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.free_force import effect, free_force
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.model.plant import JointPlant
+from nerf2real.sysid.model.joint import JointModel
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 # kind, values by name, how far [rad rms] the two may differ: rounding where the arithmetic is the
@@ -57,19 +59,24 @@ CASES = [
 ]
 
 
+def _position(plant: JointModel, terms=(), values=()) -> np.ndarray:
+  """Returns the simulated positions of the first log."""
+  c = compose(plant, terms, np.array(values, float))
+  return plant.run(c.p, c.loads, 0, table=c.table).position
+
+
 @pytest.mark.parametrize(("kind", "values", "tolerance"), CASES, ids=[c[0] for c in CASES])
 def test_kind_moves_the_joint_as_mujoco_does(kind: str, values: dict, tolerance: float) -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "sweep", rounding=0.0, duration=4.0)
-  plant = JointPlant(model, "joint", [log])
+  plant = JointModel(model, "joint", [log])
   target = "arm" if kind == "payload" else ("joint" if kind not in _COMMON else None)
   names = tuple(values)
   zeros = (0.0,) * len(names)
   term = Term(kind, target, names, zeros, zeros, zeros, (zeros,))
-  p, changed = compose(plant, [term], np.array([values[n] for n in names]))
-  got = plant.simulate(p, surroundings=[changed])[0][0].position
+  got = _position(plant, [term], [values[n] for n in names])
   want = evaluation.simulate(model, log, [Effect(kind, target, values)])[:, 0]
-  bare = plant.simulate(plant.declared)[0][0].position
+  bare = _position(plant)
   difference = float(np.sqrt(np.mean((got - want) ** 2)))
   effect = float(np.sqrt(np.mean((bare - want) ** 2)))
   assert effect > 5 * tolerance, "the case must move the joint"
@@ -82,7 +89,7 @@ _COMMON = ("supply_sag", "gravity_tilt", "clock_drift")
 def test_every_weakening_keeps_its_own_choice_of_limits() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "steps", rounding=0.0, duration=4.0)
-  plant = JointPlant(model, "joint", [log])
+  plant = JointModel(model, "joint", [log])
   effects = [
     Effect("motor_gain", "joint", {"gain": 0.6, "scales_limit": 1.0}),
     Effect("supply_sag", None, {"droop": 0.04, "fade": 0.0, "scales_limit": 0.0}),
@@ -91,46 +98,55 @@ def test_every_weakening_keeps_its_own_choice_of_limits() -> None:
     Term(e.kind, e.target, (), (), (), (), ((),), fixed=tuple(e.parameters.items()))
     for e in effects
   ]
-  got = plant.simulate(compose(plant, terms, np.zeros(0))[0])[0][0].position
+  got = _position(plant, terms)
   want = evaluation.simulate(model, log, effects)[:, 0]
   assert np.sqrt(np.mean((got - want) ** 2)) < 3e-4
   other = dataclasses.replace(terms[0], fixed=(("gain", 0.6), ("scales_limit", 0.0)))
-  unlike = plant.simulate(compose(plant, [other, terms[1]], np.zeros(0))[0])[0][0].position
+  unlike = _position(plant, [other, terms[1]])
   assert np.sqrt(np.mean((unlike - want) ** 2)) > 3e-3
 
 
 def test_every_candidate_is_checked() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
-  plant = JointPlant(model, "joint", [log_of(PENDULUM, "sweep", duration=2.0)])
+  plant = JointModel(model, "joint", [log_of(PENDULUM, "sweep", duration=2.0)])
   kinds = {t.kind for t in candidates.library(plant)}
   assert kinds - {case[0] for case in CASES} == {"clock_drift"}  # checked below
 
 
 def test_every_candidate_at_rest_leaves_the_motion_as_it_was() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
-  plant = JointPlant(model, "joint", [log_of(PENDULUM, "steps", duration=2.0)])
+  plant = JointModel(model, "joint", [log_of(PENDULUM, "steps", duration=2.0)])
   weaker = Term(
     "motor_gain", "joint", (), (), (), (), ((),), fixed=(("gain", 0.6), ("scales_limit", 1.0))
   )
   rough = Term("coulomb_friction", "joint", (), (), (), (), ((),), fixed=(("torque", 0.1),))
   others = [weaker, rough]  # a choice between models, and a friction constraint without creep
-  want = plant.simulate(compose(plant, others, np.zeros(0))[0])[0][0].position
+  want = _position(plant, others)
   for term in candidates.library(plant):
     idle = term.at_rest(dict(zip(term.names, term.starts[0], strict=True)))
-    p, changed = compose(plant, [*others, idle], np.zeros(0))
-    got = plant.simulate(p, surroundings=[changed])[0][0].position
+    got = _position(plant, [*others, idle])
     assert idle.name is None
     np.testing.assert_allclose(got, want, atol=1e-9, err_msg=f"{term.kind} {term.fixed}")
+
+
+def test_a_force_of_any_form_is_that_of_the_suite() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=4.0)
+  plant = JointModel(model, "joint", [log])
+  term = free_force(plant)
+  values = np.random.default_rng(0).normal(0.0, 0.3, len(term.names)) * np.array(term.prior)
+  want = evaluation.simulate(model, log, [effect(term, values)])[:, 0]
+  assert np.sqrt(np.mean((_position(plant) - want) ** 2)) > 3e-3
+  assert np.sqrt(np.mean((_position(plant, [term], values) - want) ** 2)) < 1e-6
 
 
 def test_clock_drift_stretches_time() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "slow", rounding=0.0, duration=4.0)
-  plant = JointPlant(model, "joint", [log])
+  plant = JointModel(model, "joint", [log])
   term = Term("clock_drift", None, ("rate",), (0.0,), (0.1,), (0.01,), ((0.0,),))
-  p, _ = compose(plant, [term], np.array([0.02]))
-  got = plant.simulate(p)[0][0].position
-  declared = plant.simulate(plant.declared)[0][0].position
+  got = _position(plant, [term], [0.02])
+  declared = _position(plant)
   want = np.interp(log.states.stamp / 1.02, log.states.stamp, declared)
   inner = slice(20, -20)
   assert np.abs(got - want)[inner].max() < 3e-4
@@ -140,8 +156,8 @@ def test_joint_among_moving_others_follows_the_whole_model() -> None:
   model = mujoco.MjModel.from_xml_string(ARM)
   log = log_of(ARM, "sweep", rounding=0.0, duration=6.0)
   for joint in ("shoulder", "elbow"):
-    plant = JointPlant(model, joint, [log])
-    got = plant.simulate(plant.declared)[0][0].position
+    plant = JointModel(model, joint, [log])
+    got = _position(plant)
     want = log.states.position[:, log.states.column(joint)]
     assert np.sqrt(np.mean((got - want) ** 2)) < 1.5e-3
 
@@ -154,21 +170,19 @@ def test_surroundings_of_a_payload_are_those_of_a_heavier_model() -> None:
     "</body>",
   )
   log = log_of(ARM, "sweep", rounding=0.0, duration=3.0)
-  plain = JointPlant(mujoco.MjModel.from_xml_string(ARM), "shoulder", [log])
-  loaded = JointPlant(mujoco.MjModel.from_xml_string(heavier), "shoulder", [log])
-  added = plain.payload("lower", 0.2, 0.02, 0.1, -0.05)[0]
-  want, base = loaded.surroundings[0], plain.surroundings[0]
-  for name in ("inertia", "here", "across", "bias"):
-    np.testing.assert_allclose(
-      getattr(added, name), getattr(want, name) - getattr(base, name), atol=2e-7, err_msg=name
-    )
+  plain = JointModel(mujoco.MjModel.from_xml_string(ARM), "shoulder", [log])
+  loaded = JointModel(mujoco.MjModel.from_xml_string(heavier), "shoulder", [log])
+  zeros = (0.0,) * 4
+  payload = Term("payload", "lower", ("mass", "x", "y", "z"), zeros, zeros, zeros, (zeros,))
+  got = plain.at_samples(compose(plain, [payload], np.array([0.2, 0.02, 0.1, -0.05])).loads, 0)
+  np.testing.assert_allclose(got, loaded.at_samples((), 0), atol=2e-7)
 
 
 def test_pairs_move_the_joint_as_mujoco_does() -> None:
   # A kind may use what another one changes: the torque that acts, the friction, the strength.
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "sweep", rounding=0.0, duration=3.0)
-  plant = JointPlant(model, "joint", [log])
+  plant = JointModel(model, "joint", [log])
   cases = [*{case[0]: case for case in reversed(CASES)}.values()]  # the first of a kind
   cases.append(("backlash", {"gap": 0.01, "encoder_on_motor": 1.0}, 2e-3))
   weaker = {"motor_gain", "supply_sag", "thermal_derating"}  # one flag tells what their limits do
@@ -179,8 +193,7 @@ def test_pairs_move_the_joint_as_mujoco_does() -> None:
       continue
     values = [*first[1].values(), *second[1].values()]
     terms, effects = zip(*(_case(kind, v) for kind, v, _ in (first, second)), strict=True)
-    p, changed = compose(plant, terms, np.array(values))
-    got = plant.simulate(p, surroundings=[changed])[0][0].position
+    got = _position(plant, terms, values)
     want = evaluation.simulate(model, log, list(effects))[:, 0]
     if float(np.sqrt(np.mean((got - want) ** 2))) > 4e-3:
       wrong.append(kinds)

@@ -1,0 +1,70 @@
+"""A force over position and velocity of any smooth form: what no name is needed for.
+
+    F(q, v) = sum over k, m of c_km cos(pi k q') cos(pi m v'),  q' and v' from 0 to 1 over the range
+
+over the hyperbolic cross (1 + k)(1 + m) <= K: fine along one axis or coarse along both. c_km is
+normal about zero with a deviation that falls as those of a step do, 1 / (1 + k + m). Where
+it predicts left-out motion better than all named effects, something is there that they are not.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.hypotheses.candidates import typical_torque
+from nerf2real.sysid.hypotheses.terms import FREE, Term
+from nerf2real.sysid.model.plant import JointPlant
+
+Array = np.ndarray
+
+_CROSS = 14
+"""K, chosen: half waves down to a thirteenth of a joint's range, with 41 values."""
+_ORDERS = [(k, m) for k in range(_CROSS) for m in range(_CROSS) if (1 + k) * (1 + m) <= _CROSS]
+_GRID = 20
+"""Places of the table along each axis: as many as `suite.effects.residual_force` takes."""
+
+
+def free_force(plant: JointPlant) -> Term:
+  """Returns the force with its prior, as large as the torque that the joint works at."""
+  q = np.concatenate([log.position for log in plant.logs])
+  v = np.concatenate([log.velocity for log in plant.logs])
+  fast = max(float(np.quantile(np.abs(v), 0.995)), 1e-6)
+  low, high = float(q.min()), float(max(q.max(), q.min() + 1e-6))
+  size = typical_torque(plant)
+  sigma = tuple(size / (1.0 + k + m) for k, m in _ORDERS)
+  count = len(_ORDERS)
+  return Term(
+    FREE,
+    plant.joint,
+    tuple(f"c{k}_{m}" for k, m in _ORDERS),
+    (-5.0 * size,) * count,
+    (5.0 * size,) * count,
+    sigma,
+    ((0.0,) * count,),
+    sigma,
+    (0.0,) * count,
+    fixed=(
+      ("position_low", low),
+      ("position_high", high),
+      ("velocity_low", -fast),
+      ("velocity_high", fast),
+    ),
+  )
+
+
+def table(term: Term, x: Array) -> tuple[Array, Array]:
+  """Returns the kernel's table: weights [P, V] and bounds [4]."""
+  waves = np.cos(np.pi * np.arange(_CROSS)[None] * np.linspace(0.0, 1.0, _GRID)[:, None])
+  orders = zip(x, _ORDERS, strict=True)
+  weights = np.sum([c * np.outer(waves[:, k], waves[:, m]) for c, (k, m) in orders], axis=0)
+  return weights, np.array([value for _, value in term.fixed])
+
+
+def effect(term: Term, x: Array) -> Effect:
+  """Returns the force as an effect, of which nothing is left to fit."""
+  weights, _ = table(term, x)
+  grid = {"num_positions": _GRID, "num_velocities": _GRID}
+  values: dict[str, Any] = {"weights": [float(w) for w in weights.ravel()]}
+  values |= grid | dict(term.fixed)
+  return Effect(FREE, term.target, values)
