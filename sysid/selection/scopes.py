@@ -17,7 +17,7 @@ from nerf2real.sysid.fit.posterior import deviations
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import wide
 from nerf2real.sysid.selection.changes import Changed, leaves
-from nerf2real.sysid.selection.decision import USUAL
+from nerf2real.sysid.selection.naming import USUAL
 from nerf2real.sysid.selection.subject import Subject
 from nerf2real.sysid.selection.wide import Evidence, Wide
 from nerf2real.sysid.settings import Settings
