@@ -10,8 +10,8 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood, _correlation_time, _
 from nerf2real.sysid.fit.posterior import Fitter, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.plant import with_values
 from tests.sysid.synthetic import PENDULUM, log_of
 
 
@@ -100,10 +100,11 @@ def test_what_a_reference_leaves_comes_as_late_as_what_it_goes_with(viscous, clo
   plant, _ = viscous
   stamps = [log.time for log in plant.logs]
   left = [(t, np.array([np.sin(3.0 * t)])) for t in stamps]
-  baseline = with_values(plant.declared, {clock: 0.004})
+  baseline, much_later = plant.declared.copy(), plant.declared.copy()
+  baseline[kernel.INDEX[clock]], much_later[kernel.INDEX[clock]] = 0.004, 0.034
   expected = Expectation(plant.logs, left, baseline)
   np.testing.assert_allclose(expected.under(baseline)[0], np.sin(3.0 * np.concatenate(stamps)))
-  later = expected.under(with_values(plant.declared, {clock: 0.034}))[0]
+  later = expected.under(much_later)[0]
   inner = np.concatenate([t > 0.05 for t in stamps])
   shifted = np.sin(3.0 * (np.concatenate(stamps) - 0.03))
   np.testing.assert_allclose(later[inner], shifted[inner], atol=3e-4)
