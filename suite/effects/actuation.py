@@ -171,7 +171,7 @@ KINDS = (
     "the command reaches the actuator late",
     "joint",
     "command",
-    (Parameter("delay", "s", 0.0, 0.0, 0.1, "latency", minimum=0.0, maximum=2.0),),
+    (Parameter("delay", "s", 0.0, 0.0, 0.2, "latency", minimum=0.0, maximum=2.0),),
     CommandDelay,
   ),
   Kind(

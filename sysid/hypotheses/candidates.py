@@ -33,7 +33,7 @@ def library(plant: JointPlant) -> list[Term]:
   torque = typical_torque(plant)
   speed = _typical_speed(plant)
   terms = [
-    _one("command_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)),
+    _one("command_delay", joint, "delay", 0.0, 0.25, 0.01, (0.006, 0.03, 0.08, 0.16)),
     _one("clock_drift", None, "rate", -0.05, 0.05, 0.003, (0.003, -0.003)),
     _one("coulomb_friction", joint, "torque", 0.0, torque, 0.1 * torque, (0.05 * torque,)),
     _one(
