@@ -24,7 +24,7 @@ loop: install
 	@echo "open out/loop/loop.html"
 
 test: install lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadscope
 
 lint: install
 	$(BIN)/ruff check .

@@ -21,8 +21,8 @@ def run(arguments: Arguments) -> None:
   Raises:
     CommandError: As `actor.join`.
   """
-  from nerf2real.agents.distill.collecting import Collector
-  from nerf2real.agents.distill.evaluating import Evaluator
+  from nerf2real.agents.distill.collecting.collector import Collector
+  from nerf2real.agents.distill.collecting.evaluator import Evaluator
 
   join(
     arguments,

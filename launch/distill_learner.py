@@ -60,7 +60,8 @@ def settings_of(arguments: Arguments) -> Any:
   Raises:
     ValueError: The preset is unknown, or there is no policy to begin with.
   """
-  from nerf2real.agents.distill import beginning, settings
+  from nerf2real.agents.distill import settings
+  from nerf2real.agents.distill.learning import beginning
 
   if arguments.resume:
     if not (arguments.run / settings.SETTINGS).exists():
@@ -91,7 +92,7 @@ def run(arguments: Arguments) -> None:
 
 
 def _distil(arguments: Arguments) -> None:
-  from nerf2real.agents.distill.learner import Learner
+  from nerf2real.agents.distill.learning.learner import Learner
 
   try:
     learner = Learner(

@@ -46,7 +46,9 @@ def assemble(
   _copy_files(results, out)
   parts = collision.read_parts(out / "collision")
   figures = _figures(results)
-  figures |= _sight_line_figures(results, parts, settings)
+  judged = _judge(results, parts, settings)
+  if judged is not None:
+    figures |= _sight_line_figures(judged)
   if measure is not None:
     truth = measure(_reconstruction(results, parts, collision_top=settings.collision.top))
     figures |= truth.figures
@@ -66,6 +68,8 @@ def assemble(
       f"Exposure changed by a factor of {ratio:.1f} while filming. It was evened out, but clipped "
       "highlights stay; lock the phone's exposure."
     )
+  if judged is not None and judged.unfit is not None:
+    warnings.append(judged.unfit)
   goals = results.contact.value.goals
   path = alignment.world_from_unit.apply(poses.world_from_camera[:, :3, 3])
   report.write(
@@ -150,10 +154,10 @@ def _figures(results: SceneResults) -> dict[str, Any]:
   }
 
 
-def _sight_line_figures(
+def _judge(
   results: SceneResults, parts: list[convex.Part], settings: SceneSettings
-) -> dict[str, float]:
-  """Judges the parts by sight lines of held-out pictures; nothing where points have no pictures."""
+) -> sight_lines.Judgement | None:
+  """Judges the parts by sight lines of held-out pictures; None where points have no pictures."""
   place, names = results.world.value, np.array(results.poses.value.names)
   upper = np.minimum(place.extent_upper, [np.inf, np.inf, settings.collision.top])
   lines = sight_lines.sight_lines(
@@ -163,12 +167,14 @@ def _sight_line_figures(
     lower=place.extent_lower,
     upper=upper,
   )
-  found = sight_lines.judge_parts(lines, parts)
-  if found is None:
-    return {}
+  return sight_lines.judge_parts(lines, parts)
+
+
+def _sight_line_figures(found: sight_lines.Judgement) -> dict[str, float]:
   return {
     "sight_lines": float(found.lines),
     "sight_lines_blocked": found.blocked,
+    "sight_lines_blocked_p95_m": found.blocked_p95,
     "points_missed": found.missed,
     "points_to_parts_p95_m": found.distance_p95,
   }

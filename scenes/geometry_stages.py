@@ -16,7 +16,7 @@ from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import FloorError
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.capture.capture import Capture
-from nerf2real.scenes.geometry import collision, convex, floor_plan, fusion, map_server, mesh
+from nerf2real.scenes.geometry import collision, decomposition, floor_plan, fusion, map_server, mesh
 from nerf2real.scenes.poses.localise import Localisation
 from nerf2real.scenes.quality import collision_error
 from nerf2real.scenes.results import Contact
@@ -24,6 +24,7 @@ from nerf2real.scenes.stages import Made, StageResult, Stages
 
 _OUTLOOK_VERSION = 2  # 2: no floor among the localised points is warned of
 _WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
+_CONTACT_VERSION = 2  # 2: unseen space is matter behind seen matter alone; no tolerance grows
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 
@@ -216,7 +217,7 @@ def contact(
       settings=shape,
       progress=part(progress, 0.0, 0.2),
     )
-    parts = convex.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
+    parts = decomposition.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
     collision.write_parts(parts, folder / "collision")
     progress(0.8, "free space")
     space = floor_plan.floor_plan(
@@ -247,5 +248,6 @@ def contact(
     write_json(folder / "contact.json", figures)
 
   everything = [collision_settings, floor_settings]
-  stage = cache.run("contact", write, settings=everything, inputs={"world": world.stamp})
+  inputs = {"world": world.stamp}
+  stage = cache.run("contact", write, settings=everything, inputs=inputs, version=_CONTACT_VERSION)
   return Made(read_json(stage.folder / "contact.json", Contact), stage)

@@ -25,7 +25,7 @@ from nerf2real.scenes.quality import held_out, image_quality
 from nerf2real.scenes.results import Source, TrainedField
 from nerf2real.scenes.stages import Made, Stages
 
-_POSES_VERSION = 2  # 2: the unit frame's yaw follows from the first camera
+_POSES_VERSION = 3  # 2: the unit frame's yaw; 3: the rolling shutter is taken out
 _FIELD_VERSION = 2  # 2: the lens's falloff is taken out of the pictures
 
 
@@ -46,8 +46,13 @@ def poses(
   """Estimates the camera, its poses and sparse points by structure from motion."""
 
   def write(folder: Path, progress: Progress) -> None:
-    images, known = capture.value.folder, capture.value.known
-    localise.localise(images, folder, settings=settings, known=known, progress=progress)
+    taken = capture.value
+    times = None
+    if taken.times is not None:
+      times = dict(zip([path.name for path in taken.images], taken.times.tolist(), strict=True))
+    localise.localise(
+      taken.folder, folder, settings=settings, known=taken.known, times=times, progress=progress
+    )
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large
 
   inputs = {"keyframes": capture.stamp}

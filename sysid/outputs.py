@@ -109,9 +109,10 @@ def _identify(
   analysing = part(progress, 0.0, _ANALYSIS)
   found = analyse(compiled, logs, reference=reference, settings=settings, progress=analysing)
   progress(_ANALYSIS, "sensors and floor")
-  sensed = sensing.find(compiled, logs, reference)
-  if sensed.effects:
-    found.objects += sensed.effects
+  sensed = sensing.find(compiled, logs, reference, tilt=_tilt(found))
+  found.objects += sensed.effects
+  found.in_reference += sensed.in_reference
+  if sensed.rows:
     found.effects += sensed.rows
     found.verdict = "effects" if found.verdict == "none" else found.verdict
   progress(_SENSORS, "errors on the logs")
@@ -178,6 +179,13 @@ def _identify(
   content["seconds"] = round(time.perf_counter() - began, 1)
   write_atomically(out / "report.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
   return content
+
+
+def _tilt(found: Identified) -> dict[str, float] | None:
+  """Returns how far gravity is turned, where that is claimed."""
+  claimed = any(row["kind"] == "gravity_tilt" for row in found.effects)
+  tilts = [e for e in found.objects if e.kind == "gravity_tilt"] if claimed else []
+  return {n: float(v) for n, v in tilts[0].parameters.items()} if tilts else None  # type: ignore[arg-type]
 
 
 def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:

@@ -56,13 +56,10 @@ class Settings:
   """Hypotheses that are grown further."""
   worth: float = 2.8
   """Standard errors by which a further effect must be better for the search to go on."""
-  suspects: int = 3
-  """Joints on which effects of wider scope are looked for, and without references any: those that
-  leave most."""
   reference_depth: int = 1
   """Effects of a joint at most that are looked for in reference logs."""
   structured: float = 0.5
-  """Of the readings' noise: a residual beside a reference that goes together is that large."""
+  """Of the readings' noise: a residual that goes together is that large beyond rounding."""
   alike: float = 0.5
   """Of the residual's scale: hypotheses whose predictions differ by less are not told apart."""
   more: float = 2.0

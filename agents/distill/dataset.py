@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
-from nerf2real.agents.dmpo.prior import write_layout
+from nerf2real.agents.dmpo.replay.prior import write_layout
 from nerf2real.agents.dmpo.specs import BALL, Layout
 from nerf2real.core import files
 

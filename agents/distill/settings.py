@@ -63,7 +63,7 @@ class DistillSettings:
   environment: str
   """Where data are collected, as `agents.environments.loading` names it, without pushes."""
   teacher: str = "quick"
-  """One of `teacher.TEACHERS`, or the folder of an exported policy."""
+  """One of `teacher.TEACHERS`, a walker's settings as JSON, or the folder of an exported policy."""
   init_from: str = ""
   """Folder of an exported policy that the student begins with; random weights if empty."""
   agent: DmpoConfig = DmpoConfig(network=NetworkConfig(init_stddev=0.1))

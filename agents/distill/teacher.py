@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
+from nerf2real.core.serialization import read_json
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import Pose, SteeringSettings, Walker
 from nerf2real.suite.op3 import constants
@@ -204,16 +205,19 @@ class PolicyTeacher:
 
 
 def make_teacher(name: str, scene: Any) -> Teacher:
-  """Returns a teacher by its name in TEACHERS, or from the folder of an exported policy.
+  """Returns a teacher by its name in TEACHERS, from a walker's JSON, or from a policy's folder.
 
   Raises:
-    ValueError: it is neither.
+    ValueError: it is none of these, or the file holds no `WalkerSettings`.
   """
   if name in TEACHERS:
     return WalkerTeacher(scene, TEACHERS[name]())
-  if not Path(name).is_dir():
+  path = Path(name)
+  if path.suffix == ".json" and path.is_file():
+    return WalkerTeacher(scene, read_json(path, WalkerSettings))
+  if not path.is_dir():
     raise ValueError(
-      f"Unknown teacher {name!r}: expected one of {', '.join(TEACHERS)}, or the folder of an "
-      "exported policy."
+      f"Unknown teacher {name!r}: expected one of {', '.join(TEACHERS)}, the JSON of a walker's "
+      "settings, or the folder of an exported policy."
     )
   return PolicyTeacher(load_policy(name))

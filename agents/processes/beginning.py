@@ -10,7 +10,7 @@ import numpy as np
 from nerf2real.agents.dmpo import config as configs
 from nerf2real.agents.dmpo import training_state
 from nerf2real.agents.dmpo.policy import acting, export
-from nerf2real.agents.dmpo.replay import Replay
+from nerf2real.agents.dmpo.replay.ring import Replay
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.dmpo.training_state import TrainingState
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter

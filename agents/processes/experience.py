@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from nerf2real.agents.dmpo.config import DmpoConfig
-from nerf2real.agents.dmpo.frozen import FrozenEncoder
 from nerf2real.agents.dmpo.networks import Params
-from nerf2real.agents.dmpo.prior import PriorData, sample_mixed, write_layout
-from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
+from nerf2real.agents.dmpo.replay.features import FrozenEncoder
+from nerf2real.agents.dmpo.replay.prior import PriorData, sample_mixed, write_layout
+from nerf2real.agents.dmpo.replay.ring import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.processes import beginning
 from nerf2real.agents.processes.settings import RunSettings

@@ -23,7 +23,7 @@ import tyro
 from benchmarks import harness
 from nerf2real.agents.dmpo import config, learning, losses, networks
 from nerf2real.agents.dmpo.config import DmpoConfig
-from nerf2real.agents.dmpo.replay import trajectory_fields
+from nerf2real.agents.dmpo.replay.ring import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
 STATE_LAYOUT = Layout(None, None, ("position", "velocity"), (3, 2), (), (), 1)

@@ -9,7 +9,10 @@ from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.effects import Effect
 
 # Effects of the library that are a right description of one that it lacks.
-_DESCRIBED_BY = {"supply_course": ("supply_sag", "motor_gain")}
+_DESCRIBED_BY = {
+  "supply_course": ("supply_sag", "motor_gain"),
+  "floor_slope": ("gravity_tilt",),  # of a robot that is held upright to the floor
+}
 LEARNED = "residual_force"  # a force without a name
 
 
@@ -27,16 +30,20 @@ class Comparison(NamedTuple):
 
   rows: tuple[Row, ...]
   wrong: tuple[str, ...]  # named and not hidden
+  in_reference: tuple[str, ...] = ()  # what the robot had before, too: its own build
 
 
-def compare(hidden: Sequence[Undeclared], effects: Sequence[Effect]) -> Comparison:
+def compare(
+  hidden: Sequence[Undeclared], effects: Sequence[Effect], in_reference: Sequence[Effect] = ()
+) -> Comparison:
   """Returns what was named of what was hidden, and what was named besides.
 
   Errors of declared constants and learned forces carry no name and are not judged.
 
   Args:
     hidden: What the robot had.
-    effects: What identification found.
+    effects: What identification found to have changed.
+    in_reference: What it found that was there before, too; neither right nor wrong.
   """
   named = [e for e in effects if e.kind not in (*CONSTANTS, LEARNED)]
   rows, used = [], set()
@@ -55,7 +62,8 @@ def compare(hidden: Sequence[Undeclared], effects: Sequence[Effect]) -> Comparis
         covered=covered,
       )
     )
-  return Comparison(tuple(rows), tuple(describe(e) for e in named if id(e) not in used))
+  wrong = tuple(describe(e) for e in named if id(e) not in used)
+  return Comparison(tuple(rows), wrong, tuple(describe(e) for e in in_reference))
 
 
 def describe(effect: Effect) -> str:

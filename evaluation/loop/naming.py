@@ -4,6 +4,7 @@ The rest of the loop knows `Named` alone: verdict, effects with intervals, what 
 """
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from nerf2real.suite.effects import Effect, read_effects, write_effects
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.op3.op3 import OP3
 from nerf2real.sysid.sensors import floor
+from nerf2real.sysid.sensors.sensed import Part
 
 NONE = "none"
 _FINDING = "finding.json"  # the loop's own file: written last, so that it stands for a whole stage
@@ -30,7 +32,7 @@ class Named(NamedTuple):
 
   verdict: str  # "none", "effects", "unexplained", ...
   content: dict[str, Any]  # of the analyser's report.json
-  effects: list[Effect]  # with intervals; constants of the joints concerned among them
+  effects: list[Effect]  # what the model lacks, with intervals; constants of joints among them
   effects_path: Path  # effects.json
   share: float | None  # of the held-out squared error above the noise, explained
   notes: list[str]
@@ -38,8 +40,20 @@ class Named(NamedTuple):
 
   @property
   def named(self) -> list[Effect]:
-    """The effects without errors of declared constants."""
-    return [effect for effect in self.effects if effect.kind not in CONSTANTS]
+    """The effects that are claimed, without errors of declared constants."""
+    rows = self.content.get("effects")
+    return [
+      effect
+      for effect in self.effects
+      if effect.kind not in CONSTANTS and (rows is None or _listed(effect, rows))
+    ]
+
+  @property
+  def in_reference(self) -> list[Effect]:
+    """The effects that the reference shows, too: the robot's own build."""
+    rows = self.content.get("in_reference", ())
+    own = [effect for effect in self.effects if _listed(effect, rows)]
+    return [effect for effect in own if effect not in self.named]
 
 
 def name(out: Path, logs: Path, reference: Path | None = None) -> Named:
@@ -64,11 +78,19 @@ def name(out: Path, logs: Path, reference: Path | None = None) -> Named:
       reference=[] if reference is None else [reference / f"{name}.mcap" for name in TRAIN],
       out=out,
     )
-    effects, notes = _floor(logs / f"{FLOOR}.mcap")
-    write_effects(out / "effects.json", [*read_effects(out / "effects.json"), *effects])
-    if effects and content["verdict"] == NONE:
+    stood = _floor(logs / f"{FLOOR}.mcap")
+    before = None if reference is None else _floor(reference / f"{FLOOR}.mcap")
+    if before is not None:
+      stood = stood.beside(before)
+    effects = read_effects(out / "effects.json")
+    if any(effect.kind == "floor_slope" for effect in stood.effects):  # gravity is turned once
+      effects = [effect for effect in effects if effect.kind != "gravity_tilt"]
+    write_effects(out / "effects.json", [*effects, *stood.effects])
+    if stood.rows and content["verdict"] == NONE:
       content["verdict"] = "effects"
-    content["notes"] = [*content["notes"], *notes]
+    content["effects"] = [*content["effects"], *stood.rows]
+    content["in_reference"] = [*content["in_reference"], *stood.in_reference]
+    content["notes"] = [*content["notes"], *stood.notes]
     write_json(out / _FINDING, content)
   return read(out)
 
@@ -97,12 +119,17 @@ def _share(error: dict[str, Any]) -> float | None:
   return max(0.0, 1.0 - left / (held["before"] ** 2 - noise**2))
 
 
-def _floor(log: Path) -> tuple[list[Effect], list[str]]:
-  """Returns the floor's slope from a robot that stood at several headings, and notes."""
+def _listed(effect: Effect, rows: Sequence[Mapping[str, Any]]) -> bool:
+  """Tells whether an effect has an entry in a report."""
+  places = [(row["kind"], row.get("body") or row.get("geom") or row.get("joint")) for row in rows]
+  return (effect.kind, effect.target) in places
+
+
+def _floor(log: Path) -> Part:
+  """Returns what a robot that stood at several headings shows of the floor's slope."""
   if not log.exists():
-    return [], []
+    return Part()
   spec = mujoco.MjSpec.from_string(OP3().mjcf_model.to_xml_string())
   spec.body(constants.TORSO_LINK).add_freejoint()
   spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
-  part = floor.find(spec.compile(), [read_log(log)])
-  return ([], []) if part is None else (part.effects, part.notes)
+  return floor.find(spec.compile(), [read_log(log)]) or Part()

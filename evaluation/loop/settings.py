@@ -49,8 +49,8 @@ class LoopSettings:
   preset: str = "adapt"
   """Settings of that distillation."""
   teacher: str = "auto"
-  """quick, swift, steady, the folder of a policy, or auto: the walker that succeeds more often
-  with the effects in the simulation."""
+  """quick, swift, steady, a walker's settings as JSON, the folder of a policy, or auto: the walker
+  that succeeds most often with the effects in the simulation, fitted to them if all fail."""
   actors: int = 1
   """Collectors of the distillation."""
   out: Path = Path("out/loop")

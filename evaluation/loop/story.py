@@ -91,7 +91,9 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
     after = trained.policy
     run(Condition(name=TRAINED, policy=after, simulated=True, effects=effects))
   run(Condition(name=AFTER, policy=after, altered=hidden))
-  comparison = compare(hidden, named.effects) if settings.robot == recording.VIRTUAL else None
+  comparison = None
+  if settings.robot == recording.VIRTUAL:
+    comparison = compare(hidden, named.named, named.in_reference)
   story = Story(settings, found, named, trained, comparison, stages.seconds)
   write_json(settings.out / "loop.json", summary(story))
   return story

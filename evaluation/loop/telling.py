@@ -111,6 +111,7 @@ def as_text(story: Story) -> str:
     rows = story.comparison.rows
     lines += [f"hidden: {row.hidden}; named: {row.named or 'nothing'}" for row in rows]
     lines += [f"named besides: {'; '.join(story.comparison.wrong) or 'nothing'}"]
+    lines += [f"in the reference, too: {found}" for found in story.comparison.in_reference]
   return "\n".join(["", *lines])
 
 
@@ -156,6 +157,9 @@ def _finding(named: Named) -> Section:
   )
   blocks += [Text(note) for note in named.notes]
   listed = "; ".join(describe(e) for e in named.named) or "nothing"
+  own = "; ".join(describe(e) for e in named.in_reference)
+  if own:
+    blocks.append(Text(f"In the reference, too, so that the robot had it before: {own}."))
   return Section("What the recordings say", f"Verdict: {named.verdict}. {listed}.", blocks)
 
 
@@ -215,4 +219,8 @@ def _hidden(found: Comparison) -> Section:
   text = "Nothing was hidden." if not rows else ""
   besides = "; ".join(found.wrong) or "nothing"
   blocks: list[Block] = [Table(header, rows)] if rows else []
-  return Section("What was hidden", text, [*blocks, Text(f"Named besides: {besides}.")])
+  blocks.append(Text(f"Named besides: {besides}."))
+  if found.in_reference:
+    own = "; ".join(found.in_reference)
+    blocks.append(Text(f"In the reference, too, and neither right nor wrong: {own}."))
+  return Section("What was hidden", text, blocks)

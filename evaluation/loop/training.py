@@ -9,20 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nerf2real.agents.distill import settings as distillation
-from nerf2real.agents.distill.checkpoint import STATE
-from nerf2real.agents.distill.teacher import TEACHERS
+from nerf2real.agents.distill.learning.checkpoint import STATE
 from nerf2real.agents.supervision import training
-from nerf2real.core.serialization import to_plain, write_json
-from nerf2real.evaluation import runner
 from nerf2real.evaluation.loop.settings import LoopSettings
-from nerf2real.evaluation.plants import plant as plants
-from nerf2real.evaluation.plants.plant import NAVIGATION
-from nerf2real.evaluation.policies import GaitPolicy
-from nerf2real.evaluation.session import choose
+from nerf2real.evaluation.loop.teachers import choose_teacher
 
 POLICY = Path("policy") / "newest"
-_WALKERS = ("quick", "steady")  # teachers that navigate
-_TRIALS = 6  # of each teacher, spread over the protocol; chosen: seconds without pictures
 _DONE = 0.99  # of the minutes, from which a training is taken for finished
 
 
@@ -72,7 +64,11 @@ def train(
   """
   run = settings.out / "training"
   run.mkdir(parents=True, exist_ok=True)
-  teacher, teachers, count = _choose_teacher(settings, effects, scene)
+  teacher, teachers, count = settings.teacher, dict[str, int](), 0
+  if teacher == "auto":
+    teacher, teachers, count = choose_teacher(
+      run, effects, scene, seed=settings.seed, time_limit=settings.time_limit
+    )
   if _minutes(run) < _DONE * settings.minutes:
     forwarded = ["--minutes", str(settings.minutes), "--teacher", teacher]
     if policy is not None:
@@ -123,39 +119,3 @@ def _minutes(run: Path) -> float:
     return 0.0
   with np.load(run / STATE, allow_pickle=False) as stored:
     return float(json.loads(stored["counters"].tobytes())["elapsed"]) / 60
-
-
-def _choose_teacher(
-  settings: LoopSettings, effects: Path, scene: Any
-) -> tuple[str, dict[str, int], int]:
-  """Returns the teacher, each walker's successes with the effects, and how many trials it had."""
-  if settings.teacher != "auto":
-    return settings.teacher, {}, 0
-  path = settings.out / "training" / "teachers.json"
-  if path.exists():
-    kept = json.loads(path.read_text())
-    return kept["teacher"], kept["successes"], kept["trials"]
-  from nerf2real.evaluation.plants.simulated import SimulatedPlant
-
-  chosen = choose(plants.trials(NAVIGATION), min(_TRIALS, settings.trials))
-  successes: dict[str, int] = {}
-  plant = SimulatedPlant(
-    scene,
-    NAVIGATION,
-    image_size=None,
-    effects=effects,
-    draw_effects=True,
-    time_limit=settings.time_limit,
-  )
-  with contextlib.closing(plant):
-    for name in _WALKERS:
-      made = TEACHERS[name]()
-      walker = GaitPolicy(scene, NAVIGATION, settings=made.gait, steering=made.steering, name=name)
-      successes[name] = sum(
-        runner.run_trial(plant, walker, trial, group=group, index=index).success
-        for index, (group, trial) in chosen
-      )
-  teacher = max(successes, key=lambda name: successes[name])
-  found = {"teacher": teacher, "successes": successes, "trials": len(chosen)}
-  write_json(path, to_plain(found))
-  return teacher, successes, len(chosen)

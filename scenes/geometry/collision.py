@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.geometry import convex, fusion
+from nerf2real.scenes.geometry import convex, decomposition, fusion
 from nerf2real.scenes.geometry import mesh as meshes
 
 
@@ -33,7 +33,9 @@ class CollisionSettings:
   """Standard deviation of the blur over voxels that takes off depth noise."""
   min_component: float = 0.15
   """Smaller floating pieces are dropped, diagonal of their box."""
-  parts: convex.ConvexSettings = dataclasses.field(default_factory=convex.ConvexSettings)
+  parts: decomposition.ConvexSettings = dataclasses.field(
+    default_factory=decomposition.ConvexSettings
+  )
 
 
 _CORE = -0.2  # value, in truncations, below which a voxel is matter whatever its neighbours are

@@ -17,6 +17,7 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.sources import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.shutter import Shutter
 
 _FIGURES = "localisation.json"
 
@@ -49,6 +50,8 @@ class Localisation:
   """Which pairs were matched and which mapper was used."""
   unit_from_source: Similarity
   """From the source's frame (COLMAP's, or that of the known poses)."""
+  shutter: Shutter | None = None
+  """Motion while a picture was read, unit frame; None where all lines count as read at once."""
   warnings: tuple[str, ...] = ()
   """What may ruin the reconstruction."""
   seconds: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -93,6 +96,7 @@ def save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Pat
     "reprojection_error_px": localisation.reprojection_error_px,
     "strategy": localisation.strategy,
     "unit_from_source": localisation.unit_from_source,
+    "shutter": localisation.shutter,
     "warnings": localisation.warnings,
     "seconds": localisation.seconds,
   }
@@ -114,5 +118,7 @@ def load(folder: Path) -> Localisation:
   except (OSError, ValueError, RuntimeError) as error:
     raise LocalisationError(f"{folder} holds no localisation: {error}") from error
   values["unit_from_source"] = from_plain(values["unit_from_source"], Similarity)
+  if values.get("shutter") is not None:
+    values["shutter"] = from_plain(values["shutter"], Shutter)
   values["warnings"] = tuple(values["warnings"])
   return from_model(model, values)

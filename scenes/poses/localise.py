@@ -6,19 +6,21 @@ keyframes, P points.
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
 import shutil
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.serialization import to_plain
-from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap
+from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap, to_opencv
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, matching
+from nerf2real.scenes.poses import mapping, matching, shutter
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -31,13 +33,20 @@ from nerf2real.scenes.poses.localisation import (
 from nerf2real.scenes.poses.matching import FeatureSettings, quiet
 from nerf2real.scenes.poses.pairs import PairSettings, repair_pairs
 from nerf2real.scenes.poses.parallax import parallax_share
+from nerf2real.scenes.poses.shutter import Shutter
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
 
 __all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "localise"]
 
 
 _MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
-_STAGE_SHARES = {"features": 0.25, "matching": 0.4, "mapping": 0.25, "refining": 0.1}
+_STAGE_SHARES = {
+  "features": 0.25,
+  "matching": 0.4,
+  "mapping": 0.25,
+  "refining": 0.05,
+  "shutter": 0.05,
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,6 +79,7 @@ def localise(
   *,
   settings: LocaliseSettings | None = None,
   known: KnownPoses | None = None,
+  times: Mapping[str, float] | None = None,
   progress: Progress = no_progress,
 ) -> Localisation:
   """Localises the pictures of a folder.
@@ -79,6 +89,7 @@ def localise(
     out_folder: Receives `sfm/` and `work/`.
     settings: How.
     known: Poses that came with the pictures, in the order of their sorted names; they are kept.
+    times: When each picture of a film was taken [s]: its rolling shutter is taken out.
     progress: Called with the fraction done and a text.
 
   Raises:
@@ -102,6 +113,8 @@ def localise(
   else:
     database = _prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
     result = _map(database, images_folder, names, settings, known, steps)
+    if times is not None and known is None:
+      result = _without_shutter(result, times, steps)
   localisation = _describe(result, len(names), known, images_folder, steps)
   save(result.model, localisation, out_folder / _MODEL_FOLDER)
   return localisation
@@ -113,6 +126,9 @@ class _Mapped:
   """In the source's frame."""
   strategy: str
   warnings: tuple[str, ...]
+  lens: mapping.FreeLens | None = None
+  """What was estimated of the lens; None where it was known."""
+  shutter: Shutter | None = None
 
 
 class _Steps:
@@ -230,9 +246,25 @@ def _map(
   model, lens = mapping.refine(model, report=steps.report)
   if mapping.drop_weak_images(model):
     _check_registered(model, names, settings, share)
-  if lens != "all OPENCV parameters":
-    warnings.append(f"Lens: estimated {lens}.")
-  return _Mapped(model, f"{words}, {mapper} mapper; lens: {lens}", tuple(warnings))
+  if not lens.principal:
+    warnings.append(f"Lens: estimated {lens.words}.")
+  return _Mapped(model, f"{words}, {mapper} mapper; lens: {lens.words}", tuple(warnings), lens)
+
+
+def _without_shutter(mapped: _Mapped, times: Mapping[str, float], steps: _Steps) -> _Mapped:
+  """Takes the rolling shutter out of a model; the model itself where that spoils the lens."""
+  lens = mapped.lens
+  assert lens is not None  # for the type checker: only known poses have none
+  adjust = functools.partial(mapping.adjust, principal=lens.principal, distortion=lens.distortion)
+  steps.begin("shutter")
+  model, found = shutter.correct(mapped.model, times, adjust, report=steps.report)
+  mapping.drop_bad_observations(model)
+  fault = mapping.camera_fault(to_opencv(next(iter(model.cameras.values()))))
+  if fault is not None:
+    words = f"{mapped.strategy}; rolling shutter not taken out, because {fault}"
+    return dataclasses.replace(mapped, strategy=words)
+  words = f"{mapped.strategy}; rolling shutter of {1e3 * found.readout:.1f} ms taken out"
+  return dataclasses.replace(mapped, model=model, strategy=words, shutter=found)
 
 
 def _picture_width(database: Path) -> int:
@@ -318,6 +350,7 @@ def _describe(
     "reprojection_error_px": reprojection_error(model),
     "strategy": result.strategy,
     "unit_from_source": unit,
+    "shutter": None if result.shutter is None else result.shutter.scaled(unit.scale),
     "warnings": result.warnings,
     "seconds": dict(steps.seconds),
   }

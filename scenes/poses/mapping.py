@@ -4,6 +4,7 @@ import os
 import shutil
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,7 +103,8 @@ def drop_weak_images(model: pycolmap.Reconstruction) -> int:
   return len(weak)
 
 
-def _adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool) -> None:
+def adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool) -> None:
+  """Adjusts poses, points, focal lengths and, where chosen, principal point and distortion."""
   options = pycolmap.BundleAdjustmentOptions()
   options.refine_principal_point = principal
   options.refine_extra_params = distortion
@@ -118,7 +120,17 @@ def _adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool
   config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
   with quiet():  # pycolmap.bundle_adjustment writes to the terminal whatever the log level
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def drop_bad_observations(model: pycolmap.Reconstruction) -> None:
+  """Drops observations far from their point, and points seen under a small angle only."""
+  with quiet():
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+
+
+def _adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool) -> None:
+  adjust(model, principal=principal, distortion=distortion)
+  drop_bad_observations(model)
 
 
 def camera_fault(camera: Camera) -> str | None:
@@ -142,9 +154,17 @@ def camera_fault(camera: Camera) -> str | None:
   return None
 
 
+class FreeLens(NamedTuple):
+  """Parameters of the lens that pictures determine, beside the focal lengths."""
+
+  distortion: bool
+  principal: bool
+  words: str  # which are free, and why not all
+
+
 def refine(
   model: pycolmap.Reconstruction, *, report: Progress = no_progress
-) -> tuple[pycolmap.Reconstruction, str]:
+) -> tuple[pycolmap.Reconstruction, FreeLens]:
   """Adjusts poses, points and all parameters of the lens; frees fewer where the result is absurd.
 
   Parameters are freed in the order focal lengths, distortion, principal point. When an estimate is
@@ -152,7 +172,7 @@ def refine(
   adjustment is repeated with fewer free parameters; distortion that stays absurd is set to zero.
 
   Returns:
-    The refined model and a sentence on the lens: which parameters are free and why not all.
+    The refined model and the free parameters of the lens.
   """
   report(0.0, "adjusting poses and lens")
   base = pycolmap.Reconstruction(model)
@@ -163,7 +183,8 @@ def refine(
     for camera in base.cameras.values():
       camera.params = np.concatenate([camera.params[:4], np.zeros(4)])
     _adjust(base, principal=False, distortion=False)
-    return base, f"focal lengths only, no distortion, because {fault}"
+    words = f"focal lengths only, no distortion, because {fault}"
+    return base, FreeLens(distortion=False, principal=False, words=words)
   report(0.5, "adjusting poses and lens, principal point free")
   full = pycolmap.Reconstruction(base)
   _adjust(full, principal=True, distortion=True)
@@ -172,8 +193,9 @@ def refine(
   if fault is None and abs(change) > _MAX_FOCAL_CHANGE:
     fault = f"it moves the focal length by {change:+.1%}"
   if fault is not None:
-    return base, f"all OPENCV parameters but the principal point, because {fault}"
-  return full, "all OPENCV parameters"
+    words = f"all OPENCV parameters but the principal point, because {fault}"
+    return base, FreeLens(distortion=True, principal=False, words=words)
+  return full, FreeLens(distortion=True, principal=True, words="all OPENCV parameters")
 
 
 def _camera(model: pycolmap.Reconstruction) -> Camera:

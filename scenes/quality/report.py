@@ -79,6 +79,9 @@ FIGURES: Mapping[str, Meaning] = {
   "sight_lines_blocked": Meaning(
     "", "share of them that a part blocks more than 5 cm before the point", "near 0"
   ),
+  "sight_lines_blocked_p95_m": Meaning(
+    "m", "95th percentile of how far before its point a sight line meets a part", "below 0.1"
+  ),
   "points_missed": Meaning("", "share of their points with no part or floor within 5 cm", "near 0"),
   "points_to_parts_p95_m": Meaning(
     "m", "95th percentile of their points' distance from parts or floor", "lower"

@@ -3,8 +3,10 @@
 Where a picture shows a point, the line between is free: a part across it is wrong. Where there is a
 point, there is matter: a point far from every part and from the floor is missed. No truth is
 needed, so every capture has the figure; what the judge itself gets wrong is measured on the
-built-in room, where its points can be held against the truth. The held-out pictures trained
-nothing, but the points may have guided training through other pictures that see them, too.
+built-in room, where its points can be held against the truth. Points that judge are localised to
+half the tolerance: their deviation follows from their reprojection error and from where they were
+seen from. The held-out pictures trained nothing, but the points may have guided training through
+other pictures that see them, too.
 Shapes: S sight lines, P points.
 """
 
@@ -16,13 +18,15 @@ import numpy as np
 from scipy import spatial
 
 from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.capture.sources import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.geometry import collision, convex
 from nerf2real.scenes.quality.collision_error import sample_parts
 
 TOLERANCE = 0.05  # m that matter may be away, as the other figures of contact geometry count
-_MOST_ERROR = 1.0  # reprojection error of points that judge [pixel]
-_FEWEST_VIEWS = 4  # pictures that see them
+FIT = 0.1  # m that 95 % may be wrong by in geometry to train in: a robot's foot is 0.12 m long
+_LEAST_ERROR = 0.5  # reprojection error that a deviation is reckoned with at least [pixel]
+_FEWEST_VIEWS = 4  # pictures that see a point that judges
 _STEPS = 200  # of a march along a sight line; the closest of lines graze surfaces at centimetres
 _CONTACT = 0.005  # m from a true surface at which a march ends
 
@@ -45,9 +49,55 @@ class Judgement(NamedTuple):
 
   lines: int  # that judged
   blocked: float  # share that matter crosses more than the tolerance before the point
+  blocked_p95: float  # 95th percentile of where matter begins before the point [m]
   missed: float  # share of points with no matter within the tolerance
   distance_median: float  # of points from matter [m]
   distance_p95: float  # its 95th percentile [m]
+
+  @property
+  def unfit(self) -> str | None:
+    """What makes the geometry unfit to train in and what to do; None where it is fit."""
+    found = []
+    if self.blocked_p95 > FIT:
+      found.append(
+        f"5 % of the sight lines to localised points meet matter {self.blocked_p95:.2f} m or more "
+        "before their point"
+      )
+    if self.distance_p95 > FIT:
+      found.append(f"5 % of the points lie {self.distance_p95:.2f} m or more from all matter")
+    if not found:
+      return None
+    return (
+      f"The contact geometry is unfit to train in: {' and '.join(found)}, expected at most "
+      f"{FIT:g} m. Film again, slower, with more light, walking sideways along plain walls and "
+      "black or shiny things, or train longer (--preset quality)."
+    )
+
+
+def deviations(model: pycolmap.Reconstruction) -> dict[int, float]:
+  """Standard deviation [model's unit] of each point along its least certain direction.
+
+  A picture at distance r fixes the two directions across its ray to the reprojection error times
+  r over the focal length.
+  """
+  camera = to_opencv(next(iter(model.cameras.values())))
+  eyes = {
+    number: image.cam_from_world().inverse().translation
+    for number, image in model.images.items()
+    if image.has_pose
+  }
+  found = {}
+  for number, point in model.points3D.items():
+    seen = {e.image_id for e in point.track.elements if e.image_id in eyes}
+    if len(seen) < _FEWEST_VIEWS:
+      continue
+    ways = point.xyz - np.array([eyes[k] for k in seen])
+    squares = np.square(ways).sum(-1)
+    across = np.eye(3) - ways[:, :, None] * ways[:, None] / squares[:, None, None]
+    angle = max(point.error, _LEAST_ERROR) * camera.pixel_angle
+    certainty = (across / (squares * angle**2)[:, None, None]).sum(0)
+    found[number] = float(1 / np.sqrt(np.linalg.eigvalsh(certainty)[0]))
+  return found
 
 
 def sight_lines(
@@ -68,9 +118,9 @@ def sight_lines(
     upper: Upper corner [3] [m].
   """
   good = {
-    number: point.xyz
-    for number, point in model.points3D.items()
-    if point.error < _MOST_ERROR and point.track.length() >= _FEWEST_VIEWS
+    number: model.points3D[number].xyz
+    for number, deviation in deviations(model).items()
+    if deviation * world_from_unit.scale < TOLERANCE / 2
   }
   eyes, points = [np.zeros((0, 3))], [np.zeros((0, 3))]
   for image in model.images.values():
@@ -86,9 +136,11 @@ def sight_lines(
 
 def judge(lines: SightLines, reach: np.ndarray, distance: np.ndarray) -> Judgement:
   """Judges a geometry by its first hit along each line [S] and the points' distance from it [S]."""
+  before = np.maximum(lines.lengths - reach, 0.0)
   return Judgement(
     len(reach),
-    float((reach < lines.lengths - TOLERANCE).mean()),
+    float((before > TOLERANCE).mean()),
+    float(np.percentile(before, 95)),
     float((distance > TOLERANCE).mean()),
     float(np.median(distance)),
     float(np.percentile(distance, 95)),

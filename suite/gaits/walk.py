@@ -68,6 +68,8 @@ class GaitSettings:
   """rad of ankle pitch per rad of pitch error."""
   roll_gain: float = -0.2117
   """rad of ankle roll per rad of roll."""
+  shift: float = 0.0
+  """m that both feet stand left of the hips' middle: below a centre of mass that lies there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,7 +222,7 @@ class Gait:
       ankle = np.array(
         [
           reach * forward * settings.stride / 2 - settings.backset,
-          side * settings.spread + sway,
+          side * settings.spread + sway + settings.shift,
           amplitude * lifted * settings.lift - settings.height,
         ]
       )

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nerf2real.sysid.fit.expectation import Expectation
 from nerf2real.sysid.fit.noise import effort_noise, timing
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
@@ -24,6 +25,8 @@ from nerf2real.sysid.model.measured import Measured
 from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
+
+_NOTHING = np.zeros(0)
 
 
 class JointLikelihood:
@@ -49,7 +52,7 @@ class JointLikelihood:
     shaky = self.stamp_noise * self.speed / self.position_noise
     self.gain = np.array([self.mask / np.sqrt(1.0 + shaky**2), self.mask][: len(self.channels)])
     self._cut()
-    self.expected: Array | float = 0.0
+    self.expectation: Expectation | None = None
     self.scale = np.maximum(self.floor, 1e-12)
     self.independent = np.ones(len(self.channels))
 
@@ -102,32 +105,41 @@ class JointLikelihood:
         channels.append(self._efforts([along for _, along in outputs]))
       rows.append(channels)
     result = np.nan_to_num(np.array(rows), nan=1e3, posinf=1e3, neginf=-1e3)
-    return (result - self.expected) * self.gain
+    if self.expectation is not None:
+      for row, x in zip(result, np.atleast_2d(xs), strict=True):
+        row -= self.expectation.under(compose(self.plant, terms, x)[0])
+    return result * self.gain
 
-  def expect(self, reference: "JointLikelihood", residuals: Array) -> bool:
+  def expect(
+    self,
+    reference: "JointLikelihood",
+    residuals: Array,
+    terms: Sequence[Term] = (),
+    x: Array = _NOTHING,
+  ) -> bool:
     """Takes what a reference leaves for expected, where it was driven by the very same commands.
-
-    What no model of the machine holds is then the same in both, and cancels.
 
     Args:
       reference: logs of the machine before.
       residuals: what its baseline leaves there [C, N], weighted as `residuals` gives it.
+      terms: of that baseline.
+      x: their values [n].
 
     Returns:
       Whether every log has its like.
     """
     ends = np.cumsum([len(log.time) for log in reference.plant.logs])
     starts = np.append(0, ends[:-1])
-    parts = []
+    likes = []
     residuals = residuals / np.maximum(reference.gain, 1e-9)
     for log in self.plant.logs:
       like = next((i for i, r in enumerate(reference.plant.logs) if _same_commands(log, r)), None)
       if like is None:
         return False
       other, keep = reference.plant.logs[like], reference.mask[starts[like] : ends[like]] > 0
-      rows = residuals[:, starts[like] : ends[like]]
-      parts.append(np.array([np.interp(log.time, other.time[keep], r[keep]) for r in rows]))
-    self.expected = np.concatenate(parts, axis=1)
+      likes.append((other.time[keep], residuals[:, starts[like] : ends[like]][:, keep]))
+    baseline = compose(reference.plant, terms, x)[0]
+    self.expectation = Expectation(self.plant.logs, likes, baseline)
     return True
 
   def _efforts(self, along: Sequence[Simulated | None]) -> Array:

@@ -20,11 +20,19 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.suite.randomisation import inertia as masses
+from nerf2real.sysid.model import point_mass
 
 Array = np.ndarray
 
 _EVERY = 3  # samples between poses at which a model is evaluated (30 ms at 100 Hz); ours
+_REACH = 0.1  # m of the places at which a mass is put to see its moments
+_UNIT = _REACH * np.eye(3)
+_MONOMIALS_AT = np.array(
+  [np.zeros(3), *_UNIT, *(-_UNIT), _UNIT[0] + _UNIT[1], _UNIT[0] + _UNIT[2], _UNIT[1] + _UNIT[2]]
+)
+_MONOMIALS = np.array(
+  [[1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z] for x, y, z in _MONOMIALS_AT]
+)
 _SMOOTHING = 0.035  # s, half width of the local polynomial that differentiates positions; ours
 
 
@@ -119,6 +127,8 @@ class Reduction:
     ids = [model.joint(name).id for name in log.joints]
     self._qpos = model.jnt_qposadr[ids]
     self._dofs = model.jnt_dofadr[ids]
+    self._poses: point_mass.Poses | None = None
+    self._moments: dict[int, dict[str, list[Surroundings]]] = {}
 
   def of_joint(self, joint: str) -> Surroundings:
     """Returns what a joint feels of the model as it is now."""
@@ -132,7 +142,7 @@ class Reduction:
     full = np.zeros((model.nv, model.nv))
     alone = len(self.log.joints) == 1 and model.nv == 1
     others = np.arange(model.nv) != dof
-    chosen = np.unique(np.append(np.arange(0, count, _EVERY), count - 1))
+    chosen = self._chosen()
     for n in chosen[:1] if alone else chosen:
       data.qpos[:] = model.qpos0
       data.qpos[self._qpos] = motion.position[n]
@@ -157,21 +167,12 @@ class Reduction:
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         across[n] = data.qfrc_bias[dof]
-    at = motion.position[:, column].copy()
-    if not alone:  # gravity as a vector that turns with the joint, between the chosen samples
-      cos, sin = np.cos(at), np.sin(at)
-      fixed = np.array([here * cos - across * sin, here * sin + across * cos])
-      fixed = np.array([np.interp(np.arange(count), chosen, f[chosen]) for f in fixed])
-      if hinge:
-        here, across = fixed[0] * cos + fixed[1] * sin, fixed[1] * cos - fixed[0] * sin
-      else:
-        here = np.interp(np.arange(count), chosen, here[chosen])
-      inertia = np.interp(np.arange(count), chosen, inertia[chosen])
-      bias = np.interp(np.arange(count), chosen, bias[chosen])
     if alone:
       inertia[:], here[:], across[:] = inertia[0], here[0], across[0]
-      at[:] = 0.0
-    return Surroundings(inertia, here, across, at, bias)
+      return Surroundings(inertia, here, across, np.zeros(count), bias)
+    at = motion.position[:, column].copy()
+    fields = np.array([inertia, here, across, bias])[:, chosen]
+    return _between(chosen, at, fields, hinge=hinge)
 
   def moments(self, joint: str, body: int) -> list[Surroundings]:
     """Returns what mass and its moments on a body add, per unit.
@@ -179,29 +180,50 @@ class Reduction:
     In the order 1, x, y, z, xx, yy, zz, xy, xz, yz: each is what a joint's surroundings gain per
     unit of mass times that monomial of its place in the body's frame.
     """
-    base = self.of_joint(joint)
-    reach, added = 0.1, 0.2
-    unit = np.eye(3) * reach
-    places = [np.zeros(3), *unit, *(-unit)]
-    places += [unit[0] + unit[1], unit[0] + unit[2], unit[1] + unit[2]]
-    rows, values = [], []
-    for place in places:
-      x, y, z = place
-      rows.append([1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z])
-      values.append(_stack(self._with_mass(joint, body, added, place), base) / added)
-    solved = np.linalg.solve(np.array(rows), np.array(values).reshape(len(rows), -1))
-    solved = solved.reshape(len(rows), 4, -1)
-    return [Surroundings(s[0], s[1], s[2], base.at, s[3]) for s in solved]
+    if body not in self._moments:
+      self._moments[body] = self._moments_of(body)
+    if joint in self._moments[body]:
+      return self._moments[body][joint]
+    zero = np.zeros(len(self.motion.time))
+    return [Surroundings(zero, zero, zero, self.of_joint(joint).at, zero)] * len(_MONOMIALS)
 
-  def _with_mass(self, joint: str, body: int, mass: float, place: Array) -> Surroundings:
-    model = self.model
-    snapshot = masses.Snapshot(model)
-    try:
-      masses.attach_mass(model, body, added=mass, position=place)
-      masses.refresh(model, mujoco.MjData(model), snapshot)
-      return self.of_joint(joint)
-    finally:
-      snapshot.restore(model)
+  def _moments_of(self, body: int) -> dict[str, list[Surroundings]]:
+    """Returns the moments for all joints that carry a body."""
+    model, motion, chosen = self.model, self.motion, self._chosen()
+    count = len(motion.time)
+    alone = len(self.log.joints) == 1 and model.nv == 1
+    if alone:
+      chosen = chosen[:1]
+    positions = motion.position[chosen] * (not alone)
+    if self._poses is None:
+      self._poses = point_mass.Poses(model, self._qpos, positions)
+    carrying = point_mass.carrying(model, body)
+    names = [model.joint(k).name for k in carrying]
+    velocity, acceleration = np.zeros((2, len(chosen), len(carrying)))
+    for i, name in enumerate(names):
+      if name in self.log.joints and not alone:
+        column = self.log.states.column(name)
+        velocity[:, i] = motion.velocity[chosen, column]
+        acceleration[:, i] = motion.acceleration[chosen, column]
+    values = []
+    for place in _MONOMIALS_AT:
+      point = self._poses.point(body, place)
+      values.append(point_mass.added(self._poses, carrying, point, velocity, acceleration))
+    solved = np.linalg.solve(_MONOMIALS, np.array(values).reshape(len(_MONOMIALS), -1))
+    solved = solved.reshape(len(_MONOMIALS), len(carrying), 4, len(chosen))
+    result = {}
+    for i, name in enumerate(names):
+      if name not in self.log.joints:
+        continue
+      hinge = self._poses.hinge(carrying[i])
+      at = np.zeros(count) if alone else motion.position[:, self.log.states.column(name)].copy()
+      result[name] = [_between(chosen, at, part, hinge=hinge) for part in solved[:, i]]
+    return result
+
+  def _chosen(self) -> Array:
+    """Returns the samples at which the model is evaluated."""
+    count = len(self.motion.time)
+    return np.unique(np.append(np.arange(0, count, _EVERY), count - 1))
 
   def gravity(self, joint: str) -> list[Surroundings]:
     """Returns what gravity adds to a joint's surroundings per m/s^2 along the world's x, y, z."""
@@ -217,6 +239,29 @@ class Reduction:
       return parts
     finally:
       model.opt.gravity[:] = before
+
+
+def _between(chosen: Array, at: Array, fields: Array, *, hinge: bool) -> Surroundings:
+  """Returns surroundings at all samples from those at the chosen ones.
+
+  Gravity is interpolated as a vector that turns with a hinge.
+
+  Args:
+    chosen: samples [M].
+    at: position of the joint at all samples [N].
+    fields: inertia, gravity here and across, and bias at the chosen ones [4, M].
+    hinge: whether the joint is one.
+  """
+  inertia, here, across, bias = fields
+  all_of = lambda values: np.interp(np.arange(len(at)), chosen, values)  # noqa: E731
+  if hinge:
+    cos, sin = np.cos(at), np.sin(at)
+    c, s = cos[chosen], sin[chosen]
+    x, y = all_of(here * c - across * s), all_of(here * s + across * c)
+    here, across = x * cos + y * sin, y * cos - x * sin
+  else:
+    here, across = all_of(here), np.zeros(len(at))
+  return Surroundings(all_of(inertia), here, across, at, all_of(bias))
 
 
 def _stack(s: Surroundings, base: Surroundings) -> Array:

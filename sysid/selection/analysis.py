@@ -28,7 +28,7 @@ from nerf2real.sysid.selection.joint import Found
 from nerf2real.sysid.selection.naming import Name
 from nerf2real.sysid.selection.scopes import Shared
 from nerf2real.sysid.selection.screening import Screened
-from nerf2real.sysid.selection.subject import WHOLE, explain_reference, prepare
+from nerf2real.sysid.selection.subject import WHOLE, Subject, explain_reference, prepare
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 _GRADES = ("none", "effects", "partly", "unexplained")
@@ -64,15 +64,7 @@ def analyse(
     )
     for joint in joints
   ]
-  shared = scopes.shared_effects(model, subjects, settings) if len(subjects) > 1 else []
-  most = sorted(subjects, key=lambda s: -s.left)[: settings.suspects]
-  for subject in subjects:
-    if subject.alone or changes.leaves(subject, subject.explainer.null, settings):
-      explain_reference(subject, settings)
-  changed = [
-    changes.explain(subject, settings, thorough=bool(reference) or subject in most)
-    for subject in subjects
-  ]
+  shared, changed = _explained(model, subjects, settings)
   origins = [s.origin.joint for s in shared]
   changed.sort(
     key=lambda c: (
@@ -99,6 +91,28 @@ def analyse(
     result.effects.append(claims.constants_of_all(off))
   result.verdict = _verdict([c.verdict for c in changed] + ["effects"] * bool(shared))
   return result
+
+
+def _explained(
+  model: mujoco.MjModel, subjects: Sequence[Subject], settings: Settings
+) -> tuple[list[Shared], list[Changed]]:
+  """Returns what joints share and what each has of its own, until nothing shared is needless."""
+  before = [s.state for s in subjects]
+  refuted: set[str] = set()
+  while True:
+    shared: list[Shared] = []
+    if len(subjects) > 1:
+      shared = scopes.shared_effects(model, subjects, settings, refuted=refuted)
+    for subject in subjects:
+      if subject.alone or changes.leaves(subject, subject.explainer.null, settings):
+        explain_reference(subject, settings)
+    changed = [changes.explain(subject, settings) for subject in subjects]
+    needless = scopes.needless(shared, changed)
+    if not needless:
+      return shared, changed
+    refuted |= {s.term.kind for s in needless}
+    for subject, state in zip(subjects, before, strict=True):
+      subject.state = state
 
 
 def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:

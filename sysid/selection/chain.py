@@ -16,8 +16,8 @@ from nerf2real.sysid.selection import decision, race
 from nerf2real.sysid.selection.decision import Thresholds
 from nerf2real.sysid.selection.joint import Found, decide
 from nerf2real.sysid.selection.race import Entry
-from nerf2real.sysid.selection.scopes import ancestors
 from nerf2real.sysid.selection.screening import Screened
+from nerf2real.sysid.selection.wide import ancestors
 
 Array = np.ndarray
 

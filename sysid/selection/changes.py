@@ -68,18 +68,13 @@ class Changed:
     return self.subject.explainer.null
 
 
-def explain(subject: Subject, settings: Settings = SETTINGS, *, thorough: bool = True) -> Changed:
-  """Explains what is new at a joint.
-
-  Args:
-    subject: the joint.
-    settings: tolerances and effort.
-    thorough: whether effects are tried; of many joints without references on a few alone.
-  """
+def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
+  """Explains what is new at a joint, beyond the effects of wider scope that it has."""
   now, before, usual = subject.now, subject.before, subject.usual
   known, explainer = subject.known, subject.explainer
-  as_it_was = now.residuals(known, np.concatenate([t.centre for t in known])[None])[0]
-  if thorough and (subject.alone or leaves(subject, explainer.null, settings)):
+  own = [t for t in known if t.names]
+  as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
+  if subject.alone or leaves(subject, explainer.null, settings):
     ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
@@ -99,7 +94,9 @@ def explain(subject: Subject, settings: Settings = SETTINGS, *, thorough: bool =
     ranked,
     found,
     named,
-    _verdict(found, named, leaves(subject, found.best, settings), over, settings),
+    _verdict(
+      found, named, len(own) < len(known), leaves(subject, found.best, settings), over, settings
+    ),
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
   )
@@ -149,19 +146,27 @@ def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, bey
 
 
 def _verdict(
-  found: Explanation, named: Sequence[str], remains: bool, over: float, settings: Settings
+  found: Explanation,
+  named: Sequence[str],
+  shared: bool,
+  remains: bool,
+  over: float,
+  settings: Settings,
 ) -> str:
   """Returns the graded verdict of a joint.
 
   Args:
     found: the best hypothesis.
     named: kinds that are certain.
+    shared: whether the joint has effects of wider scope.
     remains: whether more remains than the machine leaves anyway.
     over: what the median block leaves, over what the machine leaves anyway.
     settings: limits.
   """
-  if not named:
+  if not named and not shared:
     return "unexplained" if remains or found.best.names else "none"
+  if not named and not remains:
+    return "none"
   if over <= settings.more:
     return "effects"
   return "partly" if found.share_low > settings.most else "unexplained"

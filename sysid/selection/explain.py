@@ -34,8 +34,13 @@ class Scored:
   @property
   def evidence(self) -> float:
     """Sum of the blocks' nats, less what the priors cost."""
+    return float(self.nats.sum()) - self.prior
+
+  @property
+  def prior(self) -> float:
+    """What the priors cost, nats."""
     sigma, centre = self.fit.layout.sigma, self.fit.layout.centre
-    return float(self.nats.sum() - 0.5 * np.sum(((self.fit.x - centre) / sigma) ** 2))
+    return 0.5 * float(np.sum(((self.fit.x - centre) / sigma) ** 2))
 
 
 def named(terms: Sequence[Term]) -> frozenset[str]:
@@ -55,10 +60,14 @@ def clear(better: Scored, other: Scored) -> float:
 def standardised(differences: Array, total: float | None = None, least: float = 1e-300) -> float:
   """Returns a sum of blocks' differences over its standard error."""
   total = float(differences.sum()) if total is None else total
+  return total / max(np.sqrt(variance(differences)), least)
+
+
+def variance(differences: Array) -> float:
+  """Returns the variance of a sum of blocks' differences, of which neighbours may go together."""
   e = differences - differences.mean()
   own = float(e @ e)
-  variance = max(own + 2.0 * float(e[1:] @ e[:-1]), own) * len(e) / max(len(e) - 1, 1)
-  return total / max(np.sqrt(variance), least)
+  return max(own + 2.0 * float(e[1:] @ e[:-1]), own) * len(e) / max(len(e) - 1, 1)
 
 
 def of_size(items: Iterable[Scored], size: int) -> list[Scored]:

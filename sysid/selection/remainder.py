@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.model.measured import quantum
 from nerf2real.sysid.selection.explain import Scored
 from nerf2real.sysid.settings import Settings
 
@@ -12,11 +13,14 @@ Array = np.ndarray
 
 def structured(joint: JointLikelihood, item: Scored, settings: Settings) -> bool:
   """Tells whether neighbouring readings' residuals go together in more than one block, which may
-  hold a knock."""
+  hold a knock, by more than rounding makes them where a joint is slow."""
   certain, size = _together(joint, item.fit.residuals[0][0])
   # Two of B blocks exceed z by chance with a probability of (B p)^2 / 2 at most.
   rare = float(norm.isf(np.sqrt(2.0 * settings.level) / len(certain)))
-  large = size > (settings.structured * joint.position_noise) ** 2
+  step = min(quantum(log.position) for log in joint.plant.logs)
+  recordings = 1 if joint.expectation is None else 2
+  rounding = recordings * step**2 / 12.0
+  large = size > (settings.structured * joint.position_noise) ** 2 + rounding
   return int(np.sum((certain > rare) & large)) >= 2
 
 

@@ -1,28 +1,28 @@
 """Effects of a body or of the whole machine: one hypothesis, evidence summed over its joints.
 
-Joints are fitted apart, but for the values that they share. An effect is of the wider scope where
-the other joints' evidence, together with what the joint that shows it most loses by sharing its
-values, is clearly for it.
+They come before joints are explained one by one. An effect is of the wider scope where it is
+clearly better than nothing, than the same effect at one joint alone and than every other of wider
+scope, and where the joints' explanations need it in the end.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 
-from nerf2real.sysid.fit.posterior import Fitter, Layout, deviations
-from nerf2real.sysid.hypotheses.candidates import library
-from nerf2real.sysid.hypotheses.plausible import plausible
+from nerf2real.suite.effects import kind_of
+from nerf2real.sysid.fit import intervals
+from nerf2real.sysid.fit.posterior import deviations
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.explain import Scored, clear, standardised
-from nerf2real.sysid.selection.subject import WHOLE, Subject
+from nerf2real.sysid.selection import wide
+from nerf2real.sysid.selection.changes import Changed, leaves
+from nerf2real.sysid.selection.decision import USUAL
+from nerf2real.sysid.selection.subject import Subject
+from nerf2real.sysid.selection.wide import Evidence, Wide
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
-
-_LATE = ("command_delay", "measurement_delay")
-"""Kinds that are a joint's or the bus's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,14 +35,12 @@ class Shared:
   spread: Array
   """Their standard deviations [n]."""
   origin: Subject
-  """The joint that it was found on."""
+  """The joint that shows it most."""
   members: tuple[Subject, ...]
   clear: float
-  """Standard errors by which it is better than the same effect of one joint alone."""
+  """Standard errors by which it is better than any that lacks it."""
   nats: float
   """What its joints gain together, priors included."""
-  blocks: Array
-  """[B] gain of blocks of time, joints added."""
 
   @property
   def held(self) -> Term:
@@ -51,116 +49,94 @@ class Shared:
 
 
 def shared_effects(
-  model: mujoco.MjModel, subjects: Sequence[Subject], settings: Settings
+  model: mujoco.MjModel,
+  subjects: Sequence[Subject],
+  settings: Settings,
+  *,
+  refuted: Collection[str] = (),
 ) -> list[Shared]:
-  """Finds effects of bodies and of the machine, puts them into their joints' hypotheses."""
+  """Finds effects of bodies and of the machine, puts them into their joints' hypotheses.
+
+  Looks for them as long as a joint leaves more than the machine does anyway.
+
+  Args:
+    model: the declared one.
+    subjects: its joints.
+    settings: effort.
+    refuted: kinds that are not tried.
+  """
   found: list[Shared] = []
   while len(found) < settings.depth:
-    tried = _tried(model, subjects, {s.term.kind for s in found}, settings)
-    best = max(tried, key=lambda s: s.nats, default=None)
-    if best is None or best.clear < best.origin.beyond:
+    leaving = [s for s in subjects if leaves(s, s.explainer.null, settings)]
+    known = {s.term.kind for s in found} | set(refuted)
+    tried = [
+      wide.screened(term, members)
+      for term, members in (wide.hypotheses(model, subjects) if leaving else ())
+      if term.kind not in known and any(m in leaving for m in members)
+    ]
+    before = [s.state for s in subjects]
+    best = _best(tried, own_latency=subjects[0].before is None)
+    if best is None:
+      for subject, state in zip(subjects, before, strict=True):
+        subject.state = state
       break
     found.append(best)
-    for subject in best.members:
-      subject.take(best.held)
+    for member in best.members:
+      member.take(best.held)
   return found
 
 
-def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
-  """Returns the joints that carry a body, the nearest first."""
+def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
+  """Returns the best of the screened effects if it is clear of all that lack it."""
+  forms: dict[tuple[str, str | None], Wide] = {}
+  for item in sorted(tried, key=lambda w: -w.evidence().total):
+    forms.setdefault(item.key, item)
+  if not forms:
+    return None
+  beyond = max(m.beyond for item in forms.values() for m in item.members)
+  top, *others = forms.values()
+  if top.evidence().clear < beyond:
+    return None
+  near = [w for w in others if (top.evidence() - w.evidence()).clear < beyond]
+  top = wide.adopted(wide.fitted(top), [m for w in near for m in w.members])
+  items = sorted([top, *map(wide.fitted, near)], key=lambda w: -w.evidence().total)
+  alike = [w for w in items if wide.same(items[0], w)]
+  best = min(alike, key=lambda w: USUAL.index(w.key[0]) if w.key[0] in USUAL else len(USUAL))
+  mine = best.evidence()
+  single = [wide.alone(best, at) for at in range(len(best.members))]
+  most = max(range(len(single)), key=lambda at: single[at].total)
+  rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
+  clear = min(mine.clear, *((mine - r).clear for r in rivals))
+  spread = deviations(best.fit, [m.now for m in best.members])[: len(best.x)]
+  if clear < beyond or _is_nothing(best.term, best.x, spread, own_latency=own_latency):
+    return None
+  origin = best.members[most]
+  return Shared(best.term, best.x, spread, origin, best.members, clear, mine.total)
+
+
+def _is_nothing(term: Term, x: Array, spread: Array, *, own_latency: bool) -> bool:
+  """Tells whether an effect has sizes only, whose intervals hold the values that do nothing."""
+  sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
+  bounds = intervals.around(term, x, spread, own_latency=own_latency)
+  return all(n in sizes and low <= sizes[n] <= high for n, (low, high) in bounds.items())
+
+
+def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
+  """Returns the shared effects without which the joints' explanations do about as well.
+
+  What joints have of their own may look like one effect of all of them.
+
+  Args:
+    found: the shared effects.
+    changed: the joints' explanations beside them.
+  """
   result = []
-  while body > 0:
-    first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-    result += [model.joint(first + i).name for i in range(count)][::-1]
-    body = int(model.body_parentid[body])
+  for shared in found:
+    rows, prior = {}, 0.0
+    for item in (c for c in changed if c.subject in shared.members):
+      best = item.found.best
+      without = wide.without(item.subject, best, shared.held)
+      rows[item.joint], prior = best.nats - without.nats, prior + best.prior - without.prior
+    if Evidence(rows, prior).clear < shared.origin.beyond:
+      result.append(shared)
   return result
-
-
-def _tried(
-  model: mujoco.MjModel, subjects: Sequence[Subject], known: set[str], settings: Settings
-) -> list[Shared]:
-  """Returns effects of wider scope that were fitted, from the joints that leave most."""
-  found: dict[tuple[str, str | None], Shared] = {}
-  for origin in sorted(subjects, key=lambda s: -s.left)[: settings.suspects]:
-    explainer = origin.explainer
-    names = explainer.library
-    explainer.library = [*names, *_of_the_machine(origin)]
-    singles = explainer.extend(explainer.null, settings.kept)
-    explainer.library = names
-    for single in singles:
-      term = next(t for t in single.terms if t.name is not None)
-      members = _members(model, term, subjects)
-      if term.kind in known or len(members) < 2 or clear(single, explainer.null) < settings.worth:
-        continue
-      item = _fitted(origin, single, term, members)
-      key = (term.kind, item.term.target)
-      if key not in found or found[key].nats < item.nats:
-        found[key] = item
-    for single in singles:  # effects of the machine are no explanations of a joint
-      if next(t for t in single.terms if t.name is not None).kind in WHOLE:
-        explainer.scored.pop(single.terms, None)
-  return list(found.values())
-
-
-def _of_the_machine(origin: Subject) -> list[Term]:
-  plant = origin.now.plant
-  terms = [t for t in library(plant) if t.kind in WHOLE]
-  return [plausible(t) for t in terms] if plant.hinge else terms
-
-
-def _members(model: mujoco.MjModel, term: Term, subjects: Sequence[Subject]) -> list[Subject]:
-  """Returns the joints that an effect concerns beyond the one that shows it."""
-  if term.kind in (*WHOLE, *_LATE):
-    return list(subjects)
-  if term.kind != "payload":
-    return []
-  index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, str(term.target))
-  carrying = ancestors(model, index) if index >= 0 else []
-  return [s for s in subjects if s.joint in carrying]
-
-
-def _fitted(origin: Subject, single: Scored, term: Term, members: Sequence[Subject]) -> Shared:
-  """Returns an effect fitted to its joints together, from the values that one joint gives it."""
-  whole = term if term.kind == "payload" else dataclasses.replace(term, target=None)
-  start = np.array(list(single.fit.values(term).values()))
-  own = [m.explainer.null.terms for m in members]
-  layout = Layout(own, [whole])
-  joints = [m.now for m in members]
-  fitter = Fitter(joints, layout)
-  x = np.concatenate([start, *[_begin(m, whole, start) for m in members]])
-  fit = fitter.leave_out(fitter.fit(x, iterations=3))
-  values = fit.x[: len(start)]
-  nats = [j.loglik(h) for j, h in zip(joints, fit.held, strict=True)]
-  without = [m.explainer.null.nats for m in members]
-  gain = np.sum(nats, axis=0) - np.sum(without, axis=0)
-  at = [m is origin for m in members].index(True)
-  alone = single.nats - without[at]
-  prior = float(fitter.prior(fit.x[None])[0])
-  priors = [_prior(m.explainer.null) for m in members]
-  total = float(gain.sum()) - prior + sum(priors)
-  local = float(alone.sum()) - _prior(single) + priors[at]
-  return Shared(
-    whole,
-    values,
-    deviations(fit, joints)[: len(start)],
-    origin,
-    tuple(members),
-    standardised(gain - alone, total - local, 1.0),
-    total,
-    gain,
-  )
-
-
-def _prior(item: Scored) -> float:
-  """Returns what the priors of a hypothesis cost, nats."""
-  return float(item.nats.sum()) - item.evidence
-
-
-def _begin(member: Subject, term: Term, x: Array) -> Array:
-  """Returns a joint's constants to begin with: as they are, or as they were before they were bent
-  by what is missing."""
-  null = member.explainer.null
-  centre = np.concatenate([t.centre for t in null.terms])
-  tried = np.array([np.concatenate([own, x]) for own in (null.fit.x, centre)])
-  costs = Fitter([member.now], Layout([[*null.terms, term]])).costs(tried)
-  return tried[int(np.argmin(costs)), : len(centre)]

@@ -6,6 +6,7 @@ without, the constants are the declared ones within their tolerances.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -66,6 +67,19 @@ class Subject:
     self.known = (*self.known, term)
     self.explainer = _explainer(self.now, self.known, self.library, self.freed)
 
+  @property
+  def state(self) -> tuple[Any, ...]:
+    """What is known, the hypothesis without effects, and the residual's scale."""
+    known = self.known, self.freed, self.usual, self.paired, self.now.expectation
+    return known, self.explainer, self.explainer.null, self.now.scale, self.now.independent.copy()
+
+  @state.setter
+  def state(self, state: tuple[Any, ...]) -> None:
+    known, self.explainer, null, self.now.scale, independent = state
+    self.known, self.freed, self.usual, self.paired, self.now.expectation = known
+    self.now.independent = independent.copy()
+    self.explainer.null, self.explainer.scored = null, {null.terms: null}
+
 
 def prepare(
   model: mujoco.MjModel,
@@ -100,7 +114,7 @@ def prepare(
   before = _likelihood(model, joint, reference, reductions[1], settings)
   usual = Explainer(before, constants(before.plant, settings), (), settings=settings).null
   known = known_terms(usual, settings)
-  paired = now.expect(before, usual.fit.residuals[0])
+  paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   freed = freed_constants(known[0], settings)
   explainer = _explainer(now, known, library, freed)
   return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
@@ -118,7 +132,7 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   usual = conclude(before, first.explain(settings.reference_depth), subject.beyond).best
   shared = [t for t in subject.known if not t.names]
   subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
-  subject.paired = subject.now.expect(before, usual.fit.residuals[0])
+  subject.paired = subject.now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   subject.freed = freed_constants(subject.known[0], settings)
   subject.explainer = _explainer(subject.now, subject.known, subject.library, subject.freed)
 

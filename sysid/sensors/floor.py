@@ -27,7 +27,7 @@ from nerf2real.core import least_squares, rotations
 from nerf2real.core.robot_logs.reading import ImuSeries, Log
 from nerf2real.sysid.model.reduction import smooth_motion
 from nerf2real.sysid.sensors import standing
-from nerf2real.sysid.sensors.sensed import Part, row
+from nerf2real.sysid.sensors.sensed import Estimate, Part, row
 
 Array = np.ndarray
 
@@ -228,6 +228,11 @@ def _judge(stops: _Stops, plane: str) -> Part:
     gain = _left_out(stops, False) - _left_out(stops, True)
     well = np.linalg.norm(x[:2]) - half.max() > _USUAL and half.max() < np.linalg.norm(x[:2])
     told = np.linalg.matrix_rank(_design(stops).reshape(-1, 4), tol=0.3) == 4
+    if told:
+      part.estimates = {
+        ("floor_slope", axis): Estimate(*values, _USUAL)
+        for axis, values in _about_axes(x[:2], half).items()
+      }
     if well and told and gain > _GAIN and np.sqrt(np.mean(left**2)) < _ROUGH:
       part.rows.append(_row(plane, x[:2], half, gain))
       part.after = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))

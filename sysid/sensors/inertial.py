@@ -22,8 +22,9 @@ import numpy as np
 from nerf2real.core import least_squares
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
-from nerf2real.suite.effects import Effect, kind_of
+from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model.reduction import smooth_motion
+from nerf2real.sysid.sensors.sensed import Estimate, Estimates, Part
 
 Array = np.ndarray
 
@@ -60,20 +61,6 @@ _SIGMAS = 3.0  # an interval's half width in standard deviations
 
 
 @dataclasses.dataclass(frozen=True)
-class Inertial:
-  """What the IMU's readings say."""
-
-  effects: list[Effect]
-  rows: list[dict[str, Any]]
-  """Entries of the report for them."""
-  alternatives: list[dict[str, Any]]
-  """Kinds that cannot be told apart."""
-  before: float
-  """RMS of the residual in units of the readings' noise, without the effects."""
-  after: float
-
-
-@dataclasses.dataclass(frozen=True)
 class _Readings:
   """One log: what an ideal IMU would read and what was read."""
 
@@ -84,7 +71,7 @@ class _Readings:
   noise: Array  # [6]
 
 
-def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Inertial | None:
+def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Part | None:
   """Returns the IMU's effects; None where model or logs have no IMU, or its motion is unknown."""
   sensors = _sensors(model)
   if sensors is None or any(log.imu is None or len(log.imu.stamp) < _FEWEST for log in logs):
@@ -116,22 +103,26 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Inertial | None:
       if sure:
         row = _row(name, values, own[name], where, bare - alone, bare - full)
         alternatives.append(row)
-  effects = [_effect(row) for row in rows.values()]
   kept = tuple(n for n in names if n.split("/")[0] in rows)
   after = _score(parts, noise, kept)[0]
-  return Inertial(
-    effects, list(rows.values()), alternatives, float(np.exp(bare)), float(np.exp(after))
+  return Part(
+    list(rows.values()),
+    alternatives,
+    before=float(np.exp(bare)),
+    after=float(np.exp(after)),
+    estimates=_estimates(names, fitted, bounds),
   )
 
 
-def _effect(row: dict[str, Any]) -> Effect:
-  found = row["parameters"].items()
-  return Effect(
-    row["kind"],
-    None,
-    {name: p["value"] for name, p in found},
-    {name: (p["low"], p["high"]) for name, p in found},
-  )
+def _estimates(
+  names: Sequence[str], x: Array, bounds: dict[str, dict[str, tuple[float, float]]]
+) -> Estimates:
+  """Returns all values of a fit with their intervals."""
+  return {
+    (part.split("/")[0], name): Estimate(float(value), *bounds[part][name], _USUAL[part])
+    for part, values in _unpack(names, x).items()
+    for name, value in zip(_LAYOUT[part], values, strict=True)
+  }
 
 
 def _row(

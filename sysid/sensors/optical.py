@@ -25,7 +25,7 @@ from nerf2real.core import least_squares
 from nerf2real.core.cameras import Camera
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.sensors import pictures, tracks, viewpoint
-from nerf2real.sysid.sensors.sensed import Part, row
+from nerf2real.sysid.sensors.sensed import Estimate, Part, row
 from nerf2real.sysid.sensors.tracks import Tracks
 from nerf2real.sysid.sensors.viewpoint import View
 
@@ -283,6 +283,9 @@ def _judge(problem: _Problem, camera: str) -> tuple[Part, float]:
   bare, _ = problem.score(())
   spread = problem.spread(names, fitted)
   part = Part(before=float(np.exp(bare)), after=float(np.exp(bare)))
+  part.estimates = {
+    (kind, KINDS[kind]): Estimate(*_value(kind, fitted, spread), _USUAL[kind]) for kind in names
+  }
   for kind in names:
     rest = tuple(n for n in names if n != kind)
     gain = problem.score(rest)[0] - full

@@ -2,9 +2,25 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from nerf2real.suite.effects import Effect, kind_of
+
+
+class Estimate(NamedTuple):
+  """A parameter as it was estimated."""
+
+  value: float
+  low: float
+  high: float
+  usual: float = 0.0
+  """What sensors of one kind differ by."""
+
+
+Estimates = Mapping[tuple[str, str], Estimate]
+"""By kind of effect and parameter."""
 
 
 @dataclasses.dataclass
@@ -20,11 +36,37 @@ class Part:
   before: float | None = None
   """Error in the sensor's own measure, without the effects."""
   after: float | None = None
+  estimates: Estimates = dataclasses.field(default_factory=dict)
+  """What was estimated, named or not."""
+  in_reference: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+  """Entries for what reference logs show, too."""
 
   @property
   def effects(self) -> list[Effect]:
-    """What is named, as effects that can be simulated."""
-    return [effect(entry) for entry in self.rows]
+    """What the model lacks, as effects that can be simulated."""
+    return [effect(entry) for entry in (*self.rows, *self.in_reference)]
+
+  def beside(self, reference: "Part") -> "Part":
+    """Returns the part with what a reference shows, too, apart from what is named.
+
+    A value has changed where it is off the reference's by more than both intervals, as independent
+    errors, and what is usual leave.
+    """
+    same = [row for row in self.rows if _is_same(row, reference.estimates)]
+    changed = [row for row in self.rows if not any(row is s for s in same)]
+    return dataclasses.replace(self, rows=changed, in_reference=same)
+
+
+def _is_same(row: Mapping[str, Any], known: Estimates) -> bool:
+  """Tells whether no parameter of an entry differs from what a reference's estimates say."""
+  for name, found in row["parameters"].items():
+    before = known.get((row["kind"], name))
+    if before is None:
+      return False
+    reach = np.hypot(0.5 * (found["high"] - found["low"]), 0.5 * (before.high - before.low))
+    if abs(found["value"] - before.value) > reach + before.usual:
+      return False
+  return True
 
 
 def effect(entry: Mapping[str, Any]) -> Effect:

@@ -1,12 +1,15 @@
 """What the sensors beside the joints say: IMU, camera and floor, in one finding."""
 
+import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.sensors import brightness, floor, inertial, optical
 from nerf2real.sysid.sensors.sensed import Part
@@ -25,8 +28,13 @@ class Sensed:
     return [row for part in self.parts.values() for row in part.rows]
 
   @property
+  def in_reference(self) -> list[dict[str, Any]]:
+    """Entries of the report for what reference logs show, too."""
+    return [row for part in self.parts.values() for row in part.in_reference]
+
+  @property
   def effects(self) -> list[Effect]:
-    """The same as effects that can be simulated."""
+    """What the model lacks, as effects that can be simulated."""
     return [effect for part in self.parts.values() for effect in part.effects]
 
   @property
@@ -51,23 +59,45 @@ class Sensed:
     }
 
 
-def find(model: mujoco.MjModel, logs: Sequence[Log], reference: Sequence[Log] = ()) -> Sensed:
+def find(
+  model: mujoco.MjModel,
+  logs: Sequence[Log],
+  reference: Sequence[Log] = (),
+  *,
+  tilt: Mapping[str, float] | None = None,
+) -> Sensed:
   """Returns what the sensors show beyond the model's.
 
   Args:
     model: the declared one.
     logs: to identify from.
-    reference: of the same apparatus at the same place; what brightness is compared with.
+    reference: of the same apparatus at the same place; what sensors show there, too, is no change.
+    tilt: turn of gravity about x and y in the logs, as the joints show it [rad].
   """
   parts: dict[str, Part] = {}
-  imu = inertial.find(model, logs)
+  imu = inertial.find(_leaning(model, tilt) if tilt else model, logs)
   if imu is not None:
-    parts["imu"] = Part(imu.rows, imu.alternatives, [], imu.before, imu.after)
+    parts["imu"] = _compared(imu, lambda: inertial.find(model, reference), reference)
   seen = optical.find(model, logs)
   if seen is not None:
-    parts["camera"] = seen.part
+    before = lambda: getattr(optical.find(model, reference), "part", None)  # noqa: E731
+    parts["camera"] = _compared(seen.part, before, reference)
     parts["brightness"] = brightness.find(model, seen, reference)
   stood = floor.find(model, logs)
   if stood is not None:
-    parts["floor"] = stood
+    parts["floor"] = _compared(stood, lambda: floor.find(model, reference), reference)
   return Sensed(parts)
+
+
+def _compared(part: Part, before: Callable[[], Part | None], reference: Sequence[Log]) -> Part:
+  """Returns what a sensor shows beside what it showed in the reference, if there is one."""
+  known = before() if part.rows and reference else None
+  return part if known is None else part.beside(known)
+
+
+def _leaning(model: mujoco.MjModel, tilt: Mapping[str, float]) -> mujoco.MjModel:
+  """Returns a model with gravity turned."""
+  result = copy.copy(model)
+  turn = matrix_from_rotvec([tilt["x"], tilt["y"], 0.0])
+  result.opt.gravity[:] = turn @ np.array(model.opt.gravity)
+  return result

@@ -33,11 +33,13 @@ def test_stepped_work_that_takes_too_long_misses_periods():
 def test_real_work_runs_about_as_often_as_asked():
   clock = RealClock()
   times = []
+  begun = clock.now()
   job = clock.every(0.01, lambda: times.append(clock.now()), name="work")
   time.sleep(0.3)
   job.stop()
+  periods = (clock.now() - begun) / 0.01  # a loaded machine sleeps longer
   count = len(times)
-  assert 5 <= count + job.missed <= 33
+  assert count >= 5 and count + job.missed <= periods + 2
   time.sleep(0.05)
   assert len(times) == count
 

@@ -18,7 +18,7 @@ from nerf2real.scenes.builtin import filming, yardstick
 from nerf2real.scenes.bundle import Bundle, BundleError
 from nerf2real.scenes.field.settings import preset as train_preset
 from nerf2real.scenes.geometry import collision as contact
-from nerf2real.scenes.geometry import convex
+from nerf2real.scenes.geometry import decomposition
 from nerf2real.scenes.geometry.mesh import MeshSettings
 from nerf2real.scenes.settings import preset
 
@@ -72,7 +72,7 @@ def settings():
     align=dataclasses.replace(base.align, camera_height=1.0),
     depth_width=120,
     collision=contact.CollisionSettings(
-      voxel=0.1, truncation=0.25, parts=convex.ConvexSettings(tolerance=0.2, max_parts=60)
+      voxel=0.1, truncation=0.25, parts=decomposition.ConvexSettings(tolerance=0.2, max_parts=60)
     ),
   )
 

@@ -6,8 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill import dataset, episodes, learning, losses, settings, student
+from nerf2real.agents.distill import dataset, settings
 from nerf2real.agents.distill import teacher as teachers
+from nerf2real.agents.distill.collecting import episodes
+from nerf2real.agents.distill.learning import losses, student
+from nerf2real.agents.distill.learning.updates import make_updates
 from nerf2real.agents.dmpo.specs import BALL, FlatObservation
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3 import constants
@@ -49,7 +52,7 @@ def test_only_balls_in_view_count_for_a_picture():
 
 
 def test_a_students_heads_learn_the_balls_place():
-  updates = learning.make_updates(TINY, WITH_BALL)
+  updates = make_updates(TINY, WITH_BALL)
   state = updates.init(jax.random.PRNGKey(0))
   assert {"pose", "ball"} <= set(state.student["encoder"])
   batch = _batch()

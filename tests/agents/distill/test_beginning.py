@@ -6,8 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill import beginning, learning, settings, student
-from nerf2real.agents.distill.collecting import student_policy
+from nerf2real.agents.distill import settings
+from nerf2real.agents.distill.collecting.collector import student_policy
+from nerf2real.agents.distill.learning import beginning, student
+from nerf2real.agents.distill.learning.updates import make_updates, standardised
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.core.serialization import to_plain
 from nerf2real.launch import distill_learner
@@ -42,11 +44,11 @@ def _act(policy, seed=0):
 
 
 def test_it_acts_as_the_policy_did_also_once_inputs_are_standardised(exported):
-  updates = learning.make_updates(TINY, LAYOUT)
+  updates = make_updates(TINY, LAYOUT)
   state = beginning.begin_with(updates.init(jax.random.PRNGKey(9)), export.load_arrays(exported))
   rows = np.random.default_rng(1).normal(2.0, 3.0, (99, 5))
   labels = np.random.default_rng(2).normal(0.3, 0.2, (99, 4)).astype(np.float32)
-  scaled = learning.standardised(
+  scaled = standardised(
     state, state_rows=rows, labels=labels, layout=LAYOUT, min_spread=0.05, keep_policy=True
   )
   wanted = _act(export.load_policy(exported).policy)
@@ -54,19 +56,17 @@ def test_it_acts_as_the_policy_did_also_once_inputs_are_standardised(exported):
     served = student.served_parameters(begun.student, begun.scales)
     np.testing.assert_allclose(_act(student_policy(served, TINY)), wanted, atol=1e-4)
   assert np.abs(np.asarray(scaled.scales["state"]["mean"]) - 2.0).max() < 1.5  # of the new data
-  fresh = learning.standardised(
-    state, state_rows=rows, labels=labels, layout=LAYOUT, min_spread=0.05
-  )
+  fresh = standardised(state, state_rows=rows, labels=labels, layout=LAYOUT, min_spread=0.05)
   served = student.served_parameters(fresh.student, fresh.scales)
   assert np.abs(_act(student_policy(served, TINY)) - wanted).max() > 0.05
 
 
 def test_other_networks_are_refused_with_the_array(exported):
-  other = learning.make_updates(settings.nerf_nav(), LAYOUT).init(jax.random.PRNGKey(0))
+  other = make_updates(settings.nerf_nav(), LAYOUT).init(jax.random.PRNGKey(0))
   with pytest.raises(ValueError, match=r"other networks: for \S+ found \(.*, expected \("):
     beginning.begin_with(other, export.load_arrays(exported))
   arrays = export.load_arrays(exported)
-  state = learning.make_updates(TINY, LAYOUT).init(jax.random.PRNGKey(0))
+  state = make_updates(TINY, LAYOUT).init(jax.random.PRNGKey(0))
   without = {name: array for name, array in arrays.items() if "resnet" not in name}
   with pytest.raises(ValueError, match="policy/resnet/.* found nothing"):
     beginning.begin_with(state, without)

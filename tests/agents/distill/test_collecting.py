@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill import episodes, evaluating, schedule, settings
+from nerf2real.agents.distill import schedule, settings
+from nerf2real.agents.distill.collecting import episodes, evaluator
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Label
 from nerf2real.agents.dmpo.policy.inference import PolicyState, PolicyStep
@@ -49,11 +50,11 @@ def test_pushes_come_in_steps():
 
 def test_trials_during_a_run_are_not_those_that_are_reported():
   reported = protocols.navigation()
-  others = evaluating.other_trials(list(reported))
+  others = evaluator.other_trials(list(reported))
   assert not {t.seed for t in others} & {t.seed for t in reported}
   headings = np.array([[o.yaw - t.yaw for t in reported] for o in others])
   assert np.abs((headings + np.pi) % (2 * np.pi) - np.pi).min() > 1.0
-  pushed = evaluating.other_trials(list(protocols.ball_center()))
+  pushed = evaluator.other_trials(list(protocols.ball_center()))
   assert pushed[0].robot_yaw != protocols.ball_center()[0].robot_yaw
 
 

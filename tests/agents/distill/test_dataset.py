@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.distill.dataset import Dataset, Span, Streams, fields, transition_fields
-from nerf2real.agents.dmpo.prior import PriorData
+from nerf2real.agents.dmpo.replay.prior import PriorData
 from nerf2real.agents.dmpo.specs import Layout
 
 LAYOUT = Layout(

@@ -13,7 +13,9 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill import checkpoint, learning, schedule, settings
+from nerf2real.agents.distill import schedule, settings
+from nerf2real.agents.distill.learning import checkpoint
+from nerf2real.agents.distill.learning.updates import make_updates
 from nerf2real.agents.distill.settings import Stage
 from nerf2real.agents.dmpo.policy.export import load_policy
 from tests.agents.distill.test_student import LAYOUT, TINY
@@ -35,7 +37,7 @@ def test_stages_take_their_shares():
 
 
 def test_a_state_is_read_as_it_was_written(tmp_path):
-  updates = learning.make_updates(TINY, LAYOUT)
+  updates = make_updates(TINY, LAYOUT)
   state = updates.init(jax.random.PRNGKey(3))
   counters = checkpoint.Counters(updates=7, elapsed=12.5, begun=900)
   checkpoint.save_state(tmp_path / "state.npz", state, counters)
@@ -45,7 +47,7 @@ def test_a_state_is_read_as_it_was_written(tmp_path):
   assert jax.tree.structure(found) == jax.tree.structure(state)
   for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(state), strict=True):
     assert np.array_equal(a, b)
-  other = learning.make_updates(settings.nerf_nav(), LAYOUT).init(jax.random.PRNGKey(0))
+  other = make_updates(settings.nerf_nav(), LAYOUT).init(jax.random.PRNGKey(0))
   with pytest.raises(ValueError, match="of other networks"):
     checkpoint.load_state(tmp_path / "state.npz", like=other)
 

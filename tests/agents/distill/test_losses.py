@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill import losses
+from nerf2real.agents.distill.learning import losses
 
 
 def test_pose_targets_and_their_errors():

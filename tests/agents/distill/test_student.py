@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerf2real.agents.distill import learning, settings, student
-from nerf2real.agents.distill.collecting import student_policy
+from nerf2real.agents.distill import settings
+from nerf2real.agents.distill.collecting.collector import student_policy
+from nerf2real.agents.distill.learning import student
+from nerf2real.agents.distill.learning.updates import make_updates, standardised
 from nerf2real.agents.dmpo import scaling
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import POSITION, ROTATION, Layout
@@ -25,7 +27,7 @@ TINY = settings.preset("tiny")
 
 
 def make_state(seed=0):
-  updates = learning.make_updates(TINY, LAYOUT)
+  updates = make_updates(TINY, LAYOUT)
   state = updates.init(jax.random.PRNGKey(seed))
   rows = {"state": np.random.default_rng(0).normal(3.0, [1, 5, 0.1, 2, 9], (50, 5))}
   layout = Layout(**{**LAYOUT.__dict__, "privileged_names": (), "privileged_sizes": ()})
@@ -107,10 +109,10 @@ def test_an_unroll_in_two_parts_is_the_unroll_in_one():
 
 
 def test_a_fresh_student_does_what_the_teacher_does_on_average():
-  updates = learning.make_updates(TINY, LAYOUT)
+  updates = make_updates(TINY, LAYOUT)
   labels = np.random.default_rng(0).normal([0.5, -0.5, 0.0, 0.2], [0.3, 0.001, 0.1, 0.2], (99, 4))
   rows = np.random.default_rng(1).normal(3.0, 2.0, (99, 5))
-  state = learning.standardised(
+  state = standardised(
     updates.init(jax.random.PRNGKey(0)),
     state_rows=rows,
     labels=labels.astype(np.float32),

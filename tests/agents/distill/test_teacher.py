@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.agents.distill import student
 from nerf2real.agents.distill import teacher as teachers
+from nerf2real.agents.distill.learning import student
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import POSITION, ROTATION
 from nerf2real.core.serialization import to_plain

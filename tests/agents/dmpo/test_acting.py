@@ -12,7 +12,7 @@ from dm_env import specs
 
 from nerf2real.agents.dmpo import config, networks, training_state
 from nerf2real.agents.dmpo.policy import acting, export, inference
-from nerf2real.agents.dmpo.replay import check_trajectory, trajectory_fields
+from nerf2real.agents.dmpo.replay.ring import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments import loading
 from nerf2real.core.serialization import to_plain

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.dmpo import config, learning, losses, networks, objective, training_state
-from nerf2real.agents.dmpo.frozen import FrozenEncoder
+from nerf2real.agents.dmpo.replay.features import FrozenEncoder
 from nerf2real.agents.dmpo.specs import Layout
 from tests.agents.dmpo.test_learning import CONFIG, LAYOUT, _batch, _same
 

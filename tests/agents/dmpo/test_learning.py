@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.dmpo import config, learning, networks, objective
-from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
+from nerf2real.agents.dmpo.replay.ring import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
 LAYOUT = Layout(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import prior
-from nerf2real.agents.dmpo.prior import PriorData, sample_mixed
-from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
+from nerf2real.agents.dmpo.replay import prior
+from nerf2real.agents.dmpo.replay.prior import PriorData, sample_mixed
+from nerf2real.agents.dmpo.replay.ring import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from tests.agents.dmpo.test_replay import FIELDS, LAYOUT, LENGTH, make_trajectory
 

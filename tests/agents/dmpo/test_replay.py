@@ -5,7 +5,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo.replay import Replay, check_trajectory, trajectory_fields
+from nerf2real.agents.dmpo.replay.ring import Replay, check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
 LAYOUT = Layout("camera", (4, 5, 3), ("s",), (2,), ("privileged/p",), (3,), 2)

@@ -7,7 +7,7 @@ import pytest
 
 from nerf2real.agents.dmpo import config, learning, networks, scaling, training_state
 from nerf2real.agents.dmpo.policy import export
-from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
+from nerf2real.agents.dmpo.replay.ring import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import to_plain
 

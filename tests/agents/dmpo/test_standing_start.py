@@ -10,7 +10,7 @@ from dm_env import specs
 
 from nerf2real.agents.dmpo import config, learning, scaling, training_state
 from nerf2real.agents.dmpo.policy import acting, inference
-from nerf2real.agents.dmpo.replay import Replay, trajectory_fields
+from nerf2real.agents.dmpo.replay.ring import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
 STANDING = 0.3  # the action that moves nothing

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.agents.dmpo.replay import Field, Replay, check_trajectory
+from nerf2real.agents.dmpo.replay.ring import Field, Replay, check_trajectory
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo.replay import Replay
+from nerf2real.agents.dmpo.replay.ring import Replay
 from nerf2real.agents.link import client, schema, sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink, actor_key

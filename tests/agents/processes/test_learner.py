@@ -12,7 +12,7 @@ import pytest
 
 from nerf2real.agents.dmpo import config, learning, networks, scaling, specs
 from nerf2real.agents.dmpo.policy import export
-from nerf2real.agents.dmpo.replay import trajectory_fields
+from nerf2real.agents.dmpo.replay.ring import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.client import ActorLink

@@ -64,3 +64,19 @@ def test_a_sagging_supply_may_be_described_as_weakness(kind):
   effect = Effect(kind, None, {"gain": 0.8} if kind == "motor_gain" else {"fade": 1e-4})
   found = comparing.compare(_hidden("sagging_supply"), [effect])
   assert found.rows[0].right and found.rows[0].named and found.rows[0].covered is None
+
+
+def test_what_the_robot_had_before_is_no_wrong_name():
+  own = [_found("load_friction", "l_knee", coefficient=0.2), _found("imu_bias", gyroscope_x=0.02)]
+  late = _found("command_delay", delay=0.044)
+  found = comparing.compare(_hidden("command_delay:0.045"), [late], own)
+  assert found.rows[0].right and not found.wrong
+  assert [text.split(":")[0] for text in found.in_reference] == [
+    "load_friction at l_knee",
+    "imu_bias",
+  ]
+
+
+def test_a_tilt_of_a_robot_that_is_held_describes_the_floor_s_slope():
+  found = comparing.compare(_hidden("floor_slope:0,0.04"), [_found("gravity_tilt", x=0.0, y=0.04)])
+  assert found.rows[0].right and not found.wrong

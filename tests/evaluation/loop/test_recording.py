@@ -13,7 +13,7 @@ def test_a_slope_is_named_from_turning_on_it_and_none_where_there_is_none(tmp_pa
   altered = undeclared.parse_all([f"floor_slope:0,{slope}"])
   with machines.virtual_robot(1, altered) as (connection, robot):
     recording.record_floor(tmp_path, connection, robot)
-  effects, _ = naming._floor(tmp_path / "floor.mcap")
+  effects = naming._floor(tmp_path / "floor.mcap").effects
   if slope == 0:
     assert effects == []
     return

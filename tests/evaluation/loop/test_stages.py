@@ -129,6 +129,30 @@ def test_a_finding_is_read_again_and_says_how_much_is_explained(tmp_path):
   assert nothing.named == []
 
 
+def test_what_the_reference_shows_too_is_not_named(tmp_path):
+  folder = tmp_path / "identified"
+  folder.mkdir()
+  effects = [
+    Effect("command_delay", None, {"delay": 0.045}),
+    Effect("load_friction", "l_knee", {"coefficient": 0.2}),
+    Effect("coulomb_friction", "r_knee", {"torque": 0.2}),
+  ]
+  write_effects(folder / "effects.json", effects)
+  content = {
+    "verdict": "effects",
+    "effects": [{"kind": "command_delay", "joint": None}],
+    "in_reference": [{"kind": "load_friction", "joint": "l_knee"}],
+    "error": {"held": None, "floor": 0.0005, "train": None},
+    "notes": [],
+    "seconds": 1.0,
+  }
+  (folder / "finding.json").write_text(json.dumps(content))
+  named = naming.name(folder, Path("no logs are read again"))
+  assert [e.kind for e in named.named] == ["command_delay"]
+  assert [e.kind for e in named.in_reference] == ["load_friction"]
+  assert [e.kind for e in named.effects] == [e.kind for e in effects]  # all go into the suite
+
+
 def test_training_draws_the_effects_of_the_finding(tmp_path):
   path = tmp_path / "effects.json"
   write_effects(path, [Effect("motor_gain", "l_knee", {"gain": 0.6}, {"gain": (0.5, 0.7)})])

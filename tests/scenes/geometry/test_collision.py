@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core import cameras
-from nerf2real.scenes.geometry import collision, convex, floor_plan, fusion
+from nerf2real.scenes.geometry import collision, convex, decomposition, floor_plan, fusion
 from nerf2real.scenes.quality import collision_error
 from tests.scenes import furnished_room
 
@@ -29,7 +29,7 @@ def grid(views):
 
 @pytest.fixture(scope="module")
 def parts(grid):
-  return convex.decompose(grid)
+  return decomposition.decompose(grid)
 
 
 def test_parts_are_few_and_convex(parts):
@@ -141,7 +141,7 @@ def test_floor_is_taken_out_and_matter_stands_on_the_ground(views):
   with pytest.raises(ValueError, match="above the extent"):
     collision.remove_floor(grid, threshold=5.0)
   with pytest.raises(ValueError, match="no matter"):
-    convex.decompose(grid._replace(values=np.ones_like(grid.values)))
+    decomposition.decompose(grid._replace(values=np.ones_like(grid.values)))
 
 
 def test_files_round_trip(parts, tmp_path):

@@ -225,8 +225,8 @@ def test_refinement_falls_back_when_distortion_folds(corner, monkeypatch):
   model = mapping.pycolmap.Reconstruction(str(folder / "out" / "sfm"))
   faults = iter(["the test says so"])
   monkeypatch.setattr(mapping, "camera_fault", lambda _: next(faults, None))
-  refined, words = mapping.refine(model)
-  assert words == "focal lengths only, no distortion, because the test says so"
+  refined, lens = mapping.refine(model)
+  assert lens.words == "focal lengths only, no distortion, because the test says so"
   np.testing.assert_array_equal(refined.cameras[1].params[4:], 0)
 
 

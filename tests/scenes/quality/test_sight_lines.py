@@ -37,13 +37,16 @@ def test_right_geometry_is_found_right(lines):
   judged = sight_lines.judge_parts(lines, _parts())
   assert judged.lines == len(lines.points) > 500
   assert judged.blocked == 0 and judged.missed < 0.01 and judged.distance_p95 < 0.02
+  assert judged.unfit is None
 
 
 def test_matter_in_seen_free_space_blocks_lines(lines):
   wall = convex.hull(
     np.array([[x, y, z] for x in (0.3, 0.5) for y in (-2, 2) for z in (0, 2.0)], float)
   )
-  assert sight_lines.judge_parts(lines, [*_parts(), wall]).blocked > 0.2
+  judged = sight_lines.judge_parts(lines, [*_parts(), wall])
+  assert judged.blocked > 0.2 and judged.blocked_p95 > 0.5
+  assert "unfit to train in" in judged.unfit and "expected at most 0.1 m" in judged.unfit
 
 
 def test_missing_matter_is_missed(lines):

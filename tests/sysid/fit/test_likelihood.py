@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.expectation import Expectation
 from nerf2real.sysid.fit.likelihood import JointLikelihood, _correlation_time, _same_commands
 from nerf2real.sysid.fit.posterior import Fitter, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.plant import with_values
 from tests.sysid.synthetic import PENDULUM, log_of
 
 
@@ -91,3 +93,17 @@ def test_what_a_reference_leaves_cancels_beside_the_same_commands():
   assert beside < 1e-9 < 1e-3 < alone
   _, other = _joint(kinds=("steps", "slow"), effects=effect)
   assert not other.expect(before, left)
+
+
+@pytest.mark.parametrize("clock", ["command_delay", "measurement_delay"])
+def test_what_a_reference_leaves_comes_as_late_as_what_it_goes_with(viscous, clock):
+  plant, _ = viscous
+  stamps = [log.time for log in plant.logs]
+  left = [(t, np.array([np.sin(3.0 * t)])) for t in stamps]
+  baseline = with_values(plant.declared, {clock: 0.004})
+  expected = Expectation(plant.logs, left, baseline)
+  np.testing.assert_allclose(expected.under(baseline)[0], np.sin(3.0 * np.concatenate(stamps)))
+  later = expected.under(with_values(plant.declared, {clock: 0.034}))[0]
+  inner = np.concatenate([t > 0.05 for t in stamps])
+  shifted = np.sin(3.0 * (np.concatenate(stamps) - 0.03))
+  np.testing.assert_allclose(later[inner], shifted[inner], atol=3e-4)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.selection import analysis, scopes, subject
+from nerf2real.sysid.selection import analysis, subject, wide
 from tests.sysid.selection.test_changes import few
 from tests.sysid.synthetic import ARM, log_of
 
@@ -55,5 +55,20 @@ def test_two_healthy_joints_have_nothing(model):
 
 def test_a_body_is_carried_by_the_joints_on_its_way():
   model = mujoco.MjModel.from_xml_string(ARM)
-  assert scopes.ancestors(model, model.body("lower").id) == ["elbow", "shoulder"]
-  assert np.all([j.startswith("s") for j in scopes.ancestors(model, model.body("upper").id)])
+  assert wide.ancestors(model, model.body("lower").id) == ["elbow", "shoulder"]
+  assert np.all([j.startswith("s") for j in wide.ancestors(model, model.body("upper").id)])
+
+
+def test_joints_add_up_where_each_alone_would_not_do():
+  random = np.random.default_rng(0)
+  rows = {f"joint_{i}": random.normal(0.3, 1.0, 30) for i in range(20)}
+  alone = [wide.Evidence({joint: row}).clear for joint, row in rows.items()]
+  assert np.median(alone) < 2.5 < 5.0 < wide.Evidence(rows).clear
+  assert (wide.Evidence(rows) - wide.Evidence(rows)).total == 0.0
+
+
+def test_a_difference_counts_joints_that_one_side_lacks():
+  row = np.linspace(0.9, 1.1, 10)
+  both = wide.Evidence({"a": row, "b": row}, prior=2.0)
+  assert both.total == pytest.approx(18.0)
+  assert (both - wide.Evidence({"a": row}, prior=0.5)).total == pytest.approx(8.5)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from nerf2real.core.robot_logs import messages
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.robot_logs.writer import open_log
-from nerf2real.sysid.sensors import inertial
+from nerf2real.sysid.sensors import inertial, sensing
 from tests.sysid import imu_machines
 
 START = 1_700_000_000_000_000_000
@@ -138,3 +138,18 @@ def test_healthy_imus_are_not_accused(seeds):
     listed += bool(found.alternatives)
   assert accused <= len(seeds) // 20
   assert listed <= max(1, len(seeds) // 10)
+
+
+def test_an_imu_s_own_bias_is_the_reference_s_too_and_gravity_that_turned_is_no_tilt(tmp_path):
+  model = mujoco.MjModel.from_xml_string(MODEL)
+  own = {"bias": (0.02, 0, -0.01, 0, 0, 0)}
+  before = [_log(tmp_path / "before.mcap", seed=5, **own)]
+  now = [_log(tmp_path / "now.mcap", seed=6, **own)]
+  found = sensing.find(model, now, before).parts["imu"]
+  assert found.rows == [] and [r["kind"] for r in found.in_reference] == ["imu_bias"]
+  later = [_log(tmp_path / "later.mcap", seed=7, bias=(0.02, 0, 0.03, 0, 0, 0))]
+  (row,) = sensing.find(model, later, before).parts["imu"].rows
+  assert row["kind"] == "imu_bias"
+  leaning = sensing._leaning(model, {"x": 0.05, "y": 0.0})
+  np.testing.assert_allclose(leaning.opt.gravity, [0, 9.81 * np.sin(0.05), -9.81 * np.cos(0.05)])
+  np.testing.assert_allclose(model.opt.gravity, [0, 0, -9.81])

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.agents.dmpo.frozen import FrozenEncoder
-from nerf2real.agents.dmpo.replay import Replay, open_stored, trajectory_fields
+from nerf2real.agents.dmpo.replay.features import FrozenEncoder
+from nerf2real.agents.dmpo.replay.ring import Replay, open_stored, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import read_json, write_json
 

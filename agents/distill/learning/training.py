@@ -6,13 +6,13 @@ import jax
 import numpy as np
 
 from nerf2real.agents.distill import settings as stages
-from nerf2real.agents.distill import student
 from nerf2real.agents.distill.dataset import Dataset, Streams
-from nerf2real.agents.distill.features import FeatureCache
-from nerf2real.agents.distill.learning import make_updates, standardised
+from nerf2real.agents.distill.learning import student
+from nerf2real.agents.distill.learning.features import FeatureCache
+from nerf2real.agents.distill.learning.updates import make_updates, standardised
+from nerf2real.agents.distill.learning.validation import validate
 from nerf2real.agents.distill.schedule import cosine
 from nerf2real.agents.distill.settings import DistillSettings
-from nerf2real.agents.distill.validation import validate
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.processes.timings import StageTimes
 

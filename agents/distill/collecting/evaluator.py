@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.distill.collecting import student_policy
+from nerf2real.agents.distill.collecting.collector import student_policy
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.dmpo.policy.acting import Agent, run_episode, task_of
 from nerf2real.agents.dmpo.specs import Layout

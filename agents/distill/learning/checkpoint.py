@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerf2real.agents.distill.learning import TrainingState
+from nerf2real.agents.distill.learning.updates import TrainingState
 from nerf2real.core import files
 from nerf2real.core.serialization import from_plain, to_plain
 

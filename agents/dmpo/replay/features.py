@@ -18,7 +18,7 @@ from nerf2real.agents.dmpo import networks
 from nerf2real.agents.dmpo.augmentation import augment
 from nerf2real.agents.dmpo.config import DmpoConfig
 from nerf2real.agents.dmpo.networks import Params
-from nerf2real.agents.dmpo.replay import Field
+from nerf2real.agents.dmpo.replay.ring import Field
 
 
 class FrozenEncoder:

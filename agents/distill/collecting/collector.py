@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from nerf2real.agents.distill.episodes import EpisodeRunner
+from nerf2real.agents.distill.collecting.episodes import EpisodeRunner
 from nerf2real.agents.distill.schedule import may_collect, mixture_at, push_level, pushed
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import make_teacher

@@ -17,12 +17,12 @@ import jax
 import numpy as np
 
 from nerf2real.agents.distill import settings as stages
-from nerf2real.agents.distill.beginning import begin_with
-from nerf2real.agents.distill.checkpoint import STATE, Counters, load_state, save_state
 from nerf2real.agents.distill.dataset import Dataset
+from nerf2real.agents.distill.learning.beginning import begin_with
+from nerf2real.agents.distill.learning.checkpoint import STATE, Counters, load_state, save_state
+from nerf2real.agents.distill.learning.training import Trainer
 from nerf2real.agents.distill.schedule import stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
-from nerf2real.agents.distill.training import Trainer
 from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments.loading import make_environment

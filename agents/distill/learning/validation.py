@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from nerf2real.agents.distill.dataset import Dataset, Span
-from nerf2real.agents.distill.features import FeatureCache
-from nerf2real.agents.distill.learning import TrainingState, Updates
+from nerf2real.agents.distill.learning.features import FeatureCache
+from nerf2real.agents.distill.learning.updates import TrainingState, Updates
 
 _EPISODES = 8  # evenly spread over those held out: a tenth of a second for the network each
 _ROUND = 200  # steps: lengths are padded to multiples of it, so that few are compiled

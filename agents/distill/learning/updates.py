@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from nerf2real.agents.distill import losses, student
+from nerf2real.agents.distill.learning import losses, student
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.dmpo import augmentation, belief, scaling
 from nerf2real.agents.dmpo.networks import LstmState, Params

@@ -1,0 +1,1 @@
+"""The collectors' side of a distillation: labelled episodes, and trials of the student alone."""

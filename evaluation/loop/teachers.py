@@ -1,0 +1,144 @@
+"""The teacher of a loop's training: the walker that copes best with the effects, or a fitted one.
+
+The scripted gaits were searched for on the nominal robot. Where none of them copes with what was
+identified (a load and a slope that push the same way, say), a few parameters of the best one are
+searched for in the simulation with the effects, on trials that are not the protocol's.
+"""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerf2real.agents.distill.collecting.evaluator import other_trials
+from nerf2real.agents.distill.teacher import TEACHERS, WalkerSettings
+from nerf2real.core.serialization import read_json, write_json
+from nerf2real.evaluation import runner
+from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.plants.plant import NAVIGATION, Plant, Trial
+from nerf2real.evaluation.plants.simulated import SimulatedPlant
+from nerf2real.evaluation.policies import GaitPolicy
+from nerf2real.evaluation.session import choose
+from nerf2real.suite.gaits.evolution import Evolution
+
+WALKERS = ("quick", "steady", "swift")  # teachers that navigate
+FITTED = "teacher.json"
+_CHOICE = "teachers.json"
+_TRIALS = 9  # of each teacher; seconds of processor time each, without pictures
+_COPES = 0.85  # of its trials, from which a walker is taken as it is: at most one of nine fails
+_GENERATIONS, _POPULATION, _DRAWN = 6, 8, 6  # of the search; trials of a candidate
+# Parameter: width of the first round. What carries a displaced centre of mass, or treads lighter.
+_SEARCHED = {
+  "shift": 0.008,
+  "backset": 0.005,
+  "stride": 0.012,
+  "lift": 0.005,
+  "spread": 0.004,
+  "sway": 0.003,
+}
+
+
+class Choice(NamedTuple):
+  """A teacher, and how the walkers did with the effects."""
+
+  teacher: str  # a name in TEACHERS, or the file of a fitted walker
+  successes: dict[str, int]  # by walker; the fitted one's among them
+  trials: int  # of each
+
+
+def choose_teacher(
+  folder: Path, effects: Path, scene: Any, *, seed: int, time_limit: float | None = None
+) -> Choice:
+  """Returns the teacher that copes best with the effects; kept in the folder.
+
+  Args:
+    folder: Of the training; the choice and a fitted walker are kept in it.
+    effects: effects.json, drawn from its intervals.
+    scene: The bundle.
+    seed: Of the search.
+    time_limit: Length of a trial [s]; the task's own if None.
+  """
+  kept = folder / _CHOICE
+  if kept.exists():
+    return read_json(kept, Choice)
+  folder.mkdir(parents=True, exist_ok=True)
+  with _plant(scene, effects, time_limit) as plant:
+    fresh = _Trials(plant, scene)
+    successes = {name: fresh.successes(TEACHERS[name]()) for name in WALKERS}
+    teacher = max(successes, key=lambda name: successes[name])
+    if successes[teacher] < _COPES * len(fresh.chosen):
+      fitted = fit(plant, scene, TEACHERS[teacher](), seed=seed)
+      successes["fitted"] = fresh.successes(fitted)
+      if successes["fitted"] > successes[teacher]:
+        write_json(folder / FITTED, fitted)
+        teacher = str((folder / FITTED).resolve())
+  found = Choice(teacher, successes, len(fresh.chosen))
+  write_json(kept, found)
+  return found
+
+
+def fit(plant: Plant, scene: Any, start: WalkerSettings, *, seed: int) -> WalkerSettings:
+  """Returns a walker whose gait was searched for on a plant by CMA-ES, from another's.
+
+  A generation's candidates meet the same trials and draws, the next generation others. What is
+  returned is the mean of the last round.
+  """
+  names, widths = tuple(_SEARCHED), np.array(list(_SEARCHED.values()))
+  origin = np.array([getattr(start.gait, name) for name in names])
+
+  def walker(candidate: np.ndarray) -> WalkerSettings:
+    values = dict(zip(names, (float(v) for v in origin + widths * candidate), strict=True))
+    return dataclasses.replace(start, gait=dataclasses.replace(start.gait, **values))
+
+  listed = other_trials([trial for _, trial in plants.trials(NAVIGATION)])
+  rng = np.random.default_rng(seed)
+  evolution = Evolution(np.zeros(len(names)), 1.0, _POPULATION, seed)
+  for generation in range(_GENERATIONS):
+    picked = rng.choice(len(listed), _DRAWN, replace=False)
+    trials = [listed[i]._replace(seed=listed[i].seed + generation) for i in picked]
+    candidates = evolution.ask()
+    scores = [_score(plant, scene, walker(candidate), trials) for candidate in candidates]
+    evolution.tell(candidates, np.array(scores))
+  return walker(evolution.mean)
+
+
+def _score(plant: Plant, scene: Any, settings: WalkerSettings, trials: Sequence[Trial]) -> float:
+  """Returns the mean over trials: 1 to 0.5 of a success by its time, less of what stayed up."""
+  limit, total = plant.time_limit, 0.0
+  for index, trial in enumerate(trials):
+    episode = _episode(plant, scene, settings, trial, index)
+    share = min(1.0, episode.duration / limit)
+    total += 1.0 - 0.5 * share if episode.success else 0.3 * share
+  return total / len(trials)
+
+
+class _Trials:
+  """Trials of the protocol that walkers are counted on."""
+
+  def __init__(self, plant: Plant, scene: Any):
+    self._plant, self._scene = plant, scene
+    self.chosen = [trial for _, (_, trial) in choose(plants.trials(NAVIGATION), _TRIALS)]
+
+  def successes(self, settings: WalkerSettings) -> int:
+    return sum(
+      _episode(self._plant, self._scene, settings, trial, index).success
+      for index, trial in enumerate(self.chosen)
+    )
+
+
+def _episode(plant: Plant, scene: Any, settings: WalkerSettings, trial: Trial, index: int) -> Any:
+  walker = GaitPolicy(scene, NAVIGATION, settings=settings.gait, steering=settings.steering)
+  return runner.run_trial(plant, walker, trial, group=NAVIGATION, index=index)
+
+
+@contextlib.contextmanager
+def _plant(scene: Any, effects: Path, time_limit: float | None) -> Iterator[Plant]:
+  """Yields the simulation with the effects, without pictures."""
+  plant = SimulatedPlant(
+    scene, NAVIGATION, image_size=None, effects=effects, draw_effects=True, time_limit=time_limit
+  )
+  with contextlib.closing(plant):
+    yield plant

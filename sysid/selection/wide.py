@@ -1,0 +1,222 @@
+"""Hypotheses of a body or of the whole machine, fitted to all joints that they concern.
+
+Every hypothesis is screened over all its joints: from where its values and the joints' constants
+cost least, two Gauss-Newton steps of the shared values with the constants following. What the best
+of them is not clearly better than is fitted to the end. Shapes: B blocks, n shared values.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.fit.posterior import CLOCKS, Fit, Fitter, Layout
+from nerf2real.sysid.hypotheses.candidates import library
+from nerf2real.sysid.hypotheses.plausible import plausible
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.point_mass import carrying
+from nerf2real.sysid.selection.explain import Scored, variance
+from nerf2real.sysid.selection.subject import WHOLE, Subject
+
+Array = np.ndarray
+
+_LATE = ("command_delay", "measurement_delay")
+"""Kinds that are a joint's or the bus's."""
+_ENOUGH = 20  # steps of a fit, which ends by itself: a bound on time
+_NEAR = tuple(0.001 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))  # s from a delay to look about
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Wide:
+  """An effect that several joints share, fitted."""
+
+  term: Term
+  members: tuple[Subject, ...]
+  """The joints that it concerns."""
+  fit: Fit
+
+  @property
+  def x(self) -> Array:
+    """Its values [n]."""
+    return self.fit.x[: len(self.term.names)]
+
+  @property
+  def key(self) -> tuple[str, str | None]:
+    """What it claims: its kind and its body."""
+    return self.term.kind, self.term.target
+
+  def own(self, at: int) -> Array:
+    """Returns the constants of one of the joints."""
+    return self.fit.x[self.fit.layout.index[at]][: -len(self.x) or None]
+
+  def evidence(self) -> "Evidence":
+    """Returns the gain over the joints without it."""
+    return _evidence(self.members, self.fit)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+  """Nats of blocks, joint by joint, and what the priors take."""
+
+  rows: dict[str, Array]
+  """[B] by joint."""
+  prior: float = 0.0
+
+  def __sub__(self, other: "Evidence") -> "Evidence":
+    """Returns the difference; joints that one lacks count as zero there."""
+    rows = dict(self.rows)
+    for joint, row in other.rows.items():
+      rows[joint] = rows[joint] - row if joint in rows else -row
+    return Evidence(rows, self.prior - other.prior)
+
+  @property
+  def total(self) -> float:
+    """Nats in all."""
+    return float(sum(row.sum() for row in self.rows.values())) - self.prior
+
+  @property
+  def clear(self) -> float:
+    """Standard errors from zero: joints are independent, so that their variances add."""
+    error = np.sqrt(sum(variance(row) for row in self.rows.values()))
+    return self.total / max(float(error), 1.0)
+
+
+def hypotheses(
+  model: mujoco.MjModel, subjects: Sequence[Subject]
+) -> list[tuple[Term, tuple[Subject, ...]]]:
+  """Returns the effects of bodies and of the machine that joints may share, with the joints."""
+  result: list[tuple[Term, tuple[Subject, ...]]] = []
+  everyone = tuple(subjects)
+  machine: dict[tuple, Term] = {}
+  for subject in subjects:
+    plant = subject.now.plant
+    terms = [plausible(t) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
+    late = [dataclasses.replace(t, target=None) for t in subject.library if t.kind in _LATE]
+    for term in (*terms, *late):
+      known = machine.get((term.kind, term.fixed))
+      if known is None or term.scale < known.scale:  # of the joint that bears most
+        machine[term.kind, term.fixed] = term
+    for term in (t for t in subject.library if t.kind == "payload"):
+      index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, str(term.target))
+      way = ancestors(model, index) if index >= 0 else []
+      members = tuple(s for s in subjects if s.joint in way)
+      if len(members) > 1:
+        result.append((term, members))
+  return [*((term, everyone) for term in machine.values()), *result]
+
+
+def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
+  """Returns the joints that carry a body, the nearest first."""
+  return [model.joint(k).name for k in reversed(carrying(model, body))]
+
+
+def screened(term: Term, members: Sequence[Subject]) -> Wide:
+  """Returns an effect after two steps from its best start, constants' derivatives taken over."""
+  layout = Layout([m.explainer.null.terms for m in members], [term])
+  joints = [m.now for m in members]
+  begin = _begin(term, members)
+  count = len(term.names)
+  known = []
+  for m in members:
+    jacobian = m.explainer.null.fit.jacobian[0]
+    known.append(np.concatenate([jacobian, np.zeros((count, *jacobian.shape[1:]))]))
+  fresh = np.arange(layout.count) < count
+  fit = Fitter(joints, layout).fit(begin, iterations=2, known=known, fresh=fresh, quick=True)
+  return Wide(term, tuple(members), fit)
+
+
+def fitted(item: Wide) -> Wide:
+  """Returns a screened effect fitted to the end, with its predictions of left-out blocks."""
+  fitter = Fitter([m.now for m in item.members], item.fit.layout)
+  fit = fitter.fit(item.fit.x, iterations=_ENOUGH)
+  near = [_replaced(fit.x, at, fit.x[at] + shift) for at in _late(item.term) for shift in _NEAR]
+  if near:
+    near = [np.clip(x, fit.layout.low, fit.layout.high) for x in near]
+    best = near[int(np.argmin(fitter.costs(np.array(near))))]
+    other = fitter.fit(best, iterations=_ENOUGH)
+    fit = min(fit, other, key=lambda f: f.cost)
+  return dataclasses.replace(item, fit=fitter.leave_out(fit))
+
+
+def _late(term: Term) -> list[int]:
+  """Returns the indices of a term's delays."""
+  return [at for at, name in enumerate(term.names) if name in CLOCKS]
+
+
+def _replaced(x: Array, at: int, value: float) -> Array:
+  """Returns a copy of values [n] with one replaced."""
+  result = x.copy()
+  result[at] = value
+  return result
+
+
+def adopted(item: Wide, others: Sequence[Subject]) -> Wide:
+  """Returns a fitted effect under the scale that it sets, under which joints are scored anew."""
+  for member, residual in zip(item.members, item.fit.residuals, strict=True):
+    member.now.rescale(residual)
+  for subject in {m.joint: m for m in (*item.members, *others)}.values():
+    explainer = subject.explainer
+    explainer.null = explainer.refit(explainer.null, 4)
+  return fitted(item)
+
+
+def _begin(term: Term, members: Sequence[Subject]) -> Array:
+  """Returns the start that costs least over all joints, each with its constants as they are or as
+  they were before they were bent by what is missing."""
+  starts = np.array(term.starts)
+  if _late(term):  # held commands make stairs of a delay, whose derivatives mislead
+    starts = np.arange(term.low[0], term.high[0], 0.5 * term.scale[0])[:, None]
+  totals, owns = np.zeros(len(starts)), []
+  for m in members:
+    null = m.explainer.null
+    places = (null.fit.x, np.concatenate([t.centre for t in null.terms]))
+    tried = np.array([np.concatenate([own, s]) for s in starts for own in places])
+    costs = Fitter([m.now], Layout([[*null.terms, term]])).costs(tried)
+    costs = costs.reshape(len(starts), len(places))
+    totals += costs.min(axis=1)
+    owns.append([places[k] for k in costs.argmin(axis=1)])
+  best = int(np.argmin(totals))
+  return np.concatenate([starts[best], *[own[best] for own in owns]])
+
+
+def alone(item: Wide, at: int) -> Evidence:
+  """Returns the evidence of the same effect at one of its joints, fitted there alone."""
+  member = item.members[at]
+  fitter = Fitter([member.now], Layout([(*member.explainer.null.terms, item.term)]))
+  fit = fitter.fit(np.concatenate([item.own(at), item.x]), iterations=_ENOUGH)
+  return _evidence([member], fitter.leave_out(fit))
+
+
+def _evidence(members: Sequence[Subject], fit: Fit) -> Evidence:
+  nulls = [m.explainer.null for m in members]
+  squares = fit.held or [m.now.squares(r) for m, r in zip(members, fit.residuals, strict=True)]
+  rows = {
+    m.joint: m.now.loglik(s) - null.nats for m, s, null in zip(members, squares, nulls, strict=True)
+  }
+  prior = float(Fitter([m.now for m in members], fit.layout).prior(fit.x[None])[0])
+  return Evidence(rows, prior - sum(n.prior for n in nulls))
+
+
+def without(member: Subject, item: Scored, held: Term) -> Scored:
+  """Returns a joint's hypothesis without one of its effects of wider scope, fitted on."""
+  terms = tuple(t for t in item.terms if t != held)
+  fitter = Fitter([member.now], Layout([terms]))
+  fit = fitter.leave_out(fitter.fit(item.fit.x, iterations=4))
+  return Scored(terms, fit, member.now.loglik(fit.held[0]))
+
+
+def same(one: Wide, other: Wide) -> bool:
+  """Tells whether two effects predict the same of all joints, but for a part of what remains."""
+  if [m.joint for m in one.members] != [m.joint for m in other.members]:
+    return False
+  return all(
+    _alike(m.now, a - b)
+    for m, a, b in zip(one.members, one.fit.residuals, other.fit.residuals, strict=True)
+  )
+
+
+def _alike(joint: JointLikelihood, apart: Array) -> bool:
+  mean = np.median(joint.squares(apart), axis=1)
+  return bool(np.all(mean < joint.settings.alike**2 * joint.scale**2))

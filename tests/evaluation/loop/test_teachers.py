@@ -1,0 +1,69 @@
+"""The teacher of a loop's training: a walker that copes, or one that is fitted to the effects."""
+
+import types
+
+import numpy as np
+import pytest
+
+from nerf2real.agents.distill.teacher import TEACHERS, WalkerTeacher, make_teacher
+from nerf2real.evaluation.loop import teachers
+from nerf2real.suite.gaits.floor import EmptyFloor
+
+_LOAD = 0.02  # m that the feet must stand to the side of, in these tests
+
+
+class _Plant:
+  time_limit = 20.0
+
+
+def _episodes(monkeypatch, load):
+  """Puts a rule in place of the simulation: who stands beside the load falls, sooner if further."""
+  seen = []
+
+  def episode(plant, scene, settings, trial, index):
+    seen.append(trial)
+    off = abs(settings.gait.shift - load)
+    duration = float(np.clip(20.0 * (1 - off / 0.03), 1.0, 20.0))
+    return types.SimpleNamespace(success=off < 0.01, duration=10.0 if off < 0.01 else duration)
+
+  monkeypatch.setattr(teachers, "_episode", episode)
+  monkeypatch.setattr(teachers, "_plant", lambda *_: _Context())
+  return seen
+
+
+class _Context:
+  def __enter__(self):
+    return _Plant()
+
+  def __exit__(self, *_):
+    return False
+
+
+def test_a_walker_that_copes_is_taken_as_it_is(monkeypatch, tmp_path):
+  seen = _episodes(monkeypatch, 0.0)
+  found = teachers.choose_teacher(tmp_path, tmp_path / "effects.json", EmptyFloor(), seed=0)
+  assert found.teacher in teachers.WALKERS and set(found.successes.values()) == {found.trials}
+  assert len(seen) == len(teachers.WALKERS) * found.trials
+  assert not (tmp_path / teachers.FITTED).exists()
+
+
+def test_where_none_copes_one_is_fitted_and_kept(monkeypatch, tmp_path):
+  seen = _episodes(monkeypatch, _LOAD)
+  found = teachers.choose_teacher(tmp_path, tmp_path / "effects.json", EmptyFloor(), seed=0)
+  assert found.successes["fitted"] == found.trials
+  assert [found.successes[name] for name in teachers.WALKERS] == [0] * len(teachers.WALKERS)
+  teacher = make_teacher(found.teacher, EmptyFloor())
+  assert isinstance(teacher, WalkerTeacher)
+  assert teacher._walker._gait.settings.shift == pytest.approx(_LOAD, abs=0.01)
+  count = len(seen)
+  assert teachers.choose_teacher(tmp_path, tmp_path, EmptyFloor(), seed=0) == found
+  assert len(seen) == count  # nothing is run twice
+
+
+def test_a_fit_meets_no_trial_of_the_protocol(monkeypatch):
+  seen = _episodes(monkeypatch, _LOAD)
+  teachers.fit(_Plant(), EmptyFloor(), TEACHERS["quick"](), seed=0)
+  from nerf2real.evaluation.plants import plant as plants
+
+  protocol = [trial for _, trial in plants.trials(plants.NAVIGATION)]
+  assert not any(trial.seed == other.seed for trial in seen for other in protocol)
