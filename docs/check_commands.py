@@ -3,6 +3,7 @@
   python docs/check_commands.py            # all, in the order of the READMEs
   python docs/check_commands.py --list     # runs none
   python docs/check_commands.py --only identify
+  python docs/check_commands.py --write --missing  # what is not in it, or failed
   python docs/check_commands.py --write    # docs/commands.md, too; --only runs these anew in it
 
 Commands are the code spans and lines that begin with `.venv/bin/python`, `python`, `nerf2real` or
@@ -33,6 +34,7 @@ _BEGINS = r"(?:\.venv/bin/python|python|nerf2real|make)"
 _SPAN = re.compile(rf"`({_BEGINS} [^`\n]+)`")
 _LINE = re.compile(rf"^ *({_BEGINS} (?:[^`\n]*\\\n)*[^`\n]+?)(?: +#.*)?$", re.MULTILINE)
 _TIMEOUT = 1800.0  # s of a command
+_ENDING = 60.0  # s after Ctrl-C
 _LINKS = "nerf2real"  # holds links to the packages
 OK, FAILED, SKIPPED = "ok", "FAILED", "left out"
 _CELL = 150  # characters of what a command says
@@ -111,7 +113,12 @@ def run(command: str, entry: dict[str, Any]) -> Ended:
     ready = time.monotonic() - begin
     if process.poll() is None:
       os.killpg(process.pid, signal.SIGINT)
-    rest, _ = process.communicate(timeout=60)
+    try:
+      rest, _ = process.communicate(timeout=_ENDING)
+    except subprocess.TimeoutExpired:
+      os.killpg(process.pid, signal.SIGKILL)
+      process.communicate()
+      return Ended(FAILED, ready, f"not over {_ENDING:g} s after Ctrl-C")
     good = process.returncode in (0, 128 + signal.SIGINT) and "Traceback" not in rest
     last = (lines or [rest])[-1].strip()
     return Ended(OK if good else FAILED, ready, last if good else "".join(lines[-5:]) + rest[-300:])
@@ -160,12 +167,17 @@ def main() -> int:
   parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
   parser.add_argument("--list", action="store_true", help="prints the commands, runs none")
   parser.add_argument("--only", default="", help="runs commands that hold this text")
+  parser.add_argument("--missing", action="store_true", help="runs what has not ended well yet")
   parser.add_argument("--write", action="store_true", help="writes docs/commands.md")
   arguments = parser.parse_args()
+  # What a shell puts into the background ignores Ctrl-C, and so would the commands.
+  signal.signal(signal.SIGINT, signal.default_int_handler)
   known, rows, failed, count = table(), recorded(), 0, 0
   printed = list(commands())
   for path, command in printed:
     if arguments.only not in command:
+      continue
+    if arguments.missing and f"| {FAILED} |" not in rows.get(command, f"| {FAILED} |"):
       continue
     entry = known.get(command, {})
     if arguments.list:
