@@ -186,7 +186,7 @@ class Recorder:
         pipe.write(LENGTH.pack(len(data)) + data)
         if self._queue.empty():
           pipe.flush()
-      except (BrokenPipeError, OSError):
+      except (OSError, ValueError):  # the process is gone; or `close` waited long enough for it
         self.dropped += 1 + self._queue.qsize()
         _log.error("The recorder of %s has died: the rest of the run is not recorded.", self.path)
         return
