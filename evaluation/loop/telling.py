@@ -171,7 +171,12 @@ def _training(story: Story) -> Section:
   figures = [
     Figure("training", round(made.minutes, 1), "min", "of updates"),
     Figure("frames", made.frames, "", "control steps collected"),
-    Figure("teacher", made.teacher, "", f"walkers with the effects: {chosen}" if chosen else ""),
+    Figure(
+      "teacher",
+      Path(made.teacher).name,
+      "",
+      f"walkers with the effects: {chosen}" if chosen else "",
+    ),
     Figure(
       "success in the simulation with the effects",
       _percent(story.tallies.get(loop.TRAINED)),
