@@ -1,6 +1,7 @@
 """Commands run in this process: quick, and what they import is imported once."""
 
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -19,8 +20,9 @@ class Ended(NamedTuple):
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-  """Runs a script with arguments; signal handlers and environment are as before afterwards."""
+  """Runs a script with arguments; signals, environment and logging are as before afterwards."""
   environment = dict(os.environ)
+  loggers = list(logging.getLogger().handlers)  # a script's would hold this test's closed streams
   handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
 
   def call(script, *arguments):
@@ -33,6 +35,8 @@ def run(monkeypatch, capsys):
     return Ended(status, *capsys.readouterr())
 
   yield call
+  for logger in set(logging.getLogger().handlers) - set(loggers):
+    logging.getLogger().removeHandler(logger)
   for number, handler in handlers.items():
     signal.signal(number, handler)
   os.environ.clear()
