@@ -25,6 +25,7 @@ _LIGHT_DIRECTION = np.array(
 )  # towards the light, in the world; chosen: a lamp above
 _AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; chosen
 _CULLING_SLACK = 1e-3  # rad added to the cone around a geom
+_TILE = 16  # pixels, side of the tiles that are culled before single rays are
 
 
 class FieldRenderer(Protocol):
@@ -110,6 +111,29 @@ def world_from_camera(data: mujoco.MjData, camera_id: int) -> np.ndarray:
   return pose_of_mujoco_camera(data.cam_xpos[camera_id], data.cam_xmat[camera_id])
 
 
+def _tiles(
+  directions: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Returns tiles of a picture's rays, to cull geoms by.
+
+  Args:
+    directions: Unit vectors of the rays [H * W, 3].
+    shape: Height and width of the picture.
+
+  Returns:
+    The tile of each ray [H * W], and of each tile the axis [T, 3] and the half angle [rad] of the
+    cone that holds its rays [T].
+  """
+  rows, columns = (np.arange(size) // _TILE for size in shape)
+  tiles = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
+  axes = np.stack([np.bincount(tiles, weights=directions[:, k]) for k in range(3)], axis=1)
+  axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+  away = np.arccos(np.clip(np.einsum("ni,ni->n", directions, axes[tiles]), -1.0, 1.0))
+  angles = np.zeros(len(axes))
+  np.maximum.at(angles, tiles, away)
+  return tiles, axes, angles
+
+
 class GeomCaster:
   """Casts a camera's rays against the geoms that can move."""
 
@@ -127,6 +151,7 @@ class GeomCaster:
     self._shape = (camera.height, camera.width)
     self._rays = camera.rays().reshape(-1, 3)  # [N, 3], z = 1
     self._directions = self._rays / np.linalg.norm(self._rays, axis=1, keepdims=True)
+    self._tiles, self._tile_axes, self._tile_angles = _tiles(self._directions, self._shape)
     moving = model.body_weldid[model.geom_bodyid] != 0
     self._geoms = np.flatnonzero(np.isin(model.geom_group, groups) & moving)
     self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
@@ -146,9 +171,13 @@ class GeomCaster:
       return np.empty(0, np.int64)
     outside = distances > radii
     angle = np.arcsin(np.divide(radii, distances, where=outside, out=np.ones_like(radii)))
-    limits = np.where(outside, np.cos(angle + _CULLING_SLACK), -1.0)
-    cosines = self._directions @ (offsets / np.maximum(distances, 1e-9)[:, None]).T  # [N, G]
-    return np.flatnonzero((cosines >= limits).any(axis=1))
+    limits = np.where(outside, angle + _CULLING_SLACK, np.pi)
+    axes = offsets / np.maximum(distances, 1e-9)[:, None]  # [G, 3]
+    wider = np.minimum(limits[:, None] + self._tile_angles, np.pi)  # [G, T]
+    near = (axes @ self._tile_axes.T >= np.cos(wider)).any(axis=0)
+    rays = np.flatnonzero(near[self._tiles])
+    cosines = axes @ self._directions[rays].T  # [G, R]
+    return rays[(cosines >= np.cos(limits)[:, None]).any(axis=0)]
 
   def cast(self, data: mujoco.MjData, pose: np.ndarray) -> tuple[np.ndarray, ...]:
     """Casts the rays.
