@@ -1,7 +1,8 @@
 """Keeps the ball in the robot's view: pan and tilt point at it, and sweep while it is not seen.
 
 All that it does while the ball is out of view can be told from the head's own motion, so that a
-policy with the same sensors can learn it.
+policy with the same sensors can learn it: a sweep goes on where the head moves, one of a head that
+rests goes to the farther side.
 """
 
 import dataclasses
@@ -23,6 +24,7 @@ _REACHED = 0.1  # rad from that angle at which it does
 _LEAD = 0.4  # rad that a sweep's target is ahead of the head; chosen: some 2 rad/s
 _SWEEP_TILT = -0.3  # rad: from 0.4 m ahead to the walls
 _LOST = 2.0  # s without a view after which the head sweeps; chosen
+_RESTS = 0.01  # rad in a control step below which the head rests; chosen: a fifth of a sweep's
 _SWEEPS = 3  # turns of a sweep after which the robot turns, too: the ball is behind it
 
 
@@ -62,7 +64,8 @@ class Gaze:
   def reset(self) -> None:
     """Begins an episode: nothing has been seen."""
     self._unseen = np.inf  # s since the ball was in view
-    self._direction = 1.0  # of a sweep, 1 to the left
+    self._pan: float | None = None  # rad, of the last control step
+    self._outward = 0.0  # side of the end that a sweep has turned back at: 1 left, 0 none
     self._sweeps = 0
 
   @property
@@ -80,12 +83,16 @@ class Gaze:
       tilt: And its tilt [rad].
     """
     self._unseen = 0.0 if is_seen(view, pan=pan, tilt=tilt) else self._unseen + _TIMESTEP
+    moved, self._pan = 0.0 if self._pan is None else pan - self._pan, pan
     if not self.searches:
-      self._sweeps = 0
+      self._outward, self._sweeps = 0.0, 0
       bearing = float(np.clip(view.bearing, -_PAN, _PAN))
       return dataclasses.replace(command, head=(bearing, _LEAN - depression(view.distance)))
-    if self._direction * pan > _PAN - _REACHED:
-      self._direction, self._sweeps = -self._direction, self._sweeps + 1
-    target = float(np.clip(pan + self._direction * _LEAD, -_PAN, _PAN))
+    side = 1.0 if pan > 0 else -1.0
+    at_end = abs(pan) > _PAN - _REACHED
+    if at_end and side != self._outward:
+      self._outward, self._sweeps = side, self._sweeps + 1
+    onward = np.sign(moved) if abs(moved) > _RESTS and not at_end else -side
+    target = float(np.clip(pan + onward * _LEAD, -_PAN, _PAN))
     behind = self._sweeps >= _SWEEPS
     return Command(turn=float(behind), step=behind, head=(target, _SWEEP_TILT))

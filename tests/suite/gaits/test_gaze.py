@@ -58,6 +58,18 @@ def test_a_ball_behind_the_robot_makes_it_turn():
   assert commands[-1].step and commands[-1].turn == 1.0 and commands[-1].forward == 0.0
 
 
+@pytest.mark.parametrize("pan", [-1.4, 0.6])
+def test_the_sweep_of_a_head_that_rests_is_told_by_where_it_points(pan):
+  behind = view_of((0.0, 0.0, 0.0), np.array([-1.0, 0.0]))
+  targets = []
+  for begin in (-0.5, 0.5):  # two heads that came from either side
+    gaze = Gaze()
+    for place in [*np.linspace(pan + begin, pan, 10), pan, pan]:
+      command = gaze.apply(WALK, behind, pan=place, tilt=-0.3)
+    targets.append(command.head[0])
+  assert targets[0] == targets[1] == pytest.approx(pan - 0.4 * np.sign(pan))
+
+
 def test_a_ball_that_is_out_of_sight_for_a_moment_is_not_lost():
   gaze, head = Gaze(), np.array([0.0, -0.2])
   _, head = _step(gaze, head, np.array([1.0, 0.0]))
