@@ -59,6 +59,7 @@ def resolution(policy: EvaluatedPolicy) -> str:
 class GaitPolicy:
   """The scripted walker, with the observed pose or by dead reckoning without one."""
 
+  name = "gait"
   image_size: tuple[int, int] | None = None
   control = "none"
   trained_on = ""
@@ -71,7 +72,6 @@ class GaitPolicy:
     *,
     settings: GaitSettings | None = None,
     steering: SteeringSettings | None = None,
-    name: str = "gait",
   ):
     """Creates the policy.
 
@@ -80,9 +80,7 @@ class GaitPolicy:
       protocol: One of `plants.PROTOCOLS`.
       settings: Parameters of the gait.
       steering: And of its steering.
-      name: For the tables.
     """
-    self.name = name
     head_pan = constants.BALL_PUSHING_HEAD_PAN if protocol == BALL else None
     self._walker = Walker(scene, gait=settings, steering=steering, head_pan_limit=head_pan)
     made_of: Any = settings or GaitSettings()

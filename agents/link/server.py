@@ -38,8 +38,6 @@ Insert = Callable[[Mapping[str, np.ndarray], int, int], int]
 class ActorRecord:
   """The learner's record of an actor."""
 
-  heard: float
-  """Monotonic time of its last message [s]."""
   alive: bool = True
   parameters_version: int = 0
   refused: int = 0
@@ -213,8 +211,8 @@ class LearnerLink:
         self.limiter.forget(actor)
 
   def _record(self, actor: str) -> ActorRecord:
-    record = self._actors.setdefault(actor, ActorRecord(time.monotonic()))
-    record.heard, record.alive = time.monotonic(), True
+    record = self._actors.setdefault(actor, ActorRecord())
+    record.alive = True
     return record
 
   def _answering(self, answer: Callable[[schema.Message], bytes]) -> Callable[[zenoh.Query], None]:
@@ -341,5 +339,5 @@ class LearnerLink:
     with self.lock:
       self._ledger.record(actor_key(actor), number)
       self.limiter.returned(actor, steps)
-      unknown = ActorRecord(time.monotonic(), alive=False)
+      unknown = ActorRecord(alive=False)
       self._actors.setdefault(actor, unknown).refused += 1

@@ -168,14 +168,14 @@ class Walker:
     further = np.flatnonzero(distance[nearest:] >= ahead)
     return path[nearest + int(further[0])] if len(further) else path[-1]
 
-  def _aim(self, point: np.ndarray, *, speed: float = 1.0) -> Command:
+  def _aim(self, point: np.ndarray) -> Command:
     """Returns the command that turns and walks to a point [2]."""
     steering = self.steering
     offset = point - self.pose.xy
     error = np.arctan2(offset[1], offset[0]) - self.pose.yaw
     error = float((error + np.pi) % (2 * np.pi) - np.pi)
     turn = float(np.clip(steering.turn_gain * error, -1.0, 1.0))
-    forward = speed * max(0.0, 1.0 - abs(error) / steering.turn_first)
+    forward = max(0.0, 1.0 - abs(error) / steering.turn_first)
     return Command(forward=forward, turn=turn)
 
   def _push(self, ball: np.ndarray, target: np.ndarray) -> Command:
