@@ -8,10 +8,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation.plants.plant import BALL, Sight
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import SteeringSettings, Walker
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.protocols import BALL
 
 
 class Belief(NamedTuple):
@@ -77,7 +78,7 @@ class GaitPolicy:
 
     Args:
       scene: An opened bundle.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       settings: Parameters of the gait.
       steering: And of its steering.
     """

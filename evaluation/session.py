@@ -113,13 +113,12 @@ def make_plant(
     )
   from nerf2real.evaluation.plants.operated import OperatedPlant
 
-  camera: Any = int(settings.camera) if settings.camera.isdigit() else settings.camera
   return OperatedPlant(
     scene,
     settings.protocol,
     settings.perturb,
     robot=settings.robot,
-    camera=camera,
+    camera=settings.camera,
     image_size=image_size,
     time_limit=settings.time_limit,
     record=record,

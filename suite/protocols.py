@@ -110,12 +110,18 @@ def ball_wall() -> tuple[BallTrial, ...]:
   return tuple(trials)
 
 
+def ball() -> tuple[BallTrial, ...]:
+  """Returns the 46 trials of ball pushing, Center before Wall."""
+  return (*ball_center(), *ball_wall())
+
+
+NAVIGATION, BALL, GAIN = "navigation", "ball", "gain"
 PROTOCOLS: dict[str, Callable[[], tuple[NavigationTrial, ...] | tuple[BallTrial, ...]]] = {
-  "navigation": navigation,
-  "camera_gain": camera_gain,
-  "ball_center": ball_center,
-  "ball_wall": ball_wall,
+  NAVIGATION: navigation,
+  BALL: ball,
+  GAIN: camera_gain,
 }
+"""Trials by the name of an evaluation: the paper's tables I, II and V."""
 
 
 def navigation_starts(free_xy: np.ndarray, goals: np.ndarray) -> np.ndarray:

@@ -112,11 +112,10 @@ class ActorLink:
     self.outbox.acknowledge(grant["acknowledged"])
     return grant
 
-  def send(self, trajectory: Mapping[str, np.ndarray]) -> None:
-    """Puts a trajectory into the outbox and sends what is due."""
-    values = {"actor": self.actor, "number": self.outbox.made + 1}
-    payload = schema.encode("trajectory", values, trajectory)
-    self.outbox.add(payload, trajectory["reward"].shape[0] - 1)
+  def send(self, trajectory: Mapping[str, np.ndarray], *, steps: int) -> None:
+    """Puts a trajectory of some environment steps into the outbox and sends what is due."""
+    values = {"actor": self.actor, "number": self.outbox.made + 1, "steps": steps}
+    self.outbox.add(schema.encode("trajectory", values, trajectory), steps)
     self.flush()
 
   def flush(self) -> None:

@@ -12,17 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.agents.environments.loading import camera_settings
-from nerf2real.agents.environments.trials import Interval, clopper_pearson
+from nerf2real.core.intervals import Interval, clopper_pearson
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.evaluation.plants import plant as plants
-from nerf2real.evaluation.plants.plant import NAVIGATION, Plant
+from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy, resolution
 from nerf2real.evaluation.session import choose, free_name
 from nerf2real.real.virtual.undeclared import Undeclared
+from nerf2real.suite.protocols import NAVIGATION
 
 Say = Callable[[str], None]
 
@@ -179,7 +180,7 @@ def _make_plant(
     scene,
     NAVIGATION,
     robot=settings.robot,
-    camera=settings.camera_source,
+    camera=settings.camera,
     image_size=policy.image_size,
     robot_name=settings.robot,
     time_limit=settings.time_limit,

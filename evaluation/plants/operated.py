@@ -58,7 +58,7 @@ class OperatedPlant(RobotPlant):
 
     Args:
       scene: An opened bundle of the room.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       robot: Serial port, or a `real.loading.Connection`.
       camera: Device number, file or URL.

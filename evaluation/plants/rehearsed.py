@@ -10,7 +10,7 @@ import numpy as np
 
 from nerf2real import real
 from nerf2real.evaluation.plants import perturbations, swaps
-from nerf2real.evaluation.plants.plant import BALL, TASKS, Sight, Trial, make_intruder
+from nerf2real.evaluation.plants.plant import TASKS, Sight, Trial, make_intruder
 from nerf2real.evaluation.plants.robot_plant import RobotPlant
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.camera import LENS
@@ -18,7 +18,7 @@ from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
-from nerf2real.suite.protocols import NavigationTrial
+from nerf2real.suite.protocols import BALL, NavigationTrial
 
 
 class CoveredCamera:
@@ -62,7 +62,7 @@ class RehearsedPlant(RobotPlant):
 
     Args:
       scene: An opened bundle of the room that the robot stands in.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the policy's picture; None for no camera.
       robot_seed: Which robot: the seed of what is hidden in it; None: as in the data sheets.

@@ -39,7 +39,7 @@ class SimulatedPlant(Plant):
 
     Args:
       scene: An opened bundle.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the picture; None for no camera.
       camera: Settings of the camera; the suite's own if None.

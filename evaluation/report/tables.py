@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.agents.environments.trials import clopper_pearson
+from nerf2real.core.intervals import clopper_pearson
 from nerf2real.evaluation import episodes as kept
 from nerf2real.evaluation.episodes import Episode, select
 from nerf2real.suite import protocols

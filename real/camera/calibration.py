@@ -147,9 +147,8 @@ def calibrate(views: Iterable[View], *, corners: tuple[int, int]) -> Calibration
   _check(kept)
   width, height = kept[0].size
   board = np.zeros((corners[0] * corners[1], 3), np.float32)
-  board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(
-    -1, 2
-  )  # the lens does not depend on their size
+  # squares of side 1: the lens does not depend on it
+  board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
   values, errors = _fit(kept, board)
   limit = _OUTLIER * np.median(errors)
   rejected = tuple(v.name for v, e in zip(kept, errors, strict=True) if e > limit)

@@ -88,7 +88,7 @@ def _act(link, count, *, timeout=60.0, pause=0.0):
       credits = grant["granted"] if grant else 0
       if not credits:
         time.sleep(0.01)
-    link.send(mini_learner.make_trajectory(link.outbox.made + 1))
+    link.send(mini_learner.make_trajectory(link.outbox.made + 1), steps=mini_learner.LENGTH - 1)
     credits, made = 0, made + 1
     time.sleep(pause)
 
@@ -127,7 +127,9 @@ def test_kill_9_of_the_learner_loses_and_repeats_nothing(learner, tmp_path):
   link = _join(learner, resend_after=1.0, ask_timeout=0.5)
   _act(link, 10)
   learner.kill()
-  link.send(mini_learner.make_trajectory(link.outbox.made + 1))  # nobody is there
+  link.send(
+    mini_learner.make_trajectory(link.outbox.made + 1), steps=mini_learner.LENGTH - 1
+  )  # nobody is there
   assert link.request(1) is None
   assert link.outbox.size > 0
   learner.start()
@@ -154,7 +156,7 @@ def _freeze_while_acting(learner, link, tmp_path, seconds):
   learner.process.send_signal(signal.SIGSTOP)
   # Without asking: what is put while the learner is frozen must not vanish either.
   for _ in range(3):
-    link.send(mini_learner.make_trajectory(link.outbox.made + 1))
+    link.send(mini_learner.make_trajectory(link.outbox.made + 1), steps=mini_learner.LENGTH - 1)
   time.sleep(seconds)
   learner.process.send_signal(signal.SIGCONT)
   _act(link, 5)
@@ -192,11 +194,12 @@ def test_malformed_messages_are_refused_and_counted(learner):
   while not link.learner_is_there:
     time.sleep(0.01)
   good = mini_learner.make_trajectory(1)
-  values = {"actor": "broken", "number": 1}
+  values = {"actor": "broken", "number": 1, "steps": 47}
   bad = [
     b"rubbish",
     schema.encode("metrics", values, good),
-    schema.encode("trajectory", {"actor": "broken"}, good),
+    schema.encode("trajectory", {"actor": "broken", "steps": 47}, good),
+    schema.encode("trajectory", {"actor": "broken", "number": 1}, good),
     schema.encode("trajectory", values | {"number": -1}, good),
     schema.encode("trajectory", values, {"reward": good["reward"]}),
     schema.encode("trajectory", values | {"number": 2}, {"image": good["image"]}),
@@ -223,7 +226,7 @@ def test_a_refused_trajectory_is_acknowledged_and_what_follows_arrives(learner, 
   assert link.request(47)["granted"] == 47
   bad = mini_learner.make_trajectory(1)
   bad["reward"][3] = np.nan
-  link.send(bad)
+  link.send(bad, steps=47)
   assert link.drain(timeout=5)
   assert link.request(0)["granted"] == 0  # says what is held: nothing any more
   status = link.status()["status"]
@@ -258,7 +261,7 @@ def test_a_failing_replay_is_reported_and_ends_the_taking_in(tmp_path):
     while not link.learner_is_there:
       time.sleep(0.01)
     assert not served.failure
-    link.send(mini_learner.make_trajectory(1))
+    link.send(mini_learner.make_trajectory(1), steps=47)
     deadline = time.monotonic() + 5
     while not served.failure:
       assert time.monotonic() < deadline, "The failure was not noticed."

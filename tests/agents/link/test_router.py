@@ -30,7 +30,7 @@ def test_everything_goes_through_a_router_and_a_killed_learner_comes_back(router
     _act(link, 5)
     assert link.drain(timeout=5)
     learner.kill()
-    link.send(mini_learner.make_trajectory(link.outbox.made + 1))  # nobody is there
+    link.send(mini_learner.make_trajectory(link.outbox.made + 1), steps=47)  # nobody is there
     assert link.request(1) is None
     learner.start()
     _act(link, 5)
