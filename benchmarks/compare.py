@@ -28,7 +28,7 @@ from benchmarks.ledger.records import ROOT
 from benchmarks.turns import percentile
 
 # Words of the path to a number that do not describe it.
-_CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs"}
+_CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs", "here"}
 _MOST_ALONE = 6  # names that only one checkout has and that are listed
 # Words that older files had for the same.
 _SYNONYMS = {"second": "s", "cpu": "processor", "max": "longest"}

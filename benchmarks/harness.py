@@ -67,24 +67,17 @@ class Options:
   """With --other: runs in each checkout."""
 
 
-def run(
-  main: Callable[[T], Any],
-  settings: type[T],
-  description: str | None,
-  *,
-  compares: bool = True,
-) -> None:
+def run(main: Callable[[T], Any], settings: type[T], description: str | None) -> None:
   """Runs a script; with --other, the comparison of two checkouts instead.
 
   Args:
     main: Takes the settings; what it returns is the exit status.
     settings: Their class.
     description: Of the script.
-    compares: Whether two checkouts are compared here; if not, `main` does.
   """
   chosen = tyro.cli(settings, description=description)
   other = getattr(chosen, "other", None)
-  if compares and other is not None:
+  if other is not None:
     command = compare.own_command(sys.argv, other)
     sys.exit(compare.main(compare.Settings(other=other, command=command, turns=chosen.turns)))  # type: ignore[attr-defined]
   sys.exit(main(chosen))

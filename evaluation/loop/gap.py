@@ -8,13 +8,10 @@ import numpy as np
 
 from nerf2real import suite
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.randomisation.draws import NOMINAL
 from nerf2real.suite.tasks.base import Start
 
 _STEP = constants.CONTROL_TIMESTEP
-_NOMINAL = RandomisationSettings(
-  pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
-)
 
 
 def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
@@ -23,7 +20,7 @@ def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
     "nerf_nav",
     image_size=None,
     random=0,
-    randomisation=_NOMINAL,
+    randomisation=NOMINAL,
     privileged=False,
     time_limit=len(actions) * _STEP + 1.0,
     effects=effects,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.evaluation import runner, session
-from nerf2real.evaluation.plants import operated, perturbations
+from nerf2real.evaluation import runner
+from nerf2real.evaluation.plants import making, operated, perturbations
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
@@ -70,7 +70,7 @@ def test_the_gait_reaches_a_goal_in_simulation(scene, simulated):
 @pytest.mark.parametrize("trained_on, pictures", [("", 8), ("suite:nerf_nav?camera_rate=10", 2)])
 def test_the_simulated_camera_has_the_rate_of_the_policys_training(scene, trained_on, pictures):
   settings = EvaluationSettings(policy="a/folder", plant="sim")
-  plant = session.make_plant(settings, scene, (6, 8), trained_on=trained_on)
+  plant = making.make_plant(settings, scene, (6, 8), trained_on=trained_on)
   try:
     plant.start(protocols.navigation()[0])
     seen = [plant.step(np.zeros(20)).observation["camera"].copy() for _ in range(9)]

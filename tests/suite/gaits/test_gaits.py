@@ -10,12 +10,8 @@ from nerf2real.suite.effects import Effect
 from nerf2real.suite.gaits import legs, walk
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.op3 import constants, op3
-from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.randomisation.draws import NOMINAL, RandomisationSettings
 from nerf2real.suite.tasks.base import Start
-
-NOMINAL = RandomisationSettings(
-  pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
-)
 
 
 @pytest.fixture(scope="module")

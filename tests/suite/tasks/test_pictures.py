@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
+from nerf2real.suite.randomisation.draws import NOMINAL
 from nerf2real.suite.sensors.camera import CameraSettings, world_from_camera
 from nerf2real.suite.tasks.state import Start
 from tests.suite.synthetic import FlatRenderer
-from tests.suite.tasks.small_room import NOMINAL
 
 
 def test_own_arm_appears_in_the_picture(nav):

@@ -9,8 +9,9 @@ from dm_control import composer
 from nerf2real.suite import protocols
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.randomisation.draws import NOMINAL
 from nerf2real.suite.tasks.state import Start
-from tests.suite.tasks.small_room import NOMINAL, load
+from tests.suite.tasks.small_room import load
 
 
 def test_start_poses_fill_the_free_space(room):
