@@ -15,8 +15,9 @@ import numpy as np
 from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.core.serialization import read_json
 from nerf2real.suite.gaits.walk import GaitSettings
-from nerf2real.suite.gaits.walker import Pose, SteeringSettings, Walker
+from nerf2real.suite.gaits.walker import SteeringSettings, Walker
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 
 COMMAND_SIZE = 2  # forward, turn
 # rad, the upper end of the paper's range: at the reference -0.47 the camera sees little but floor.

@@ -32,9 +32,9 @@ from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.scenes.quality.image_quality import psnr
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL
 from nerf2real.suite.sensors.camera import CameraSettings
-from nerf2real.suite.tasks.base import Start
 
 _STEP = constants.CONTROL_TIMESTEP
 _LEG_SWAY, _ARM_SWAY = 0.05, 0.2  # rad
@@ -132,7 +132,7 @@ class Simulation:
       time_limit=settings.seconds + 1.0,
     )
     x, y, yaw = settings.start
-    self.environment.task.set_start(Start((x, y), yaw))
+    self.environment.task.set_start(Pose(x, y, yaw))
     self._data = mujoco.MjData(self.environment.physics.model.ptr)
 
   def run(self, actions: np.ndarray, settings: Settings) -> Trace:

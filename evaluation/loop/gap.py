@@ -8,8 +8,8 @@ import numpy as np
 
 from nerf2real import suite
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL
-from nerf2real.suite.tasks.base import Start
 
 _STEP = constants.CONTROL_TIMESTEP
 
@@ -25,7 +25,7 @@ def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
     time_limit=len(actions) * _STEP + 1.0,
     effects=effects,
   )
-  environment.task.set_start(Start((0.0, 0.0), 0.0))
+  environment.task.set_start(Pose(0.0, 0.0, 0.0))
   environment.reset()
   rows = []
   for action in actions:

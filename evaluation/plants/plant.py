@@ -9,7 +9,7 @@ import numpy as np
 from nerf2real.core import errors
 from nerf2real.evaluation.plants import perturbations
 from nerf2real.suite import protocols
-from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.protocols import BALL, PROTOCOLS, BallTrial, NavigationTrial
 from nerf2real.suite.tasks import catalogue, rewards
 

@@ -16,7 +16,6 @@ from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.camera import LENS
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.virtual.undeclared import Undeclared
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
 from nerf2real.suite.protocols import BALL, NavigationTrial
 
@@ -151,11 +150,10 @@ class RehearsedPlant(RobotPlant):
       or truth.position[2] < MIN_HEIGHT
       or self._stopped_by_a_fall()
     )
-    pose = Pose(float(truth.position[0]), float(truth.position[1]), truth.yaw)
     ball = None if truth.ball is None else truth.ball[:2]
     # Touching the room is a failure of navigation alone (paper, "Tasks").
     touched = truth.touches_room and self.protocol != BALL
-    return Sight(pose, ball, touched or self._hit, bool(fallen))
+    return Sight(truth.pose, ball, touched or self._hit, bool(fallen))
 
   def close(self) -> None:
     self._environment.close()

@@ -7,7 +7,7 @@ turning rate and the steps that it has commanded.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,22 +16,10 @@ from nerf2real.suite.gaits.planner import Planner
 from nerf2real.suite.gaits.pushing import Push, PushSettings
 from nerf2real.suite.gaits.walk import Command, Gait, GaitSettings
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 
 _TIMESTEP = constants.CONTROL_TIMESTEP
 _HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")]
-
-
-class Pose(NamedTuple):
-  """Where the robot is on the floor."""
-
-  x: float  # m
-  y: float  # m
-  yaw: float  # rad
-
-  @property
-  def xy(self) -> np.ndarray:
-    """The place [2] [m]."""
-    return np.array([self.x, self.y])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -84,7 +84,7 @@ def test_rigid_bodies_agree_with_mujoco(kind):
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
 
 
-def _energy(tree, q, qd, gravity:
+def _energy(tree, q, qd, gravity):
   """Returns kinetic plus potential energy, J, from centres of mass and spins (not the matrix)."""
   work = rigid_body.make_work(len(q))
   rigid_body.dynamics(tree, q, qd, gravity, work)

@@ -16,8 +16,8 @@ from nerf2real.agents.dmpo.policy.acting import episode_success, task_of
 from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState
 from nerf2real.agents.dmpo.specs import BALL, FlatObservation, Layout, planar_pose
 from nerf2real.agents.processes.timings import StageTimes
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 
 _HEAD_PAN = constants.JOINT_NAMES.index("head_pan")
 TEACHER, STUDENT, DETOUR = 0, 1, 2  # drivers, as `dataset.fields` counts them
