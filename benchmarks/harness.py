@@ -15,6 +15,7 @@ Nothing here imports numpy, so that `one_thread` comes before its threads are ma
 import dataclasses
 import datetime
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
@@ -31,6 +32,7 @@ from benchmarks import compare
 from benchmarks.ledger import records as ledger
 from benchmarks.ledger.records import ROOT, Rate, Value
 from benchmarks.turns import Times, interleave, percentile
+from nerf2real.core import markdown
 
 __all__ = [  # what scripts use of this module, and of those that it is made of
   "Machine",
@@ -175,16 +177,12 @@ def provenance(seed: int | str | None = None) -> dict[str, Any]:
 
 def table(figures: Mapping[str, Mapping[str, Value]], *, first: str = "") -> str:
   """Returns Markdown tables, one for rows of the same values: a row a name, a column a value."""
-  lines: list[str] = []
-  columns: list[str] = []
-  for name, values in figures.items():
-    if list(values) != columns:
-      columns = list(values)
-      lines += [""] * bool(lines)
-      heads = [first, *(column.replace("_", " ") for column in columns)]
-      lines += ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
-    lines.append("| " + " | ".join([name, *map(_cell, values.values())]) + " |")
-  return "\n".join(lines)
+  tables = []
+  for columns, rows in itertools.groupby(figures.items(), lambda item: list(item[1])):
+    heads = [first, *(column.replace("_", " ") for column in columns)]
+    cells = [(name, *map(_cell, values.values())) for name, values in rows]
+    tables.append(markdown.table(heads, cells))
+  return "\n\n".join(tables)
 
 
 def _cell(value: Value) -> str:
