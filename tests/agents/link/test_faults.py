@@ -6,7 +6,6 @@ same cases with the whole agent are in `tests/agents/processes/test_runs.py`.
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from nerf2real.agents.dmpo.replay.ring import Replay
 from nerf2real.agents.link import client, schema, sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink, actor_key
+from nerf2real.agents.supervision.training import free_port
 from tests.agents.link import mini_learner
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -32,9 +32,7 @@ class Learner:
   """Starts, kills and freezes the mini learner."""
 
   def __init__(self, folder, *, lease=10.0, users=None, router=None):
-    with socket.socket() as probe:
-      probe.bind(("127.0.0.1", 0))
-      self.endpoint = router or f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    self.endpoint = router or f"tcp/127.0.0.1:{free_port()}"
     self._folder, self._lease, self._users = folder, lease, users
     self._joins = router is not None
     self.start()
@@ -242,9 +240,7 @@ def test_a_refused_trajectory_is_acknowledged_and_what_follows_arrives(learner, 
 
 def test_a_failing_replay_is_reported_and_ends_the_taking_in(tmp_path):
   """Such as on a full disk: whoever runs the learner sees it, and nothing is acknowledged."""
-  with socket.socket() as probe:
-    probe.bind(("127.0.0.1", 0))
-    endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+  endpoint = f"tcp/127.0.0.1:{free_port()}"
 
   def insert(trajectory, actor, number):
     raise OSError(28, "No space left on device")
@@ -368,9 +364,7 @@ def test_tls(tmp_path):
     subprocess.run(command, check=True, capture_output=True)
   except (OSError, subprocess.CalledProcessError) as error:
     pytest.skip(f"needs openssl to make a certificate: {error}")
-  with socket.socket() as probe:
-    probe.bind(("127.0.0.1", 0))
-    endpoint = f"tls/localhost:{probe.getsockname()[1]}"
+  endpoint = f"tls/localhost:{free_port()}"
   session = sessions.listen(
     endpoint,
     sessions.LinkSettings(security=sessions.Security(tls_certificate=certificate, tls_key=key)),
