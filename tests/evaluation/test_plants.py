@@ -16,7 +16,8 @@ from nerf2real.evaluation.policies import GaitPolicy
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.suite import loading, protocols
+from nerf2real.suite import protocols
+from nerf2real.suite.scene import open_scene
 from nerf2real.suite.tasks.workspace import find_workspace
 
 NEAREST = 46  # a trial of navigation that starts 1.3 m from its goal
@@ -24,7 +25,7 @@ NEAREST = 46  # a trial of navigation that starts 1.3 m from its goal
 
 @pytest.fixture(scope="module")
 def scene():
-  return loading.open_scene(None)
+  return open_scene(None)
 
 
 @pytest.fixture(scope="module")
