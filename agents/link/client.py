@@ -72,7 +72,7 @@ class ActorLink:
   def ask(
     self, question: str, message: bytes, *, kind: str, timeout: float | None = None
   ) -> schema.Message | None:
-    """Asks the learner; None if no answer comes in time.
+    """Sends a query to the learner; returns its answer, None if none comes in time.
 
     Raises:
       MessageError: if the learner refuses the question or answers with something else.
@@ -89,7 +89,7 @@ class ActorLink:
     return None
 
   def request(self, wanted: int, *, held: int = 0) -> Grant | None:
-    """Asks for credits and learns what was acknowledged; None if the learner is away.
+    """Requests credits and acknowledgements; returns None if the learner is away.
 
     Args:
       wanted: environment steps to be granted.
@@ -148,7 +148,7 @@ class ActorLink:
     return self.version, message.arrays
 
   def status(self) -> dict[str, Any] | None:
-    """Asks for the learner's status, its description and this actor's predecessors.
+    """Requests the learner's status, its description and this actor's predecessors.
 
     Returns None if the learner is away.
     """

@@ -55,7 +55,7 @@ class Outbox:
     return self._pending[self.made]
 
   def acknowledge(self, up_to: int) -> None:
-    """Forgets all numbers up to and including `up_to`."""
+    """Removes all numbers up to and including `up_to`."""
     while self._pending and next(iter(self._pending)) <= up_to:
       number, _ = self._pending.popitem(last=False)
       self._sent_at.pop(number, None)

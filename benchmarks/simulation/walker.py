@@ -50,7 +50,7 @@ class Settings(harness.Options):
 
 
 class Seen(NamedTuple):
-  """What an observer sees."""
+  """The observer's view of the robot."""
 
   pose: Pose
   fallen: bool

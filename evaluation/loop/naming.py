@@ -1,6 +1,6 @@
 """What identification says of a robot's recordings: the one place that calls the analyser.
 
-The rest of the loop knows `Named` alone: verdict, effects with intervals, what is explained.
+The rest of the loop depends on `Named` alone: verdict, effects with intervals, what is explained.
 """
 
 import json
@@ -116,7 +116,7 @@ def _share(error: dict[str, Any]) -> float | None:
 
 
 def _listed(effect: Effect, rows: Sequence[Mapping[str, Any]]) -> bool:
-  """Tells whether an effect has an entry in a report."""
+  """Returns whether an effect has an entry in a report."""
   places = [(row["kind"], row.get("body") or row.get("geom") or row.get("joint")) for row in rows]
   return (effect.kind, effect.target) in places
 

@@ -70,7 +70,7 @@ def policy_folder(settings: LoopSettings) -> Path | None:
 def claim(settings: LoopSettings) -> None:
   """Makes the folder this loop's; trials, minutes and names may change from run to run.
 
-  What is hidden is noted as a digest: a folder tells nobody before the end.
+  What is hidden is written as a digest alone until the end.
 
   Raises:
     ValueError: It is another loop's.

@@ -70,7 +70,7 @@ class Plant(abc.ABC):
 
   @abc.abstractmethod
   def sight(self) -> Sight:
-    """Returns what an observer sees now."""
+    """Returns the observer's present view of the robot."""
 
   def reached(self, sight: Sight) -> bool | None:
     """Returns whether the goal is reached; None where it is not measured."""

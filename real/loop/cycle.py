@@ -115,7 +115,7 @@ class Cycle:
     return self._torque_off
 
   def rearm(self) -> None:
-    """Forgets the stop."""
+    """Clears the stop."""
     with self._commands:
       self._monitor.arm(self._bus.clock.now())
       self.stop = None

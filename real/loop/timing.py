@@ -27,7 +27,7 @@ class Timing:
     self.counts[name] += number
 
   def reset(self) -> None:
-    """Forgets everything."""
+    """Clears the measurements."""
     self.values.clear()
     self.counts.clear()
 

@@ -57,7 +57,7 @@ class LowPass:
     self.reset()
 
   def reset(self) -> None:
-    """Forgets the past: the next sample is the new steady state."""
+    """Clears the state: the next sample is the new steady state."""
     self._state: Array | None = None
 
   def __call__(self, sample: Array) -> Array:

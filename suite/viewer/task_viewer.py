@@ -250,7 +250,7 @@ class TaskViewer:
     return self._drivers[name]
 
   def _start_episode(self) -> None:
-    """Forgets a push and shows the robot where it stands now."""
+    """Clears a push and shows the robot where it stands now."""
     self._push_until = 0.0
     self._keep_in_view(within=0.0)
 

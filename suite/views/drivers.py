@@ -44,7 +44,7 @@ class Standing:
     self._action = task.standing_action
 
   def restart(self) -> None:
-    """Has nothing to forget."""
+    """Does nothing: there is no state."""
 
   def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
     return self._action

@@ -55,7 +55,7 @@ class Cable:
 
 
 class Serial(serial.SerialBase):
-  """The host's end, as pyserial has it; time-outs are not this port's matter (timeout=0)."""
+  """The host's end, as a pyserial class without time-outs (timeout=0)."""
 
   def open(self) -> None:
     """Opens the port.
@@ -78,7 +78,7 @@ class Serial(serial.SerialBase):
         os.close(end)
 
   def _reconfigure_port(self) -> None:
-    """Takes any speed: the bytes' time is the devices' matter."""
+    """Accepts any speed: the devices time the bytes."""
 
   @property
   def in_waiting(self) -> int:
@@ -97,5 +97,5 @@ class Serial(serial.SerialBase):
     return len(data)
 
   def reset_input_buffer(self) -> None:
-    """Forgets what has come."""
+    """Discards what has come."""
     self._cable.received.clear()
