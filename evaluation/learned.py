@@ -1,7 +1,6 @@
 """Learned policies in an evaluation: exported networks with their belief about where they are."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -42,7 +41,7 @@ class LearnedPolicy:
     self.name = folder.resolve().name
     if self.name in ("best", "newest", "policy"):
       self.name = f"{folder.resolve().parents[1 if self.name != 'policy' else 0].name}-{self.name}"
-    self.policy_id = str(_digest(folder))
+    self.policy_id = str(export.read_record(folder)["sha256"])[:12]
     shape = self._layout.image_shape
     self.image_size = None if shape is None else (shape[0], shape[1])
     self.trained_on = self._loaded.environment
@@ -64,7 +63,3 @@ class LearnedPolicy:
     if self._loaded.policy.has_belief and self._agent.embedding.size:
       self.belief = Belief(*self._loaded.policy.belief(self._agent.embedding))
     return np.clip(action, -1.0, 1.0)
-
-
-def _digest(folder: Path) -> str:
-  return str(json.loads((folder / "policy.json").read_text())["sha256"])[:12]

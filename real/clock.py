@@ -1,4 +1,4 @@
-"""Time for everything in `real`: the machine's clock, or one that jumps from event to event.
+"""Clocks of `real`: the machine's, and one of stepped time that jumps from event to event.
 
 `RealClock` is for hardware. `SteppedClock` makes a rehearsal with a virtual robot faster than real
 time and repeatable: nothing waits, periodic work runs in the caller's thread when its time comes,

@@ -1,4 +1,4 @@
-"""Every trajectory arrives once: numbering and resending on one side, acknowledgement on the other.
+"""Exactly-once delivery of trajectories: numbering, resending, acknowledgement.
 
 zenoh's put does not report whether data arrived: it vanishes while no learner is there, and after a
 transport was closed. So an actor numbers its trajectories from 1 and keeps each until it is

@@ -1,4 +1,4 @@
-"""Does the scripted walker walk? A metre straight ahead, then five goals, on every plant.
+"""Measures the scripted walker on every plant: a metre straight ahead, then five goals.
 
 Straight ahead only the gait acts, without a pose. The goals are reached one after
 another, steered by the true pose. Simulation: episodes as in training, without pushes. Virtual

@@ -75,8 +75,10 @@ def claim(settings: LoopSettings) -> None:
   Raises:
     ValueError: It is another loop's.
   """
+  from nerf2real.agents.dmpo.policy.export import read_record
+
   folder = policy_folder(settings) if settings.policy else None
-  digest = "" if folder is None else json.loads((folder / "policy.json").read_text())["sha256"]
+  digest = "" if folder is None else read_record(folder)["sha256"]
   own: dict[str, Any] = {
     "policy": digest or settings.policy,
     "robot": settings.robot,

@@ -1,4 +1,4 @@
-"""How well the loop keeps its time: durations, ages of what was observed, missed deadlines."""
+"""Timing statistics of the control loop: durations, ages of observations, missed deadlines."""
 
 import collections
 from collections.abc import Mapping

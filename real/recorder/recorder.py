@@ -130,7 +130,7 @@ class Recorder:
       stamps: When each joint was read, s since 1970.
     """
     # Not efforts: amperes, volts, shares and seconds travel in a JointState's effort, by topic.
-    others = {
+    others: dict[str, Sequence[float] | np.ndarray] = {
       messages.CURRENTS: currents,
       messages.VOLTAGES: voltages,
       messages.PWM: pwm,

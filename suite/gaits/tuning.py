@@ -1,7 +1,7 @@
-"""Searches for the gait's parameters in simulation: walks on an empty floor, better ones win.
+"""Searches for the gait's parameters in simulation, by CMA-ES over walks on an empty floor.
 
 Every candidate walks in several worlds (servo strength, friction, delays, floor), so that the gait
-does not lean on one of them. The best parameters are the defaults in
+does not depend on one of them. The best parameters are the defaults in
 `suite.gaits.walk.GaitSettings`.
 """
 

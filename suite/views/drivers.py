@@ -1,4 +1,4 @@
-"""What acts in an environment that is shown: a standing robot, random motions, a scripted walker.
+"""Drivers of an environment that is shown: a standing robot, random motions, a scripted walker.
 
 Learned policies come from `evaluation.driving`, with the same protocol.
 """

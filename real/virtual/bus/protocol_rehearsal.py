@@ -1,4 +1,4 @@
-"""The cable of a rehearsal in stepped time: a serial port that no kernel stands behind.
+"""The cable of a rehearsal in stepped time: a serial port in memory, as a pyserial class.
 
 A pseudo-terminal hands every byte from one kernel thread to another; on a busy machine that costs a
 rehearsal ten times what it computes. Here the same bytes go from buffer to buffer. pyserial opens
