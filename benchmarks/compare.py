@@ -26,9 +26,10 @@ import tyro
 
 from benchmarks.ledger.records import ROOT
 from benchmarks.turns import percentile
+from nerf2real.core.markdown import table
 
 # Words of the path to a number that do not describe it.
-_CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs"}
+_CONTAINERS = {"figures", "variants", "results", "rows", "sizes", "runs", "here"}
 _MOST_ALONE = 6  # names that only one checkout has and that are listed
 # Words that older files had for the same.
 _SYNONYMS = {"second": "s", "cpu": "processor", "max": "longest"}
@@ -147,14 +148,14 @@ def compare(
 
 def markdown(rows: list[Comparison]) -> str:
   """Returns the table."""
-  lines = [
-    "| figure | here: median (p95) | other: median (p95) | here / other |",
-    "|---|---|---|---|",
-  ]
-  for row in rows:
-    cells = [f"{percentile(v, 50):.4g} ({percentile(v, 95):.4g})" for v in (row.here, row.other)]
-    lines.append(f"| {row.name} | {cells[0]} | {cells[1]} | {row.ratio:.3f} |")
-  return "\n".join(lines)
+
+  def cell(values: list[float]) -> str:
+    return f"{percentile(values, 50):.4g} ({percentile(values, 95):.4g})"
+
+  return table(
+    ("figure", "here: median (p95)", "other: median (p95)", "here / other"),
+    [(row.name, cell(row.here), cell(row.other), f"{row.ratio:.3f}") for row in rows],
+  )
 
 
 def own_command(arguments: list[str], other: Path) -> str:

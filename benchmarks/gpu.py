@@ -116,24 +116,16 @@ def check_field(settings: Settings) -> Figures:
   """Trains a field in JAX at preset "paper" on keyframes of the built-in room."""
   import jax
 
-  from benchmarks.rooms import blur_ablation, field
-  from benchmarks.rooms.field_worker import save_views
+  from benchmarks.rooms import field
 
   if settings.device == "cuda" and jax.default_backend() != "gpu":
     raise RuntimeError(f"JAX found {jax.default_backend()}, expected a GPU: install the extra gpu.")
-  film = blur_ablation.Settings(keyframes=16, width=80) if settings.tiny else None
-  changes = {"field": _TINY_FIELD, "batch_rays": 64, "max_steps": 3} if settings.tiny else {}
-  with tempfile.TemporaryDirectory() as folder:
-    path = Path(folder) / "views.npz"
-    save_views(path, blur_ablation.film_views(film or blur_ablation.Settings()))
-    arguments = {
-      "views": path,
-      "seconds": 5.0 if settings.tiny else 150.0,
-      "preset": "paper",
-      "changes": json.dumps(changes),
-      "renderer": f"nerf2real.scenes.field.render.renderer:{settings.device}",
-    }
-    return {"field_paper": dict(field.train(ROOT, arguments))}
+  changes: dict[str, Any] = {}
+  chosen = field.Settings(preset="paper", seconds=150.0, keyframes=120)
+  if settings.tiny:
+    changes = {"field": _TINY_FIELD, "batch_rays": 64, "max_steps": 3}
+    chosen = field.Settings(preset="paper", seconds=5.0, keyframes=16, width=80)
+  return {"field_paper": field.train(chosen, changes=changes, device=settings.device)}
 
 
 def commands(settings: Settings, out: Path) -> dict[str, list[str]]:

@@ -15,6 +15,7 @@ Nothing here imports numpy, so that `one_thread` comes before its threads are ma
 import dataclasses
 import datetime
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
@@ -31,6 +32,7 @@ from benchmarks import compare
 from benchmarks.ledger import records as ledger
 from benchmarks.ledger.records import ROOT, Rate, Value
 from benchmarks.turns import Times, interleave, percentile
+from nerf2real.core import markdown
 
 __all__ = [  # what scripts use of this module, and of those that it is made of
   "Machine",
@@ -67,24 +69,17 @@ class Options:
   """With --other: runs in each checkout."""
 
 
-def run(
-  main: Callable[[T], Any],
-  settings: type[T],
-  description: str | None,
-  *,
-  compares: bool = True,
-) -> None:
+def run(main: Callable[[T], Any], settings: type[T], description: str | None) -> None:
   """Runs a script; with --other, the comparison of two checkouts instead.
 
   Args:
     main: Takes the settings; what it returns is the exit status.
     settings: Their class.
     description: Of the script.
-    compares: Whether two checkouts are compared here; if not, `main` does.
   """
   chosen = tyro.cli(settings, description=description)
   other = getattr(chosen, "other", None)
-  if compares and other is not None:
+  if other is not None:
     command = compare.own_command(sys.argv, other)
     sys.exit(compare.main(compare.Settings(other=other, command=command, turns=chosen.turns)))  # type: ignore[attr-defined]
   sys.exit(main(chosen))
@@ -182,16 +177,12 @@ def provenance(seed: int | str | None = None) -> dict[str, Any]:
 
 def table(figures: Mapping[str, Mapping[str, Value]], *, first: str = "") -> str:
   """Returns Markdown tables, one for rows of the same values: a row a name, a column a value."""
-  lines: list[str] = []
-  columns: list[str] = []
-  for name, values in figures.items():
-    if list(values) != columns:
-      columns = list(values)
-      lines += [""] * bool(lines)
-      heads = [first, *(column.replace("_", " ") for column in columns)]
-      lines += ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
-    lines.append("| " + " | ".join([name, *map(_cell, values.values())]) + " |")
-  return "\n".join(lines)
+  tables = []
+  for columns, rows in itertools.groupby(figures.items(), lambda item: list(item[1])):
+    heads = [first, *(column.replace("_", " ") for column in columns)]
+    cells = [(name, *map(_cell, values.values())) for name, values in rows]
+    tables.append(markdown.table(heads, cells))
+  return "\n\n".join(tables)
 
 
 def _cell(value: Value) -> str:

@@ -20,6 +20,7 @@ from typing import Any, Literal
 from benchmarks import harness
 from benchmarks.blind_sets import scoring
 from benchmarks.ledger.records import ROOT
+from nerf2real.core import markdown
 
 RESULTS = ROOT / "benchmarks" / "results"
 
@@ -185,30 +186,30 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any]) -> str:
     + ", ".join(f"{n} {plant}" for plant, n in plants.items())
     + f". {sum(s.below_floor for s in scores)} with effects below the floor, in no figure.",
     "",
-    "| figure | measured | of | target | met |",
-    "|---|---|---|---|---|",
   ]
+  found: list[tuple[object, ...]] = []
   for figure in scoring.table(scores):
     value = "-" if figure.value is None else f"{figure.value:.3g}"
     if figure.value is not None and "%" in figure.target:
       value = f"{100 * figure.value:.0f} %"
     met = {True: "yes", False: "no", None: "-"}[figure.met]
-    lines.append(f"| {figure.question} | {value} | {figure.of} | {figure.target} | {met} |")
+    found.append((figure.question, value, figure.of, figure.target, met))
   for plant in plants:
     for key, words in (("wall_s", "seconds"), ("cpu_s", "processor seconds")):
       used = sorted(r["used"][key] for r in rows if r["plant"] == plant and key in r["used"])
       if used:
-        lines.append(
-          f"| {plant}: {words} a set, median (most {used[-1]:.0f}) | {used[len(used) // 2]:.0f} "
-          f"| {len(used)} | - | - |"
-        )
-  lines += ["", "## What was said of what", "", "| set | is | said | right |", "|---|---|---|---|"]
+        name = f"{plant}: {words} a set, median (most {used[-1]:.0f})"
+        found.append((name, f"{used[len(used) // 2]:.0f}", len(used), "-", "-"))
+  lines += [markdown.table(("figure", "measured", "of", "target", "met"), found)]
+  said = []
   for row in rows:
     s = row["score"]
     right = _right(s)
     note = " (below the floor)" if s.below_floor else ""
     mark = {True: "yes", False: "**no**", None: "-"}[right]
-    lines.append(f"| {row['set']} {row['plant']} | {s.truth}{note} | {s.said} | {mark} |")
+    said.append((f"{row['set']} {row['plant']}", f"{s.truth}{note}", s.said, mark))
+  table = markdown.table(("set", "is", "said", "right"), said)
+  lines += ["", "## What was said of what", "", table]
   return "\n".join(lines) + "\n"
 
 

@@ -22,22 +22,17 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerf2real import real
 from nerf2real.core.robot_logs.reading import read_log
-from nerf2real.core.rotations import yaw_quaternion
-from nerf2real.real.recorder.recorder import Recorder
+from nerf2real.evaluation.loop import motions, recording
 from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.op3.op3 import OP3
 from nerf2real.sysid.sensors import floor, sensing
 from nerf2real.sysid.sensors.sensed import Part
 
 _STEP = constants.CONTROL_TIMESTEP
 _LATE, _SCALE, _GAIN = 0.04, 1.08, 0.5
 _GAMMA = 2.2  # of the virtual sensor: the gain acts on light, levels go with its power 1 / 2.2
-_HEADINGS = (0.0, 1.2, 2.4, 3.6)  # rad
-_TURNING = 1.0  # rad/s of the person who turns the robot
 _SLOPES = ((0.05, -0.02), (0.0, 0.0), (0.0, 0.06))  # rad
 
 
@@ -53,26 +48,6 @@ class Arguments:
   """Length of a filmed motion."""
   write: bool = False
   """Keep what is found as records in benchmarks/results/records/."""
-
-
-class Gate:
-  """A recorder that notes nothing until it is opened."""
-
-  def __init__(self, recorder: Recorder):
-    """Takes the recorder, closed."""
-    self._recorder = recorder
-    self.open = False
-
-  def __getattr__(self, name: str) -> Any:
-    """Returns the recorder's method, or one that does nothing."""
-    return getattr(self._recorder, name) if self.open else lambda *_, **__: None
-
-
-def held_model() -> mujoco.MjModel:
-  """Returns the suite's OP3 held by its torso, without contacts."""
-  root = OP3().mjcf_model
-  root.option.flag.contact = "disable"
-  return mujoco.MjModel.from_xml_string(root.to_xml_string())
 
 
 def motion(seed: int, count: int) -> np.ndarray:
@@ -109,31 +84,18 @@ def film(
 ) -> None:
   """Records a held robot that moves and films."""
   camera = VirtualCamera(latency=_LATE, gain=gain)
+  declared = dataclasses.replace(LENS, fx=LENS.fx / scale, fy=LENS.fy / scale)
   with VirtualRobot(stepped=True, seed=seed, world="room", camera=camera) as robot:
     connection = dataclasses.replace(robot.connection(), camera=Arrival(robot.camera, late))
     actions = motion(wave, round(arguments.seconds / _STEP))
-    lifting = round(2.0 / _STEP)
-    with Recorder(path) as recorder:
-      gate = Gate(recorder)
-      with real.load(
-        "nerf_nav",
-        robot=connection,
-        image_size=(30, 40),
-        recorder=gate,
-        time_limit=(lifting + len(actions)) * _STEP + 1.0,
-      ) as environment:
-        environment.reset()
-        robot.hold(True)
-        for index, action in enumerate([*np.repeat(actions[:1], lifting, axis=0), *actions]):
-          if index == lifting:
-            gate.open = True
-            declared = dataclasses.replace(LENS, fx=LENS.fx / scale, fy=LENS.fy / scale)
-            recorder.camera_info(robot.clock.wall(robot.clock.now()), declared)
-          environment.step(action)
-        gate.open = False
+
+    def play(gate: recording.Gate) -> None:
+      recording.play_actions(connection, actions, robot, held=True, recorder=gate, lens=declared)
+
+    recording.record(path, play)
 
 
-def stand(path: Path, seed: int, slope: tuple[float, float]) -> None:
+def stand(folder: Path, seed: int, slope: tuple[float, float]) -> None:
   """Records a robot that stands on a slope, is lifted, turned and put down again and again."""
 
   def furnish(spec: mujoco.MjSpec) -> None:
@@ -141,43 +103,7 @@ def stand(path: Path, seed: int, slope: tuple[float, float]) -> None:
     plane.quat = Rotation.from_rotvec([*slope, 0.0]).as_quat(scalar_first=True)
 
   with VirtualRobot(stepped=True, seed=seed, furnish=furnish) as robot:
-    hand = int(robot.body.model.body("hand").mocapid[0])
-    lower, upper = constants.joint_limits()
-    targets = constants.standing_targets()
-    action = np.float32(np.clip((2 * targets - lower - upper) / (upper - lower), -1, 1))
-    with Recorder(path) as recorder:
-      gate = Gate(recorder)
-      with real.load(
-        "nerf_nav", robot=robot.connection(), image_size=None, recorder=gate, time_limit=60.0
-      ) as environment:
-        environment.reset()
-        for _ in range(round(1.0 / _STEP)):
-          environment.step(action)
-        gate.open = True
-        for index, heading in enumerate(_HEADINGS):
-          for _ in range(round(2.0 / _STEP)):
-            environment.step(action)
-          if index + 1 == len(_HEADINGS):
-            break
-          robot.hold(True)
-          turn = _HEADINGS[index + 1] - heading
-          steps = round(turn / _TURNING / _STEP)
-          yaws = robot.truth().yaw + turn * np.arange(1, steps + 1) / steps
-          for yaw in yaws:
-            robot.body.data.mocap_quat[hand] = yaw_quaternion(yaw)
-            environment.step(action)
-          robot.hold(False)
-          for _ in range(round(1.0 / _STEP)):
-            environment.step(action)
-        gate.open = False
-
-
-def standing_model() -> mujoco.MjModel:
-  """Returns the suite's OP3, free, on a plane."""
-  spec = mujoco.MjSpec.from_string(OP3().mjcf_model.to_xml_string())
-  spec.body(constants.TORSO_LINK).add_freejoint()
-  spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
-  return spec.compile()
+    recording.record_floor(folder, robot.connection(), robot)
 
 
 def found(parts: dict[str, Part], *names: str) -> dict[str, harness.Value]:
@@ -200,7 +126,8 @@ def found(parts: dict[str, Part], *names: str) -> dict[str, harness.Value]:
 def main(arguments: Arguments) -> None:
   """Records what is missing in the folder, identifies, prints."""
   arguments.out.mkdir(parents=True, exist_ok=True)
-  model, free = held_model(), standing_model()
+  model = mujoco.MjModel.from_xml_string(motions.declared_model())
+  free = motions.standing_model()
   figures: dict[str, dict[str, harness.Value]] = {}
 
   def note(name: str, truth: str, what: dict[str, harness.Value]) -> None:
@@ -230,9 +157,10 @@ def main(arguments: Arguments) -> None:
       parts = sensing.find(model, [read_log(path)], reference).parts
       note(f"seed_{seed}_camera_{name}", truth, found(parts, "camera", "brightness"))
     for slope in _SLOPES:
-      path = arguments.out / f"slope_{slope[0]}_{slope[1]}_{seed}.mcap"
+      folder = arguments.out / f"slope_{slope[0]}_{slope[1]}_{seed}"
+      path = folder / f"{recording.FLOOR}.mcap"
       if not path.exists():
-        stand(path, seed, slope)
+        stand(folder, seed, slope)
       part = floor.find(free, [read_log(path)])
       parts = {} if part is None else {"floor": part}
       truth = f"{slope[0]}, {slope[1]} rad"

@@ -20,6 +20,7 @@ import tyro
 from benchmarks.ledger import prose
 from benchmarks.ledger import records as ledger
 from benchmarks.ledger.records import ROOT, Record
+from nerf2real.core.markdown import table
 
 MOVE = "b263fe5"  # commit that moved the code into folders; earlier figures are of the code before
 TEMPLATES = Path(__file__).parent / "ledger" / "tables.md"
@@ -118,8 +119,7 @@ def _topic(records: list[Record]) -> list[str]:
   above = ". ".join(rows[0][name] for name in shared if rows[0][name])
   columns = [name for name in rows[0] if name not in shared]
   lines = [f"{above}.", ""] if above else []
-  lines += ["| " + " | ".join(columns) + " |", "| --- " * len(columns) + "|"]
-  return lines + ["| " + " | ".join(row[name] for name in columns) + " |" for row in rows]
+  return [*lines, table(columns, [[row[name] for name in columns] for row in rows])]
 
 
 def _page_row(record: Record) -> dict[str, str]:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.evaluation.plants.plant import BALL, Sight
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief, EvaluatedPolicy
+from nerf2real.suite.protocols import BALL
 
 NONE, BLACK, OTHER_GOAL = "none", "black", "other_goal"
 CONTROLS = (NONE, BLACK, OTHER_GOAL)
@@ -66,7 +67,7 @@ def under_control(
     policy: The policy.
     control: One of CONTROLS.
     scene: The bundle, for its goals.
-    protocol: One of `plants.PROTOCOLS`.
+    protocol: One of `protocols.PROTOCOLS`.
 
   Raises:
     ValueError: There is nothing to falsify.

@@ -12,7 +12,6 @@ from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
 from nerf2real.evaluation.policy_names import WALKERS, policy_folder
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.views.drivers import SCRIPTED, WALKER, MakeDriver
 
 
@@ -29,9 +28,7 @@ class LearnedDriver:
     self._task, self._policy = task, policy
 
   def _sight(self) -> Sight:
-    state = self._task.state
-    pose = Pose(float(state.position[0]), float(state.position[1]), float(state.yaw))
-    return Sight(pose, None, collided=False, fallen=False)
+    return Sight(self._task.state.pose, None, collided=False, fallen=False)
 
   def restart(self) -> None:
     self._policy.reset(self._sight())

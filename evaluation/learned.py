@@ -1,13 +1,13 @@
 """Learned policies in an evaluation: exported networks with their belief about where they are."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from nerf2real.agents.dmpo.policy import export
+from nerf2real.agents.dmpo.policy.acting import Agent
 from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
 
@@ -41,7 +41,7 @@ class LearnedPolicy:
     self.name = folder.resolve().name
     if self.name in ("best", "newest", "policy"):
       self.name = f"{folder.resolve().parents[1 if self.name != 'policy' else 0].name}-{self.name}"
-    self.policy_id = str(_digest(folder))
+    self.policy_id = str(export.read_record(folder)["sha256"])[:12]
     shape = self._layout.image_shape
     self.image_size = None if shape is None else (shape[0], shape[1])
     self.trained_on = self._loaded.environment
@@ -50,26 +50,16 @@ class LearnedPolicy:
 
   def reset(self, sight: Sight) -> None:
     """Begins an episode."""
-    self._state = self._loaded.policy.initial_state()
-    self._random = np.random.default_rng(self._seed)
+    self._agent = Agent(
+      self._loaded.policy, self._layout, seed=self._seed, deterministic=not self._stochastic
+    )
     self.belief = None
 
   def act(
     self, observation: Mapping[str, np.ndarray], *, goal: np.ndarray, sight: Sight
   ) -> np.ndarray:
     """Returns the action [20]."""
-    policy = self._loaded.policy
-    flat = self._layout.flatten(observation)
-    step = policy.step(flat.image, flat.state, self._state)
-    self._state = step.state
-    if policy.has_belief and step.embedding.size:
-      self.belief = Belief(*policy.belief(step.embedding))
-    action = step.mean
-    if self._stochastic:
-      noise = self._random.standard_normal(action.shape, dtype=np.float32)
-      action = action + step.stddev * noise
+    action = self._agent.act(self._layout.flatten(observation))
+    if self._loaded.policy.has_belief and self._agent.embedding.size:
+      self.belief = Belief(*self._loaded.policy.belief(self._agent.embedding))
     return np.clip(action, -1.0, 1.0)
-
-
-def _digest(folder: Path) -> str:
-  return str(json.loads((folder / "policy.json").read_text())["sha256"])[:12]

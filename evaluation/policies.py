@@ -8,10 +8,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation.plants.plant import BALL, Sight
+from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.suite.gaits.walk import GaitSettings
 from nerf2real.suite.gaits.walker import SteeringSettings, Walker
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.protocols import BALL
 
 
 class Belief(NamedTuple):
@@ -59,6 +60,7 @@ def resolution(policy: EvaluatedPolicy) -> str:
 class GaitPolicy:
   """The scripted walker, with the observed pose or by dead reckoning without one."""
 
+  name = "gait"
   image_size: tuple[int, int] | None = None
   control = "none"
   trained_on = ""
@@ -71,18 +73,15 @@ class GaitPolicy:
     *,
     settings: GaitSettings | None = None,
     steering: SteeringSettings | None = None,
-    name: str = "gait",
   ):
     """Creates the policy.
 
     Args:
       scene: An opened bundle.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       settings: Parameters of the gait.
       steering: And of its steering.
-      name: For the tables.
     """
-    self.name = name
     head_pan = constants.BALL_PUSHING_HEAD_PAN if protocol == BALL else None
     self._walker = Walker(scene, gait=settings, steering=steering, head_pan_limit=head_pan)
     made_of: Any = settings or GaitSettings()

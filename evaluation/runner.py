@@ -98,7 +98,7 @@ def run_trial(
     trial: Where it starts.
     group: Of the trial within its protocol.
     index: Of the trial in its protocol.
-    watch: Sees every step.
+    watch: Called at every step.
   """
   timestep = plant.start(trial)
   watch(timestep, policy)
@@ -170,7 +170,7 @@ def run_all(
     trials: Index in the plant's protocol, and group and trial.
     store: Keeps every episode as it ends.
     report: Called with an episode, its number and the number of trials.
-    watch: Sees every step of every episode.
+    watch: Called at every step of every episode.
   """
   setting, done = setting_of(plant, policy), store.done()
   listed = list(trials)

@@ -14,7 +14,6 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from nerf2real.agents.environments.loading import camera_settings
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.evaluation import episodes, runner
@@ -22,7 +21,7 @@ from nerf2real.evaluation.controls import under_control
 from nerf2real.evaluation.driving import density
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import plant as plants
-from nerf2real.evaluation.plants import swaps
+from nerf2real.evaluation.plants.making import free_name, make_plant
 from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
 from nerf2real.evaluation.policy_names import WALKERS, policy_folder
@@ -62,81 +61,6 @@ def each_plant(settings: EvaluationSettings) -> list[EvaluationSettings]:
   if settings.plant == "both":
     return [dataclasses.replace(settings, plant="sim"), *robots]
   return [settings]
-
-
-def make_plant(
-  settings: EvaluationSettings,
-  scene: Any,
-  image_size: tuple[int, int] | None,
-  *,
-  trained_on: str = "",
-) -> Plant:
-  """Returns the plant that the settings of one name; see `each_plant`.
-
-  Args:
-    settings: The evaluation.
-    scene: An opened bundle.
-    image_size: Height and width of the policy's picture; None for no camera.
-    trained_on: Name of the policy's environment: a simulated camera has its rate, lens and
-      response. Robots have cameras of their own.
-  """
-  swaps.check(settings.swap, plant=settings.plant, built_in=settings.scene is None)
-  record = None
-  if settings.record and settings.plant != "sim":
-    record = free_name(settings.out / f"{settings.plant}_{settings.protocol}.mcap")
-  if settings.plant == "sim":
-    from nerf2real.evaluation.plants.simulated import SimulatedPlant
-
-    return SimulatedPlant(
-      scene,
-      settings.protocol,
-      settings.perturb,
-      image_size=image_size,
-      camera=camera_settings(trained_on),
-      effects=settings.effects,
-      seed=settings.seed,
-      time_limit=settings.time_limit,
-      swap=settings.swap,
-    )
-  if settings.plant == "virtual":
-    from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
-
-    return RehearsedPlant(
-      scene,
-      settings.protocol,
-      settings.perturb,
-      image_size=image_size,
-      robot_seed=settings.robot_seed[0],
-      time_limit=settings.time_limit,
-      swap=settings.swap,
-      record=record,
-    )
-  from nerf2real.evaluation.plants.operated import OperatedPlant
-
-  camera: Any = int(settings.camera) if settings.camera.isdigit() else settings.camera
-  return OperatedPlant(
-    scene,
-    settings.protocol,
-    settings.perturb,
-    robot=settings.robot,
-    camera=camera,
-    image_size=image_size,
-    time_limit=settings.time_limit,
-    record=record,
-    offsets=settings.offsets,
-    lens=settings.lens,
-    dry_run=settings.dry_run,
-  )
-
-
-def free_name(path: Path) -> Path:
-  """Returns the path, or one with a number behind it if that is taken."""
-  number = 1
-  found = path
-  while found.exists():
-    number += 1
-    found = path.with_stem(f"{path.stem}_{number}")
-  return found
 
 
 def choose(listed: tuple[Any, ...], count: int | None) -> list[tuple[int, Any]]:
@@ -253,7 +177,10 @@ def _run_trials(
   size = _FILMED if settings.video and size is None else size
   chosen = choose(plants.trials(settings.protocol), count)
   for single in each_plant(settings):
-    plant = make_plant(single, scene, size, trained_on=policy.trained_on)
+    log = None
+    if single.record and single.plant != "sim":
+      log = free_name(single.out / f"{single.plant}_{single.protocol}.mcap")
+    plant = make_plant(single, scene, size, trained_on=policy.trained_on, record=log)
     say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
     try:
       with _filming(settings, plant) as watch:

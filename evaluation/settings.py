@@ -4,14 +4,12 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-WALKER = "walker"
-
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSettings:
   """What is evaluated, where and how."""
 
-  policy: str = WALKER
+  policy: str = "walker"
   """"walker" (scripted), "shipped", a run's folder, or that of an exported policy."""
   plant: Literal["sim", "virtual", "both", "robot"] = "sim"
   """Where: the training simulation, virtual robots in the true room, both after one another, or a

@@ -50,7 +50,7 @@ def run(arguments: Arguments) -> int:
       recorder = stack.enter_context(Recorder(arguments.record))
     lines = check.check(
       stack.enter_context(check.connected(arguments.robot)),
-      camera=command.device(arguments.camera),
+      camera=arguments.camera,
       seconds=arguments.seconds,
       offsets=arguments.offsets,
       lens=arguments.lens,

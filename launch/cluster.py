@@ -30,9 +30,7 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
   Raises:
     CommandError: The run cannot start, or it failed.
   """
-  supervised(
-    lambda: cluster.train(arguments, SCRIPTS, forwarded=forwarded, command=command.command_line())
-  )
+  supervised(cluster.train, arguments, SCRIPTS, forwarded)
 
 
 def main() -> int:

@@ -186,11 +186,6 @@ def learner_folder(run: Path) -> Iterator[None]:
     yield
 
 
-def device(camera: str | None) -> str | int | None:
-  """Returns the number of a camera's device, or its file or address as it is."""
-  return int(camera) if camera is not None and camera.isdigit() else camera
-
-
 def command_line() -> str:
   """Returns the command that was given, as a shell takes it."""
   program = ["python", sys.argv[0]] if sys.argv[0].endswith(".py") else sys.argv[0].split()

@@ -44,9 +44,7 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
   Raises:
     CommandError: The run cannot start, or it failed.
   """
-  supervised(
-    lambda: training.train(arguments, SCRIPTS, forwarded=forwarded, command=command.command_line())
-  )
+  supervised(training.train, arguments, SCRIPTS, forwarded)
 
 
 def main() -> int:

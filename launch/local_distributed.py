@@ -12,6 +12,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from nerf2real.agents.supervision import training
 from nerf2real.launch import command
@@ -36,25 +37,25 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
   Raises:
     CommandError: The run cannot start, or it failed.
   """
-  supervised(
-    lambda: training.train(
-      arguments,
-      SCRIPTS,
-      port=arguments.port,
-      forwarded=forwarded,
-      command=command.command_line(),
-    )
-  )
+  supervised(training.train, arguments, SCRIPTS, forwarded, port=arguments.port)
 
 
-def supervised(train: Callable[[], str]) -> None:
+def supervised(
+  train: Callable[..., str],
+  arguments: training.TrainingSettings,
+  scripts: training.Scripts,
+  forwarded: list[str],
+  **options: Any,
+) -> None:
   """Calls a function that runs a training and returns why it failed, empty if it did not.
 
   Raises:
     CommandError: The run cannot start, or it failed.
   """
   try:
-    failure = train()
+    failure = train(
+      arguments, scripts, forwarded=forwarded, command=command.command_line(), **options
+    )
   except training.RunRefusedError as error:
     raise command.CommandError(error, status=command.WRONG_ARGUMENTS) from error
   if failure:

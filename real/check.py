@@ -33,7 +33,7 @@ def connected(robot: str) -> Iterator[str | Connection]:
 def check(
   robot: str | Connection,
   *,
-  camera: str | int | None = None,
+  camera: str | None = None,
   seconds: float = 5.0,
   offsets: Path | None = None,
   lens: Path | None = None,

@@ -1,4 +1,4 @@
-"""Time for everything in `real`: the machine's clock, or one that jumps from event to event.
+"""Clocks of `real`: the machine's, and one of stepped time that jumps from event to event.
 
 `RealClock` is for hardware. `SteppedClock` makes a rehearsal with a virtual robot faster than real
 time and repeatable: nothing waits, periodic work runs in the caller's thread when its time comes,
@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 def prefer_this_thread(*, acting: bool = False) -> bool:
-  """Asks Linux to run this thread before ordinary programs, as motion control does.
+  """Gives this thread a real-time priority on Linux, as motion control does.
 
   Threads and processes that it starts are ordinary ones.
 
@@ -28,7 +28,7 @@ def prefer_this_thread(*, acting: bool = False) -> bool:
     acting: Whether it computes actions; threads that watch the robot come before it.
 
   Returns:
-    Whether it does. It needs root, CAP_SYS_NICE or an `rtprio` limit (limits.conf).
+    Whether that is so. It needs root, CAP_SYS_NICE or an `rtprio` limit (limits.conf).
   """
   try:
     priority = os.sched_param(_ACTING if acting else _WATCHING)

@@ -1,4 +1,4 @@
-"""Builds the robot's environment: the same word as in simulation, another module."""
+"""Builds the environment of a robot from a task's name, as `suite.loading` does in simulation."""
 
 import dataclasses
 from pathlib import Path

@@ -91,13 +91,13 @@ def ball_center() -> tuple[BallTrial, ...]:
   return tuple(trials)
 
 
-def ball_wall(seed: int = START_SEED) -> tuple[BallTrial, ...]:
+def ball_wall() -> tuple[BallTrial, ...]:
   """Returns the 14 Wall trials: robot in the centre, facing the target; ball near a wall cell.
 
   The ball starts within `WALL_SPREAD` of the centre of each of the 7 outer cells other than the
   target, twice.
   """
-  rng = np.random.default_rng(seed)
+  rng = np.random.default_rng(START_SEED)
   yaw = float(np.arctan2(TARGET_CELL[1], TARGET_CELL[0]))
   trials: list[BallTrial] = []
   for cell in _outer_cells():
@@ -110,22 +110,21 @@ def ball_wall(seed: int = START_SEED) -> tuple[BallTrial, ...]:
   return tuple(trials)
 
 
+def ball() -> tuple[BallTrial, ...]:
+  """Returns the 46 trials of ball pushing, Center before Wall."""
+  return (*ball_center(), *ball_wall())
+
+
+NAVIGATION, BALL, GAIN = "navigation", "ball", "gain"
 PROTOCOLS: dict[str, Callable[[], tuple[NavigationTrial, ...] | tuple[BallTrial, ...]]] = {
-  "navigation": navigation,
-  "camera_gain": camera_gain,
-  "ball_center": ball_center,
-  "ball_wall": ball_wall,
+  NAVIGATION: navigation,
+  BALL: ball,
+  GAIN: camera_gain,
 }
+"""Trials by the name of an evaluation: the paper's tables I, II and V."""
 
 
-def navigation_starts(
-  free_xy: np.ndarray,
-  goals: np.ndarray,
-  *,
-  count: int = NUM_POSITIONS,
-  min_goal_distance: float = MIN_GOAL_DISTANCE,
-  seed: int = START_SEED,
-) -> np.ndarray:
+def navigation_starts(free_xy: np.ndarray, goals: np.ndarray) -> np.ndarray:
   """Chooses start positions among places, far from each other and from the goals.
 
   Greedy farthest points: deterministic for a scene, and spread over it as the paper's three "unique
@@ -134,22 +133,20 @@ def navigation_starts(
   Args:
     free_xy: positions [N, 2] at which the robot may stand, m.
     goals: goal positions [G, 2], m.
-    count: how many positions.
-    min_goal_distance: distance from every goal, m; less where the scene has no such place.
-    seed: of the first position.
 
   Returns:
-    Positions [count, 2], m.
+    Positions [3, 2], m, `MIN_GOAL_DISTANCE` from every goal where the scene has such places.
   """
+  count = NUM_POSITIONS
   free = np.asarray(free_xy, np.float64).reshape(-1, 2)
   if len(free) < count:
     raise ValueError(f"Found {len(free)} free positions, expected at least {count}.")
   goals = np.asarray(goals, np.float64).reshape(-1, 2)
   if len(goals):
     to_goal = np.linalg.norm(free[:, None] - goals, axis=-1).min(axis=1)
-    far = to_goal >= min_goal_distance
+    far = to_goal >= MIN_GOAL_DISTANCE
     free = free[far] if far.sum() >= count else free[np.argsort(-to_goal, kind="stable")[:count]]
-  chosen = [int(np.random.default_rng(seed).integers(len(free)))]
+  chosen = [int(np.random.default_rng(START_SEED).integers(len(free)))]
   while len(chosen) < count:
     distance = np.linalg.norm(free[:, None] - free[chosen], axis=-1).min(axis=1)
     chosen.append(int(np.argmax(distance)))

@@ -1,4 +1,4 @@
-"""What a policy sees and does, as specifications: the same in simulation and on the robot."""
+"""Specifications of observations and actions, the same in simulation and on the robot."""
 
 import collections
 

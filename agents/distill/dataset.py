@@ -129,8 +129,6 @@ class Dataset:
       ValueError: arrays are missing or of another shape, or the capacity is reached.
       OSError: it cannot be written.
     """
-    if {"state", "reward"} <= set(episode):  # the link has counted transitions by one reward more
-      episode = {**episode, "reward": episode["reward"][: len(episode["state"])]}
     frames = self._check(episode, self._written)
     name = f"{len(self._spans):06d}_{key:016x}_{number}.npz"
     with files.atomic_path(self._folder / name) as path:

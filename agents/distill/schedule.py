@@ -1,4 +1,4 @@
-"""What changes over a run: its stages, the learning rate, who drives, how hard pushes are."""
+"""Schedules of a distillation: stages, learning rate, shares of the drivers, forces of pushes."""
 
 import urllib.parse
 from typing import NamedTuple

@@ -2,7 +2,7 @@
 
 DAgger (Ross, Gordon and Bagnell 2011, https://arxiv.org/abs/1011.0686) needs the expert's action at
 the states that the student reaches. A teacher with a hidden state, such as a gait's phase, must
-therefore follow what the robot really did, or its labels contradict what the student sees.
+therefore follow what the robot really did, or its labels contradict the student's observations.
 """
 
 import dataclasses
@@ -12,11 +12,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from nerf2real.agents.dmpo.policy.acting import Agent
 from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.core.serialization import read_json
 from nerf2real.suite.gaits.walk import GaitSettings
-from nerf2real.suite.gaits.walker import Pose, SteeringSettings, Walker
+from nerf2real.suite.gaits.walker import SteeringSettings, Walker
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 
 COMMAND_SIZE = 2  # forward, turn
 # rad, the upper end of the paper's range: at the reference -0.47 the camera sees little but floor.
@@ -180,14 +182,13 @@ class WalkerTeacher:
 
 
 class PolicyTeacher:
-  """An exported policy, such as one that was trained from state; its LSTM sees what it is shown."""
+  """An exported policy, such as one that was trained from state; its LSTM steps at every label."""
 
   def __init__(self, loaded: ExportedPolicy):
-    self._policy, self._layout = loaded.policy, loaded.layout
-    self._state = self._policy.initial_state()
+    self._agent = Agent(loaded.policy, loaded.layout, seed=0, deterministic=True)
 
   def reset(self, pose: Pose) -> None:
-    self._state = self._policy.initial_state()
+    self._agent.reset()
 
   def label(
     self,
@@ -197,11 +198,9 @@ class PolicyTeacher:
     pose: Pose,
     ball: np.ndarray | None = None,
   ) -> Label:
-    flat = self._layout.flatten(observation)
-    step = self._policy.step(flat.image, flat.state, self._state)
-    self._state = step.state
+    action = self._agent.act(self._agent.layout.flatten(observation))
     unknown = np.full(COMMAND_SIZE, np.nan, np.float32)
-    return Label(np.clip(step.mean, -1.0, 1.0).astype(np.float32), unknown)
+    return Label(np.clip(action, -1.0, 1.0).astype(np.float32), unknown)
 
 
 def make_teacher(name: str, scene: Any) -> Teacher:

@@ -225,7 +225,7 @@ def critic_loss(
 
   Args:
     critic: parameters that learn.
-    critic_inputs: what the critic sees [B, T, S + P].
+    critic_inputs: the critic's observations [B, T, S + P].
     batch: `action` [B, T, A], `reward` and `discount` [B, T], `last` [B], `burn_in` [B].
     target_probabilities: the target critic's distribution at every state [B, T, K].
     config: the agent's settings.

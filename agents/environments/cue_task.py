@@ -23,7 +23,7 @@ _PATCH_COLOUR = (220, 60, 40)
 
 
 class CueTask(dm_env.Environment):
-  """Remember on which side the patch was."""
+  """A task of stepping to the side on which a patch was shown."""
 
   def __init__(self, *, seed: int):
     self._random = np.random.default_rng(seed)

@@ -25,6 +25,8 @@ from dm_env import specs
 
 from nerf2real.agents.dmpo.specs import PRIVILEGED
 from nerf2real.agents.environments.trials import Trials
+from nerf2real.suite import protocols
+from nerf2real.suite.tasks import catalogue
 
 
 def make_environment(name: str, *, seed: int, history: int = 1) -> dm_env.Environment:
@@ -66,7 +68,7 @@ def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
   from nerf2real.suite.randomisation.draws import RandomisationSettings
 
   protocol = options.pop("protocol", None)
-  known = _protocols(rest)
+  known = catalogue.PROTOCOLS.get(rest, ())
   if protocol is not None and protocol not in known:
     raise ValueError(
       f"suite:{rest} has no protocol {protocol!r}: expected one of {', '.join(known) or 'none'}."
@@ -91,7 +93,9 @@ def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
   environment = suite.load(
     rest, random=seed, camera=camera, randomisation=randomisation, **arguments
   )
-  return environment if protocol is None else Trials(environment, known[protocol], seed=seed)
+  if protocol is None:
+    return environment
+  return Trials(environment, protocols.PROTOCOLS[protocol](), seed=seed)
 
 
 def _take_camera(options: dict[str, str]) -> Any:
@@ -113,17 +117,6 @@ def camera_settings(name: str) -> Any:
     OSError: The file of its lens cannot be read.
   """
   return _take_camera(dict(urllib.parse.parse_qsl(name.partition("?")[2])))
-
-
-def _protocols(task: str) -> dict[str, tuple[Any, ...]]:
-  """The evaluation protocols of a task of the suite; the first is that of the paper's table I."""
-  from nerf2real.suite import protocols
-
-  known: dict[str, dict[str, tuple[Any, ...]]] = {
-    "nerf_nav": {"navigation": protocols.navigation(), "gain": protocols.camera_gain()},
-    "ball_push": {"ball": (*protocols.ball_center(), *protocols.ball_wall())},
-  }
-  return known.get(task, {})
 
 
 def _take(options: dict[str, str], settings: Any, *, prefix: str = "") -> Any:
@@ -162,10 +155,10 @@ def evaluation_name(name: str) -> str:
   """
   path, _, query = name.partition("?")
   family, _, task = path.partition(":")
-  if family != "suite" or not _protocols(task):
+  if family != "suite" or task not in catalogue.PROTOCOLS:
     return name
   options = dict(urllib.parse.parse_qsl(query))
-  options = {"protocol": next(iter(_protocols(task)))} | options | {"pushes": "false"}
+  options = {"protocol": catalogue.PROTOCOLS[task][0]} | options | {"pushes": "false"}
   return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
 
 

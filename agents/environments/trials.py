@@ -1,12 +1,9 @@
-"""Episodes that are the trials of an evaluation protocol, and exact intervals of their success."""
+"""Episodes that are the trials of an evaluation protocol."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import dm_env
-from scipy import stats
-
-_CONFIDENCE = 0.95
 
 
 class Trials(dm_env.Environment):
@@ -71,20 +68,3 @@ class Trials(dm_env.Environment):
 
   def close(self) -> None:
     self._environment.close()
-
-
-class Interval(NamedTuple):
-  """An interval of a probability."""
-
-  low: float
-  high: float
-
-
-def clopper_pearson(successes: int, trials: int, *, confidence: float = _CONFIDENCE) -> Interval:
-  """Returns the exact binomial interval of a success rate (Clopper and Pearson 1934)."""
-  if not 0 <= successes <= trials or not trials:
-    raise ValueError(f"Expected 0 to {trials} successes of at least 1 trial, found {successes}.")
-  tail = (1 - confidence) / 2
-  low = stats.beta.ppf(tail, successes, trials - successes + 1) if successes else 0.0
-  high = stats.beta.ppf(1 - tail, successes + 1, trials - successes) if successes < trials else 1.0
-  return Interval(float(low), float(high))

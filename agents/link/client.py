@@ -72,7 +72,7 @@ class ActorLink:
   def ask(
     self, question: str, message: bytes, *, kind: str, timeout: float | None = None
   ) -> schema.Message | None:
-    """Asks the learner; None if no answer comes in time.
+    """Sends a query to the learner; returns its answer, None if none comes in time.
 
     Raises:
       MessageError: if the learner refuses the question or answers with something else.
@@ -89,7 +89,7 @@ class ActorLink:
     return None
 
   def request(self, wanted: int, *, held: int = 0) -> Grant | None:
-    """Asks for credits and learns what was acknowledged; None if the learner is away.
+    """Requests credits and acknowledgements; returns None if the learner is away.
 
     Args:
       wanted: environment steps to be granted.
@@ -112,11 +112,10 @@ class ActorLink:
     self.outbox.acknowledge(grant["acknowledged"])
     return grant
 
-  def send(self, trajectory: Mapping[str, np.ndarray]) -> None:
-    """Puts a trajectory into the outbox and sends what is due."""
-    values = {"actor": self.actor, "number": self.outbox.made + 1}
-    payload = schema.encode("trajectory", values, trajectory)
-    self.outbox.add(payload, trajectory["reward"].shape[0] - 1)
+  def send(self, trajectory: Mapping[str, np.ndarray], *, steps: int) -> None:
+    """Puts a trajectory of some environment steps into the outbox and sends what is due."""
+    values = {"actor": self.actor, "number": self.outbox.made + 1, "steps": steps}
+    self.outbox.add(schema.encode("trajectory", values, trajectory), steps)
     self.flush()
 
   def flush(self) -> None:
@@ -149,7 +148,7 @@ class ActorLink:
     return self.version, message.arrays
 
   def status(self) -> dict[str, Any] | None:
-    """Asks for the learner's status, its description and this actor's predecessors.
+    """Requests the learner's status, its description and this actor's predecessors.
 
     Returns None if the learner is away.
     """

@@ -1,4 +1,4 @@
-"""Every trajectory arrives once: numbering and resending on one side, acknowledgement on the other.
+"""Exactly-once delivery of trajectories: numbering, resending, acknowledgement.
 
 zenoh's put does not report whether data arrived: it vanishes while no learner is there, and after a
 transport was closed. So an actor numbers its trajectories from 1 and keeps each until it is
@@ -55,7 +55,7 @@ class Outbox:
     return self._pending[self.made]
 
   def acknowledge(self, up_to: int) -> None:
-    """Forgets all numbers up to and including `up_to`."""
+    """Removes all numbers up to and including `up_to`."""
     while self._pending and next(iter(self._pending)) <= up_to:
       number, _ = self._pending.popitem(last=False)
       self._sent_at.pop(number, None)

@@ -125,7 +125,7 @@ class RateLimiter:
       self._outstanding[actor] = max(0, self._outstanding[actor] - steps)
 
   def updated(self, *, paid: bool = True) -> None:
-    """Counts an update; one that is not paid for neither asks for steps nor gives credits."""
+    """Counts an update; one that is not paid for neither requests steps nor gives credits."""
     self.updates += 1
     if not paid:
       self.unpaid -= self.settings.steps_per_update

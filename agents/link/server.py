@@ -38,8 +38,6 @@ Insert = Callable[[Mapping[str, np.ndarray], int, int], int]
 class ActorRecord:
   """The learner's record of an actor."""
 
-  heard: float
-  """Monotonic time of its last message [s]."""
   alive: bool = True
   parameters_version: int = 0
   refused: int = 0
@@ -213,8 +211,8 @@ class LearnerLink:
         self.limiter.forget(actor)
 
   def _record(self, actor: str) -> ActorRecord:
-    record = self._actors.setdefault(actor, ActorRecord(time.monotonic()))
-    record.heard, record.alive = time.monotonic(), True
+    record = self._actors.setdefault(actor, ActorRecord())
+    record.alive = True
     return record
 
   def _answering(self, answer: Callable[[schema.Message], bytes]) -> Callable[[zenoh.Query], None]:
@@ -317,6 +315,7 @@ class LearnerLink:
     message = schema.decode(data, kind="trajectory")
     actor = schema.text(message, "actor")
     number = schema.integer(message, "number", low=1)
+    claimed = schema.integer(message, "steps")
     key = actor_key(actor)
     with self.lock:
       if self._ledger.seen(key, number):
@@ -325,7 +324,7 @@ class LearnerLink:
     try:
       steps = self._insert(message.arrays, key, number)
     except ValueError as error:
-      self._drop(actor, number, message.arrays)
+      self._drop(actor, number, claimed)
       self._refuse(f"trajectory {number} of {actor}: {error}")
       return
     with self.lock:
@@ -334,12 +333,10 @@ class LearnerLink:
       self.counters.trajectories += 1
       self.counters.bytes += len(data)
 
-  def _drop(self, actor: str, number: int, arrays: Mapping[str, np.ndarray]) -> None:
+  def _drop(self, actor: str, number: int, steps: int) -> None:
     """Acknowledges a trajectory that does not fit, so that its actor does not send it for ever."""
-    rewards = arrays.get("reward")
-    steps = 0 if rewards is None or rewards.ndim != 1 else max(0, rewards.shape[0] - 1)
     with self.lock:
       self._ledger.record(actor_key(actor), number)
       self.limiter.returned(actor, steps)
-      unknown = ActorRecord(time.monotonic(), alive=False)
+      unknown = ActorRecord(alive=False)
       self._actors.setdefault(actor, unknown).refused += 1

@@ -103,7 +103,7 @@ class ActorProcess(JoinedProcess):
 
   def _send(self, trajectory: acting.Trajectory | None) -> None:
     if trajectory is not None:
-      self.link.send(trajectory)
+      self.link.send(trajectory, steps=len(trajectory["reward"]) - 1)
 
   def _acquire(self) -> bool:
     """Waits for credits; returns whether to go on."""

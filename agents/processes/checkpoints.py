@@ -98,19 +98,16 @@ class Checkpoints:
       shutil.rmtree(old, ignore_errors=True)
     return path
 
-  def restore(
-    self, example: TrainingState, *, path: Path | None = None
-  ) -> tuple[TrainingState, dict[str, Any]]:
-    """Reads a checkpoint: the newest one if no path is given.
+  def restore(self, example: TrainingState) -> tuple[TrainingState, dict[str, Any]]:
+    """Reads the newest checkpoint.
 
     Args:
       example: a state of the shapes to be read.
-      path: a checkpoint's folder.
 
     Raises:
       CheckpointError: if there is none, or it does not fit the settings.
     """
-    paths = [path] if path is not None else self.list()[-1:]
+    paths = self.list()[-1:]
     if not paths:
       raise CheckpointError(f"{self._folder} holds no checkpoint: start without --resume.")
     record = _read_record(paths[0])

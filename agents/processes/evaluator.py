@@ -7,10 +7,10 @@ import zenoh
 
 from nerf2real.agents.dmpo.policy import acting
 from nerf2real.agents.environments.loading import trials_of
-from nerf2real.agents.environments.trials import clopper_pearson
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.link.schema import MessageError
 from nerf2real.agents.processes.joining import AWAY_POLL, JoinedProcess
+from nerf2real.core.intervals import clopper_pearson
 
 _EPISODES = 5  # of an evaluation, where there is no protocol
 

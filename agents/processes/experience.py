@@ -79,7 +79,7 @@ class Experience:
     return steps - 1
 
   def sample(self, rng: np.random.Generator) -> dict[str, Any]:
-    """Draws a batch, with the asked share of prior data."""
+    """Draws a batch, with the configured share of prior data."""
     if self._prior is None:
       return self.replay.sample(rng, self._config.batch_size)
     return sample_mixed(

@@ -1,7 +1,6 @@
 """Keeps the processes of a run alive: restarts within a window, and an end in order.
 
-Where a process runs is its `Process`'s affair: on this machine (`LocalProcess`), or where Ray
-places it (`cluster.py`).
+A `Process` runs on this machine (`LocalProcess`), or where Ray places it (`cluster.py`).
 """
 
 import dataclasses

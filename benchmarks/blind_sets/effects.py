@@ -1,6 +1,6 @@
-"""What a machine can have that its declared model lacks: draws, and what they change in the plant.
+"""Effects of a machine that its declared model lacks: draws, and what they change in the plant.
 
-`LIBRARY` are the kinds that an analyser may name; `OUTSIDE` are kinds that nobody's library has.
+`LIBRARY` are the kinds that an analyser may name; `OUTSIDE` are kinds outside its library.
 Parameters have the names and units of `suite.effects`; magnitudes are drawn from continuous ranges.
 """
 

@@ -330,18 +330,3 @@ def solve(parent, matrix, right):
       right[i] -= matrix[i, j] * right[j]
       j = parent[j]
     right[i] /= matrix[i, i]
-
-
-def energy(tree: Tree, q: np.ndarray, qd: np.ndarray, gravity: np.ndarray) -> float:
-  """Returns kinetic plus potential energy, J, from centres of mass and spins (not the matrix)."""
-  work = make_work(len(q))
-  dynamics(tree, q, qd, gravity, work)
-  total = 0.0
-  for i in range(len(q)):
-    rotation, spin = work.rotation[i], work.velocity[i, :3]
-    place = work.position[i] + rotation @ tree.center[i]
-    speed = work.velocity[i, 3:] + np.cross(spin, place)
-    turning = rotation @ tree.inertia[i] @ rotation.T
-    total += 0.5 * tree.mass[i] * speed @ speed + 0.5 * spin @ turning @ spin
-    total -= tree.mass[i] * gravity @ place
-  return float(total)

@@ -47,23 +47,3 @@ def weights(machine, q: Array) -> Array:
     each[:, 0] += machine.gravity[:, 0] * machine.mass[:, 1] * machine.length[:, 0] * sine[:, 0]
     each[:, 0] += each[:, 1]
   return each
-
-
-def energy(machine, q: Array, v: Array) -> Array:
-  """Returns kinetic and potential energy [B] J of the links, without rotors and gears."""
-  if machine.slides:
-    height = q * np.sin(machine.tilt)
-    total = machine.mass * (0.5 * v**2 + machine.gravity * height)
-    return total[:, 0]
-  angles = np.cumsum(q, axis=1) + machine.tilt
-  height = -machine.moment_x * np.sin(angles) + machine.moment_z * np.cos(angles)
-  rates = np.cumsum(v, axis=1)
-  total = 0.5 * machine.inertia * rates**2 + machine.gravity * height
-  if q.shape[1] == 1:
-    return total[:, 0]
-  length, mass = machine.length[:, 0], machine.mass[:, 1]
-  x, z = machine.moment_x[:, 1], machine.moment_z[:, 1]
-  coupling = length * (x * np.sin(q[:, 1]) - z * np.cos(q[:, 1]))
-  shared = 0.5 * mass * (length * rates[:, 0]) ** 2 + coupling * rates[:, 0] * rates[:, 1]
-  tip = -machine.gravity[:, 0] * mass * length * np.cos(angles[:, 0])
-  return total.sum(axis=1) + shared + tip

@@ -1,4 +1,4 @@
-"""What a machine may have that its declared model lacks: drawn, applied, written down."""
+"""Effects of a machine that its declared model lacks: drawn, applied, written down."""
 
 import dataclasses
 from collections.abc import Callable

@@ -91,7 +91,7 @@ def record(
   """Reads one machine of a batch as its host would.
 
   Args:
-    apparatus: what the host knows.
+    apparatus: the declared model of the host.
     machine: row `row` of the batch.
     habits: of the host.
     trace: the batch's motion.

@@ -20,7 +20,7 @@ class Tracker:
     """Starts at rest on the references.
 
     Args:
-      nominal: batch of what the hosts know, [B, n].
+      nominal: batch of declared models, [B, n].
       references: [C, B, n] rad.
       period: s between ticks.
     """

@@ -11,7 +11,6 @@ import json
 import multiprocessing
 import os
 import signal
-import socket
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -23,6 +22,7 @@ from benchmarks import harness
 from nerf2real.agents.link import client, sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink
+from nerf2real.agents.supervision.training import free_port
 
 STEPS = 48
 
@@ -124,7 +124,7 @@ def send_link(endpoint: str, messages: int, half: Any) -> None:
       grant = link.request(STEPS - 1)
       if grant is not None and grant["granted"]:
         break
-    link.send(make_trajectory(number))
+    link.send(make_trajectory(number), steps=STEPS - 1)
   link.drain(timeout=60)
   link.close()
 
@@ -147,9 +147,7 @@ def send_raw(endpoint: str, messages: int, half: Any) -> None:
 def run(name: str, messages: int, stall: float) -> dict[str, harness.Value]:
   """Runs one of the two; rates are those before the stall."""
   receive, send = {"zenoh": (receive_raw, send_raw), "link": (receive_link, send_link)}[name]
-  with socket.socket() as probe:
-    probe.bind(("127.0.0.1", 0))
-    endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+  endpoint = f"tcp/127.0.0.1:{free_port()}"
   context = multiprocessing.get_context("spawn")
   ours, theirs = context.Pipe()
   receiver = context.Process(target=receive, args=(endpoint, theirs), daemon=True)

@@ -40,11 +40,10 @@ class Rate:
 
   @property
   def interval(self) -> tuple[float, float]:
-    """The exact 95 % interval of the probability. Source: Clopper and Pearson 1934."""
-    from scipy.stats import binomtest  # late: threads are set before numpy is imported
+    """The exact 95 % interval of the probability."""
+    from nerf2real.core.intervals import clopper_pearson  # late: numpy comes after threads are set
 
-    low, high = binomtest(self.count, self.of).proportion_ci(0.95, method="exact")
-    return float(low), float(high)
+    return clopper_pearson(self.count, self.of)
 
   def to_dict(self) -> dict[str, Any]:
     """Returns the rate as it is kept."""

@@ -13,6 +13,7 @@ field and sensor alone: the simulation's picture from where the virtual robot's 
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from benchmarks import harness
@@ -31,15 +32,13 @@ from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.scenes.quality.image_quality import psnr
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.pose import Pose
+from nerf2real.suite.randomisation.draws import NOMINAL
 from nerf2real.suite.sensors.camera import CameraSettings
-from nerf2real.suite.tasks.base import Start
 
 _STEP = constants.CONTROL_TIMESTEP
 _LEG_SWAY, _ARM_SWAY = 0.05, 0.2  # rad
-_NOMINAL = RandomisationSettings(
-  pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
-)
+_OBSERVED = ("joint_positions", "gyroscope", "accelerometer", "gravity")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,25 +57,15 @@ class Settings(harness.Options):
   """Of the swaying's frequencies."""
 
 
-@dataclasses.dataclass
 class Trace:
-  """What was observed, T control steps."""
+  """What was observed, control step by control step."""
 
-  joints: np.ndarray
-  """[T, 20] rad."""
-  gyroscope: np.ndarray
-  """[T, 3] rad/s."""
-  accelerometer: np.ndarray
-  """[T, 3] m/s^2."""
-  gravity: np.ndarray
-  """[T, 3]."""
-  place: np.ndarray
-  """[T, 2] of the torso, by an observer [m]."""
-  pictures: dict[int, np.ndarray]
-  """By step, uint8 [30, 40, 3]."""
-  same_pose: dict[int, np.ndarray]
-  """The simulation's, from the virtual camera's pose."""
-  fell: bool = False
+  def __init__(self) -> None:
+    self.observed: dict[str, list[np.ndarray]] = {name: [] for name in _OBSERVED}
+    self.place: list[np.ndarray] = []  # [2] of the torso, by an observer [m]
+    self.pictures: dict[int, np.ndarray] = {}  # by step, uint8 [30, 40, 3]
+    self.same_pose: dict[int, np.ndarray] = {}  # both, from the virtual camera's pose
+    self.fell = False
 
 
 def sway_actions(count: int, seed: int) -> np.ndarray:
@@ -102,26 +91,30 @@ def walk_actions(count: int) -> np.ndarray:
   return np.stack([gait.act(Command(1.0)) for _ in range(count)])
 
 
-def _collect(timestep: Any, rows: dict[str, list]) -> None:
-  for name in ("joint_positions", "gyroscope", "accelerometer", "gravity"):
-    rows[name].append(timestep.observation[name][-1])
-
-
-def _trace(rows: dict[str, list], places: list, pictures: dict, same: dict, fell: bool) -> Trace:
-  return Trace(
-    joints=np.array(rows["joint_positions"]),
-    gyroscope=np.array(rows["gyroscope"]),
-    accelerometer=np.array(rows["accelerometer"]),
-    gravity=np.array(rows["gravity"]),
-    place=np.array(places),
-    pictures=pictures,
-    same_pose=same,
-    fell=fell,
-  )
-
-
-def _new_rows() -> dict[str, list]:
-  return {name: [] for name in ("joint_positions", "gyroscope", "accelerometer", "gravity")}
+def play(
+  environment: Any,
+  actions: np.ndarray,
+  settings: Settings,
+  *,
+  place: Callable[[], np.ndarray],
+  look: Callable[[], np.ndarray] | None = None,
+) -> Trace:
+  """Plays actions [T, 20]; `place` returns where the torso is, `look` pictures of the same pose."""
+  trace = Trace()
+  environment.reset()
+  for step, action in enumerate(actions):
+    timestep = environment.step(action)
+    for name, rows in trace.observed.items():
+      rows.append(timestep.observation[name][-1])
+    trace.place.append(place())
+    if settings.picture_steps and step % settings.picture_steps == 0:
+      trace.pictures[step] = timestep.observation["camera"].copy()
+      if look is not None:
+        trace.same_pose[step] = look()
+    if timestep.last():
+      trace.fell = True
+      break
+  return trace
 
 
 class Simulation:
@@ -133,30 +126,19 @@ class Simulation:
       "nerf_nav",
       image_size=size,
       random=0,
-      randomisation=_NOMINAL,
+      randomisation=NOMINAL,
       privileged=False,
       camera=CameraSettings(lens=LENS),
       time_limit=settings.seconds + 1.0,
     )
     x, y, yaw = settings.start
-    self.environment.task.set_start(Start((x, y), yaw))
+    self.environment.task.set_start(Pose(x, y, yaw))
     self._data = mujoco.MjData(self.environment.physics.model.ptr)
 
   def run(self, actions: np.ndarray, settings: Settings) -> Trace:
     """Runs actions [T, 20]."""
-    task, rows, places, pictures = self.environment.task, _new_rows(), [], {}
-    self.environment.reset()
-    fell = False
-    for step, action in enumerate(actions):
-      timestep = self.environment.step(action)
-      _collect(timestep, rows)
-      places.append(task.state.position[:2].copy())
-      if settings.picture_steps and step % settings.picture_steps == 0:
-        pictures[step] = timestep.observation["camera"].copy()
-      if timestep.last():
-        fell = True
-        break
-    return _trace(rows, places, pictures, {}, fell)
+    task = self.environment.task
+    return play(self.environment, actions, settings, place=lambda: task.state.position[:2].copy())
 
   def picture_at(self, truth: Truth) -> np.ndarray:
     """Returns the simulation's picture of a robot in the virtual robot's true state."""
@@ -186,27 +168,19 @@ def run_virtual(
       image_size=(30, 40) if camera else None,
       time_limit=settings.seconds + 1.0,
     )
+
+    def look() -> np.ndarray:
+      assert robot.eyes is not None and robot.camera is not None
+      now = robot.camera.sensor.develop(robot.eyes.picture())
+      small = cv2.resize(now, (40, 30), interpolation=cv2.INTER_AREA)
+      return np.stack([small, simulation.picture_at(robot.truth())])
+
     with environment:
       for name, motion in actions.items():
         robot.place(*settings.start)
-        environment.reset()
-        rows, places, pictures, same = _new_rows(), [], {}, {}
-        fell = False
-        for step, action in enumerate(motion):
-          timestep = environment.step(action)
-          _collect(timestep, rows)
-          truth = robot.truth()
-          places.append(truth.position[:2].copy())
-          if camera and step % settings.picture_steps == 0:
-            pictures[step] = timestep.observation["camera"].copy()
-            assert robot.eyes is not None
-            now = robot.camera.sensor.develop(robot.eyes.picture())  # type: ignore[union-attr]
-            small = cv2.resize(now, (40, 30), interpolation=cv2.INTER_AREA)
-            same[step] = np.stack([small, simulation.picture_at(truth)])
-          if timestep.last():
-            fell = True
-            break
-        found[name] = _trace(rows, places, pictures, same, fell)
+        found[name] = play(
+          environment, motion, settings, place=lambda: robot.truth().position[:2].copy(), look=look
+        )
   return found
 
 
@@ -216,21 +190,22 @@ def _rms(difference: np.ndarray) -> np.ndarray:
 
 def compare(simulated: Trace, virtual: Trace) -> dict[str, float]:
   """Returns the figures of one motion on one robot; lengths differ only after a fall."""
-  count = min(len(simulated.joints), len(virtual.joints))
-  joints = np.rad2deg(_rms(simulated.joints[:count] - virtual.joints[:count]))
+  count = min(len(simulated.place), len(virtual.place))
+  pairs = {
+    name: [np.array(trace.observed[name][:count]) for trace in (simulated, virtual)]
+    for name in _OBSERVED
+  }
+  joints = np.rad2deg(_rms(np.subtract(*pairs["joint_positions"])))
   figures = {
     f"{name} [deg]": float(v) for name, v in zip(constants.JOINT_NAMES, joints, strict=True)
   }
   figures["all joints, mean [deg]"] = float(joints.mean())
   for name, unit in (("gyroscope", "rad/s"), ("accelerometer", "m/s^2")):
-    difference = _rms(getattr(simulated, name)[:count] - getattr(virtual, name)[:count])
-    for axis, value in zip("xyz", difference, strict=True):
+    for axis, value in zip("xyz", _rms(np.subtract(*pairs[name])), strict=True):
       figures[f"{name} {axis} [{unit}]"] = float(value)
-  cosine = np.sum(simulated.gravity[:count] * virtual.gravity[:count], axis=1)
-  lengths = np.linalg.norm(simulated.gravity[:count], axis=1) * np.linalg.norm(
-    virtual.gravity[:count], axis=1
-  )
-  angle = np.arccos(np.clip(cosine / lengths, -1, 1))
+  lengths = np.prod([np.linalg.norm(gravity, axis=1) for gravity in pairs["gravity"]], axis=0)
+  cosine = np.sum(np.multiply(*pairs["gravity"]), axis=1) / lengths
+  angle = np.arccos(np.clip(cosine, -1, 1))
   figures["gravity [deg]"] = float(np.rad2deg(np.sqrt(np.mean(angle**2))))
   moved = [trace.place[count - 1] - trace.place[0] for trace in (simulated, virtual)]
   figures["distance travelled, simulation [m]"] = float(np.linalg.norm(moved[0]))

@@ -23,8 +23,8 @@ from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walk import Command, Gait
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import Start
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2
 
@@ -111,7 +111,7 @@ def main(settings: Settings) -> None:
     privileged=False,
   )
   task = environment.task
-  task.set_start(Start((0.0, 0.0), 0.0))
+  task.set_start(Pose(0.0, 0.0, 0.0))
   for episode in range(settings.episodes):
     errors = _walk(environment, lambda: -task.state.rotation[2])
     figures[f"simulation_episode_{episode}"] = errors.figures()

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks import harness
 from nerf2real.core.similarity import Similarity
@@ -50,28 +51,6 @@ class PoseErrors:
     return float(np.sqrt(np.mean(self.rotation**2)))
 
 
-def mean_rotation(rotations: np.ndarray) -> np.ndarray:
-  """Chordal mean [3, 3] of rotations [N, 3, 3]. Source: Hartley et al. 2013, section 5.3."""
-  u, _, vt = np.linalg.svd(rotations.sum(axis=0))
-  return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-
-
-def rotation_angle(rotations: np.ndarray) -> np.ndarray:
-  """Angle [degree] of rotations [..., 3, 3], accurate for small ones."""
-  sine = 0.5 * np.linalg.norm(
-    np.stack(
-      [
-        rotations[..., 2, 1] - rotations[..., 1, 2],
-        rotations[..., 0, 2] - rotations[..., 2, 0],
-        rotations[..., 1, 0] - rotations[..., 0, 1],
-      ]
-    ),
-    axis=0,
-  )
-  cosine = 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1)
-  return np.degrees(np.arctan2(sine, cosine))
-
-
 def pose_errors(estimated: np.ndarray, truth: np.ndarray) -> PoseErrors:
   """Compares world-from-camera poses [N, 4, 4] up to a similarity.
 
@@ -80,11 +59,10 @@ def pose_errors(estimated: np.ndarray, truth: np.ndarray) -> PoseErrors:
   """
   fit = Similarity.fit(estimated[:, :3, 3], truth[:, :3, 3])
   aligned = fit.apply_pose(estimated)
-  difference = np.swapaxes(aligned[:, :3, :3], 1, 2) @ truth[:, :3, :3]
-  offset = mean_rotation(difference)
+  difference = Rotation.from_matrix(np.swapaxes(aligned[:, :3, :3], 1, 2) @ truth[:, :3, :3])
   return PoseErrors(
     position=np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1),
-    rotation=rotation_angle(difference @ offset.T),
+    rotation=np.degrees((difference * difference.mean().inv()).magnitude()),
   )
 
 

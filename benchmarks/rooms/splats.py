@@ -6,14 +6,13 @@
 Needs `pip install mujoco-warp`. The pictures are the film's own from the robot's 24 places, 60x80.
 """
 
-import argparse
+import dataclasses
 from pathlib import Path
 
 import mujoco
 import numpy as np
-import rich
-from rich.table import Table
 
+from benchmarks import harness
 from nerf2real.core.serialization import from_plain
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import yardstick
@@ -21,9 +20,19 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export.mjcf import mujoco_quaternion
 from nerf2real.scenes.export.splats.splats import Splats
 from nerf2real.scenes.export.views import render_views, renderer_of
-from nerf2real.scenes.quality import image_quality
+from nerf2real.scenes.quality.image_quality import psnr
 
 _HEIGHT, _WIDTH = 60, 80
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """What to judge."""
+
+  splats: Path
+  """PLY of the built-in room."""
+  samples: int = 1
+  """Samples a pixel of the renderer."""
 
 
 def draw_with_mujoco_warp(splats: Splats, poses: np.ndarray, *, samples: int) -> np.ndarray:
@@ -56,12 +65,8 @@ def draw_with_mujoco_warp(splats: Splats, poses: np.ndarray, *, samples: int) ->
   return np.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], -1).astype(np.uint8)
 
 
-def main() -> None:
-  """Prints the table."""
-  parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-  parser.add_argument("--splats", type=Path, required=True, help="PLY of the built-in room")
-  parser.add_argument("--samples", type=int, default=1, help="samples a pixel of the renderer")
-  arguments = parser.parse_args()
+def main(settings: Settings) -> None:
+  """Draws and prints the table."""
   bundle = Bundle.load()
   arrays = np.load(yardstick.ROBOT_VIEWS)
   world_from_room = from_plain(bundle.figures["room_from_world"], Similarity).inverse()
@@ -71,18 +76,19 @@ def main() -> None:
     bundle, renderer_of(bundle), yardstick.robot_camera(_HEIGHT, _WIDTH), poses
   ).color
   assert field is not None
-  splats = Splats.load_ply(arguments.splats)
-  drawn = draw_with_mujoco_warp(splats, poses, samples=arguments.samples)
-  table = Table("pictures", "against", "PSNR, dB, mean of 24", title=f"{len(splats)} splats")
-  for name, found, other, with_what in (
-    ("field", field, truth, "truth"),
-    ("splats", drawn, truth, "truth"),
-    ("splats", drawn, field, "field"),
-  ):
-    values = [image_quality.psnr(a, b) for a, b in zip(found, other, strict=True)]
-    table.add_row(name, with_what, f"{np.mean(values):.2f}")
-  rich.print(table)
+  splats = Splats.load_ply(settings.splats)
+  drawn = draw_with_mujoco_warp(splats, poses, samples=settings.samples)
+  pairs = {
+    "field_against_truth": (field, truth),
+    "splats_against_truth": (drawn, truth),
+    "splats_against_field": (drawn, field),
+  }
+  figures: dict[str, dict[str, harness.Value]] = {
+    name: {"psnr_db": float(np.mean([psnr(a, b) for a, b in zip(*pair, strict=True)]))}
+    for name, pair in pairs.items()
+  }
+  harness.finish("splats", figures, settings, words=f"{len(splats)} splats, mean of 24 pictures")
 
 
 if __name__ == "__main__":
-  main()
+  harness.run(main, Settings, __doc__)

@@ -24,6 +24,7 @@ from dm_control import suite as dm_suite
 
 from nerf2real import suite
 from nerf2real.suite import loading
+from nerf2real.suite.scene import open_scene
 from nerf2real.suite.sensors.camera import world_from_camera
 
 SIZES = ((30, 40), (60, 80))
@@ -112,7 +113,7 @@ def picture_parts(variant: Variant) -> dict[str, float]:
 def main(settings: Settings) -> None:
   """Runs the benchmark."""
   harness.one_core()
-  bundle = loading.open_scene(settings.scene)
+  bundle = open_scene(settings.scene)
   renderer = loading.load_renderer(bundle)
   variants = {
     f"{settings.task}_{h}x{w}": robot_variant(

@@ -1,4 +1,4 @@
-"""Does the scripted walker walk? A metre straight ahead, then five goals, on every plant.
+"""Measures the scripted walker on every plant: a metre straight ahead, then five goals.
 
 Straight ahead only the gait acts, without a pose. The goals are reached one after
 another, steered by the true pose. Simulation: episodes as in training, without pushes. Virtual
@@ -23,10 +23,10 @@ from nerf2real import real, suite
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.walk import Command, Gait
-from nerf2real.suite.gaits.walker import Pose, Walker
+from nerf2real.suite.gaits.walker import Walker
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import Start
 
 GOALS = (
   (0.6, 0.0),
@@ -50,7 +50,7 @@ class Settings(harness.Options):
 
 
 class Seen(NamedTuple):
-  """What an observer sees."""
+  """The observer's view of the robot."""
 
   pose: Pose
   fallen: bool
@@ -115,11 +115,10 @@ def simulated(count: int) -> Iterator[tuple[str, Result]]:
     privileged=False,
   )
   task = environment.task
-  task.set_start(Start((0.0, 0.0), 0.0))
+  task.set_start(Pose(0.0, 0.0, 0.0))
 
   def see() -> Seen:
-    x, y = (float(value) for value in task.state.position[:2])
-    return Seen(Pose(x, y, task.state.yaw), bool(task.fallen))
+    return Seen(task.state.pose, bool(task.fallen))
 
   for episode in range(count):
     yield f"simulation, episode {episode}", walk(environment, see)
@@ -140,8 +139,7 @@ def rehearsed(count: int) -> Iterator[tuple[str, Result]]:
       def see(robot: VirtualRobot = robot) -> Seen:
         truth = robot.truth()
         low = truth.rotation[2, 2] < MIN_UPRIGHT or truth.position[2] < MIN_HEIGHT
-        pose = Pose(float(truth.position[0]), float(truth.position[1]), truth.yaw)
-        return Seen(pose, bool(truth.touches_floor or low))
+        return Seen(truth.pose, bool(truth.touches_floor or low))
 
       with environment:
         name = "data sheet" if seed is None else f"seed {seed}"

@@ -45,7 +45,7 @@ class Interval(NamedTuple):
   high: float
 
 
-def lines(title: str, x: str, y: str, curves: Sequence[Curve], *, height: int = 280) -> Chart:
+def lines(title: str, x: str, y: str, curves: Sequence[Curve]) -> Chart:
   """Returns curves in one chart; x and y name the axes with their units."""
   figure = go.Figure()
   for curve in curves:
@@ -57,10 +57,10 @@ def lines(title: str, x: str, y: str, curves: Sequence[Curve], *, height: int = 
       mode="lines",
       line={"color": curve.color, "width": 1.4},
     )
-  return _laid_out(figure, title, x, y, height)
+  return _laid_out(figure, title, x, y)
 
 
-def binned(title: str, x: str, y: str, curves: Sequence[Curve], *, height: int = 280) -> Chart:
+def binned(title: str, x: str, y: str, curves: Sequence[Curve]) -> Chart:
   """Returns medians of curves in bins of x, with quartiles; x and y name the axes."""
   figure = go.Figure()
   for curve in curves:
@@ -80,7 +80,7 @@ def binned(title: str, x: str, y: str, curves: Sequence[Curve], *, height: int =
         "width": 2,
       },
     )
-  return _laid_out(figure, title, x, y, height)
+  return _laid_out(figure, title, x, y)
 
 
 def _quartiles(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -141,7 +141,7 @@ def intervals(title: str, rows: Sequence[Interval]) -> Chart | None:
   return _laid_out(figure, title, "per cent of the value", "", 100 + 30 * len(names))
 
 
-def _laid_out(figure: go.Figure, title: str, x: str, y: str, height: int) -> Chart:
+def _laid_out(figure: go.Figure, title: str, x: str, y: str, height: int = 280) -> Chart:
   legend = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 1, "xanchor": "right"}
   figure.update_layout(
     title={"text": title, "font": {"size": 14}, "x": 0.01, "y": 0.97, "yanchor": "top"},
@@ -154,9 +154,7 @@ def _laid_out(figure: go.Figure, title: str, x: str, y: str, height: int) -> Cha
   return Chart(figure)
 
 
-def mesh_trace(
-  mesh: trimesh.Trimesh, *, color: str | None = None, name: str = "", opacity: float = 1.0
-) -> go.Mesh3d:
+def mesh_trace(mesh: trimesh.Trimesh, *, color: str | None = None, name: str) -> go.Mesh3d:
   """Returns a mesh for a 3D figure, in its vertex colours unless `color` is given."""
   vertices, faces = _short(mesh.vertices), np.asarray(mesh.faces)
   if len(vertices) < 1 << 16:
@@ -171,29 +169,28 @@ def mesh_trace(
     color=color,
     vertexcolor=colors,
     name=name,
-    opacity=opacity,
     hoverinfo="name",
     flatshading=color is not None,
   )
 
 
-def path_trace(points: Array, *, name: str = "camera path") -> go.Scatter3d:
-  """Returns a line through points [N, 3] for a 3D figure."""
+def path_trace(points: Array) -> go.Scatter3d:
+  """Returns a camera's path through points [N, 3] for a 3D figure."""
   return go.Scatter3d(
     **dict(zip("xyz", _short(points).T, strict=True)),
     mode="lines+markers",
-    name=name,
+    name="camera path",
     marker={"size": 2.5, "color": palette.VERMILION},
     line={"width": 3, "color": palette.VERMILION},
   )
 
 
-def figure_3d(traces: Sequence[Any], *, height: int = 560) -> Chart:
+def figure_3d(traces: Sequence[Any]) -> Chart:
   """Returns an interactive 3D figure in metres, z up; drag turns it."""
   axis = {"showbackground": False, "gridcolor": "#dfe3ea", "zerolinecolor": "#dfe3ea"}
   figure = go.Figure(list(traces))
   figure.update_layout(
-    height=height,
+    height=560,
     margin={"l": 0, "r": 0, "t": 0, "b": 0},
     showlegend=False,
     scene={

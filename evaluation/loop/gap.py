@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 
 from nerf2real import suite
+from nerf2real.core import markdown
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import Start
+from nerf2real.suite.pose import Pose
+from nerf2real.suite.randomisation.draws import NOMINAL
 
 _STEP = constants.CONTROL_TIMESTEP
-_NOMINAL = RandomisationSettings(
-  pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
-)
 
 
 def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
@@ -23,12 +21,12 @@ def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
     "nerf_nav",
     image_size=None,
     random=0,
-    randomisation=_NOMINAL,
+    randomisation=NOMINAL,
     privileged=False,
     time_limit=len(actions) * _STEP + 1.0,
     effects=effects,
   )
-  environment.task.set_start(Start((0.0, 0.0), 0.0))
+  environment.task.set_start(Pose(0.0, 0.0, 0.0))
   environment.reset()
   rows = []
   for action in actions:
@@ -48,17 +46,16 @@ def gap_table(
     np.rad2deg(np.sqrt(np.mean((robot[:count] - simulated[:count]) ** 2, axis=0)))
     for simulated in (before, after)
   ]
+  rows = {name: [gap[index] for gap in gaps] for index, name in enumerate(constants.JOINT_NAMES)}
+  rows["mean"] = [gap.mean() for gap in gaps]
+  held = content["error"]["held"]
   lines = [
     f"Joint positions, RMS over {count * _STEP:.0f} s of swaying on the floor (not fitted).",
     "",
-    "| joint | nominal suite [deg] | with effects [deg] |",
-    "| --- | --- | --- |",
-  ]
-  for index, name in enumerate(constants.JOINT_NAMES):
-    lines.append(f"| {name} | {gaps[0][index]:.3f} | {gaps[1][index]:.3f} |")
-  lines.append(f"| mean | {gaps[0].mean():.3f} | {gaps[1].mean():.3f} |")
-  held = content["error"]["held"]
-  lines += [
+    markdown.table(
+      ("joint", "nominal suite [deg]", "with effects [deg]"),
+      [(name, *(f"{value:.3f}" for value in values)) for name, values in rows.items()],
+    ),
     "",
     "Held in the air, whole log, all joints (mrad RMS): declared"
     f" {1e3 * held['before']:.2f}, extended {1e3 * held['after']:.2f}, noise of the readings"
@@ -80,24 +77,24 @@ def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:
   stall = motors.SPEED_CONSTANT * hidden.motors.battery_voltage / motors.RESISTANCE
   strength = duty * stall * hidden.motors.strength / constants.POSITION_GAIN
   constants_of = json.loads(details.read_text())["calibration"]
-  lines = [
-    "",
-    "Share of the torque that the gear takes, and strength over the declared one (voltage law and",
-    "battery included). Without a load strength cannot be told from all constants being smaller.",
-    "",
-    "| joint | gear's share | found | strength | found | also named |",
-    "| --- | --- | --- | --- | --- | --- |",
-  ]
+  rows = []
   for index, name in enumerate(constants.JOINT_NAMES):
     own = {e["kind"]: e["parameters"] for e in content["effects"] if e["joint"] == name}
     share = own.pop("load_friction", {}).get("coefficient", {}).get("value")
     gain = own.pop("motor_gain", {}).get("gain", {}).get("value", 1.0)
     gain *= constants_of[name].get("gain", 1.0)
     found = "not named" if share is None else f"{share:.2f}"
-    lines.append(
-      f"| {name} | {hidden.motors.gear_share[index]:.2f} | {found} | {strength[index]:.2f} |"
-      f" {gain:.2f} | {', '.join(own) or '-'} |"
-    )
+    gear = f"{hidden.motors.gear_share[index]:.2f}"
+    other = ", ".join(own) or "-"
+    rows.append((name, gear, found, f"{strength[index]:.2f}", f"{gain:.2f}", other))
+  header = ("joint", "gear's share", "found", "strength", "found", "also named")
+  lines = [
+    "",
+    "Share of the torque that the gear takes, and strength over the declared one (voltage law and",
+    "battery included). Without a load strength cannot be told from all constants being smaller.",
+    "",
+    markdown.table(header, rows),
+  ]
   whole = [e for e in content["effects"] if e["joint"] is None]
   for effect in whole:
     values = ", ".join(

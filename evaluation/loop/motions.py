@@ -1,4 +1,4 @@
-"""Motions that excite a robot for identification, and the model that they are fitted with.
+"""Motions that excite a robot for identification, and the models that they are fitted with.
 
 Shapes: T control steps, 20 joints.
 """
@@ -41,6 +41,14 @@ def declared_model() -> str:
   text = root.to_xml_string()
   mujoco.MjModel.from_xml_string(text)
   return text
+
+
+def standing_model() -> mujoco.MjModel:
+  """Returns the suite's OP3, free, on a plane."""
+  spec = mujoco.MjSpec.from_string(OP3().mjcf_model.to_xml_string())
+  spec.body(constants.TORSO_LINK).add_freejoint()
+  spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
+  return spec.compile()
 
 
 def motion(kind: str, count: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """What identification says of a robot's recordings: the one place that calls the analyser.
 
-The rest of the loop knows `Named` alone: verdict, effects with intervals, what is explained.
+The rest of the loop depends on `Named` alone: verdict, effects with intervals, what is explained.
 """
 
 import json
@@ -8,17 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import mujoco
-
 from nerf2real import sysid
 from nerf2real.core.files import write_atomically
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.serialization import write_json
-from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model
+from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model, standing_model
 from nerf2real.evaluation.loop.recording import FLOOR
 from nerf2real.suite.effects import Effect, read_effects, write_effects
-from nerf2real.suite.op3 import constants
-from nerf2real.suite.op3.op3 import OP3
 from nerf2real.sysid.sensors import floor
 from nerf2real.sysid.sensors.sensed import Part
 
@@ -120,7 +116,7 @@ def _share(error: dict[str, Any]) -> float | None:
 
 
 def _listed(effect: Effect, rows: Sequence[Mapping[str, Any]]) -> bool:
-  """Tells whether an effect has an entry in a report."""
+  """Returns whether an effect has an entry in a report."""
   places = [(row["kind"], row.get("body") or row.get("geom") or row.get("joint")) for row in rows]
   return (effect.kind, effect.target) in places
 
@@ -129,7 +125,4 @@ def _floor(log: Path) -> Part:
   """Returns what a robot that stood at several headings shows of the floor's slope."""
   if not log.exists():
     return Part()
-  spec = mujoco.MjSpec.from_string(OP3().mjcf_model.to_xml_string())
-  spec.body(constants.TORSO_LINK).add_freejoint()
-  spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
-  return floor.find(spec.compile(), [read_log(log)]) or Part()
+  return floor.find(standing_model(), [read_log(log)]) or Part()

@@ -9,7 +9,6 @@ from typing import Any
 from nerf2real.core import files
 from nerf2real.evaluation import policy_names
 
-WALKER = policy_names.WALKER
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"
 
@@ -56,11 +55,6 @@ class LoopSettings:
   out: Path = Path("out/loop")
   """Folder of everything; the same command goes on in it."""
 
-  @property
-  def camera_source(self) -> int | str:
-    """The robot's camera: a device's number, or a file or URL."""
-    return int(self.camera) if self.camera.isdigit() else self.camera
-
 
 def policy_folder(settings: LoopSettings) -> Path | None:
   """Returns the folder of the policy; None for the scripted walker.
@@ -68,7 +62,7 @@ def policy_folder(settings: LoopSettings) -> Path | None:
   Raises:
     ValueError: There is none.
   """
-  if settings.policy == WALKER:
+  if settings.policy in policy_names.WALKERS:
     return None
   return policy_names.policy_folder(settings.policy, task=TASK)
 
@@ -76,13 +70,15 @@ def policy_folder(settings: LoopSettings) -> Path | None:
 def claim(settings: LoopSettings) -> None:
   """Makes the folder this loop's; trials, minutes and names may change from run to run.
 
-  What is hidden is noted as a digest: a folder tells nobody before the end.
+  What is hidden is written as a digest alone until the end.
 
   Raises:
     ValueError: It is another loop's.
   """
+  from nerf2real.agents.dmpo.policy.export import read_record
+
   folder = policy_folder(settings) if settings.policy else None
-  digest = "" if folder is None else json.loads((folder / "policy.json").read_text())["sha256"]
+  digest = "" if folder is None else read_record(folder)["sha256"]
   own: dict[str, Any] = {
     "policy": digest or settings.policy,
     "robot": settings.robot,

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+from nerf2real.core import markdown
 from nerf2real.core.serialization import to_plain, write_json
 from nerf2real.evaluation.episodes import Store
 from nerf2real.evaluation.loop import machines, trials
@@ -57,13 +58,18 @@ def find_severity(settings: LoopSettings, say: Say) -> list[Step]:
 
 def as_text(steps: list[Step]) -> str:
   """Returns the steps as a table in Markdown."""
-  lines = ["| times | hidden | success | how the trials ended |", "| --- | --- | --- | --- |"]
-  for step in steps:
-    ended = ", ".join(f"{n} {name}" for name, n in step.tally.outcomes.items() if n)
-    lines.append(
-      f"| {step.factor:g} | {', '.join(step.effects) or 'nothing'} | {step.tally} | {ended} |"
+  rows = [
+    (
+      f"{step.factor:g}",
+      ", ".join(step.effects) or "nothing",
+      step.tally,
+      ", ".join(f"{n} {name}" for name, n in step.tally.outcomes.items() if n),
     )
+    for step in steps
+  ]
+  table = markdown.table(("times", "hidden", "success", "how the trials ended"), rows)
   lost = steps[0].tally.share - steps[-1].tally.share
   end = "falls" if lost >= LOSS else "does not fall"
-  lines += ["", f"Success {end} by {100 * LOSS:.0f} points: by {100 * lost:.0f} at the last size."]
-  return "\n".join(lines) + "\n"
+  return (
+    f"{table}\n\nSuccess {end} by {100 * LOSS:.0f} points: by {100 * lost:.0f} at the last size.\n"
+  )

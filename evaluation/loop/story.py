@@ -105,7 +105,7 @@ def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
   wanted = [out / "stand" / f"{name}.mcap" for name in (*_logs(), recording.FLOOR)]
   if settings.robot != recording.VIRTUAL:
     lens = None if settings.lens is None else read_camera_info(settings.lens)
-    camera = None if lens is None else settings.camera_source
+    camera = None if lens is None else settings.camera
     connection = Connection(port=settings.robot, camera=camera, offsets=settings.offsets)
     recording.record_stand(out / "stand", connection, None, seconds=seconds, lens=lens)
     recording.record_floor(out / "stand", connection, None)

@@ -18,11 +18,12 @@ from nerf2real.agents.distill.teacher import TEACHERS, WalkerSettings
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.evaluation import runner
 from nerf2real.evaluation.plants import plant as plants
-from nerf2real.evaluation.plants.plant import NAVIGATION, Plant, Trial
+from nerf2real.evaluation.plants.plant import Plant, Trial
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
 from nerf2real.evaluation.policies import GaitPolicy
 from nerf2real.evaluation.session import choose
 from nerf2real.suite.gaits.evolution import Evolution
+from nerf2real.suite.protocols import NAVIGATION
 
 WALKERS = ("quick", "steady", "swift")  # teachers that navigate
 FITTED = "teacher.json"

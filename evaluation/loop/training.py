@@ -1,7 +1,6 @@
 """Trains a policy on by distillation, with effects drawn from their intervals every episode."""
 
 import contextlib
-import json
 import signal
 import urllib.parse
 from collections.abc import Iterator
@@ -9,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nerf2real.agents.distill import settings as distillation
-from nerf2real.agents.distill.learning.checkpoint import STATE
+from nerf2real.agents.distill.learning.checkpoint import STATE, load_counters
+from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.supervision import training
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.evaluation.loop.teachers import choose_teacher
@@ -33,7 +33,7 @@ def environment_name(settings: LoopSettings, policy: Path | None, effects: Path)
   """Returns the policy's environment, or the preset's, with effects from their intervals."""
   own = distillation.preset(settings.preset).environment
   if policy is not None:
-    own = str(json.loads((policy / "policy.json").read_text())["environment"])
+    own = str(export.read_record(policy)["environment"])
   path, _, query = own.partition("?")
   options = dict(urllib.parse.parse_qsl(query))
   options |= {"effects": str(effects), "draw_effects": "true"}
@@ -91,12 +91,12 @@ def train(
         f"The training ended after {_minutes(run):.1f} of {settings.minutes:g} minutes: the same "
         "command goes on with it."
       )
-  if not (run / POLICY / "policy.json").exists():
+  if not (run / POLICY / export.RECORD).exists():
     raise RuntimeError(
       f"The training gave no policy in {_minutes(run):.1f} minutes, too few for a first student: "
       f"the same command with more than --minutes {settings.minutes:g} goes on with it."
     )
-  info = json.loads((run / POLICY / "policy.json").read_text())["info"]
+  info = export.read_record(run / POLICY)["info"]
   return Trained(run / POLICY, teacher, teachers, count, _minutes(run), int(info["steps"]))
 
 
@@ -113,9 +113,4 @@ def _signals_kept() -> Iterator[None]:
 
 def _minutes(run: Path) -> float:
   """Returns the minutes that a distillation has trained; 0 before its first saved state."""
-  import numpy as np
-
-  if not (run / STATE).exists():
-    return 0.0
-  with np.load(run / STATE, allow_pickle=False) as stored:
-    return float(json.loads(stored["counters"].tobytes())["elapsed"]) / 60
+  return load_counters(run / STATE).elapsed / 60 if (run / STATE).exists() else 0.0

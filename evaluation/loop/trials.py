@@ -9,20 +9,22 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from nerf2real.agents.environments.loading import camera_settings
-from nerf2real.agents.environments.trials import Interval, clopper_pearson
+from nerf2real.core.intervals import Interval, clopper_pearson
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
 from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.evaluation.plants import plant as plants
-from nerf2real.evaluation.plants.plant import NAVIGATION, Plant
+from nerf2real.evaluation.plants.making import free_name, make_plant
+from nerf2real.evaluation.plants.plant import Plant
 from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy, resolution
-from nerf2real.evaluation.session import choose, free_name
+from nerf2real.evaluation.session import choose
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual.undeclared import Undeclared
+from nerf2real.suite.protocols import NAVIGATION
 
 Say = Callable[[str], None]
 
@@ -132,12 +134,11 @@ def plant_label(settings: LoopSettings, condition: Condition) -> str:
 def _setting(
   policy: EvaluatedPolicy, condition: Condition, settings: LoopSettings
 ) -> episodes.Setting:
-  robot = "virtual" if settings.robot == "virtual" else "robot"
   return episodes.Setting(
     policy=policy.name,
     policy_id=policy.policy_id,
     resolution=resolution(policy),
-    plant="sim" if condition.simulated else robot,
+    plant="sim" if condition.simulated else _robot(settings),
     plant_id="",
     protocol=NAVIGATION,
     perturbation="none",
@@ -147,46 +148,32 @@ def _setting(
 def _make_plant(
   settings: LoopSettings, condition: Condition, scene: Any, policy: EvaluatedPolicy, session: Any
 ) -> Plant:
-  if condition.simulated:
-    from nerf2real.evaluation.plants.simulated import SimulatedPlant
-
-    return SimulatedPlant(
-      scene,
-      NAVIGATION,
-      image_size=policy.image_size,
-      camera=camera_settings(policy.trained_on),
-      effects=condition.effects,
-      draw_effects=condition.effects is not None,
-      time_limit=settings.time_limit,
-    )
-  log = free_name(settings.out / "trials" / f"{_slug(condition.name)}.mcap")
-  if settings.robot == "virtual":
-    from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
-
-    return RehearsedPlant(
-      scene,
-      NAVIGATION,
-      image_size=policy.image_size,
-      robot_seed=settings.seed,
-      altered=condition.altered,
-      session=session.seconds,
-      time_limit=settings.time_limit,
-      record=log,
-    )
-  from nerf2real.evaluation.plants.operated import OperatedPlant
-
-  return OperatedPlant(
-    scene,
-    NAVIGATION,
+  name = "sim" if condition.simulated else _robot(settings)
+  evaluation = EvaluationSettings(
+    plant=name,
+    scene=settings.scene,
+    effects=condition.effects,
     robot=settings.robot,
-    camera=settings.camera_source,
-    image_size=policy.image_size,
-    robot_name=settings.robot,
-    time_limit=settings.time_limit,
-    record=log,
+    robot_seed=(settings.seed,),
+    camera=settings.camera,
     offsets=settings.offsets,
     lens=settings.lens,
+    time_limit=settings.time_limit,
   )
+  return make_plant(
+    evaluation,
+    scene,
+    policy.image_size,
+    trained_on=policy.trained_on,
+    record=free_name(settings.out / "trials" / f"{_slug(condition.name)}.mcap"),
+    draw_effects=condition.effects is not None,
+    altered=condition.altered,
+    session=session.seconds,
+  )
+
+
+def _robot(settings: LoopSettings) -> Literal["virtual", "robot"]:
+  return "virtual" if settings.robot == "virtual" else "robot"
 
 
 class _Session:

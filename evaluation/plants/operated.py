@@ -34,6 +34,7 @@ class OperatedPlant(RobotPlant):
   """Episodes on a robot. Any key ends one; there is no pose unless an observer gives it."""
 
   name = "robot"
+  plant_id = "op3"
 
   def __init__(
     self,
@@ -44,7 +45,6 @@ class OperatedPlant(RobotPlant):
     robot: Any,
     camera: Any,
     image_size: tuple[int, int] | None,
-    robot_name: str = "op3",
     time_limit: float | None = None,
     record: Path | None = None,
     offsets: Path | None = None,
@@ -58,12 +58,11 @@ class OperatedPlant(RobotPlant):
 
     Args:
       scene: An opened bundle of the room.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       robot: Serial port, or a `real.loading.Connection`.
       camera: Device number, file or URL.
       image_size: Height and width of the policy's picture; None for no camera.
-      robot_name: Which robot, for the tables.
       time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
       offsets: The robot's `offset.yaml`.
@@ -74,7 +73,6 @@ class OperatedPlant(RobotPlant):
       say: Shows the operator a line.
     """
     super().__init__(scene, protocol, perturbation, record=record)
-    self.plant_id = robot_name
     connection = Connection(port=robot) if isinstance(robot, str) else robot
     own = {"camera": camera, "offsets": offsets, "lens": lens}
     given = {name: value for name, value in own.items() if value is not None}

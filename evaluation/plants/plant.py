@@ -6,21 +6,17 @@ from typing import Any, NamedTuple
 import dm_env
 import numpy as np
 
+from nerf2real.core import errors
 from nerf2real.evaluation.plants import perturbations
 from nerf2real.suite import protocols
-from nerf2real.suite.gaits.walker import Pose
-from nerf2real.suite.protocols import BallTrial, NavigationTrial
+from nerf2real.suite.pose import Pose
+from nerf2real.suite.protocols import BALL, PROTOCOLS, BallTrial, NavigationTrial
 from nerf2real.suite.tasks import catalogue, rewards
 
 Trial = NavigationTrial | BallTrial
 
-NAVIGATION, BALL, GAIN = "navigation", "ball", "gain"
-PROTOCOLS = (NAVIGATION, BALL, GAIN)
-TASKS = {
-  NAVIGATION: catalogue.NERF_NAV,
-  GAIN: catalogue.NERF_NAV,
-  BALL: catalogue.BALL_PUSH,
-}
+TASKS = {name: task for task, names in catalogue.PROTOCOLS.items() for name in names}
+"""Task of every protocol."""
 
 
 class Sight(NamedTuple):
@@ -44,7 +40,7 @@ class Plant(abc.ABC):
 
     Args:
       scene: An opened bundle.
-      protocol: One of PROTOCOLS.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
     """
     self.scene, self.protocol, self.perturbation = scene, protocol, perturbation
@@ -74,7 +70,7 @@ class Plant(abc.ABC):
 
   @abc.abstractmethod
   def sight(self) -> Sight:
-    """Returns what an observer sees now."""
+    """Returns the observer's present view of the robot."""
 
   def reached(self, sight: Sight) -> bool | None:
     """Returns whether the goal is reached; None where it is not measured."""
@@ -111,20 +107,17 @@ def trials(protocol: str) -> tuple[tuple[str, Trial], ...]:
   Raises:
     ValueError: Unknown protocol.
   """
-  if protocol == NAVIGATION:
-    return tuple((NAVIGATION, trial) for trial in protocols.navigation())
-  if protocol == BALL:
-    return tuple(
-      (trial.setting, trial) for trial in protocols.ball_center() + protocols.ball_wall()
-    )
-  if protocol == GAIN:
-    return tuple((gain_group(trial), trial) for trial in protocols.camera_gain())
-  raise ValueError(f"Unknown protocol {protocol!r}: expected one of {PROTOCOLS}.")
+  if protocol not in PROTOCOLS:
+    raise ValueError(errors.unknown_name("protocol", protocol, PROTOCOLS))
+  return tuple((_group(protocol, trial), trial) for trial in PROTOCOLS[protocol]())
 
 
-def gain_group(trial: NavigationTrial) -> str:
-  """Returns the group of a trial of the gain ablation, by the camera's own number."""
-  return f"gain {round(trial.camera_gain * protocols.DEFAULT_GAIN)}"
+def _group(protocol: str, trial: Trial) -> str:
+  if isinstance(trial, BallTrial):
+    return trial.setting
+  if protocol == protocols.GAIN:  # by the camera's own number
+    return f"gain {round(trial.camera_gain * protocols.DEFAULT_GAIN)}"
+  return protocol
 
 
 def keep_clear(scene: Any, starts: np.ndarray) -> np.ndarray:

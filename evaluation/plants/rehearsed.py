@@ -10,15 +10,14 @@ import numpy as np
 
 from nerf2real import real
 from nerf2real.evaluation.plants import perturbations, swaps
-from nerf2real.evaluation.plants.plant import BALL, TASKS, Sight, Trial, make_intruder
+from nerf2real.evaluation.plants.plant import TASKS, Sight, Trial, make_intruder
 from nerf2real.evaluation.plants.robot_plant import RobotPlant
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.camera import LENS
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.virtual.undeclared import Undeclared
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
-from nerf2real.suite.protocols import NavigationTrial
+from nerf2real.suite.protocols import BALL, NavigationTrial
 
 
 class CoveredCamera:
@@ -62,7 +61,7 @@ class RehearsedPlant(RobotPlant):
 
     Args:
       scene: An opened bundle of the room that the robot stands in.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the policy's picture; None for no camera.
       robot_seed: Which robot: the seed of what is hidden in it; None: as in the data sheets.
@@ -151,11 +150,10 @@ class RehearsedPlant(RobotPlant):
       or truth.position[2] < MIN_HEIGHT
       or self._stopped_by_a_fall()
     )
-    pose = Pose(float(truth.position[0]), float(truth.position[1]), truth.yaw)
     ball = None if truth.ball is None else truth.ball[:2]
     # Touching the room is a failure of navigation alone (paper, "Tasks").
     touched = truth.touches_room and self.protocol != BALL
-    return Sight(pose, ball, touched or self._hit, bool(fallen))
+    return Sight(truth.pose, ball, touched or self._hit, bool(fallen))
 
   def close(self) -> None:
     self._environment.close()

@@ -6,12 +6,12 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from nerf2real.evaluation.plants.plant import BALL, Plant, Trial
+from nerf2real.evaluation.plants.plant import Plant, Trial
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.safety.monitor import Reason
 from nerf2real.suite import protocols
-from nerf2real.suite.gaits.walker import Pose
-from nerf2real.suite.protocols import BallTrial
+from nerf2real.suite.pose import Pose
+from nerf2real.suite.protocols import BALL, BallTrial
 from nerf2real.suite.tasks.workspace import find_workspace
 
 
@@ -25,7 +25,7 @@ class RobotPlant(Plant):
 
     Args:
       scene: An opened bundle of the room.
-      protocol: One of `plant.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       record: Where the run is recorded; not recorded if None.
     """
@@ -51,10 +51,9 @@ class RobotPlant(Plant):
     if isinstance(trial, BallTrial):
       assert self._workspace is not None
       robot, ball = self._workspace.starts(trial, self.scene.free_space)
-      return Pose(float(robot[0]), float(robot[1]), trial.robot_yaw), ball
+      return Pose.of(robot, trial.robot_yaw), ball
     self._environment.set_goal(trial.goal)
-    x, y = (float(value) for value in self._starts[trial.position])
-    return Pose(x, y, trial.yaw), None
+    return Pose.of(self._starts[trial.position], trial.yaw), None
 
   def _stopped_by_a_fall(self) -> bool:
     stop = self._environment.stop

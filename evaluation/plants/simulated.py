@@ -10,7 +10,6 @@ from nerf2real import suite
 from nerf2real.evaluation.plants import perturbations, swaps
 from nerf2real.evaluation.plants.plant import TASKS, Plant, Sight, Trial, make_intruder
 from nerf2real.suite import protocols
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.sensors.camera import CameraSettings
 from nerf2real.suite.tasks import nerf_nav
@@ -39,7 +38,7 @@ class SimulatedPlant(Plant):
 
     Args:
       scene: An opened bundle.
-      protocol: One of `plants.PROTOCOLS`.
+      protocol: One of `protocols.PROTOCOLS`.
       perturbation: One of `perturbations.PERTURBATIONS`.
       image_size: Height and width of the picture; None for no camera.
       camera: Settings of the camera; the suite's own if None.
@@ -114,10 +113,9 @@ class SimulatedPlant(Plant):
 
   def sight(self) -> Sight:
     task = self.task
-    x, y = (float(value) for value in task.state.position[:2])
     ball = task.ball_position[:2] if self.protocol == "ball" else None
     collided = task.ending == nerf_nav.COLLISION or self._hit
-    return Sight(Pose(x, y, task.state.yaw), ball, collided, task.ending == nerf_nav.FALL)
+    return Sight(task.state.pose, ball, collided, task.ending == nerf_nav.FALL)
 
   def close(self) -> None:
     self._environment.close()

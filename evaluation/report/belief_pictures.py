@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from nerf2real.agents.dmpo.policy import belief_plot
-from nerf2real.agents.dmpo.policy.acting import task_of
+from nerf2real.agents.dmpo.policy.acting import Agent, task_of
 from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.agents.dmpo.specs import planar_pose
 from nerf2real.agents.environments.loading import make_environment
@@ -27,19 +27,17 @@ def run_episode(
   scene = task.scene
   height = round(_SCALE * float(scene.extent[1][1] - scene.extent[0][1]))
   floor = floor_picture.draw(scene.free_space, scene.extent, height=height)
-  timestep, state = environment.reset(), policy.initial_state()
+  timestep, agent = environment.reset(), Agent(policy, layout, seed=0, deterministic=True)
   goal = getattr(task, "goal", None)
   frames: list[np.ndarray] = []
-  errors: list[float] = []
+  errors = agent.errors
   while not timestep.last() and len(errors) < max_steps:
     flat = layout.flatten(timestep.observation)
-    step = policy.step(flat.image, flat.state, state)
-    state = step.state
+    action = agent.act(flat)
     truth = planar_pose(flat.privileged, layout.pose_columns)[:2]
-    errors.append(float(np.linalg.norm(policy.believed_position(step.embedding) - truth)))
-    heat = belief_plot.draw(floor, *policy.belief(step.embedding), truth=truth, target=goal)
+    heat = belief_plot.draw(floor, *policy.belief(agent.embedding), truth=truth, target=goal)
     frames.append(_beside(flat.image, heat, f"{len(errors) - 1}: {errors[-1]:.2f} m"))
-    timestep = environment.step(step.mean)
+    timestep = environment.step(action)
   chosen = np.unique(np.linspace(0, len(frames) - 1, moments).round().astype(int))
   return [frames[i] for i in chosen], errors
 

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.agents.environments.trials import clopper_pearson
+from nerf2real.core import markdown
+from nerf2real.core.intervals import clopper_pearson
 from nerf2real.evaluation import episodes as kept
 from nerf2real.evaluation.episodes import Episode, select
 from nerf2real.suite import protocols
@@ -245,6 +246,5 @@ def paper_tables(found: Sequence[Episode]) -> list[Table]:
 
 def as_text(table: Table) -> str:
   """Returns a table in Markdown."""
-  lines = ["| " + " | ".join(table.header) + " |", "|" + " --- |" * len(table.header)]
-  lines += ["| " + " | ".join((row.name, *row.cells)) + " |" for row in table.rows]
-  return f"{table.title}\n\n" + "\n".join(lines) + "\n"
+  rows = markdown.table(table.header, [(row.name, *row.cells) for row in table.rows])
+  return f"{table.title}\n\n{rows}\n"

@@ -129,9 +129,7 @@ def find_board(name: str, picture: np.ndarray, *, corners: tuple[int, int]) -> V
   return View(name=name, corners=fine.reshape(-1, 2).astype(np.float32), size=size)
 
 
-def calibrate(
-  views: Iterable[View], *, corners: tuple[int, int], square: float = 1.0
-) -> Calibration:
+def calibrate(views: Iterable[View], *, corners: tuple[int, int]) -> Calibration:
   """Fits an OPENCV model to views of a board.
 
   Views whose error is far above the median (blurred, or wrongly found) are left out. The
@@ -141,7 +139,6 @@ def calibrate(
   Args:
     views: From `find_board`, in the order they were taken.
     corners: As in `find_board`.
-    square: Side of a square [m]; the lens does not depend on it.
 
   Raises:
     ValueError: Too few views, or of different sizes.
@@ -150,7 +147,8 @@ def calibrate(
   _check(kept)
   width, height = kept[0].size
   board = np.zeros((corners[0] * corners[1], 3), np.float32)
-  board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2) * square
+  # squares of side 1: the lens does not depend on it
+  board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
   values, errors = _fit(kept, board)
   limit = _OUTLIER * np.median(errors)
   rejected = tuple(v.name for v, e in zip(kept, errors, strict=True) if e > limit)

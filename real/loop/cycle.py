@@ -115,7 +115,7 @@ class Cycle:
     return self._torque_off
 
   def rearm(self) -> None:
-    """Forgets the stop."""
+    """Clears the stop."""
     with self._commands:
       self._monitor.arm(self._bus.clock.now())
       self.stop = None
@@ -172,7 +172,7 @@ class Cycle:
     self, imu: ImuReading | None, gravity: np.ndarray | None, joints: JointReading | None
   ) -> None:
     recorder, wall = self._recorder, self._bus.clock.wall
-    if imu is not None:
+    if imu is not None and gravity is not None:
       recorder.imu(wall(imu.stamp), imu.gyroscope, imu.accelerometer, gravity)
     if joints is not None:
       recorder.joints(

@@ -272,7 +272,7 @@ class RobotEnvironment(dm_env.Environment):
     self.timing.add("imu age", imu_age)
     self.timing.add("joint age", joint_age)
     found = collections.OrderedDict(
-      (name, sensing.read(name)) for name in policy_specs.PROPRIOCEPTION
+      (name, sensing.histories.read(name)) for name in policy_specs.PROPRIOCEPTION
     )
     found["goal"] = self._goal.astype(np.float32)
     if self._pictures is not None:

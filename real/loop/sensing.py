@@ -14,9 +14,9 @@ import numpy as np
 
 from nerf2real.real.wire.bus import JointReading
 from nerf2real.real.wire.opencr import ImuReading
-from nerf2real.suite import specs
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.histories import Histories
 from nerf2real.suite.sensors.madgwick import Madgwick
 
 _LONG_GAP = 1.5  # periods after which a sample was missed
@@ -41,10 +41,7 @@ class Sensing:
     self._joints: JointReading | None = None
     self._zero = np.zeros(3)  # rad/s that the gyroscope reads at rest
     self._rest: list[np.ndarray] | None = None  # readings at rest, while they are collected
-    self._histories = {
-      name: np.zeros((specs.HISTORY, size), np.float32)
-      for name, (size, _) in specs.PROPRIOCEPTION.items()
-    }
+    self.histories = Histories()
 
   def take_imu(self, reading: ImuReading) -> np.ndarray:
     """Takes an IMU reading; returns the direction of gravity [3] in the torso."""
@@ -108,11 +105,6 @@ class Sensing:
     """The newest reading of the joints."""
     return self._joints
 
-  @property
-  def gravity(self) -> np.ndarray | None:
-    """The newest estimate of the direction of gravity [3] in the torso."""
-    return None if self._imu is None else self._imu[3]
-
   def ages(self, time: float) -> tuple[float, float]:
     """Returns how old [s] the newest IMU reading and the oldest joint of the newest are."""
     assert self._imu is not None and self._joints is not None
@@ -120,19 +112,11 @@ class Sensing:
 
   def start(self, control: np.ndarray) -> None:
     """Fills the histories with what is now and a control signal [J], normalised."""
-    for name, value in self._newest(control).items():
-      self._histories[name][:] = value
+    self.histories.fill(self._newest(control))
 
   def push(self, control: np.ndarray) -> None:
     """Moves the histories on by one control step, in which `control` [J] was applied."""
-    for name, value in self._newest(control).items():
-      history = self._histories[name]
-      history[:-1] = history[1:]
-      history[-1] = value
-
-  def read(self, name: str) -> np.ndarray:
-    """Returns a history [H, size], oldest first, float32."""
-    return self._histories[name].copy()
+    self.histories.push(self._newest(control))
 
   def _newest(self, control: np.ndarray) -> dict[str, np.ndarray]:
     imu, joints = self._imu, self._joints

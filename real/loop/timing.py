@@ -1,4 +1,4 @@
-"""How well the loop keeps its time: durations, ages of what was observed, missed deadlines."""
+"""Timing statistics of the control loop: durations, ages of observations, missed deadlines."""
 
 import collections
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ class Timing:
     self.counts[name] += number
 
   def reset(self) -> None:
-    """Forgets everything."""
+    """Clears the measurements."""
     self.values.clear()
     self.counts.clear()
 

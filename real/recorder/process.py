@@ -29,10 +29,8 @@ def nanoseconds(seconds: float) -> int:
   return whole * messages.SECOND + round((seconds - whole) * messages.SECOND)
 
 
-def image(time_ns: int, picture: bytes | np.ndarray) -> messages.Message:
-  """Returns a picture, JPEG or RGB uint8 [H, W, 3], as a message."""
-  if isinstance(picture, bytes):
-    return messages.image(time_ns, picture)
+def image(time_ns: int, picture: np.ndarray) -> messages.Message:
+  """Returns a picture, RGB uint8 [H, W, 3], as a message."""
   done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
   if not done:
     raise ValueError(f"OpenCV cannot encode a picture of shape {picture.shape}.")

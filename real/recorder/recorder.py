@@ -110,11 +110,12 @@ class Recorder:
     t: float,
     names: Sequence[str],
     positions: Sequence[float],
-    velocities: Sequence[float] | None = None,
-    currents: Sequence[float] | None = None,
-    voltages: Sequence[float] | None = None,
-    pwm: Sequence[float] | None = None,
-    stamps: Sequence[float] | None = None,
+    velocities: Sequence[float],
+    currents: Sequence[float],
+    voltages: Sequence[float],
+    pwm: Sequence[float],
+    *,
+    stamps: Sequence[float],
   ) -> None:
     """Notes one reading of the joints, J numbers each.
 
@@ -129,19 +130,15 @@ class Recorder:
       stamps: When each joint was read, s since 1970.
     """
     # Not efforts: amperes, volts, shares and seconds travel in a JointState's effort, by topic.
-    others = {
+    others: dict[str, Sequence[float] | np.ndarray] = {
       messages.CURRENTS: currents,
       messages.VOLTAGES: voltages,
       messages.PWM: pwm,
-      messages.STAMPS: None if stamps is None else np.asarray(stamps) - t,
+      messages.STAMPS: np.asarray(stamps) - t,
     }
     self._put(
       _joint_state(messages.STATES, t, names, position=positions, velocity=velocities),
-      *(
-        _joint_state(topic, t, names, effort=values)
-        for topic, values in others.items()
-        if values is not None
-      ),
+      *(_joint_state(topic, t, names, effort=values) for topic, values in others.items()),
     )
 
   def imu(
@@ -149,18 +146,14 @@ class Recorder:
     t: float,
     gyro: Sequence[float],
     accel: Sequence[float],
-    gravity: Sequence[float] | None = None,
+    gravity: Sequence[float],
   ) -> None:
     """Notes turning rates [rad/s], specific force [m/s^2] and the estimate of gravity, [3] each."""
-    calls: list[Call] = [("imu", t, (_copy(gyro), _copy(accel)), {})]
-    if gravity is not None:
-      calls.append(("gravity", t, (_copy(gravity),), {}))
-    self._put(*calls)
+    self._put(("imu", t, (_copy(gyro), _copy(accel)), {}), ("gravity", t, (_copy(gravity),), {}))
 
-  def image(self, t: float, jpeg_or_array: bytes | np.ndarray) -> None:
-    """Notes a picture, JPEG or RGB uint8 [H, W, 3]."""
-    data = jpeg_or_array if isinstance(jpeg_or_array, bytes) else np.array(jpeg_or_array, np.uint8)
-    self._put(("image", t, (data,), {}))
+  def image(self, t: float, picture: np.ndarray) -> None:
+    """Notes a picture, RGB uint8 [H, W, 3]."""
+    self._put(("image", t, (np.array(picture, np.uint8),), {}))
 
   def camera_info(self, t: float, camera: Camera) -> None:
     """Notes the lens."""
@@ -244,10 +237,10 @@ class Recorder:
 
 
 def _joint_state(
-  topic: str, t: float, names: Sequence[str], **fields: Sequence[float] | np.ndarray | None
+  topic: str, t: float, names: Sequence[str], **fields: Sequence[float] | np.ndarray
 ) -> Call:
   return "joint_state", t, (topic, tuple(names)), {k: _copy(v) for k, v in fields.items()}
 
 
-def _copy(values: Sequence[float] | np.ndarray | None) -> Any:
-  return None if values is None else np.array(values, np.float64)
+def _copy(values: Sequence[float] | np.ndarray) -> np.ndarray:
+  return np.array(values, np.float64)

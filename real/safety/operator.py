@@ -22,7 +22,7 @@ class Operator(Protocol):
     """Returns whether a key was pressed since the last call; never waits."""
 
   def support(self, held: bool) -> None:
-    """Asks to hold the robot (True) or to let it go (False); returns when that is so."""
+    """Requests to hold the robot (True) or to let it go (False); returns when that is so."""
 
   def close(self) -> None:
     """Gives the terminal back."""
@@ -65,7 +65,7 @@ class Terminal:
     self._asking = False
 
   def ask(self, question: str) -> str:
-    """Asks and returns the line that is typed; meanwhile Escape stops the robot, no other key."""
+    """Returns the line typed to a question; meanwhile Escape stops the robot, no other key."""
     if not self._open:
       return input(question)
     print(question, end="", flush=True)

@@ -18,6 +18,7 @@ from nerf2real.core import rotations
 from nerf2real.real.virtual.hidden import Hidden, Load
 from nerf2real.real.virtual.motors import Motors
 from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.sensors import filters
 from nerf2real.suite.sensors.delays import History
 
@@ -53,6 +54,11 @@ class Truth(NamedTuple):
   def yaw(self) -> float:
     """Heading [rad]."""
     return rotations.yaw_of(self.rotation)
+
+  @property
+  def pose(self) -> Pose:
+    """Place and heading on the floor."""
+    return Pose.of(self.position, self.yaw)
 
 
 class Body:

@@ -65,7 +65,7 @@ class VirtualRobotProcess:
     self._ask("push", np.asarray(force))
 
   def truth(self) -> Truth:
-    """Returns what an observer sees now."""
+    """Returns the observer's present view of the robot."""
     return self._ask("truth")
 
   def set_faults(self, **faults: Any) -> None:

@@ -117,7 +117,7 @@ class VirtualRobot:
     self.body.push = np.asarray(force, np.float64)
 
   def truth(self) -> Truth:
-    """Returns what an observer sees now."""
+    """Returns the observer's present view of the robot."""
     with self.body.lock:
       self.body.advance(self.clock.now())
       return self.body.truth()

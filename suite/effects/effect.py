@@ -145,7 +145,7 @@ class Operator:
     return time
 
   def overrides(self, hook: str) -> bool:
-    """Tells whether this operator has its own version of a hook."""
+    """Returns whether this operator has its own version of a hook."""
     return getattr(type(self), hook) is not getattr(Operator, hook)
 
   def value(self, effect: Effect, name: str) -> float:

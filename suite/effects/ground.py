@@ -1,4 +1,4 @@
-"""The floor and what rolls on it."""
+"""Effects of the floor: slope, sliding friction, rolling resistance."""
 
 import mujoco
 import numpy as np

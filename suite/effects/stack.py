@@ -1,11 +1,9 @@
 """A list of effects, bound to a model: called once a physics step and once a measurement."""
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from nerf2real.suite.effects import files
 from nerf2real.suite.effects.binding import Binding
@@ -33,11 +31,6 @@ class EffectStack:
       files.check(effect)
     self.binding: Binding | None = None
     self.operators: list[Operator] = []
-
-  @classmethod
-  def from_file(cls, path: str | Path) -> "EffectStack":
-    """Reads the effects from effects.json."""
-    return cls(files.read_effects(path))
 
   def bind(self, model: Any, *, joints: Sequence[str] | None = None) -> "EffectStack":
     """Puts the effects into a compiled model and returns self.
@@ -154,27 +147,6 @@ class EffectStack:
     for operator in self._stamps:
       time = operator.stamp(time)
     return time
-
-  def rollout(self, data: Any, controls: Array) -> tuple[Array, Array]:
-    """Steps once for each command and returns the bound joints' motion, from `data` on.
-
-    Args:
-      data: mujoco.MjData, advanced in place.
-      controls: commands [T, U], one a physics step.
-
-    Returns:
-      Positions [T, J] and velocities [T, J] after each step (true, not measured).
-    """
-    binding = self._bound()
-    data = getattr(data, "ptr", data)
-    positions = np.empty((len(controls), len(binding.joints)))
-    velocities = np.empty_like(positions)
-    for index, ctrl in enumerate(controls):
-      self.before_step(data, ctrl)
-      mujoco.mj_step(binding.model, data)
-      positions[index] = data.qpos[binding.qpos]
-      velocities[index] = data.qvel[binding.dofs]
-    return positions, velocities
 
   def _bound(self) -> Binding:
     if self.binding is None:

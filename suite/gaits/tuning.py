@@ -1,7 +1,7 @@
-"""Searches for the gait's parameters in simulation: walks on an empty floor, better ones win.
+"""Searches for the gait's parameters in simulation, by CMA-ES over walks on an empty floor.
 
 Every candidate walks in several worlds (servo strength, friction, delays, floor), so that the gait
-does not lean on one of them. The best parameters are the defaults in
+does not depend on one of them. The best parameters are the defaults in
 `suite.gaits.walk.GaitSettings`.
 """
 
@@ -16,8 +16,8 @@ from nerf2real.suite.gaits import walk
 from nerf2real.suite.gaits.evolution import Evolution
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import Start
 
 # Parameter: (lower, upper) bound of the search.
 BOUNDS = {
@@ -77,7 +77,7 @@ def make_environments(count: int, seconds: float) -> list[suite.environment.Envi
     for index, effects in enumerate(WORLDS[:count])
   ]
   for environment in environments:
-    environment.task.set_start(Start((0.0, 0.0), 0.0))
+    environment.task.set_start(Pose(0.0, 0.0, 0.0))
   return environments
 
 

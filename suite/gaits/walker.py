@@ -7,7 +7,7 @@ turning rate and the steps that it has commanded.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,22 +16,10 @@ from nerf2real.suite.gaits.planner import Planner
 from nerf2real.suite.gaits.pushing import Push, PushSettings
 from nerf2real.suite.gaits.walk import Command, Gait, GaitSettings
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 
 _TIMESTEP = constants.CONTROL_TIMESTEP
 _HEAD = [constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt")]
-
-
-class Pose(NamedTuple):
-  """Where the robot is on the floor."""
-
-  x: float  # m
-  y: float  # m
-  yaw: float  # rad
-
-  @property
-  def xy(self) -> np.ndarray:
-    """The place [2] [m]."""
-    return np.array([self.x, self.y])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -168,14 +156,14 @@ class Walker:
     further = np.flatnonzero(distance[nearest:] >= ahead)
     return path[nearest + int(further[0])] if len(further) else path[-1]
 
-  def _aim(self, point: np.ndarray, *, speed: float = 1.0) -> Command:
+  def _aim(self, point: np.ndarray) -> Command:
     """Returns the command that turns and walks to a point [2]."""
     steering = self.steering
     offset = point - self.pose.xy
     error = np.arctan2(offset[1], offset[0]) - self.pose.yaw
     error = float((error + np.pi) % (2 * np.pi) - np.pi)
     turn = float(np.clip(steering.turn_gain * error, -1.0, 1.0))
-    forward = speed * max(0.0, 1.0 - abs(error) / steering.turn_first)
+    forward = max(0.0, 1.0 - abs(error) / steering.turn_first)
     return Command(forward=forward, turn=turn)
 
   def _push(self, ball: np.ndarray, target: np.ndarray) -> Command:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from dm_control import composer, mjcf
-from dm_control.composer.observation import observable
 
 from nerf2real.suite.op3 import constants
 
@@ -129,9 +128,6 @@ class OP3(composer.Robot):
       )
     return body
 
-  def _build_observables(self) -> "OP3Observables":
-    return OP3Observables(self)
-
   @property
   def mjcf_model(self) -> Any:
     return self._root
@@ -176,25 +172,3 @@ class OP3(composer.Robot):
   def control_limits(self) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper position targets [20] [rad]."""
     return self._lower.copy(), self._upper.copy()
-
-
-class OP3Observables(composer.Observables):
-  """The robot's true state, undelayed and unfiltered; off unless enabled."""
-
-  @composer.observable
-  def joint_positions(self) -> Any:
-    return observable.MJCFFeature("qpos", self._entity.joints)
-
-  @composer.observable
-  def joint_velocities(self) -> Any:
-    return observable.MJCFFeature("qvel", self._entity.joints)
-
-  @composer.observable
-  def gyroscope(self) -> Any:
-    return observable.MJCFFeature("sensordata", self._entity.mjcf_model.find("sensor", "gyroscope"))
-
-  @composer.observable
-  def accelerometer(self) -> Any:
-    return observable.MJCFFeature(
-      "sensordata", self._entity.mjcf_model.find("sensor", "accelerometer")
-    )

@@ -66,6 +66,18 @@ class RandomisationSettings:
   """N, horizontal; chosen: 0.08 to 0.7 m/s for the 3.2 kg robot if nothing held it."""
 
 
+NOMINAL = RandomisationSettings(
+  pushes=False,
+  delays=False,
+  jitter=False,
+  torso_mass=False,
+  imu_pose=False,
+  ball_mass=False,
+  ball_radius=False,
+)
+"""Every switch off: all episodes are the nominal one."""
+
+
 class Pushes(NamedTuple):
   """Horizontal forces on the torso over an episode, N pushes in order of time."""
 

@@ -26,7 +26,7 @@ class History:
     """Samples pushed so far."""
 
   def clear(self) -> None:
-    """Forgets everything."""
+    """Clears the queue."""
     self.count = 0
 
   @property

@@ -13,8 +13,6 @@ at the bandwidth (`CHIP_BANDWIDTH_HZ`) and a constant transport delay (`CHIP_DEL
 line may add.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy import signal
 
@@ -33,67 +31,42 @@ MIN_DELAY, MAX_DELAY = 0.010, 0.050  # s, paper, constant over an episode
 JITTER = 0.005  # s, paper
 
 
-class Coefficients(NamedTuple):
-  """y[k] = b0 x[k] + b1 x[k-1] + b2 x[k-2] - a1 y[k-1] - a2 y[k-2]."""
-
-  b0: float
-  b1: float
-  b2: float
-  a1: float
-  a2: float
-
-
-def low_pass_coefficients(cutoff_hz: float, sample_rate_hz: float, *, order: int) -> Coefficients:
-  """Returns the digital Butterworth low-pass of order 1 or 2 (bilinear, pre-warped).
-
-  Args:
-    cutoff_hz: frequency at which the gain is 1/sqrt(2), Hz, below half the sample rate.
-    sample_rate_hz: rate of the calls, Hz.
-    order: 1 or 2.
-  """
-  if not 0 < cutoff_hz < sample_rate_hz / 2:
-    raise ValueError(
-      f"Found a cutoff of {cutoff_hz} Hz at {sample_rate_hz} Hz sampling, expected between 0 and"
-      f" half the sampling rate, {sample_rate_hz / 2} Hz."
-    )
-  if order not in (1, 2):
-    raise ValueError(f"Found low-pass order {order}, expected 1 or 2.")
-  b, a = signal.butter(order, cutoff_hz, fs=sample_rate_hz)
-  (b0, b1, b2), (_, a1, a2) = (np.append(values, 0.0)[:3].tolist() for values in (b, a))
-  return Coefficients(b0, b1, b2, a1, a2)
-
-
 class LowPass:
-  """A low-pass filter of first or second order over an array of any shape.
+  """First-order digital Butterworth low-pass (bilinear, pre-warped) over an array of any shape.
 
-  The first sample after a reset is taken as the steady state, so that there is no start-up ramp
-  from zero (an accelerometer reads 9.81 m/s^2 from the first sample on).
+  y[k] = b0 x[k] + b1 x[k-1] - a1 y[k-1]. The first sample after a reset is taken as the steady
+  state, so that there is no start-up ramp from zero (an accelerometer reads 9.81 m/s^2 from the
+  first sample on).
   """
 
-  def __init__(self, cutoff_hz: float, sample_rate_hz: float, *, order: int = 1):
-    self.coefficients = low_pass_coefficients(cutoff_hz, sample_rate_hz, order=order)
+  def __init__(self, cutoff_hz: float, sample_rate_hz: float):
+    """Creates the filter.
+
+    Args:
+      cutoff_hz: Frequency at which the gain is 1/sqrt(2), Hz, below half the sample rate.
+      sample_rate_hz: Rate of the calls, Hz.
+    """
+    if not 0 < cutoff_hz < sample_rate_hz / 2:
+      raise ValueError(
+        f"Found a cutoff of {cutoff_hz} Hz at {sample_rate_hz} Hz sampling, expected between 0 and"
+        f" half the sampling rate, {sample_rate_hz / 2} Hz."
+      )
+    (self._b0, self._b1), (_, self._a1) = (
+      values.tolist() for values in signal.butter(1, cutoff_hz, fs=sample_rate_hz)
+    )
     self.reset()
 
   def reset(self) -> None:
-    """Forgets the past: the next sample is the new steady state."""
-    self._started = False
-    self._state1 = self._state2 = np.zeros(())
+    """Clears the state: the next sample is the new steady state."""
+    self._state: Array | None = None
 
   def __call__(self, sample: Array) -> Array:
     """Returns the filtered sample, a new array of the same shape."""
-    b0, b1, b2, a1, a2 = self.coefficients
     x = np.asarray(sample, np.float64)
-    if not self._started:
-      self._started = True
-      # Steady state of the transposed direct form II for a constant input and unit gain.
-      self._state2 = (b2 - a2) * x
-      self._state1 = (b1 - a1) * x + self._state2
-    y = b0 * x + self._state1
-    if b2 == 0 and a2 == 0:
-      self._state1 = b1 * x - a1 * y
-    else:
-      self._state1 = b1 * x - a1 * y + self._state2
-      self._state2 = b2 * x - a2 * y
+    # Steady state of the transposed direct form II for a constant input and unit gain.
+    state = (self._b1 - self._a1) * x if self._state is None else self._state
+    y = self._b0 * x + state
+    self._state = self._b1 * x - self._a1 * y
     return y
 
 

@@ -10,10 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nerf2real.suite import specs
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
 from nerf2real.suite.sensors.delays import DelayLine
+from nerf2real.suite.sensors.histories import Histories
 from nerf2real.suite.sensors.madgwick import Madgwick
 
 _EPSILON = 1e-9  # s, against rounding in sums of time steps
@@ -36,10 +36,7 @@ class Proprioception:
     # Row 0 holds the last values of the previous control step: ticks fall between physics steps.
     self._imu = np.zeros((substeps + 1, 6))
     self._joints = np.zeros((substeps + 1, len(constants.JOINT_NAMES)))
-    self._histories = {
-      name: np.zeros((specs.HISTORY, size), np.float32)
-      for name, (size, _) in specs.PROPRIOCEPTION.items()
-    }
+    self.histories = Histories()
     self._step = 0
     self._tick = 0
     self.observe: Callable[[str, np.ndarray, float], np.ndarray] | None = None
@@ -75,10 +72,7 @@ class Proprioception:
     self._imu[0], self._joints[0] = self._low_pass(imu), joints
     self._step, self._tick = 0, 0
     self._sample(self._imu[0], self._joints[0])
-    values = self._newest(0.0)
-    values["previous_control"] = control
-    for name, history in self._histories.items():
-      history[:] = values[name]
+    self.histories.fill(self._newest(0.0, control))
 
   def record(self, substep: int, imu: np.ndarray, joints: np.ndarray) -> None:
     """Notes the true values at the end of a physics step (0 to S-1) of this control step."""
@@ -105,15 +99,7 @@ class Proprioception:
         (1 - weight) * self._joints[row] + weight * self._joints[row + 1],
       )
     self._imu[0], self._joints[0] = self._imu[-1], self._joints[-1]
-    values = self._newest(end)
-    values["previous_control"] = control
-    for name, history in self._histories.items():
-      history[:-1] = history[1:]
-      history[-1] = values[name]
-
-  def read(self, name: str) -> np.ndarray:
-    """Returns the history of a reading [H, size], oldest first, float32."""
-    return self._histories[name].copy()
+    self.histories.push(self._newest(end, control))
 
   def _sample(self, imu: np.ndarray, joints: np.ndarray) -> None:
     """Takes the sample of one 125 Hz tick."""
@@ -128,11 +114,12 @@ class Proprioception:
     self._joint_line.push(time, np.rint(joints / constants.ENCODER_STEP) * constants.ENCODER_STEP)
     self._tick += 1
 
-  def _newest(self, time: float) -> dict[str, np.ndarray]:
+  def _newest(self, time: float, control: np.ndarray) -> dict[str, np.ndarray]:
     imu = self._imu_line.read(time)
     return {
       "gyroscope": imu[:3],
       "accelerometer": imu[3:6],
       "gravity": imu[6:],
       "joint_positions": self._joint_line.read(time),
+      "previous_control": control,
     }

@@ -12,13 +12,13 @@ from dm_control import composer
 from nerf2real.core import rotations
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.sensors.camera import RobotCamera
 from nerf2real.suite.tasks import catalogue, rewards, touch
 from nerf2real.suite.tasks.ball import Ball
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.privileged import Quantity
 from nerf2real.suite.tasks.settings import TaskSettings
-from nerf2real.suite.tasks.state import Start
 from nerf2real.suite.tasks.workspace import Workspace, find_workspace
 
 NAME = catalogue.BALL_PUSH
@@ -62,7 +62,7 @@ class BallPush(RobotTask):
     self._arena.add_free_entity(self.ball)
     self.ball_start: tuple[float, float] | None = None  # if set, the ball starts here
 
-  def set_start(self, start: Start | None, *, ball_xy: tuple[float, float] | None = None) -> None:
+  def set_start(self, start: Pose | None, *, ball_xy: tuple[float, float] | None = None) -> None:
     """Fixes where robot and ball start in the episodes to come; None draws them again."""
     self.start, self.ball_start = start, ball_xy
 
@@ -73,7 +73,7 @@ class BallPush(RobotTask):
     """
     robot, ball = self.workspace.starts(trial, self.scene.free_space)
     self.set_start(
-      Start((float(robot[0]), float(robot[1])), trial.robot_yaw),
+      Pose.of(robot, trial.robot_yaw),
       ball_xy=(float(ball[0]), float(ball[1])),
     )
 
@@ -104,7 +104,7 @@ class BallPush(RobotTask):
         in_front = False
       self._put_ball((0.0, 0.0), height=10.0)  # out of the way while the robot is placed
       self._stand_somewhere(
-        lambda: Start(tuple(self._free_place(random_state)), random_state.uniform(-np.pi, np.pi))
+        lambda: Pose.of(self._free_place(random_state), random_state.uniform(-np.pi, np.pi))
       )
       if self.ball_start is not None:
         self._put_ball(self.ball_start)

@@ -18,6 +18,7 @@ from nerf2real.suite.effects import Effect, EffectStack
 from nerf2real.suite.effects.drawing import as_gravity, draw_effects
 from nerf2real.suite.environment import Reading
 from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation import draws as randomising
 from nerf2real.suite.sensors import filters
 from nerf2real.suite.sensors.camera import RobotCamera
@@ -25,7 +26,7 @@ from nerf2real.suite.sensors.proprioception import Proprioception
 from nerf2real.suite.tasks import privileged, touch
 from nerf2real.suite.tasks.delayed_picture import DelayedPicture
 from nerf2real.suite.tasks.settings import TaskSettings
-from nerf2real.suite.tasks.state import RobotIndices, RobotState, Start
+from nerf2real.suite.tasks.state import RobotIndices, RobotState
 
 _MAX_START_ATTEMPTS = 100
 
@@ -83,7 +84,7 @@ class RobotTask(composer.Task):
     self._proprioception = Proprioception(
       physics_timestep=settings.physics_timestep, substeps=self._substeps
     )
-    self.start: Start | None = None  # if set, every episode starts here (evaluation, rehearsal)
+    self.start: Pose | None = None  # if set, every episode starts here (evaluation, rehearsal)
     self.hand_force = np.zeros(3)  # N on the torso in the world, in addition to the pushes
     self.draws: randomising.EpisodeDraws | None = None
     self.reward_terms: dict[str, float] = {}
@@ -308,7 +309,7 @@ class RobotTask(composer.Task):
       or self._touch.floor
     )
 
-  def _stand_somewhere(self, draw: Callable[[], Start]) -> None:
+  def _stand_somewhere(self, draw: Callable[[], Pose]) -> None:
     """Stands the robot at `start`, or at a drawn place where it touches nothing but the floor."""
     if self.start is not None:
       self._indices.stand_at(self.start)
@@ -349,7 +350,7 @@ class RobotTask(composer.Task):
       elif name == "camera":
         readings[name] = Reading(self._take_picture, spec)
       else:
-        readings[name] = Reading(functools.partial(self._proprioception.read, name), spec)
+        readings[name] = Reading(functools.partial(self._proprioception.histories.read, name), spec)
     if self.settings.privileged:
       known = privileged.of_robot(
         lambda: self._state, goal=self._goal_position, draws=lambda: self.draws

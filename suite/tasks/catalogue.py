@@ -1,4 +1,4 @@
-"""The tasks' names and the lengths of their episodes: data that needs no simulator."""
+"""The tasks' names, protocols and lengths of episodes: data that needs no simulator."""
 
 from nerf2real.suite import protocols
 
@@ -8,4 +8,9 @@ TIME_LIMITS = {
   NERF_NAV: 30.0,
   BALL_PUSH: protocols.BALL_TIME_LIMIT,  # paper
 }  # s
+PROTOCOLS = {
+  NERF_NAV: (protocols.NAVIGATION, protocols.GAIN),
+  BALL_PUSH: (protocols.BALL,),
+}
+"""Evaluation protocols of a task; policies are evaluated by the first while they learn."""
 ALL_TASKS: tuple[str, ...] = tuple(TIME_LIMITS)

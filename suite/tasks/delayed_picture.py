@@ -18,7 +18,7 @@ _ROUNDING = 1e-9  # of a frame
 
 
 class DelayedPicture:
-  """Remembers the last states and renders the one that the newest picture to arrive shows."""
+  """Keeps the last states and renders the one that the newest picture to arrive shows."""
 
   def __init__(
     self,

@@ -11,11 +11,11 @@ import numpy as np
 
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.sensors.camera import RobotCamera
 from nerf2real.suite.tasks import catalogue, rewards
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.settings import TaskSettings
-from nerf2real.suite.tasks.state import Start
 
 NAME = catalogue.NERF_NAV
 TIME_LIMIT = catalogue.TIME_LIMITS[NAME]  # s
@@ -54,7 +54,7 @@ class NerfNav(RobotTask):
     self._goal = self._goals[(present + 1) % len(self._goals)]
     self.success, self.success_time = False, float("nan")
 
-  def set_start(self, start: Start | None, *, goal_index: int | None = None) -> None:
+  def set_start(self, start: Pose | None, *, goal_index: int | None = None) -> None:
     """Fixes the start pose and the goal of the episodes to come; None draws them again."""
     if goal_index is not None and not 0 <= goal_index < len(self._goals):
       raise ValueError(
@@ -64,8 +64,8 @@ class NerfNav(RobotTask):
 
   def set_trial(self, trial: protocols.NavigationTrial) -> None:
     """Fixes start pose, goal and camera gain to those of a trial of an evaluation protocol."""
-    xy = self.evaluation_starts[trial.position]
-    self.set_start(Start((float(xy[0]), float(xy[1])), trial.yaw), goal_index=trial.goal)
+    start = Pose.of(self.evaluation_starts[trial.position], trial.yaw)
+    self.set_start(start, goal_index=trial.goal)
     if self.robot_camera is not None:
       self.robot_camera.set_gain(trial.camera_gain)
 
@@ -79,9 +79,8 @@ class NerfNav(RobotTask):
     self._goal = self._goals[drawn if self.goal_index is None else self.goal_index]
     rng = np.random.default_rng(random_state.randint(2**31))
 
-    def draw() -> Start:
-      x, y, yaw = self.scene.free_space.sample(rng, 1)[0]
-      return Start((x, y), yaw)
+    def draw() -> Pose:
+      return Pose(*self.scene.free_space.sample(rng, 1)[0])
 
     self._stand_somewhere(draw)
 

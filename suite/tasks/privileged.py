@@ -1,4 +1,4 @@
-"""What only the critic may see: true poses and velocities, and the episode's random draws."""
+"""Privileged observations, for the critic alone: true poses and velocities, the episode's draws."""
 
 from collections.abc import Callable
 from typing import NamedTuple

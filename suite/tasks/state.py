@@ -9,6 +9,7 @@ from dm_control import composer, mjcf
 
 from nerf2real.core import rotations
 from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.tasks import rewards
 from nerf2real.suite.tasks.settings import PHYSICS_TIMESTEP
 
@@ -31,18 +32,16 @@ class RobotState(NamedTuple):
     """Heading in the world [rad]."""
     return rotations.yaw_of(self.aligned)
 
+  @property
+  def pose(self) -> Pose:
+    """Place and heading on the floor."""
+    return Pose.of(self.position, self.yaw)
+
   def relative(self, xy: np.ndarray) -> np.ndarray:
     """Returns a point of the floor [2] relative to the robot, gravity-aligned frame [2] [m]."""
     offset = np.array([xy[0], xy[1], 0.0]) - self.position
     offset[2] = 0.0
     return (offset @ self.aligned)[:2]
-
-
-class Start(NamedTuple):
-  """Where the robot stands at the start of an episode."""
-
-  xy: tuple[float, float]  # m
-  yaw: float  # rad
 
 
 class RobotIndices:
@@ -92,7 +91,7 @@ class RobotIndices:
       joint_velocities=data.qvel[self._joint_dofs],
     )
 
-  def stand_at(self, start: Start) -> None:
+  def stand_at(self, start: Pose) -> None:
     """Writes the standing posture at a place into qpos."""
     posture = standing_posture()
     qpos, root = self._data.qpos, self.root_qpos

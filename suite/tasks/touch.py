@@ -9,7 +9,7 @@ _SCENE, _FLOOR = 1, 2  # bits
 
 
 class Touch:
-  """Remembers what parts of the robot other than the feet have touched in an episode."""
+  """Records what parts of the robot other than the feet have touched in an episode."""
 
   def __init__(self, model: mujoco.MjModel, *, root: int, feet: list[int]):
     """Prepares a table of all pairs of geoms.
@@ -37,7 +37,7 @@ class Touch:
     return bool(self._touched & _FLOOR)
 
   def reset(self) -> None:
-    """Forgets everything for a new episode."""
+    """Clears the record for a new episode."""
     self._touched = 0
 
   def note(self, data: mujoco.MjData) -> None:

@@ -18,6 +18,7 @@ from nerf2real.scenes.geometry.mesh import load_glb
 from nerf2real.suite import loading
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.scene import open_scene
 from nerf2real.suite.viewer.elements import bars, geom_mesh
 from nerf2real.suite.views.drivers import SCRIPTED, Driver, MakeDriver, move_on
 from nerf2real.suite.views.third_person import best_azimuth, clear_distance, direction
@@ -249,7 +250,7 @@ class TaskViewer:
     return self._drivers[name]
 
   def _start_episode(self) -> None:
-    """Forgets a push and shows the robot where it stands now."""
+    """Clears a push and shows the robot where it stands now."""
     self._push_until = 0.0
     self._keep_in_view(within=0.0)
 
@@ -315,7 +316,7 @@ def view_task(
     host: Address to serve on.
     port: Port to serve on.
   """
-  bundle = loading.open_scene(scene)
+  bundle = open_scene(scene)
   renderer = loading.load_renderer(bundle)
   environment = suite.load(
     task,

@@ -1,4 +1,4 @@
-"""What acts in an environment that is shown: a standing robot, random motions, a scripted walker.
+"""Drivers of an environment that is shown: a standing robot, random motions, a scripted walker.
 
 Learned policies come from `evaluation.driving`, with the same protocol.
 """
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from nerf2real.core.floor_map import Extent
-from nerf2real.suite.gaits.walker import Pose, Walker
+from nerf2real.suite.gaits.walker import Walker
 from nerf2real.suite.op3 import constants
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Standing:
     self._action = task.standing_action
 
   def restart(self) -> None:
-    """Has nothing to forget."""
+    """Does nothing: there is no state."""
 
   def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
     return self._action
@@ -78,19 +78,14 @@ class Walking:
     self._pushes = pushes
     self.restart()
 
-  @property
-  def _pose(self) -> Pose:
-    state = self._task.state
-    return Pose(float(state.position[0]), float(state.position[1]), float(state.yaw))
-
   def restart(self) -> None:
-    self._walker.reset(self._pose)
+    self._walker.reset(self._task.state.pose)
 
   def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
     task = self._task
     goal = task.workspace.target if self._pushes else task.goal
     ball = task.ball_position if self._pushes else None
-    return self._walker.act(observation, goal=goal, pose=self._pose, ball=ball)
+    return self._walker.act(observation, goal=goal, pose=task.state.pose, ball=ball)
 
   def density(self, extent: Extent) -> np.ndarray | None:
     return None

@@ -35,7 +35,7 @@ class TopDown:
     return self._floor.extent
 
   def restart(self) -> None:
-    """Forgets the trail."""
+    """Clears the trail."""
     self._trail.clear()
 
   def draw(self, density: np.ndarray | None = None) -> np.ndarray:

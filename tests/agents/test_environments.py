@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.dmpo.policy.acting import task_of
-from nerf2real.agents.environments import loading, trials
+from nerf2real.agents.environments import loading
 from nerf2real.agents.environments.loading import evaluation_name, make_environment
 from nerf2real.suite import protocols
 
@@ -81,22 +81,3 @@ def test_trials_of_the_protocol_are_set_up_and_seeded():
   other.choose(listed[7:8], seed=6)
   second.reset()
   assert task_of(first).draws.torso_mass != task_of(second).draws.torso_mass
-
-
-@pytest.mark.parametrize(
-  ("successes", "count", "expected"),
-  [(0, 18, (0.0, 0.1853)), (18, 18, (0.8147, 1.0)), (15, 27, (0.3533, 0.7452))],
-)
-def test_clopper_pearson(successes, count, expected):
-  np.testing.assert_allclose(trials.clopper_pearson(successes, count), expected, atol=1e-4)
-
-
-def test_clopper_pearson_s_definition():
-  """At the lower end, as many successes or more have a chance of 2.5 %; at the upper end, fewer."""
-  from scipy import stats
-
-  low, high = trials.clopper_pearson(4, 9)
-  assert stats.binom.sf(3, 9, low) == pytest.approx(0.025)
-  assert stats.binom.cdf(4, 9, high) == pytest.approx(0.025)
-  with pytest.raises(ValueError, match="0 to 9 successes"):
-    trials.clopper_pearson(10, 9)

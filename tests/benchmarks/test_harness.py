@@ -12,7 +12,6 @@ import pytest
 
 from benchmarks import compare, harness
 from benchmarks.ledger import records as ledger
-from benchmarks.rooms import field
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -148,12 +147,3 @@ def test_a_script_s_command_loses_other_and_gains_out(tmp_path):
   assert (
     compare.own_command(words, tmp_path) == "benchmarks/simulation/env.py --rounds 2 --out {out}"
   )
-
-
-def test_the_field_s_trainer_is_found_in_both_layouts(tmp_path):
-  assert field.layout(ROOT) == {}
-  (tmp_path / "scenes").mkdir()
-  (tmp_path / "scenes" / "train.py").touch()
-  assert field.layout(tmp_path)["training"] == "scenes.train"
-  with pytest.raises(ValueError, match="Found none of"):
-    field.layout(tmp_path / "scenes")

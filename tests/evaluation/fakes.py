@@ -8,7 +8,7 @@ from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.plant import Plant, Sight
 from nerf2real.suite import specs
 from nerf2real.suite.gaits.floor import EmptyFloor
-from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.pose import Pose
 
 FAR = Sight(Pose(0.0, 0.0, 0.0), None, False, False)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.evaluation import runner, session
-from nerf2real.evaluation.plants import operated, perturbations
+from nerf2real.evaluation import runner
+from nerf2real.evaluation.plants import making, operated, perturbations
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
@@ -16,7 +16,8 @@ from nerf2real.evaluation.policies import GaitPolicy
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
-from nerf2real.suite import loading, protocols
+from nerf2real.suite import protocols
+from nerf2real.suite.scene import open_scene
 from nerf2real.suite.tasks.workspace import find_workspace
 
 NEAREST = 46  # a trial of navigation that starts 1.3 m from its goal
@@ -24,7 +25,7 @@ NEAREST = 46  # a trial of navigation that starts 1.3 m from its goal
 
 @pytest.fixture(scope="module")
 def scene():
-  return loading.open_scene(None)
+  return open_scene(None)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def test_the_gait_reaches_a_goal_in_simulation(scene, simulated):
 @pytest.mark.parametrize("trained_on, pictures", [("", 8), ("suite:nerf_nav?camera_rate=10", 2)])
 def test_the_simulated_camera_has_the_rate_of_the_policys_training(scene, trained_on, pictures):
   settings = EvaluationSettings(policy="a/folder", plant="sim")
-  plant = session.make_plant(settings, scene, (6, 8), trained_on=trained_on)
+  plant = making.make_plant(settings, scene, (6, 8), trained_on=trained_on)
   try:
     plant.start(protocols.navigation()[0])
     seen = [plant.step(np.zeros(20)).observation["camera"].copy() for _ in range(9)]

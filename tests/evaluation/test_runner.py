@@ -16,7 +16,7 @@ from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies import Belief
 from nerf2real.evaluation.report import page as report
 from nerf2real.suite.gaits.floor import EmptyFloor
-from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.pose import Pose
 from tests.evaluation.fakes import FAR, TRIAL, ScriptedPlant, StillPolicy
 
 NEAR = FAR._replace(pose=Pose(0.8, 0.0, 0.0))  # 0.2 m from the goal

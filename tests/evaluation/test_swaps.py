@@ -9,6 +9,7 @@ from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.suite import loading
+from nerf2real.suite.scene import open_scene
 from nerf2real.suite.sensors.camera import CameraSettings
 
 
@@ -34,7 +35,7 @@ def test_the_simulated_camera_takes_the_robots_timing():
 
 
 def test_a_robot_without_secrets_is_that_of_the_data_sheets():
-  scene = loading.open_scene(None)
+  scene = open_scene(None)
   plain, known = (
     RehearsedPlant(scene, "navigation", image_size=None, robot_seed=2, world="floor", swap=swap)
     for swap in ("none", "physics")
@@ -51,7 +52,7 @@ def test_a_robot_without_secrets_is_that_of_the_data_sheets():
 @pytest.mark.slow
 def test_the_true_room_is_seen_from_the_fields_frame():
   """The picture resembles the field's from the same pose, and its depth is in the field's unit."""
-  scene = loading.open_scene(None)
+  scene = open_scene(None)
   camera = Camera.from_vertical_fov(np.deg2rad(43.3), 40, 30)
   pose = np.eye(4)
   pose[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looking along world's x

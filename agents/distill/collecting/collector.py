@@ -103,9 +103,8 @@ class Collector:
     begin = time.perf_counter()
     mixture = mixture_at(self._settings.mixture, frames, begun=self._begun)
     arrays, figures = self._runner.run(self._policy, mixture)
-    # The link counts a trajectory's transitions by its rewards: one less than observations.
-    self._link.send(arrays | {"reward": np.append(arrays["reward"], np.float32(0))})
     steps = len(arrays["state"])
+    self._link.send(arrays, steps=steps)
     rates = {"steps_per_second": steps / (time.perf_counter() - begin), "push_force": level[1]}
     about = {"teacher_share": mixture.teacher, "belief_share": mixture.belief}
     self._link.report(figures | rates | about | self._runner.times.take(steps))

@@ -12,12 +12,12 @@ from nerf2real.agents.distill.dataset import fields, transition_fields
 from nerf2real.agents.distill.schedule import Mixture
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Teacher
-from nerf2real.agents.dmpo.policy.acting import episode_success, task_of
-from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState
+from nerf2real.agents.dmpo.policy.acting import Agent, episode_success, task_of
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import BALL, FlatObservation, Layout, planar_pose
 from nerf2real.agents.processes.timings import StageTimes
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 
 _HEAD_PAN = constants.JOINT_NAMES.index("head_pan")
 TEACHER, STUDENT, DETOUR = 0, 1, 2  # drivers, as `dataset.fields` counts them
@@ -105,7 +105,10 @@ class EpisodeRunner:
     rows: dict[str, list[Any]] = {name: [] for name in kept}
     with self.times.stage("env"):
       timestep = self._environment.reset()
-    segment, state = _Segment(), policy.initial_state() if policy else None
+    segment = _Segment()
+    agent = None
+    if policy is not None:
+      agent = Agent(policy, self._layout, seed=0, deterministic=True)
     flat = self._layout.flatten(timestep.observation)
     self._teacher.reset(pose_of(self._layout, flat))
     by_belief = policy is not None and self._rng.random() < mixture.belief
@@ -116,10 +119,11 @@ class EpisodeRunner:
       truth = pose = pose_of(self._layout, flat)
       ball = ball_of(self._layout, flat)
       student: np.ndarray | None = None
-      if policy is not None:
+      if agent is not None:
         with self.times.stage("student"):
-          student, state, believed = self._step_student(policy, flat, state)
-        pose = believed if by_belief and believed is not None else truth
+          student = np.clip(agent.act(flat), -1.0, 1.0)
+          if by_belief and agent.policy.has_belief:
+            pose = likeliest_pose(agent.policy, agent.embedding)
       with self.times.stage("teacher"):
         if segment.left <= 0:
           segment = self._draw_segment(policy is not None, mixture)
@@ -158,14 +162,6 @@ class EpisodeRunner:
       "student_share": float(np.mean(arrays["driver"] == STUDENT)),
     }
     return arrays, figures
-
-  def _step_student(
-    self, policy: Policy, flat: FlatObservation, state: PolicyState | None
-  ) -> tuple[np.ndarray, PolicyState, Pose | None]:
-    assert state is not None
-    step = policy.step(flat.image, flat.state, state)
-    believed = likeliest_pose(policy, step.embedding) if policy.has_belief else None
-    return np.clip(step.mean, -1.0, 1.0), step.state, believed
 
   def _draw_segment(self, has_student: bool, mixture: Mixture) -> _Segment:
     settings, rng = self._settings, self._rng

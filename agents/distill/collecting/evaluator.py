@@ -19,9 +19,9 @@ from nerf2real.agents.environments.loading import (
   make_environment,
   trials_of,
 )
-from nerf2real.agents.environments.trials import clopper_pearson
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.processes.joining import wait_for
+from nerf2real.core.intervals import clopper_pearson
 from nerf2real.core.serialization import from_plain
 
 _POLL = 1.0  # s

@@ -1,6 +1,5 @@
 """A student that begins with an exported policy: fine-tuning in place of training from scratch."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from nerf2real.agents.distill.learning.updates import TrainingState
 from nerf2real.agents.dmpo.config import DmpoConfig
+from nerf2real.agents.dmpo.policy.export import RECORD, read_record
 from nerf2real.core.serialization import from_plain
 
 # No export holds these heads.
@@ -23,11 +23,7 @@ def agent_of(folder: Path) -> DmpoConfig:
   Raises:
     ValueError: The folder holds none.
   """
-  path = Path(folder) / "policy.json"
-  if not path.is_file():
-    raise ValueError(f"{folder} holds no policy.json: give the folder of an exported policy.")
-  settings = json.loads(path.read_text())["settings"]
-  return from_plain(settings, DmpoConfig, source=path)
+  return from_plain(read_record(folder)["settings"], DmpoConfig, source=folder / RECORD)
 
 
 def begin_with(state: TrainingState, arrays: Mapping[str, np.ndarray]) -> TrainingState:

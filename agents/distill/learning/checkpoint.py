@@ -49,9 +49,14 @@ def load_state(path: Path, *, like: TrainingState) -> tuple[TrainingState, Count
     ValueError: it is of other settings.
   """
   with np.load(path, allow_pickle=False) as stored:
-    counters = from_plain(json.loads(stored["counters"].tobytes()), Counters)
     found = [stored[name] for name in sorted(n for n in stored.files if n.startswith("leaf"))]
   expected, structure = jax.tree.flatten(like)
   if [x.shape for x in found] != [x.shape for x in expected]:
     raise ValueError(f"{path} is of other networks than the settings: take those it began with.")
-  return jax.tree.unflatten(structure, [jnp.asarray(x) for x in found]), counters
+  return jax.tree.unflatten(structure, [jnp.asarray(x) for x in found]), load_counters(path)
+
+
+def load_counters(path: Path) -> Counters:
+  """Reads the counters of what `save_state` wrote."""
+  with np.load(path, allow_pickle=False) as stored:
+    return from_plain(json.loads(stored["counters"].tobytes()), Counters)

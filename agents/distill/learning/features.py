@@ -43,7 +43,7 @@ class FeatureCache:
     self.frames = 0  # encoded
 
   def clear(self) -> None:
-    """Forgets all features: the encoder has changed."""
+    """Discards all features, such as when the encoder has changed."""
     self.frames = 0
 
   def extend(self, encoder: Any) -> None:

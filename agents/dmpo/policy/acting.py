@@ -1,4 +1,4 @@
-"""Acting: an agent that steps its policy, and trajectories made from what it sees.
+"""Acting: an agent that steps its policy, and trajectories made from its observations.
 
 A trajectory has up to T observations. Its last one only bootstraps, and is the first one of the
 next trajectory of the same episode, so that every transition is stored exactly once. The LSTM's
@@ -10,7 +10,7 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState, PolicyStep
+from nerf2real.agents.dmpo.policy.inference import Policy, PolicyState
 from nerf2real.agents.dmpo.specs import FlatObservation, Layout, planar_pose
 
 Trajectory = dict[str, np.ndarray]
@@ -106,6 +106,7 @@ class Agent:
     self._random = np.random.default_rng(seed)
     self._deterministic = deterministic
     self.state = policy.initial_state()
+    self.embedding = np.zeros(0, np.float32)  # of the last step, for the belief [U]
     self.errors: list[float] = []  # the belief's distance from the truth in this episode [m]
 
   def reset(self) -> None:
@@ -116,19 +117,19 @@ class Agent:
   def act(self, observation: FlatObservation) -> np.ndarray:
     """Returns an action [A], not clipped, and moves the recurrent state on."""
     step = self.policy.step(observation.image, observation.state, self.state)
-    self.state = step.state
-    self._measure(step, observation)
+    self.state, self.embedding = step.state, step.embedding
+    self._measure(observation)
     if self._deterministic:
       return step.mean
     noise = self._random.standard_normal(step.mean.shape, dtype=np.float32)
     return step.mean + step.stddev * noise
 
-  def _measure(self, step: PolicyStep, observation: FlatObservation) -> None:
+  def _measure(self, observation: FlatObservation) -> None:
     columns = self.layout.pose_columns
     if columns is None or not self.policy.has_belief or not observation.privileged.size:
       return
     truth = planar_pose(observation.privileged, columns)[:2]
-    believed = self.policy.believed_position(step.embedding)
+    believed = self.policy.believed_position(self.embedding)
     self.errors.append(float(np.linalg.norm(believed - truth)))
 
 

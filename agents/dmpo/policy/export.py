@@ -20,7 +20,7 @@ from nerf2real.core import files
 from nerf2real.core.serialization import from_plain, to_plain
 
 FORMAT_VERSION = 1
-_ARRAYS, _RECORD = "policy.npz", "policy.json"
+_ARRAYS, RECORD = "policy.npz", "policy.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ def export_policy(
     "sha256": hashlib.sha256(data).hexdigest(),
   }
   files.write_atomically(folder / _ARRAYS, data)
-  files.write_atomically(folder / _RECORD, json.dumps(record, indent=1))
+  files.write_atomically(folder / RECORD, json.dumps(record, indent=1))
 
 
 def load_policy(folder: Path | str) -> ExportedPolicy:
@@ -97,10 +97,19 @@ def load_arrays(folder: Path | str) -> dict[str, np.ndarray]:
   return _read(Path(folder))[1]
 
 
+def read_record(folder: Path) -> dict[str, Any]:
+  """Returns what is known of an exported policy besides its arrays, as `export_policy` wrote it.
+
+  Raises:
+    ValueError: the folder holds no policy.
+  """
+  if not (folder / RECORD).is_file():
+    raise ValueError(f"{folder} holds no {RECORD}: give the folder of an exported policy.")
+  return json.loads((folder / RECORD).read_text())
+
+
 def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-  if not (folder / _RECORD).exists():
-    raise ValueError(f"{folder} holds no {_RECORD}: give the folder of an exported policy.")
-  record = json.loads((folder / _RECORD).read_text())
+  record = read_record(folder)
   if record.get("format_version") != FORMAT_VERSION:
     raise ValueError(
       f"{folder} is of format {record.get('format_version')}, expected {FORMAT_VERSION}: export it "
@@ -108,6 +117,6 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     )
   data = (folder / _ARRAYS).read_bytes()
   if hashlib.sha256(data).hexdigest() != record["sha256"]:
-    raise ValueError(f"{folder}: the arrays are not those of {_RECORD}; export it again.")
+    raise ValueError(f"{folder}: the arrays are not those of {RECORD}; export it again.")
   with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
     return record, {name: arrays[name] for name in arrays.files}

@@ -61,16 +61,13 @@ class Policy:
     """
     self._stddev_scale = np.float32(init_stddev / np.log(2.0))
     self._min_stddev = np.float32(min_stddev)
-    self._set(parameters)
-
-  def _set(self, parameters: Mapping[str, np.ndarray]) -> None:
-    tree = nest(parameters)
-    self._policy = tree["policy"]
-    self._belief = tree.get("belief") or {}
+    self.update(parameters)
 
   def update(self, parameters: Mapping[str, np.ndarray]) -> None:
     """Takes newer parameters of the same policy."""
-    self._set(parameters)
+    tree = nest(parameters)
+    self._policy = tree["policy"]
+    self._belief = tree.get("belief") or {}
 
   @property
   def lstm_size(self) -> int:

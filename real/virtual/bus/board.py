@@ -46,16 +46,6 @@ class Board:
     self._next = 0.0  # s, of the next reading of the chip
 
   @property
-  def model(self) -> tuple[int, int]:
-    """Model number and firmware version."""
-    return self.table["model_number"], self.table["firmware_version"]
-
-  @property
-  def return_delay(self) -> float:
-    """Time between an instruction and its answer [s]."""
-    return 2e-6 * self.table["return_delay_time"]
-
-  @property
   def powers(self) -> bool:
     """Whether the servos have power."""
     return bool(self.table["dynamixel_power"])

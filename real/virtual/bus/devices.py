@@ -62,20 +62,18 @@ class Answer(NamedTuple):
 class Devices:
   """The servos and the board of one robot."""
 
-  def __init__(self, body: Body, *, faults: Faults, seed: int = 0, return_delay: int = 250):
+  def __init__(self, body: Body, *, faults: Faults, seed: int = 0):
     """Connects the devices to a body.
 
     Args:
       body: The plant.
       faults: What goes wrong; may change at any time.
       seed: Seed of noise and of the faults' chances.
-      return_delay: Return delay time in the servos' EEPROM [2 us]; 250 from the factory.
     """
     self.body, self.faults = body, faults
     self._rng = np.random.default_rng([seed, 6])
-    start = {"return_delay_time": return_delay}
     self.servos = {
-      IDS[name]: Servo(IDS[name], index, body.motors, start=start)
+      IDS[name]: Servo(IDS[name], index, body.motors)
       for index, name in enumerate(constants.JOINT_NAMES)
     }
     noise = np.repeat([body.hidden.gyroscope_noise, body.hidden.accelerometer_noise], 3)
@@ -157,7 +155,7 @@ class Devices:
   def _ping(self, target: int, time: float) -> list[Answer]:
     found = []
     for device in self._addressed(target, time):
-      number, firmware = device.model
+      number, firmware = device.table["model_number"], device.table["firmware_version"]
       data = number.to_bytes(2, "little") + bytes((firmware,))
       answer = self._status(device, Error.NONE, data, time)
       time = answer.time
@@ -171,7 +169,7 @@ class Devices:
       device = self._reachable(device_id, time)
       if device is None:  # the next one waits for it in vain
         break
-      time += device.return_delay
+      time += device.table.return_delay
       self.body.advance(time)
       error, data = device.read(address, length, time)
       packet = protocol.status(device_id, error | self._alert(device), data)
@@ -190,7 +188,7 @@ class Devices:
         parts.append((device_id, 0, bytes(length)))  # its place in the packet stays silent
         continue
       if not parts:
-        time += device.return_delay + _FAST_HEAD * BYTE_TIME
+        time += device.table.return_delay + _FAST_HEAD * BYTE_TIME
       self.body.advance(time)
       error, data = device.read(address, length, time)
       parts.append((device_id, error | self._alert(device), data.ljust(length, b"\0")))
@@ -243,7 +241,7 @@ class Devices:
 
   def _status(self, device: Servo | Board, error: int, data: bytes, time: float) -> Answer:
     packet = protocol.status(device.device, error | self._alert(device), data)
-    return Answer(time + device.return_delay + BYTE_TIME * len(packet), packet)
+    return Answer(time + device.table.return_delay + BYTE_TIME * len(packet), packet)
 
   def _alert(self, device: Servo | Board) -> int:
     return ALERT if device.alert else 0

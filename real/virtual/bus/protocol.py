@@ -1,4 +1,4 @@
-"""Dynamixel Protocol 2.0 as a device speaks it: packets, CRC, byte stuffing.
+"""Dynamixel Protocol 2.0 of a device: packets, CRC, byte stuffing.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0" (packet layout, instructions, error numbers,
 order of stuffing and CRC). The layout of fast reads is the one that the DYNAMIXEL SDK 4.1 decodes.

@@ -1,4 +1,4 @@
-"""The cable of a rehearsal in stepped time: a serial port that no kernel stands behind.
+"""The cable of a rehearsal in stepped time: a serial port in memory, as a pyserial class.
 
 A pseudo-terminal hands every byte from one kernel thread to another; on a busy machine that costs a
 rehearsal ten times what it computes. Here the same bytes go from buffer to buffer. pyserial opens
@@ -55,7 +55,7 @@ class Cable:
 
 
 class Serial(serial.SerialBase):
-  """The host's end, as pyserial has it; time-outs are not this port's matter (timeout=0)."""
+  """The host's end, as a pyserial class without time-outs (timeout=0)."""
 
   def open(self) -> None:
     """Opens the port.
@@ -78,7 +78,7 @@ class Serial(serial.SerialBase):
         os.close(end)
 
   def _reconfigure_port(self) -> None:
-    """Takes any speed: the bytes' time is the devices' matter."""
+    """Accepts any speed: the devices time the bytes."""
 
   @property
   def in_waiting(self) -> int:
@@ -97,5 +97,5 @@ class Serial(serial.SerialBase):
     return len(data)
 
   def reset_input_buffer(self) -> None:
-    """Forgets what has come."""
+    """Discards what has come."""
     self._cable.received.clear()

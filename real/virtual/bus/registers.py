@@ -125,15 +125,13 @@ OPENCR = (
 class Table:
   """The values of a device's control table, with the checks of a write."""
 
-  def __init__(self, registers: tuple[Register, ...], *, start: dict[str, int] | None = None):
-    """Fills the table with defaults, and with `start` where the EEPROM differs from them."""
+  def __init__(self, registers: tuple[Register, ...]):
+    """Fills the table with defaults."""
     self.registers = {register.name: register for register in registers}
     self._by_address = {register.address: register for register in registers}
     self.size = max(register.address + register.size for register in registers)
     self.memory = bytearray(self.size)
     self.reset(eeprom=True)
-    for name, value in (start or {}).items():
-      self[name] = value
 
   def __getitem__(self, name: str) -> int:
     register = self.registers[name]
@@ -144,6 +142,11 @@ class Table:
     register = self.registers[name]
     raw = int(value).to_bytes(register.size, "little", signed=register.signed)
     self.memory[register.address : register.address + register.size] = raw
+
+  @property
+  def return_delay(self) -> float:
+    """Time between an instruction and its answer [s]."""
+    return 2e-6 * self["return_delay_time"]
 
   def reset(self, *, eeprom: bool = False) -> None:
     """Writes the defaults to the RAM area, and optionally to the EEPROM area."""

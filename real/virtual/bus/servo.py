@@ -25,32 +25,22 @@ INPUT_VOLTAGE, OVERHEATING, ENCODER, SHOCK, OVERLOAD = 0x01, 0x04, 0x08, 0x10, 0
 class Servo:
   """A servo on the bus; `index` is its place in `Motors`."""
 
-  def __init__(self, device: int, index: int, motors: Motors, *, start: dict[str, int]):
+  def __init__(self, device: int, index: int, motors: Motors):
     """Makes the servo.
 
     Args:
       device: Its id.
       index: Its place in `motors`.
       motors: The motors of all servos.
-      start: EEPROM values that differ from the factory's.
     """
     self.device = device
-    self.table = registers.Table(registers.XM430, start={"id": device, **start})
+    self.table = registers.Table(registers.XM430)
+    self.table["id"] = device
     self._index, self._motors = index, motors
     self._answers_from = 0.0  # s
     self._heard = 0.0  # s, time of the last packet on the bus
     self._pending: tuple[int, bytes] | None = None
     self._apply_all(0.0)
-
-  @property
-  def model(self) -> tuple[int, int]:
-    """Model number and firmware version."""
-    return self.table["model_number"], self.table["firmware_version"]
-
-  @property
-  def return_delay(self) -> float:
-    """Time between an instruction and its answer [s]."""
-    return 2e-6 * self.table["return_delay_time"]
 
   @property
   def answers(self) -> bool:

@@ -12,8 +12,8 @@ from nerf2real.agents.distill.collecting import episodes
 from nerf2real.agents.distill.learning import losses, student
 from nerf2real.agents.distill.learning.updates import make_updates
 from nerf2real.agents.dmpo.specs import BALL, FlatObservation
-from nerf2real.suite.gaits.walker import Pose
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 from tests.agents.distill.test_student import LAYOUT, TINY, _batch
 
 WITH_BALL = dataclasses.replace(

@@ -58,7 +58,7 @@ def test_what_does_not_fit_is_refused(tmp_path):
 
 def test_the_files_are_prior_data_for_dmpo(tmp_path):
   data = _open(tmp_path)
-  sent = _episode(4, 3) | {"reward": np.arange(5, dtype=np.float32)}  # as the link wants it
+  sent = _episode(4, 3) | {"reward": np.arange(4, dtype=np.float32)}
   sent["discount"] = np.array([1, 1, 1, 0], np.float32)
   assert data.insert(sent, 1, 1) == 4 and set(data.arrays) == set(fields(LAYOUT))
   prior = PriorData(tmp_path, LAYOUT, max_steps=100)

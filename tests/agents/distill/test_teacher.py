@@ -10,9 +10,8 @@ from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import POSITION, ROTATION
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.gaits.floor import EmptyFloor
-from nerf2real.suite.gaits.walker import Pose
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import Start
 from tests.agents.distill.test_student import LAYOUT, TINY, make_state
 
 
@@ -26,7 +25,7 @@ def environment():
     time_limit=6.0,
     randomisation=RandomisationSettings(pushes=False),
   )
-  found.task.set_start(Start((0.0, 0.0), 0.0))
+  found.task.set_start(Pose(0.0, 0.0, 0.0))
   return found
 
 

@@ -6,7 +6,6 @@ same cases with the whole agent are in `tests/agents/processes/test_runs.py`.
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from nerf2real.agents.dmpo.replay.ring import Replay
 from nerf2real.agents.link import client, schema, sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink, actor_key
+from nerf2real.agents.supervision.training import free_port
 from tests.agents.link import mini_learner
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -32,9 +32,7 @@ class Learner:
   """Starts, kills and freezes the mini learner."""
 
   def __init__(self, folder, *, lease=10.0, users=None, router=None):
-    with socket.socket() as probe:
-      probe.bind(("127.0.0.1", 0))
-      self.endpoint = router or f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    self.endpoint = router or f"tcp/127.0.0.1:{free_port()}"
     self._folder, self._lease, self._users = folder, lease, users
     self._joins = router is not None
     self.start()
@@ -88,7 +86,7 @@ def _act(link, count, *, timeout=60.0, pause=0.0):
       credits = grant["granted"] if grant else 0
       if not credits:
         time.sleep(0.01)
-    link.send(mini_learner.make_trajectory(link.outbox.made + 1))
+    link.send(mini_learner.make_trajectory(link.outbox.made + 1), steps=mini_learner.LENGTH - 1)
     credits, made = 0, made + 1
     time.sleep(pause)
 
@@ -127,7 +125,9 @@ def test_kill_9_of_the_learner_loses_and_repeats_nothing(learner, tmp_path):
   link = _join(learner, resend_after=1.0, ask_timeout=0.5)
   _act(link, 10)
   learner.kill()
-  link.send(mini_learner.make_trajectory(link.outbox.made + 1))  # nobody is there
+  link.send(
+    mini_learner.make_trajectory(link.outbox.made + 1), steps=mini_learner.LENGTH - 1
+  )  # nobody is there
   assert link.request(1) is None
   assert link.outbox.size > 0
   learner.start()
@@ -154,7 +154,7 @@ def _freeze_while_acting(learner, link, tmp_path, seconds):
   learner.process.send_signal(signal.SIGSTOP)
   # Without asking: what is put while the learner is frozen must not vanish either.
   for _ in range(3):
-    link.send(mini_learner.make_trajectory(link.outbox.made + 1))
+    link.send(mini_learner.make_trajectory(link.outbox.made + 1), steps=mini_learner.LENGTH - 1)
   time.sleep(seconds)
   learner.process.send_signal(signal.SIGCONT)
   _act(link, 5)
@@ -192,11 +192,12 @@ def test_malformed_messages_are_refused_and_counted(learner):
   while not link.learner_is_there:
     time.sleep(0.01)
   good = mini_learner.make_trajectory(1)
-  values = {"actor": "broken", "number": 1}
+  values = {"actor": "broken", "number": 1, "steps": 47}
   bad = [
     b"rubbish",
     schema.encode("metrics", values, good),
-    schema.encode("trajectory", {"actor": "broken"}, good),
+    schema.encode("trajectory", {"actor": "broken", "steps": 47}, good),
+    schema.encode("trajectory", {"actor": "broken", "number": 1}, good),
     schema.encode("trajectory", values | {"number": -1}, good),
     schema.encode("trajectory", values, {"reward": good["reward"]}),
     schema.encode("trajectory", values | {"number": 2}, {"image": good["image"]}),
@@ -223,7 +224,7 @@ def test_a_refused_trajectory_is_acknowledged_and_what_follows_arrives(learner, 
   assert link.request(47)["granted"] == 47
   bad = mini_learner.make_trajectory(1)
   bad["reward"][3] = np.nan
-  link.send(bad)
+  link.send(bad, steps=47)
   assert link.drain(timeout=5)
   assert link.request(0)["granted"] == 0  # says what is held: nothing any more
   status = link.status()["status"]
@@ -239,9 +240,7 @@ def test_a_refused_trajectory_is_acknowledged_and_what_follows_arrives(learner, 
 
 def test_a_failing_replay_is_reported_and_ends_the_taking_in(tmp_path):
   """Such as on a full disk: whoever runs the learner sees it, and nothing is acknowledged."""
-  with socket.socket() as probe:
-    probe.bind(("127.0.0.1", 0))
-    endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+  endpoint = f"tcp/127.0.0.1:{free_port()}"
 
   def insert(trajectory, actor, number):
     raise OSError(28, "No space left on device")
@@ -258,7 +257,7 @@ def test_a_failing_replay_is_reported_and_ends_the_taking_in(tmp_path):
     while not link.learner_is_there:
       time.sleep(0.01)
     assert not served.failure
-    link.send(mini_learner.make_trajectory(1))
+    link.send(mini_learner.make_trajectory(1), steps=47)
     deadline = time.monotonic() + 5
     while not served.failure:
       assert time.monotonic() < deadline, "The failure was not noticed."
@@ -365,9 +364,7 @@ def test_tls(tmp_path):
     subprocess.run(command, check=True, capture_output=True)
   except (OSError, subprocess.CalledProcessError) as error:
     pytest.skip(f"needs openssl to make a certificate: {error}")
-  with socket.socket() as probe:
-    probe.bind(("127.0.0.1", 0))
-    endpoint = f"tls/localhost:{probe.getsockname()[1]}"
+  endpoint = f"tls/localhost:{free_port()}"
   session = sessions.listen(
     endpoint,
     sessions.LinkSettings(security=sessions.Security(tls_certificate=certificate, tls_key=key)),

@@ -1,11 +1,10 @@
 """A router of its own, which the learner joins: same guarantees, same rules for its users."""
 
-import socket
-
 import pytest
 
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.access import LinkError, access_control, read_users
+from nerf2real.agents.supervision.training import free_port
 from tests.agents.link import mini_learner
 from tests.agents.link.test_faults import Learner, _act, _join, _login, _stored
 
@@ -15,9 +14,7 @@ def router(tmp_path):
   """A router's endpoint, and the file of its users: the learner's first, then an actor's."""
   users = tmp_path / "users.txt"
   users.write_text("learner:one\nactor:two\n")
-  with socket.socket() as probe:
-    probe.bind(("127.0.0.1", 0))
-    endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+  endpoint = f"tcp/127.0.0.1:{free_port()}"
   session = sessions.route(endpoint, sessions.LinkSettings(security=sessions.Security(users=users)))
   yield endpoint
   session.close()
@@ -30,7 +27,7 @@ def test_everything_goes_through_a_router_and_a_killed_learner_comes_back(router
     _act(link, 5)
     assert link.drain(timeout=5)
     learner.kill()
-    link.send(mini_learner.make_trajectory(link.outbox.made + 1))  # nobody is there
+    link.send(mini_learner.make_trajectory(link.outbox.made + 1), steps=47)  # nobody is there
     assert link.request(1) is None
     learner.start()
     _act(link, 5)

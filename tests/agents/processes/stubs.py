@@ -107,7 +107,7 @@ class StubLink:
     values = {"granted": wanted, "version": 0, "stop": False, "ending": False, "steps": 0}
     return Grant(values)
 
-  def send(self, trajectory):
+  def send(self, trajectory, *, steps):
     self.sent.append(trajectory)
     if len(self.sent) >= self._limit:
       self.process.stop()

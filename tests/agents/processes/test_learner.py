@@ -2,7 +2,6 @@
 
 import errno
 import json
-import socket
 import threading
 import time
 
@@ -20,6 +19,7 @@ from nerf2real.agents.processes import actor
 from nerf2real.agents.processes.checkpoints import read_info
 from nerf2real.agents.processes.learner import Learner, LearnerError
 from nerf2real.agents.processes.settings import RunSettings
+from nerf2real.agents.supervision.training import free_port
 from tests.agents.processes.stubs import documented
 
 ENVIRONMENT = "dm_control:cartpole:swingup"
@@ -38,9 +38,7 @@ LINK = sessions.LinkSettings()
 
 
 def _endpoint():
-  with socket.socket() as probe:
-    probe.bind(("127.0.0.1", 0))
-    return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+  return f"tcp/127.0.0.1:{free_port()}"
 
 
 class Run:

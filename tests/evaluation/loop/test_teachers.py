@@ -65,5 +65,5 @@ def test_a_fit_meets_no_trial_of_the_protocol(monkeypatch):
   teachers.fit(_Plant(), EmptyFloor(), TEACHERS["quick"](), seed=0)
   from nerf2real.evaluation.plants import plant as plants
 
-  protocol = [trial for _, trial in plants.trials(plants.NAVIGATION)]
+  protocol = [trial for _, trial in plants.trials("navigation")]
   assert not any(trial.seed == other.seed for trial in seen for other in protocol)

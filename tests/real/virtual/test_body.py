@@ -8,23 +8,15 @@ from nerf2real.real.virtual.body import STEP, Body
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.tasks.state import standing_posture
-
-
-def _stand(body, seconds):
-  """Puts every goal at the standing pose, under torque, and simulates."""
-  goals = np.rint(2048 + constants.standing_targets() * 4096 / (2 * np.pi)).astype(int)
-  for index, counts in enumerate(goals):
-    body.motors.set_goal(index, int(counts), body.time)
-  body.motors.enabled[:] = True
-  body.advance(body.time + seconds)
+from tests.real.virtual.standing import stand
 
 
 def test_it_hangs_in_the_hand_and_stands_when_let_go():
   body = Body(hidden=Hidden.draw(7))
-  _stand(body, 0.3)
+  stand(body, 0.3)
   assert body.truth().held and body.truth().position[2] > 0.28
   body.hold(False)
-  _stand(body, 2.5)
+  stand(body, 2.5)
   truth = body.truth()
   assert not truth.held and not truth.touches_floor
   assert truth.position[2] == pytest.approx(standing_posture()[2], abs=0.006)
@@ -33,7 +25,7 @@ def test_it_hangs_in_the_hand_and_stands_when_let_go():
 
 def test_a_person_turns_the_robot_in_the_hand():
   body = Body()
-  _stand(body, 0.2)
+  stand(body, 0.2)
   for yaw in np.linspace(0.0, 0.6, 40):
     body.turn(yaw)
     body.advance(body.time + 0.025)
@@ -73,7 +65,7 @@ def test_the_physics_is_not_the_simulations():
 
 def test_the_imu_feels_gravity_and_turning():
   body = Body()
-  _stand(body, 0.5)
+  stand(body, 0.5)
   np.testing.assert_allclose(body.imu[3:], [0, 0, 9.81], atol=0.15)
   body.data.qvel[body._root_dof + 5] = 1.0  # turn about z, as the hand would
   body.data.eq_active[body._weld] = 0
@@ -83,12 +75,12 @@ def test_the_imu_feels_gravity_and_turning():
 
 def test_a_push_moves_it():
   body = Body()
-  _stand(body, 0.2)
+  stand(body, 0.2)
   body.hold(False)
-  _stand(body, 2.5)
+  stand(body, 2.5)
   before = body.truth().position
   body.push = np.array([0.0, 12.0, 0.0])
-  _stand(body, 0.2)
+  stand(body, 0.2)
   assert body.truth().position[1] - before[1] > 0.003
 
 
@@ -117,10 +109,10 @@ def test_things_can_be_added_and_touching_them_is_noticed():
     )
 
   body = Body(furnish=furnish)
-  _stand(body, 0.1)
+  stand(body, 0.1)
   body.data.eq_active[body._weld] = 0
   body.push = np.array([40.0, 0.0, 0.0])
-  _stand(body, 0.15)
+  stand(body, 0.15)
   assert body.truth().touches_room and not body.truth().touches_floor
 
 

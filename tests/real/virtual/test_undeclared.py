@@ -13,6 +13,7 @@ from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.motors import Motors
 from nerf2real.suite.effects import KINDS as LIBRARY
 from nerf2real.suite.op3 import constants
+from tests.real.virtual.standing import stand
 
 KNEE = constants.JOINT_NAMES.index("l_knee")
 
@@ -26,14 +27,6 @@ def _motors(*texts):
   motors.enabled[:] = True
   motors.measure(np.zeros(20), np.zeros(20))
   return motors
-
-
-def _stand(body, seconds):
-  goals = np.rint(2048 + constants.standing_targets() * 4096 / (2 * np.pi)).astype(int)
-  for index, counts in enumerate(goals):
-    body.motors.set_goal(index, int(counts), body.time)
-  body.motors.enabled[:] = True
-  body.advance(body.time + seconds)
 
 
 def test_what_is_parsed_is_written_again():
@@ -141,9 +134,9 @@ def test_a_load_hangs_on_the_forearm():
 def test_on_a_sloping_floor_a_standing_robot_feels_gravity_aslant():
   slope = 0.05  # about y: the floor falls towards +x
   body = Body(hidden=_build(f"floor_slope:0,{slope}").hidden)
-  _stand(body, 0.3)
+  stand(body, 0.3)
   body.hold(False)
-  _stand(body, 2.5)
+  stand(body, 2.5)
   truth = body.truth()
   assert truth.rotation[2, 2] > 0.999  # it stands on the floor, not along gravity
   felt = truth.rotation @ body.imu[3:]

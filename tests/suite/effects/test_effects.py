@@ -19,6 +19,7 @@ from nerf2real.suite.effects import (
   read_effects,
   write_effects,
 )
+from tests.suite.effects.rolling import rollout
 
 # Two joints with position servos, one with a motor, and a ball on a floor.
 _MODEL = """
@@ -68,7 +69,7 @@ def _arrays(model):
 def _state(model, effects):
   stack = EffectStack(effects).bind(model)
   data = mujoco.MjData(model)
-  stack.rollout(data, _controls())
+  rollout(stack, data, _controls())
   return np.concatenate([data.qpos, data.qvel, data.actuator_force])
 
 
@@ -118,7 +119,7 @@ def test_unbind_restores_the_model_bit_for_bit(name):
   if name == "floor_slope":
     effect = Effect(name, "floor", {"x": 0.1})
   stack = EffectStack([effect]).bind(model)
-  stack.rollout(mujoco.MjData(model), _controls()[:100])
+  rollout(stack, mujoco.MjData(model), _controls()[:100])
   changed = [n for n, v in _arrays(model).items() if not np.array_equal(v, before[n])]
   if kind_of(name).acts == "model":
     assert changed and stack.is_constant
@@ -134,7 +135,7 @@ def test_all_effects_at_once_stay_finite_and_reset_repeats():
   for _ in range(2):
     data = mujoco.MjData(model)
     stack.reset()
-    runs.append(stack.rollout(data, _controls())[0])
+    runs.append(rollout(stack, data, _controls())[0])
     assert np.isfinite(data.qpos).all() and not any(w.number for w in data.warning)
   np.testing.assert_array_equal(runs[0], runs[1])
 
@@ -274,7 +275,7 @@ def test_files_round_trip(tmp_path):
     "target": None,
     "parameters": {"delay": {"value": 0.02, "low": 0.018, "high": 0.022, "unit": "s"}},
   }
-  assert EffectStack.from_file(path).bind(_model()).effects == effects
+  assert EffectStack(read_effects(path)).bind(_model()).effects == effects
 
 
 def _entry(kind="viscous_friction", target="elbow", **parameter):

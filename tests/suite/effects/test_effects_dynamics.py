@@ -6,6 +6,7 @@ import pytest
 import scipy.integrate
 
 from nerf2real.suite.effects import Effect, EffectStack
+from tests.suite.effects.rolling import rollout
 
 _STEP = 1e-3
 _INERTIA = 0.01  # kg m^2 of the hinge below
@@ -34,7 +35,7 @@ def _run(model, effects, controls, *, velocity=0.0, position=0.0):
   data = mujoco.MjData(model)
   data.qvel[:], data.qpos[:] = velocity, position
   controls = np.asarray(controls, float)
-  positions, velocities = stack.rollout(data, controls.reshape(len(controls), model.nu))
+  positions, velocities = rollout(stack, data, controls.reshape(len(controls), model.nu))
   return positions[:, 0], velocities[:, 0], stack, data
 
 

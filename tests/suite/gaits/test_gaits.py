@@ -10,12 +10,8 @@ from nerf2real.suite.effects import Effect
 from nerf2real.suite.gaits import legs, walk
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.op3 import constants, op3
-from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import Start
-
-NOMINAL = RandomisationSettings(
-  pushes=False, delays=False, jitter=False, torso_mass=False, imu_pose=False
-)
+from nerf2real.suite.pose import Pose
+from nerf2real.suite.randomisation.draws import NOMINAL, RandomisationSettings
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +69,7 @@ def _walk(*, effects=(), command, seconds, randomisation=NOMINAL, seed=0):
     randomisation=randomisation,
     privileged=False,
   )
-  environment.task.set_start(Start((0.0, 0.0), 0.0))
+  environment.task.set_start(Pose(0.0, 0.0, 0.0))
   gait, timestep = walk.Gait(), environment.reset()
   yaws = []
   while not timestep.last():

@@ -88,10 +88,10 @@ def test_the_cameras_angles_are_those_of_the_robot():
   from nerf2real import suite
   from nerf2real.suite.gaits.floor import EmptyFloor
   from nerf2real.suite.op3 import constants
-  from nerf2real.suite.tasks.base import Start
+  from nerf2real.suite.pose import Pose
 
   environment = suite.load("nerf_nav", scene=EmptyFloor(), image_size=None, random=0)
-  environment.task.set_start(Start((0.0, 0.0), 0.0))
+  environment.task.set_start(Pose(0.0, 0.0, 0.0))
   environment.reset()
   model, data = environment.physics.model.ptr, environment.physics.data.ptr
   ball = np.array([0.9, 0.4])

@@ -7,9 +7,9 @@ from nerf2real import suite
 from nerf2real.scenes.geometry.free_space import FreeSpace
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.gaits.planner import Planner
-from nerf2real.suite.gaits.walker import Pose, Walker
+from nerf2real.suite.gaits.walker import Walker
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.base import Start
 
 QUIET = RandomisationSettings(pushes=False)
 GOALS = ((0.6, 0.0), (0.6, 0.5), (0.0, 0.5), (-0.3, 0.0), (0.2, -0.3))
@@ -54,7 +54,7 @@ def _environment(seconds):
     randomisation=QUIET,
     privileged=False,
   )
-  environment.task.set_start(Start((0.0, 0.0), 0.3))
+  environment.task.set_start(Pose(0.0, 0.0, 0.3))
   return environment
 
 

@@ -31,7 +31,7 @@ def _run(truth_imu, truth_joints, steps, *, imu_delay=0.0, joint_delay=0.0, jitt
       path.record(sub, truth_imu(time), truth_joints(time))
     path.finish_step(np.full(20, step))
     for name in found:
-      found[name].append(path.read(name)[-1])
+      found[name].append(path.histories.read(name)[-1])
   return path, {name: np.array(values) for name, values in found.items()}
 
 
@@ -119,10 +119,12 @@ def test_gravity_is_that_of_a_turning_body():
 
 def test_history_is_oldest_first_and_starts_full():
   path, _ = _run(_level, lambda t: np.zeros(20), 3)
-  control = path.read("previous_control")
+  control = path.histories.read("previous_control")
   np.testing.assert_array_equal(control[:, 0], [0, 0, 0, 1, 2])
-  assert control.dtype == np.float32 and path.read("accelerometer").shape == (5, 3)
-  np.testing.assert_allclose(path.read("accelerometer"), np.tile([0, 0, 9.81], (5, 1)), rtol=1e-6)
-  copy = path.read("gravity")
+  assert control.dtype == np.float32 and path.histories.read("accelerometer").shape == (5, 3)
+  np.testing.assert_allclose(
+    path.histories.read("accelerometer"), np.tile([0, 0, 9.81], (5, 1)), rtol=1e-6
+  )
+  copy = path.histories.read("gravity")
   copy[:] = 7
-  assert (path.read("gravity") != 7).all()
+  assert (path.histories.read("gravity") != 7).all()

@@ -2,8 +2,9 @@
 
 import pytest
 
+from nerf2real.suite.randomisation.draws import NOMINAL
 from tests.suite.synthetic import make_room
-from tests.suite.tasks.small_room import NOMINAL, load
+from tests.suite.tasks.small_room import load
 
 
 @pytest.fixture(scope="package")

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from dm_env import StepType
 
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.tasks import rewards
-from nerf2real.suite.tasks.state import Start
 
 
 def _step_until_end(environment, action, limit=200):
@@ -21,7 +21,7 @@ def _step_until_end(environment, action, limit=200):
 def test_a_fall_ends_the_episode(name, request):
   environment = request.getfixturevalue(name)
   far = {"ball_xy": (0.0, 1.0)} if name == "ball" else {}
-  environment.task.set_start(Start((-1.0, 0.0), 0.0), **far)
+  environment.task.set_start(Pose(-1.0, 0.0, 0.0), **far)
   environment.reset()
   environment.physics.data.ptr.qvel[4] = 8.0  # a somersault
   last = _step_until_end(environment, environment.task.standing_action)
@@ -33,14 +33,14 @@ def test_a_fall_ends_the_episode(name, request):
 def test_touching_the_room_ends_navigation_unless_it_is_a_foot(nav):
   # The table's edge is at x = 2, 0.5 m high: the robot's chest against it, then its toes
   # against a sill of 3 cm.
-  nav.task.set_start(Start((1.97, 1.8), 0.0))
+  nav.task.set_start(Pose(1.97, 1.8, 0.0))
   nav.reset()
   last = _step_until_end(nav, nav.task.standing_action, 3)
   assert last.discount == 0.0 and nav.task.outcome.ending == "collision"
-  nav.task.set_start(Start((0.0, 0.0), 0.0))
+  nav.task.set_start(Pose(0.0, 0.0, 0.0))
   nav.reset()
   toes = float(nav.physics.named.data.geom_xpos["op3/l_ank_roll_link_0", "x"]) + 0.0635
-  nav.task.set_start(Start((2.0 - toes + 0.002, 0.0), 0.0))
+  nav.task.set_start(Pose(2.0 - toes + 0.002, 0.0, 0.0))
   nav.reset()
   nav.step(nav.task.standing_action)
   model, pairs = nav.physics.model.ptr, nav.physics.data.ptr.contact.geom
@@ -57,7 +57,7 @@ def test_touching_the_room_ends_navigation_unless_it_is_a_foot(nav):
 def test_navigation_succeeds_within_25_cm_and_rewards_it(nav):
   goal = nav.task.goals[1]
   for distance, success in ((0.27, False), (0.23, True)):
-    nav.task.set_start(Start((goal[0] - distance, goal[1]), 0.0), goal_index=1)
+    nav.task.set_start(Pose(goal[0] - distance, goal[1], 0.0), goal_index=1)
     observation = nav.reset().observation
     np.testing.assert_allclose(observation["goal"], goal, atol=1e-6)
     np.testing.assert_allclose(observation["privileged/goal"], [distance, 0], atol=1e-3)
@@ -82,7 +82,7 @@ def test_reward_is_the_weighted_sum_of_the_logged_terms(nav, ball):
 
 
 def test_feet_velocity_is_that_of_the_whole_robot_sliding(nav):
-  nav.task.set_start(Start((-1.0, 0.0), 1.1))
+  nav.task.set_start(Pose(-1.0, 0.0, 1.1))
   nav.reset()
   data = nav.physics.data.ptr
   data.qvel[:2] = 0.3 * np.cos(1.1), 0.3 * np.sin(1.1)

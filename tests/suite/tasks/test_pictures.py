@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
+from nerf2real.suite.pose import Pose
+from nerf2real.suite.randomisation.draws import NOMINAL
 from nerf2real.suite.sensors.camera import CameraSettings, world_from_camera
-from nerf2real.suite.tasks.state import Start
 from tests.suite.synthetic import FlatRenderer
-from tests.suite.tasks.small_room import NOMINAL
 
 
 def test_own_arm_appears_in_the_picture(nav):
@@ -27,7 +27,7 @@ def test_own_arm_appears_in_the_picture(nav):
 
 def test_the_ball_appears_in_the_picture_unless_the_room_is_before_it(ball):
   renderer = ball.task.robot_camera._renderer
-  ball.task.set_start(Start((-1.0, 0.0), 0.0), ball_xy=(0.0, 0.0))
+  ball.task.set_start(Pose(-1.0, 0.0, 0.0), ball_xy=(0.0, 0.0))
   orange = {}
   for depth in (np.inf, 0.3 / ball.task.scene.world_from_unit.scale):
     renderer.depth = depth
@@ -53,7 +53,7 @@ def test_picture_is_late_by_the_camera_latency(room):
       randomisation=NOMINAL,
       camera=CameraSettings(latency=latency),
     )
-    environment.task.set_start(Start((0.0, 0.0), 0.0))
+    environment.task.set_start(Pose(0.0, 0.0, 0.0))
     environment.reset()
     for _ in range(8):
       environment.step(np.where(np.arange(20) == 0, 1.0, environment.task.standing_action))
@@ -77,7 +77,7 @@ def test_a_slower_camera_holds_its_last_picture(room, rate):
       randomisation=NOMINAL,
       camera=CameraSettings(rate=each),
     )
-    environment.task.set_start(Start((0.0, 0.0), 0.0))
+    environment.task.set_start(Pose(0.0, 0.0, 0.0))
     environment.reset()
     steps = [len(renderer.poses)]
     for _ in range(120):

@@ -9,8 +9,9 @@ from dm_control import composer
 from nerf2real.suite import protocols
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.op3 import constants
-from nerf2real.suite.tasks.state import Start
-from tests.suite.tasks.small_room import NOMINAL, load
+from nerf2real.suite.pose import Pose
+from nerf2real.suite.randomisation.draws import NOMINAL
+from tests.suite.tasks.small_room import load
 
 
 def test_start_poses_fill_the_free_space(room):
@@ -62,7 +63,7 @@ def test_ball_pushing_succeeds_in_the_corner_cell(ball):
   task = ball.task
   target = task.workspace.target
   np.testing.assert_allclose(target - task.workspace.center, [1.0, 1.0])
-  start = Start(tuple(task.workspace.center), 0.0)
+  start = Pose.of(task.workspace.center, 0.0)
   for offset, success in ((0.55, False), (0.45, True)):
     task.set_start(start, ball_xy=(target[0] - offset, target[1]))
     np.testing.assert_allclose(ball.reset().observation["goal"], target, atol=1e-6)

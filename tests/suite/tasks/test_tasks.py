@@ -8,9 +8,9 @@ from dm_env import test_utils
 from nerf2real import suite
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.op3 import constants
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.sensors.camera import CameraSettings
 from nerf2real.suite.tasks import ball_push, nerf_nav
-from nerf2real.suite.tasks.state import Start
 from tests.suite.synthetic import make_room
 from tests.suite.tasks.small_room import load
 
@@ -98,7 +98,7 @@ def test_reset_does_not_recompile(room):
 
 
 def test_stands_under_zero_action_change_and_reaches_the_time_limit(nav):
-  nav.task.set_start(Start((-1.0, 0.0), 0.4), goal_index=0)
+  nav.task.set_start(Pose(-1.0, 0.0, 0.4), goal_index=0)
   timestep = nav.reset()
   action = nav.task.standing_action
   count = 0

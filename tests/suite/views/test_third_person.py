@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import RandomisationSettings
-from nerf2real.suite.tasks.state import Start
 from nerf2real.suite.views import third_person
 from tests.suite.synthetic import FlatRenderer, make_room
 
@@ -21,7 +21,7 @@ def environment(tmp_path_factory):
 
 
 def _stand(environment, x, y, yaw=0.0):
-  environment.task.set_start(Start((x, y), yaw))
+  environment.task.set_start(Pose(x, y, yaw))
   environment.reset()
   return third_person.ThirdPerson(
     environment.task, environment.physics, height=_HEIGHT, width=_WIDTH
