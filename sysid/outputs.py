@@ -1,7 +1,7 @@
-"""Writes what an identification found, and reads it back to evaluate it on other logs.
+"""Writes what an identification found.
 
-report.json holds the findings, details.json what they rest on and all that `evaluate` needs: the
-declared model's path, the extended model as effects, the joints' latencies.
+report.json holds the findings, details.json what they rest on and all that `drift` needs of later
+logs: the declared model's path, the extended model as effects, the joints' hypotheses.
 """
 
 import json
@@ -20,14 +20,14 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import Effect, write_effects
-from nerf2real.suite.effects.files import from_list, to_list
+from nerf2real.suite.effects.files import to_list
 from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import excitation, identifiability
 from nerf2real.sysid.design.identifiability import Identifiability
+from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.report import capability
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
@@ -170,6 +170,7 @@ def _identify(
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
   details = _details(found, model, whole, sensed)
   details["identifiability"] = [to_plain(item) for item in shown]
+  details["joints"] = stored.to_json(stored.remembered(found, held, settings))
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
   progress(_ERRORS, "report")
   content["seconds"] = round(time.perf_counter() - began, 1)
@@ -204,7 +205,7 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
 def _details(
   found: Identified, model: Path, extended: Sequence[Effect], sensed: sensing.Sensed
 ) -> dict[str, Any]:
-  """Returns what the findings rest on, and what `evaluate` needs."""
+  """Returns what the findings rest on, and what the extended model is simulated with."""
   first = found.least_explained
   return {
     "model": str(model.resolve()),
@@ -224,37 +225,6 @@ def _details(
     "audit": found.audits,
     "sensors": sensed.errors(),
   }
-
-
-def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
-  """Returns the error of the declared and the extended model on further logs.
-
-  Args:
-    folder: what `identify` wrote.
-    held: logs.
-  """
-  folder = Path(folder)
-  for name in ("report.json", "details.json"):
-    if not (folder / name).is_file():
-      raise FileNotFoundError(
-        f"Found no {folder / name}, expected a folder that identify.py wrote."
-      )
-  content = json.loads((folder / "report.json").read_text())
-  details = json.loads((folder / "details.json").read_text())
-  model = load_model(Path(details["model"]))
-  effects = from_list(details["extended"])
-  clocks = {joint: Clocks(**values) for joint, values in details["clocks"].items()}
-  rows = []
-  for log in read_logs(held, model):
-    window = content["window_s"] or 0.5
-    rows.append(
-      {
-        "log": log.name,
-        "before": evaluation.error(model, [log], window_s=window),
-        "after": evaluation.error(model, [log], effects, clocks=clocks, window_s=window),
-      }
-    )
-  return rows
 
 
 def _claimed(found: Identified) -> list[Effect]:
