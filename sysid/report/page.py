@@ -14,7 +14,7 @@ from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.design.identifiability import Identifiability
 from nerf2real.sysid.fit.posterior import CONSTANTS
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.report import capability, meanings, residual_plots
+from nerf2real.sysid.report import capability, meanings, residual_plots, summary
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
 from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.explain import clear
@@ -60,7 +60,8 @@ def page(
   """
   items = found.found
   sections = [
-    _verdict(content),
+    summary.section(content, found),
+    _verdict(content, [note for note in content["notes"] if note != capability.sentence(shown)]),
     _errors(found, content),
     *[residual_plots.residuals(item) for item in items[:_SHOWN]],
     _ladder(found),
@@ -96,7 +97,7 @@ def _place(effect: dict[str, Any]) -> str:
   return next((place for place in places if place), "all")
 
 
-def _verdict(content: dict[str, Any]) -> Section:
+def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
   rows, bounds = _parameters(content["effects"])
   notes = [
     f"As good an explanation of {a['joint']}: {a['kind']}."
@@ -107,7 +108,7 @@ def _verdict(content: dict[str, Any]) -> Section:
   listed = [a for a in content["alternatives"] if "kinds" not in a]
   nearest, _ = _parameters([a for a in listed if "sensor" not in a])
   alike, _ = _parameters([a for a in listed if "sensor" in a])
-  blocks: list[Block] = [Warnings([*notes, *content["notes"]])]
+  blocks: list[Block] = [Warnings([*notes, *said])]
   if rows:
     blocks.append(Table(_HEADER, rows))
     chart = charts.intervals("95 % intervals", bounds)
