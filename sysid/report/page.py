@@ -60,7 +60,11 @@ def page(
   """
   items = found.found
   sections = [
-    summary.section(content, found),
+    summary.section(
+      content,
+      beyond=found.least_explained.subject.beyond,
+      unit=residual_plots.unit_of(found.least_explained),
+    ),
     _verdict(content, [note for note in content["notes"] if note != capability.sentence(shown)]),
     _errors(found, content),
     *[residual_plots.residuals(item) for item in items[:_SHOWN]],

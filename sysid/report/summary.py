@@ -5,21 +5,19 @@ from typing import Any
 
 from nerf2real.core.pages.blocks import Table
 from nerf2real.core.pages.page import Section
-from nerf2real.sysid.selection.findings import Identified
 
 _FEW = 4  # effects that are said with their values; more are counted
 _CLEAR = 99.0  # standard errors, beyond which a number says nothing more
 
 
-def section(content: dict[str, Any], found: Identified) -> Section:
+def section(content: dict[str, Any], *, beyond: float, unit: str) -> Section:
   """Returns the first section of the report.
 
   Args:
     content: what report.json holds.
-    found: what was identified.
+    beyond: standard errors that count as clear.
+    unit: of small positions, mrad or mm.
   """
-  beyond = found.joints[0].subject.beyond
-  unit = "mrad" if found.least_explained.likelihood.plant.hinge else "mm"
   rows = [
     ["What does the model lack?", _missing(content)],
     ["How sure is that?", _sure(content, beyond)],
@@ -32,9 +30,9 @@ def section(content: dict[str, Any], found: Identified) -> Section:
 def _missing(content: dict[str, Any]) -> str:
   effects = content["effects"]
   if effects:
-    words = [_effect(effect) for effect in effects[:_FEW]]
+    first = "; ".join(_effect(effect) for effect in effects[:_FEW])
     more = len(effects) - _FEW
-    return "; ".join(words) + (f"; and {more} more, listed below." if more > 0 else ".")
+    return first + (f"; and {more} more, listed below." if more > 0 else ".")
   if content["verdict"] == "none":
     return "Nothing that these logs show."
   joint = content["residual_at"]["joint"]
@@ -60,19 +58,20 @@ def _effect(effect: dict[str, Any]) -> str:
 def _sure(content: dict[str, Any], beyond: float) -> str:
   alike = [a["kind"] for a in content["alternatives"] if a.get("confounded")]
   effects = content["effects"]
+  if not effects and content["verdict"] == "none":
+    return "No hypothesis with an effect is clear of the one without."
   if not effects:
-    words = "No hypothesis with an effect is clear of one without it."
-    return words if content["verdict"] == "none" else "Not sure: no name is clear of every other."
+    return "Not sure: no name is clear of every other."
   clear = [effect.get("evidence", {}).get("clear_by_standard_errors") for effect in effects]
   least = min((c for c in clear if c is not None), default=None)
-  words = ["Evidence is said with each name below."]
+  words = "Brackets hold 95 % intervals."
   if least is not None:
     size = f"{least:.1f}" if least < _CLEAR else "more than 99"
-    words = [f"Every explanation without it is worse by {size} standard errors or more, where"]
-    words[0] += f" {beyond:.1f} are asked; brackets hold 95 % intervals."
+    words = f"Every explanation without it is worse by {size} standard errors or more, where"
+    words += f" {beyond:.1f} are asked. Brackets hold 95 % intervals."
   if alike:
-    words.append(f"These logs do not tell it from {_either(alike)}.")
-  return " ".join(words)
+    words += f" These logs do not tell it from {_either(alike)}."
+  return words
 
 
 def _either(names: Sequence[str]) -> str:
