@@ -6,7 +6,8 @@ logs of one machine: that of n later logs is expected about the mean of the L st
     t_(J (L - 1)) s sqrt(1 / L + 1 / n)
 
 s pooled over the J joints (prediction interval, e.g. Hahn and Meeker 1991, section 4.2), at least
-what the scatter of blocks makes it. What the readings are noisier by is no drift and is taken off.
+what the scatter of blocks makes it. What the readings are noisier by is no drift and is taken off,
+and what is less than half of their noise is none, as elsewhere (`settings.structured`).
 Then the named values alone are fitted anew, each joint's constants within what two recordings of
 one machine differ by, and compared with their stored intervals (`values.py`). All are judged at one
 family-wise level.
@@ -47,11 +48,8 @@ class Error:
   noise_stored: float
   noise_later: float
 
-  @property
-  def grown(self) -> bool:
-    """Whether it is larger than expected, what the readings are noisier by taken off."""
-    noisier = max(self.noise_later**2 - self.noise_stored**2, 0.0)
-    return self.later**2 - noisier > self.expected**2
+  grown: bool
+  """Whether it is larger than expected, what the readings are noisier by taken off."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,17 +107,21 @@ def judge(stored: Stored, logs: Sequence[Log], *, settings: Settings = SETTINGS)
   }
   level = settings.level / _TESTS
   values, skipped = compare(stored, now, level=level, settings=settings)
-  errors = _errors(stored.joints, now, level)
+  errors = _errors(stored.joints, now, level=level, settings=settings)
   return Drift(tuple(log.name for log in logs), errors, values, skipped)
 
 
 def _errors(
-  joints: Sequence[StoredJoint], now: dict[str, JointLikelihood], level: float
+  joints: Sequence[StoredJoint],
+  now: dict[str, JointLikelihood],
+  *,
+  level: float,
+  settings: Settings,
 ) -> tuple[Error, ...]:
   """Returns every joint's error beside what is expected of it."""
   rows = [[np.array(log.squares) for log in item.logs] for item in joints]
   logs = len(rows[0])
-  logarithms = np.array([[0.5 * np.log(blocks.mean()) for blocks in row] for row in rows])  # [J, L]
+  logarithms = np.array([[_logarithm(blocks) for blocks in row] for row in rows])  # [J, L]
   scatter = float(np.mean([_scatter(blocks) ** 2 for row in rows for blocks in row]))
   freedom = len(joints) * (logs - 1)
   if logs > 1:
@@ -132,22 +134,32 @@ def _errors(
     later = squares_by_log(joint, item.terms, np.array(item.values))
     reach = np.sqrt(spread * (1.0 / logs + 1.0 / len(later)))
     reach *= float(t.isf(level / len(joints), freedom))
+    noise, now_noise = item.noise, joint.position_noise
+    size = float(np.exp(np.mean([_logarithm(blocks) for blocks in later])))
+    expected = float(np.exp(values.mean() + reach))
+    least = max(now_noise**2 - noise**2, 0.0) + (settings.structured * noise) ** 2
     result.append(
       Error(
         item.joint,
         item.unit,
         stored=float(np.exp(values.mean())),
-        expected=float(np.exp(values.mean() + reach)),
-        later=float(np.exp(np.mean([0.5 * np.log(blocks.mean()) for blocks in later]))),
-        noise_stored=item.noise,
-        noise_later=joint.position_noise,
+        expected=expected,
+        later=size,
+        noise_stored=noise,
+        noise_later=now_noise,
+        grown=size**2 > expected**2 + least,
       )
     )
   return tuple(result)
+
+
+def _logarithm(squares: Array) -> float:
+  """Returns the logarithm of a log's RMSE, by its blocks [B]."""
+  return 0.5 * float(np.log(max(squares.mean(), 1e-300)))
 
 
 def _scatter(squares: Array) -> float:
   """Returns the standard error of the logarithm of a log's RMSE, by its blocks [B]."""
   if len(squares) < 2:
     return 0.0
-  return 0.5 * float(np.sqrt(variance(squares)) / squares.sum())
+  return 0.5 * float(np.sqrt(variance(squares)) / max(squares.sum(), 1e-300))

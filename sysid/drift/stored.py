@@ -56,8 +56,7 @@ class StoredJoint:
   @property
   def split(self) -> list[Array]:
     """The values of each term."""
-    ends = np.cumsum([len(term.names) for term in self.terms])
-    return np.split(np.array(self.values), ends[:-1])
+    return _split(self.terms, np.array(self.values))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +115,7 @@ def joint_of(
   return StoredJoint(
     first.plant.joint,
     "rad" if first.plant.hinge else "m",
-    tuple(_finite(term) for term in terms),
+    tuple(_plain(term, part) for term, part in zip(terms, _split(terms, x), strict=True)),
     tuple(map(float, x)),
     first.follows,
     first.position_noise,
@@ -130,9 +129,16 @@ def squares_by_log(joint: JointLikelihood, terms: Sequence[Term], x: Array) -> l
   return [squares[joint.log_of == index] for index in range(len(joint.plant.logs))]
 
 
-def _finite(term: Term) -> Term:
+def _split(terms: Sequence[Term], x: Array) -> list[Array]:
+  """Returns the values of each term."""
+  ends = np.cumsum([len(term.names) for term in terms])
+  return np.split(np.asarray(x, float), ends[:-1])
+
+
+def _plain(term: Term, values: Array) -> Term:
+  """Returns a term that begins at its values, with numbers that JSON has."""
   prior = tuple(float(np.nan_to_num(sigma, posinf=_NO_PRIOR)) for sigma in term.prior)
-  return dataclasses.replace(term, prior=prior)
+  return dataclasses.replace(term, prior=prior, starts=(tuple(map(float, values)),))
 
 
 def to_json(joints: Sequence[StoredJoint]) -> list[dict[str, Any]]:

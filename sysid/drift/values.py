@@ -115,7 +115,7 @@ def _refit(
   settings: Settings,
 ) -> _Refit | None:
   """Returns an entry of the report fitted anew; None if it is of no joint's hypothesis."""
-  members = row["evidence"].get("joints")
+  members = row.get("evidence", {}).get("joints")
   if row["kind"] == "parameter_error" and members:  # medians over joints
     return None
   if members:
@@ -205,10 +205,10 @@ def _held(
       continue
     part = values
     if term is free:
-      moving = dataclasses.replace(term, starts=(tuple(values),))
+      moving = term
     elif term.kind == CONSTANTS:
       sigma = tuple(repeat[name] for name in term.names)
-      moving = dataclasses.replace(term, prior=sigma, centre=tuple(values), starts=(tuple(values),))
+      moving = dataclasses.replace(term, prior=sigma, centre=tuple(values))
     elif term.kind == FREE:  # its table is made of its values
       sigma = tuple(_HELD * scale for scale in term.scale)
       moving = dataclasses.replace(term, prior=sigma, centre=tuple(values))
@@ -224,7 +224,7 @@ def _shows(joint: JointLikelihood, constants: Term, term: Term, values: Array) -
   place = Place(term, tuple(map(float, values)))
   matrix = information(
     lambda terms, x: joint.residuals(terms, x[None])[0],
-    dataclasses.replace(constants, starts=(constants.centre,)),
+    constants,
     [place],
     noise=joint.floor,
     count=float(joint.mask.sum()),

@@ -237,8 +237,8 @@ def test_what_identify_writes_is_judged(later, tmp_path):
 
 def test_the_sentence_names_what_grew_most():
   errors = (
-    Error("a", "rad", 1e-3, 2e-3, 1.5e-3, 1e-4, 1e-4),
-    Error("b", "m", 1e-3, 2e-3, 3e-3, 1e-4, 1e-4),
+    Error("a", "rad", 1e-3, 2e-3, 1.5e-3, 1e-4, 1e-4, False),
+    Error("b", "m", 1e-3, 2e-3, 3e-3, 1e-4, 1e-4, True),
   )
   words = page.sentence(Drift(("x",), errors, (), ()))
   assert words == "The machine has drifted: b leaves 3 mm, at most 2 mm were expected."
