@@ -98,7 +98,9 @@ def _next(proposal: dict[str, Any]) -> str:
   if "centre_rad" in proposal:
     words += f", {proposal['amplitude_rad']:.2g} about {proposal['centre_rad']:.2g}"
   reasons = []
-  if rivals and proposal.get("separation_in_noise"):
+  if rivals and "separation_in_noise" not in proposal:
+    reasons.append(f"it may tell the effect from {' or '.join(rivals)}")
+  elif rivals and proposal["separation_in_noise"]:
     size = f"{proposal['separation_in_noise']:.1f} times the noise"
     reasons.append(f"the nearest rival, of {' or '.join(rivals)}, would differ by {size}")
   if proposal.get("would"):

@@ -92,3 +92,8 @@ def test_a_motion_without_a_reason_is_not_proposed(content):
   assert answers(content)[3] == "Nothing in particular."
   content["next_excitation"]["would"] = "show backlash"
   assert answers(content)[3] == "steps of 1.5 s, 0.9 about 0: it would show backlash."
+
+
+def test_a_force_driven_joint_has_a_motion_in_words(content):
+  content["next_excitation"] = {"design": "a longer log", "separates": [["payload"]], "would": ""}
+  assert answers(content)[3] == "a longer log: it may tell the effect from payload."
