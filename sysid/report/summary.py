@@ -64,14 +64,14 @@ def _sure(content: dict[str, Any], beyond: float) -> str:
     return "Not sure: no name is clear of every other."
   clear = [effect.get("evidence", {}).get("clear_by_standard_errors") for effect in effects]
   least = min((c for c in clear if c is not None), default=None)
-  words = "Brackets hold 95 % intervals."
+  words = ""
   if least is not None:
     size = f"{least:.1f}" if least < _CLEAR else "more than 99"
-    words = f"Every explanation without it is worse by {size} standard errors or more, where"
-    words += f" {beyond:.1f} are asked. Brackets hold 95 % intervals."
+    words = f"Every {'other ' if alike else ''}explanation without it is worse by {size} standard"
+    words += f" errors or more, where {beyond:.1f} are asked. "
   if alike:
-    words += f" These logs do not tell it from {_either(alike)}."
-  return words
+    words += f"These logs do not tell it from {_either(alike)}. "
+  return words + "Brackets hold 95 % intervals."
 
 
 def _either(names: Sequence[str]) -> str:
@@ -93,16 +93,20 @@ def _remains(content: dict[str, Any], unit: str) -> str:
 
 
 def _next(proposal: dict[str, Any]) -> str:
-  rivals = [" with ".join(names) for names in proposal["separates"] if names]
-  words = proposal["design"]
+  rivals = " or ".join(" with ".join(names) for names in proposal["separates"] if names)
+  apart, would = proposal.get("separation_in_noise"), proposal.get("would")
+  motion = proposal["design"]
   if "centre_rad" in proposal:
-    words += f", {proposal['amplitude_rad']:.2g} about {proposal['centre_rad']:.2g}"
-  reasons = []
-  if rivals and "separation_in_noise" not in proposal:
-    reasons.append(f"it may tell the effect from {' or '.join(rivals)}")
-  elif rivals and proposal["separation_in_noise"]:
-    size = f"{proposal['separation_in_noise']:.1f} times the noise"
-    reasons.append(f"the nearest rival, of {' or '.join(rivals)}, would differ by {size}")
-  if proposal.get("would"):
-    reasons.append(f"it would {proposal['would']}")
-  return f"{words}: {'; '.join(reasons)}." if reasons else "Nothing in particular."
+    motion += f", {proposal['amplitude_rad']:.2g} about {proposal['centre_rad']:.2g}"
+  reasons = [f"it would {would}"] if would else []
+  if rivals and apart is None:
+    reasons.append(f"it may tell the effect from {rivals}")
+  elif rivals and apart >= 1.0:
+    reasons.append(f"the nearest rival, of {rivals}, would differ by {apart:.1f} times the noise")
+  if reasons:
+    return f"{motion}: {'; '.join(reasons)}."
+  if rivals:
+    return (
+      f"No motion that was tried tells the effect from {rivals}: they differ by less than noise."
+    )
+  return "Nothing in particular."

@@ -60,7 +60,8 @@ def test_what_logs_do_not_tell_apart_is_said(content):
   rival = {"kind": "spring+viscous_friction", "kinds": [], "confounded": True}
   content["alternatives"] = [rival, {**rival, "kind": "backlash", "confounded": False}]
   _, sure, _, _ = answers(content)
-  assert sure.endswith("These logs do not tell it from spring with viscous_friction.")
+  assert sure.startswith("Every other explanation")
+  assert "These logs do not tell it from spring with viscous_friction." in sure
 
 
 def test_of_many_effects_the_rest_is_counted(content):
@@ -92,6 +93,12 @@ def test_a_motion_without_a_reason_is_not_proposed(content):
   assert answers(content)[3] == "Nothing in particular."
   content["next_excitation"]["would"] = "show backlash"
   assert answers(content)[3] == "steps of 1.5 s, 0.9 about 0: it would show backlash."
+
+
+def test_rivals_that_no_motion_separates_are_said(content):
+  content["next_excitation"]["separation_in_noise"] = 0.02
+  words = "No motion that was tried tells the effect from stribeck_friction"
+  assert answers(content)[3].startswith(words)
 
 
 def test_a_force_driven_joint_has_a_motion_in_words(content):
