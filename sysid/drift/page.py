@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from nerf2real.core import palette
 from nerf2real.core.pages import charts
-from nerf2real.core.pages.blocks import Block, Grid, Table
-from nerf2real.core.pages.charts import Curve, Interval
+from nerf2real.core.pages.blocks import Grid, Table
+from nerf2real.core.pages.charts import Curve
 from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.drift.judgement import Drift, Error
@@ -22,14 +22,14 @@ def sentence(found: Drift) -> str:
     words = [_moved(value) for value in found.moved] + [_grown(error) for error in found.grown]
     return f"The machine has drifted: {'; '.join(words)}."
   worst = max(found.errors, key=lambda e: e.later / e.expected)
-  words = [f"the stored result leaves {_size(worst.later, worst)} at {worst.joint}"]
+  words = [f"it leaves {_size(worst.later, worst)} at {worst.joint}"]
   words[0] += f", up to {_size(worst.expected, worst)} are expected"
   shown = [value for value in found.values if value.state == "fits"]
   if shown:
-    words.append(f"{_named(shown)} fit their intervals")
+    words.append(f"within the stored intervals: {_named(shown)}")
   hidden = [value for value in found.values if value.state == "not shown"]
   if hidden:
-    words.append(f"{_named(hidden)} are not shown by these logs")
+    words.append(f"not shown by these logs: {_named(hidden)}")
   return f"The stored result still holds: {'; '.join(words)}."
 
 
@@ -64,9 +64,10 @@ def page(found: Drift, stored: Stored, logs: Sequence[Log]) -> Page:
   if found.values:
     sections.append(_values(found))
   sections.append(_residuals(found, stored, logs))
-  title = "The stored result still holds" if found.holds else "The machine has drifted"
   notes = [f"Not compared: {kind}." for kind in found.not_judged]
-  return Page(title, sentence(found), sections, notes, origin=Origin.of_process())
+  return Page(
+    "A stored result and later logs", sentence(found), sections, notes, origin=Origin.of_process()
+  )
 
 
 def _errors(found: Drift) -> Section:
@@ -89,24 +90,20 @@ def _errors(found: Drift) -> Section:
 
 
 def _values(found: Drift) -> Section:
-  rows, bounds = [], []
+  rows = []
   for value in found.values:
+    then, now = (
+      "" if entry is None else f"{entry[0]:.4g} ({entry[1]:.4g} to {entry[2]:.4g})"
+      for entry in (value.stored, value.later)
+    )
     label = f"{value.kind} {value.name} ({value.where})"
-    entries = (("stored", value.stored), ("now", value.later))
-    cells = []
-    for when, entry in entries:
-      cells.append("" if entry is None else f"{entry[0]:.4g} ({entry[1]:.4g} to {entry[2]:.4g})")
-      if entry is not None and entry[2] > entry[1]:
-        bounds.append(Interval(f"{label}, {when}", *entry))
-    rows.append([label, *cells, value.unit, value.apart, value.state])
+    rows.append([label, then, now, value.unit, value.apart, value.state])
   header = ["value", "stored (95 %)", "now (95 %)", "unit", "apart [standard errors]", ""]
-  blocks: list[Block] = [Table(header, rows)]
-  chart = charts.intervals("95 % intervals", bounds)
   return Section(
     "Values",
     "The named values alone fitted anew to the later logs, each joint's constants within what two"
     " recordings of one machine differ by.",
-    [*blocks, *([chart] if chart is not None else [])],
+    [Table(header, rows)],
   )
 
 

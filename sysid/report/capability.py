@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.pages.blocks import Block, Details, Heading, Table
+from nerf2real.core.pages.blocks import Block, Details, Heading, Table, Text
 from nerf2real.core.pages.page import Section
 from nerf2real.sysid.design.identifiability import Identifiability, Shown
 
@@ -19,6 +19,14 @@ _HEADER = [
 ]
 _NAMED = 3  # joints that are named one by one
 _OPEN = 3  # joints whose tables are shown at once
+
+
+_READ = (
+  "Before any fit: how much an effect of a usual size would change the readings of the declared"
+  " model under the logged commands, less what the constants imitate within their tolerances; the"
+  " size (SI units) from which that is as large as the readings' noise; the effect that imitates it"
+  " best, and the size from which the two differ by the noise."
+)
 
 
 def section(shown: Sequence[Identifiability]) -> Section:
@@ -37,15 +45,7 @@ def section(shown: Sequence[Identifiability]) -> Section:
       blocks += [Heading(item.joint), *parts]
     else:
       blocks.append(Details(item.joint, parts))
-  return Section(
-    "What these logs can show",
-    sentence(shown)
-    + " Before any fit: how much an effect of a usual size would change the readings of the"
-    " declared model under the logged commands, less what the constants imitate within their"
-    " tolerances; the size from which that is as large as the readings' noise; the effect that"
-    " imitates it best, and the size from which the two differ by the noise.",
-    blocks,
-  )
+  return Section("What these logs can show", sentence(shown), [Text(_READ), *blocks])
 
 
 def _row(effect: Shown) -> list[Any]:

@@ -5,6 +5,7 @@ from typing import Any
 
 from nerf2real.core.pages.blocks import Table
 from nerf2real.core.pages.page import Section
+from nerf2real.sysid.model import simulation
 
 _FEW = 4  # effects that are said with their values; more are counted
 _CLEAR = 99.0  # standard errors, beyond which a number says nothing more
@@ -84,6 +85,8 @@ def _remains(content: dict[str, Any], unit: str) -> str:
   after, floor = error["after"], content["error"]["floor"]
   words = f"{1e3 * after:.3g} {unit} of {1e3 * error['before']:.3g} on logs that {which},"
   words += f" {after / max(floor, 1e-12):.1f} times the readings' noise."
+  if simulation.is_worse(error):
+    words += " The extended model is worse than the declared one: do not use it."
   if content["verdict"] in ("partly", "unexplained"):
     at = content["residual_at"]
     low, high = at["velocity"]["low"], at["velocity"]["high"]

@@ -179,7 +179,7 @@ def test_a_threshold_that_is_not_reached_is_not_judged(later, tmp_path):
   found = sysid.check_drift(folder, [Path("gentle")])
   (value,) = found.values
   assert found.holds and value.state == "not shown" and value.later is None
-  assert "torque_limit limit are not shown by these logs" in page.sentence(found)
+  assert "not shown by these logs: torque_limit limit" in page.sentence(found)
 
 
 def test_the_command_says_it_and_ends_with_its_status(pendulum, later, tmp_path, capsys):

@@ -74,6 +74,11 @@ def test_without_held_logs_the_fitted_ones_are_said(content):
   assert answers(content)[2].startswith("2 mrad of 20 on logs that were fitted, 2.0 times")
 
 
+def test_an_extended_model_that_is_worse_is_said_to_be(content):
+  content["error"]["held"]["after"] = 0.04
+  assert answers(content)[2].endswith("worse than the declared one: do not use it.")
+
+
 def test_nothing_and_no_name_are_different_answers(content):
   content["effects"] = []
   content["verdict"] = "none"
