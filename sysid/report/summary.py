@@ -104,7 +104,7 @@ def _next(proposal: dict[str, Any]) -> str:
   reasons = [f"it would {would}"] if would else []
   if rivals and apart is None:
     reasons.append(f"it may tell the effect from {rivals}")
-  elif rivals and apart >= 1.0:
+  elif rivals and apart is not None and apart >= 1.0:
     reasons.append(f"the nearest rival, of {rivals}, would differ by {apart:.1f} times the noise")
   if reasons:
     return f"{motion}: {'; '.join(reasons)}."
