@@ -12,6 +12,7 @@ import json
 import os
 import pathlib
 import resource
+import signal
 import subprocess
 import sys
 import time
@@ -47,6 +48,8 @@ class Settings:
   """Sets analysed at the same time, each on one core."""
   timeout: float = 900.0
   """s that one analysis may take; longer is a failure."""
+  processor_seconds: int | None = None
+  """s of processor time that one analysis may use; more is a failure. No limit for None."""
   done_only: bool = False
   """Analyse nothing: score what was analysed so far."""
   redo: bool = False
@@ -137,18 +140,23 @@ def _analyse(settings: Settings, name: str) -> tuple[dict[str, Any], dict[str, f
       continue
     paths = sorted(str(path) for path in folder.glob(f"{pattern}_*.mcap"))
     command += [f"--{option}", *paths] if paths else []
+  command += ["--out", str(out)]
+  if settings.processor_seconds is not None:
+    command = ["sh", "-c", f'ulimit -t {settings.processor_seconds}; exec "$@"', "sh", *command]
   before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
   report: dict[str, Any] = {}
   try:
     result = subprocess.run(
-      [*command, "--out", str(out)],
+      command,
       capture_output=True,
       text=True,
       timeout=settings.timeout,
       check=False,
       env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
     )
-    if result.returncode:
+    if result.returncode in (-signal.SIGXCPU, -signal.SIGKILL) and settings.processor_seconds:
+      report = {"failed": f"used more than {settings.processor_seconds} s of processor time"}
+    elif result.returncode:
       lines = result.stderr.strip().splitlines() or ["no message"]
       report = {"failed": lines[-1]}
     else:

@@ -1,9 +1,11 @@
 """Finds the effects that a model lacks, from measured logs.
 
   python launch/identify.py --model model.xml --logs train_*.mcap --held held_*.mcap --out out/x
-  python launch/identify.py --evaluate out/x --held other.mcap
+  python launch/identify.py --evaluate out/x --held later.mcap
 
-Writes report.json, report.html, effects.json (for suite.load), model_extended.xml.
+The first writes report.json, report.html, effects.json (for suite.load), model_extended.xml. The
+second says whether a later log still fits what was found, writes drift.json and drift.html, and
+ends with status 3 where it does not.
 """
 
 import dataclasses
@@ -13,6 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.launch import command
+
+DRIFTED = 3
+"""Exit status: later logs do not fit the stored result."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,13 +34,17 @@ class Arguments:
   """Logs of the same apparatus without the effect, best of the same motions: what differs is looked
   for (one joint), or they calibrate the declared constants (several); they are how bright it is."""
   out: Path | None = None
-  """Folder to write."""
+  """Folder to write; with --evaluate the evaluated one if left out."""
   evaluate: Path | None = None
-  """A folder that was written before: print its models' errors on the --held logs."""
+  """A folder that was written before: print its models' errors on the --held logs, and whether
+  these still fit its effects; status 3 where not."""
 
 
-def run(arguments: Arguments) -> None:
+def run(arguments: Arguments) -> int:
   """Identifies or evaluates, and prints tables.
+
+  Returns:
+    DRIFTED where later logs do not fit a result that was evaluated, else 0.
 
   Raises:
     CommandError: Options are missing.
@@ -46,7 +55,7 @@ def run(arguments: Arguments) -> None:
         "Found no --held log, expected at least one to evaluate on.", status=command.WRONG_ARGUMENTS
       )
     _print_errors(arguments.evaluate, arguments.held)
-    return
+    return _check_drift(arguments.evaluate, arguments.held, arguments.out)
   if arguments.model is None or not arguments.logs or arguments.out is None:
     raise command.CommandError(
       "Found no --model, --logs or --out, expected all three (see --help).",
@@ -65,6 +74,7 @@ def run(arguments: Arguments) -> None:
       progress=progress,
     )
   _print_content(content, arguments.out)
+  return 0
 
 
 def _print_content(content: dict[str, Any], out: Path) -> None:
@@ -114,6 +124,21 @@ def _print_errors(folder: Path, held: Sequence[Path]) -> None:
     ratio = row["before"] / max(row["after"], 1e-12)
     table.add_row(row["log"], f"{row['before']:.6f}", f"{row['after']:.6f}", f"{ratio:.2f} times")
   rich.print(table)
+
+
+def _check_drift(folder: Path, held: Sequence[Path], out: Path | None) -> int:
+  """Prints whether later logs fit a stored result; returns the exit status."""
+  import rich
+
+  from nerf2real import sysid
+  from nerf2real.sysid.drift import page
+
+  found = sysid.check_drift(folder, held, out=out)
+  rich.print(f"[bold]{page.sentence(found)}[/bold]")
+  for kind in found.not_judged:
+    rich.print(f"not compared: {kind}")
+  rich.print(f"page: {(out or folder) / 'drift.html'}")
+  return 0 if found.holds else DRIFTED
 
 
 def main() -> int:

@@ -4,14 +4,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-  from nerf2real.sysid.outputs import evaluate, identify
+  from nerf2real.sysid.drift.later import check_drift, evaluate
+  from nerf2real.sysid.outputs import identify
   from nerf2real.sysid.settings import Settings
 
-__all__ = ["Settings", "evaluate", "identify"]
+__all__ = ["Settings", "check_drift", "evaluate", "identify"]
 
 _HOMES = {
   "Settings": "nerf2real.sysid.settings",
-  "evaluate": "nerf2real.sysid.outputs",
+  "check_drift": "nerf2real.sysid.drift.later",
+  "evaluate": "nerf2real.sysid.drift.later",
   "identify": "nerf2real.sysid.outputs",
 }
 

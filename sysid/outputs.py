@@ -1,7 +1,7 @@
-"""Writes what an identification found, and reads it back to evaluate it on other logs.
+"""Writes what an identification found.
 
-report.json holds the findings, details.json what they rest on and all that `evaluate` needs: the
-declared model's path, the extended model as effects, the joints' latencies.
+report.json holds the findings, details.json what they rest on and all that `drift` needs of later
+logs: the declared model's path, the extended model as effects, the joints' hypotheses.
 """
 
 import json
@@ -18,14 +18,17 @@ from nerf2real.core.folder_lock import lock_folder
 from nerf2real.core.pages import page
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
+from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import Effect, write_effects
-from nerf2real.suite.effects.files import from_list, to_list
+from nerf2real.suite.effects.files import to_list
 from nerf2real.sysid.data.opening import load_model, read_logs
-from nerf2real.sysid.design import excitation
+from nerf2real.sysid.design import excitation, identifiability
+from nerf2real.sysid.design.identifiability import Identifiability
+from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.report import capability
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.changes import Changed
@@ -34,7 +37,12 @@ from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.sensors import sensing
 from nerf2real.sysid.settings import SETTINGS, Settings
 
-_ANALYSIS, _SENSORS, _ERRORS = 0.8, 0.85, 0.95  # shares of the work done after each, about
+_SHOWN, _ANALYSIS, _SENSORS, _ERRORS = (
+  0.05,
+  0.8,
+  0.85,
+  0.95,
+)  # shares of the work done after each, about
 _LISTED = 6  # alternatives in the report
 
 
@@ -104,7 +112,9 @@ def _identify(
 ) -> dict[str, Any]:
   """Analyses logs that were read, and writes; see `identify`."""
   began = time.perf_counter()
-  progress(0.0, "comparing with the reference" if reference else "explaining every joint")
+  progress(0.0, "what the logs can show")
+  shown = identifiability.of_machine(compiled, logs, repeated=bool(reference), settings=settings)
+  progress(_SHOWN, "comparing with the reference" if reference else "explaining every joint")
   found = analyse(compiled, logs, reference, settings=settings)
   progress(_ANALYSIS, "sensors and floor")
   sensed = sensing.find(compiled, logs, reference, tilt=_tilt(found))
@@ -128,8 +138,8 @@ def _identify(
     },
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
-    "next_excitation": _next(found),
-    "notes": sensed.notes,
+    "next_excitation": _next(found, shown),
+    "notes": [capability.sentence(shown), *sensed.notes],
   }
   # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
   content["alternatives"] = [*found.nearest, *content["alternatives"]]
@@ -159,10 +169,14 @@ def _identify(
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
   details = _details(found, model, whole, sensed)
+  details["identifiability"] = [to_plain(item) for item in shown]
+  details["joints"] = stored.to_json(stored.remembered(found, held, settings))
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
   progress(_ERRORS, "report")
   content["seconds"] = round(time.perf_counter() - began, 1)
-  made = report.page(found, content, details, held, whole, settings.window_s)
+  made = report.page(
+    found, content, details, held=held, effects=whole, shown=shown, window_s=settings.window_s
+  )
   page.write(out / "report.html", made)
   content["seconds"] = round(time.perf_counter() - began, 1)
   write_atomically(out / "report.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
@@ -191,7 +205,7 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
 def _details(
   found: Identified, model: Path, extended: Sequence[Effect], sensed: sensing.Sensed
 ) -> dict[str, Any]:
-  """Returns what the findings rest on, and what `evaluate` needs."""
+  """Returns what the findings rest on, and what the extended model is simulated with."""
   first = found.least_explained
   return {
     "model": str(model.resolve()),
@@ -211,37 +225,6 @@ def _details(
     "audit": found.audits,
     "sensors": sensed.errors(),
   }
-
-
-def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
-  """Returns the error of the declared and the extended model on further logs.
-
-  Args:
-    folder: what `identify` wrote.
-    held: logs.
-  """
-  folder = Path(folder)
-  for name in ("report.json", "details.json"):
-    if not (folder / name).is_file():
-      raise FileNotFoundError(
-        f"Found no {folder / name}, expected a folder that identify.py wrote."
-      )
-  content = json.loads((folder / "report.json").read_text())
-  details = json.loads((folder / "details.json").read_text())
-  model = load_model(Path(details["model"]))
-  effects = from_list(details["extended"])
-  clocks = {joint: Clocks(**values) for joint, values in details["clocks"].items()}
-  rows = []
-  for log in read_logs(held, model):
-    window = content["window_s"] or 0.5
-    rows.append(
-      {
-        "log": log.name,
-        "before": evaluation.error(model, [log], window_s=window),
-        "after": evaluation.error(model, [log], effects, clocks=clocks, window_s=window),
-      }
-    )
-  return rows
 
 
 def _claimed(found: Identified) -> list[Effect]:
@@ -345,7 +328,13 @@ def _concentrated(values: np.ndarray, squares: np.ndarray) -> tuple[float, float
   return float(edges[best]), float(edges[best + 2]), round(share, 3)
 
 
-def _next(found: Identified) -> dict[str, Any]:
+def _next(found: Identified, shown: Sequence[Identifiability]) -> dict[str, Any]:
+  """Returns the motion that separates rivals best; without rivals, what shows most of the rest."""
   item = found.least_explained
   rivals = item.confounded or item.alternatives[:2]
-  return excitation.propose(item.likelihood, item.extended, rivals[:3])
+  result = excitation.propose(item.likelihood, item.extended, rivals[:3])
+  own = next(s for s in shown if s.joint == item.joint)
+  if not rivals and own.motion is not None:
+    result["design"] = own.motion
+  result["would"] = capability.deeds(own.resolved.get(result["design"], ()))
+  return result

@@ -4,14 +4,16 @@ Every design is simulated under the chosen hypothesis and under its rivals; the 
 readings differ most, in units of the sensor's noise, is proposed (Hunter and Reiner 1965).
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import kernel
-from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.measured import quantum
 from nerf2real.sysid.selection.explain import Scored
 
@@ -21,6 +23,9 @@ _DURATION = 12.0  # s
 _RATE = 50.0  # commands per second
 _SAMPLES = 100.0  # readings per second
 _RAMP = 0.5  # s, from the first measured position
+_SLOW = 0.02  # of the top speed: less counts as standing, chosen
+TIMES = np.arange(0.0, _DURATION - 0.02, 1.0 / _SAMPLES)
+"""s of the readings under a design [S]."""
 
 
 def designs(centre: float, reach: float, low: float, high: float) -> dict[str, Array]:
@@ -41,6 +46,19 @@ def designs(centre: float, reach: float, low: float, high: float) -> dict[str, A
   return {n: np.clip(centre + reach * ramp * s, low, high) for n, s in shapes.items()}
 
 
+def designs_of(joint: JointLikelihood) -> dict[str, Array]:
+  """Returns commands [T] of each design, over the positions that a joint's logs reach."""
+  positions = np.concatenate([log.position for log in joint.plant.logs])
+  centre, reach = float(np.median(positions)), 0.5 * float(np.ptp(positions))
+  return designs(centre, reach, float(positions.min()), float(positions.max()))
+
+
+def noise_of(joint: JointLikelihood) -> float:
+  """Returns the noise of a joint's readings, at least their resolution."""
+  positions = np.concatenate([log.position for log in joint.plant.logs])
+  return max(quantum(positions), joint.position_noise)
+
+
 def propose(joint: JointLikelihood, chosen: Scored, rivals: list[Scored]) -> dict[str, Any]:
   """Returns the design that separates the chosen hypothesis from its rivals best.
 
@@ -51,7 +69,6 @@ def propose(joint: JointLikelihood, chosen: Scored, rivals: list[Scored]) -> dic
   """
   plant = joint.plant
   positions = np.concatenate([log.position for log in plant.logs])
-  centre, reach = float(np.median(positions)), 0.5 * float(np.ptp(positions))
   if not plant.holds:
     return {
       "joint": plant.joint,
@@ -59,13 +76,13 @@ def propose(joint: JointLikelihood, chosen: Scored, rivals: list[Scored]) -> dic
       "separates": [sorted(r.names) for r in rivals],
     }
   best: tuple[float, str] = (-1.0, "")
-  noise = max(quantum(positions), joint.position_noise)
+  noise = noise_of(joint)
   table = {}
-  for name, command in designs(
-    centre, reach, float(positions.min()), float(positions.max())
-  ).items():
-    truth = _readings(joint.plant, chosen, command)
-    gaps = [np.sqrt(np.mean((truth - _readings(joint.plant, r, command)) ** 2)) for r in rivals]
+  for name, command in designs_of(joint).items():
+    truth, *others = (
+      readings(plant, s.terms, s.fit.x, command).position for s in (chosen, *rivals)
+    )
+    gaps = [np.sqrt(np.mean((truth - other) ** 2)) for other in others]
     worst = float(min(gaps)) / noise if gaps else 0.0
     table[name] = round(worst, 2)
     if worst > best[0]:
@@ -73,36 +90,64 @@ def propose(joint: JointLikelihood, chosen: Scored, rivals: list[Scored]) -> dic
   return {
     "joint": plant.joint,
     "design": best[1],
-    "centre_rad": round(centre, 3),
-    "amplitude_rad": round(reach, 3),
+    "centre_rad": round(float(np.median(positions)), 3),
+    "amplitude_rad": round(0.5 * float(np.ptp(positions)), 3),
     "separation_in_noise": table[best[1]],
     "all_designs": table,
     "separates": [sorted(r.names) for r in rivals],
   }
 
 
-def _readings(plant: JointModel, item: Scored, command: Array) -> Array:
-  """Returns simulated readings under a design, surroundings at the joint's mean."""
-  p, loads, table = compose(plant, item.terms, item.fit.x)
+def compared(plant: JointModel, command: Array) -> dict[str, tuple[float, float]]:
+  """Returns by quantity what the logs have, and what the declared model has under a design."""
+  length, torque = ("rad", "torque [N m]") if plant.hinge else ("m", "force [N]")
+  names = (
+    f"top speed [{length}/s]",
+    f"median speed [{length}/s]",
+    f"range [{length}]",
+    f"largest {torque}",
+    "reversals a second",
+  )
+  position = np.concatenate([log.position for log in plant.logs])
+  velocity = np.concatenate([log.velocity for log in plant.logs])
+  duration = sum(float(log.time[-1] - log.time[0]) for log in plant.logs)
+  here = _quantities(position, velocity, plant.declared_torque(), duration)
+  under = readings(plant, (), np.zeros(0), command)
+  speed = np.gradient(under.position, TIMES)
+  there = _quantities(under.position, speed, under.torque, _DURATION)
+  return dict(zip(names, zip(here, there, strict=True), strict=True))
+
+
+def _quantities(position: Array, velocity: Array, torque: Array, duration: float) -> list[float]:
+  """Returns top and median speed, range, largest torque and reversals a second of a motion."""
+  speed = np.abs(velocity)
+  moving = velocity[speed > _SLOW * speed.max()]
+  reversals = np.sum(np.diff(np.sign(moving)) != 0) / duration
+  found = (np.quantile(speed, 0.99), np.median(speed), np.ptp(position))
+  return [float(value) for value in (*found, np.abs(torque).max(), reversals)]
+
+
+def readings(plant: JointModel, terms: Sequence[Term], x: Array, command: Array) -> Simulated:
+  """Returns readings [S] under a design at TIMES, surroundings at the joint's mean."""
+  p, loads, table = compose(plant, terms, x)
   around = plant.fields(loads, 0)
   weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
-  samples = np.arange(0.0, _DURATION - 0.02, 1.0 / _SAMPLES)
   count = int(_DURATION / plant.step) + 100
   fields = [np.full(count, mean) for mean in (*around[:4].mean(axis=1), 0.0)]
-  out = np.zeros((4, len(samples)))
+  out = np.zeros((4, len(TIMES)))
   kernel.simulate(  # type: ignore[call-arg]
     p,
     plant.step,
     np.arange(len(command)) / _RATE,
     command,
-    samples,
+    TIMES,
     *fields,  # type: ignore
     np.zeros(count),
     plant.hinge,
     np.array([0]),
     command[:1].copy(),
     np.zeros(1),
-    np.full(len(samples), np.nan),
+    np.full(len(TIMES), np.nan),
     weights,
     bounds,
     out[0],
@@ -110,4 +155,4 @@ def _readings(plant: JointModel, item: Scored, command: Array) -> Array:
     out[2],
     out[3],
   )
-  return out[0]
+  return Simulated(out[0], out[2], out[3])

@@ -11,9 +11,10 @@ from nerf2real.core.pages.charts import Bars, Interval
 from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
+from nerf2real.sysid.design.identifiability import Identifiability
 from nerf2real.sysid.fit.posterior import CONSTANTS
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.report import meanings, residual_plots
+from nerf2real.sysid.report import capability, meanings, residual_plots, summary
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
 from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.explain import clear
@@ -40,8 +41,10 @@ def page(
   found: Identified,
   content: dict[str, Any],
   details: dict[str, Any],
+  *,
   held: Sequence[Log],
   effects: Sequence[Effect],
+  shown: Sequence[Identifiability],
   window_s: float,
 ) -> Page:
   """Returns the page.
@@ -52,11 +55,17 @@ def page(
     details: what details.json holds.
     held: logs that were not fitted.
     effects: calibration and effects of the extended model.
+    shown: what the logs can show, by joint.
     window_s: window of restarts.
   """
   items = found.found
   sections = [
-    _verdict(content),
+    summary.section(
+      content,
+      beyond=found.least_explained.subject.beyond,
+      unit=residual_plots.unit_of(found.least_explained),
+    ),
+    _verdict(content, [note for note in content["notes"] if note != capability.sentence(shown)]),
     _errors(found, content),
     *[residual_plots.residuals(item) for item in items[:_SHOWN]],
     _ladder(found),
@@ -64,7 +73,8 @@ def page(
   ]
   if held:
     sections.append(residual_plots.held_out(found, held, effects, items[:_SHOWN], window_s))
-  sections += [_joints(found), _next(content), _audit(details), meanings.section()]
+  sections += [_joints(found), _next(content), capability.section(shown)]
+  sections += [_audit(details), meanings.section()]
   names = _summary(content["effects"])
   return Page(
     "What the model lacks",
@@ -91,7 +101,7 @@ def _place(effect: dict[str, Any]) -> str:
   return next((place for place in places if place), "all")
 
 
-def _verdict(content: dict[str, Any]) -> Section:
+def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
   rows, bounds = _parameters(content["effects"])
   notes = [
     f"As good an explanation of {a['joint']}: {a['kind']}."
@@ -102,7 +112,7 @@ def _verdict(content: dict[str, Any]) -> Section:
   listed = [a for a in content["alternatives"] if "kinds" not in a]
   nearest, _ = _parameters([a for a in listed if "sensor" not in a])
   alike, _ = _parameters([a for a in listed if "sensor" in a])
-  blocks: list[Block] = [Warnings([*notes, *content["notes"]])]
+  blocks: list[Block] = [Warnings([*notes, *said])]
   if rows:
     blocks.append(Table(_HEADER, rows))
     chart = charts.intervals("95 % intervals", bounds)

@@ -1,0 +1,1 @@
+"""Whether a stored result still holds of later logs."""

@@ -1,0 +1,175 @@
+"""What an identification keeps for later: the joints' hypotheses, and what they left of logs."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.serialization import from_plain, to_plain
+from nerf2real.suite.effects import Effect
+from nerf2real.suite.effects.files import from_list
+from nerf2real.sysid.data.opening import load_model
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.settings import Settings
+
+Array = np.ndarray
+
+_NO_PRIOR = 1e150
+"""Stands for an infinite deviation, which JSON has not; its square is finite."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredLog:
+  """What a hypothesis left of a log."""
+
+  name: str
+  fitted: bool
+  squares: tuple[float, ...]
+  """[B] mean squares of its blocks, rad^2 or m^2."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredJoint:
+  """A joint's hypothesis and what it left."""
+
+  joint: str
+  unit: str
+  """rad or m."""
+  terms: tuple[Term, ...]
+  values: tuple[float, ...]
+  follows: bool
+  """Whether the simulated state follows the readings."""
+  noise: float
+  """Of the readings, rad or m."""
+  logs: tuple[StoredLog, ...]
+
+  @property
+  def split(self) -> list[Array]:
+    """The values of each term."""
+    return _split(self.terms, np.array(self.values))
+
+
+@dataclasses.dataclass(frozen=True)
+class Stored:
+  """A folder that `identify` wrote."""
+
+  content: dict[str, Any]
+  """Of report.json."""
+  model: mujoco.MjModel
+  effects: list[Effect]
+  """Of the extended model."""
+  clocks: dict[str, Clocks]
+  joints: list[StoredJoint]
+
+
+def remembered(found: Identified, held: Sequence[Log], settings: Settings) -> list[StoredJoint]:
+  """Returns what is kept of every joint.
+
+  Args:
+    found: what was identified.
+    held: logs that were not fitted.
+    settings: length of blocks.
+  """
+  reductions = [Reduction(found.model, log) for log in held]
+  result = []
+  for item in found.joints:
+    best, likelihoods = (
+      item.extended,
+      [JointLikelihood(item.likelihood.plant, settings=settings, follows=item.likelihood.follows)],
+    )
+    if held:
+      plant = JointModel(
+        found.model, item.joint, held, reductions=reductions, window_s=settings.window_s
+      )
+      likelihoods.append(JointLikelihood(plant, settings=settings, follows=item.likelihood.follows))
+    result.append(joint_of(likelihoods, best.terms, best.fit.x))
+  return result
+
+
+def joint_of(
+  likelihoods: Sequence[JointLikelihood], terms: Sequence[Term], x: Array
+) -> StoredJoint:
+  """Returns what is kept of a joint.
+
+  Args:
+    likelihoods: of the logs that were fitted; of those that were not, if any.
+    terms: its hypothesis.
+    x: values [n].
+  """
+  first = likelihoods[0]
+  logs = tuple(
+    StoredLog(log.name, joint is first, tuple(map(float, row)))
+    for joint in likelihoods
+    for log, row in zip(joint.plant.logs, squares_by_log(joint, terms, x), strict=True)
+  )
+  return StoredJoint(
+    first.plant.joint,
+    "rad" if first.plant.hinge else "m",
+    tuple(_plain(term, part) for term, part in zip(terms, _split(terms, x), strict=True)),
+    tuple(map(float, x)),
+    first.follows,
+    first.position_noise,
+    logs,
+  )
+
+
+def squares_by_log(joint: JointLikelihood, terms: Sequence[Term], x: Array) -> list[Array]:
+  """Returns the mean squares [B] of every log's blocks, of positions."""
+  squares = joint.squares(joint.residuals(terms, x[None])[0])[0]
+  return [squares[joint.log_of == index] for index in range(len(joint.plant.logs))]
+
+
+def _split(terms: Sequence[Term], x: Array) -> list[Array]:
+  """Returns the values of each term."""
+  ends = np.cumsum([len(term.names) for term in terms])
+  return np.split(np.asarray(x, float), ends[:-1])
+
+
+def _plain(term: Term, values: Array) -> Term:
+  """Returns a term that begins at its values, with numbers that JSON has."""
+  prior = tuple(float(np.nan_to_num(sigma, posinf=_NO_PRIOR)) for sigma in term.prior)
+  return dataclasses.replace(term, prior=prior, starts=(tuple(map(float, values)),))
+
+
+def to_json(joints: Sequence[StoredJoint]) -> list[dict[str, Any]]:
+  """Returns joints as details.json has them."""
+  return [to_plain(joint) for joint in joints]
+
+
+def read(folder: Path) -> Stored:
+  """Returns a result that was written.
+
+  Raises:
+    FileNotFoundError: the folder holds none.
+    ValueError: its files are not of this version.
+  """
+  folder = Path(folder)
+  for name in ("report.json", "details.json"):
+    if not (folder / name).is_file():
+      raise FileNotFoundError(
+        f"Found no {folder / name}, expected a folder that identify.py wrote."
+      )
+  content = json.loads((folder / "report.json").read_text())
+  details = json.loads((folder / "details.json").read_text())
+  if "joints" not in details:
+    raise ValueError(
+      f"Found no joints in {folder / 'details.json'}, expected a result of this version: identify"
+      " from the first logs again."
+    )
+  return Stored(
+    content,
+    load_model(Path(details["model"])),
+    from_list(details["extended"]),
+    {joint: Clocks(**values) for joint, values in details["clocks"].items()},
+    [from_plain(joint, StoredJoint, source=folder / "details.json") for joint in details["joints"]],
+  )
