@@ -126,8 +126,8 @@ def _tiles(
   """
   rows, columns = (np.arange(size) // _TILE for size in shape)
   tiles = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
-  axes = np.stack([np.bincount(tiles, weights=directions[:, k]) for k in range(3)], axis=1)
-  axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+  sums = np.stack([np.bincount(tiles, weights=directions[:, k]) for k in range(3)], axis=1)
+  axes = sums / np.linalg.norm(sums, axis=1, keepdims=True)
   away = np.arccos(np.clip(np.einsum("ni,ni->n", directions, axes[tiles]), -1.0, 1.0))
   angles = np.zeros(len(axes))
   np.maximum.at(angles, tiles, away)
