@@ -26,7 +26,6 @@ _PHASE_CORRECTION = 0.12
 _ROVING = 8  # further phases that `follow` tries in turn
 _JUMP_SHARE = 0.5  # of the present mismatch below which it takes one of them; chosen
 _LOCKABLE = 0.5  # amplitude from which the legs determine the phase; chosen
-_START = np.pi / 4  # phase that a robot which stands starts from: it sways over, the lift begins
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -159,8 +158,6 @@ class Gait:
     the present phase, one a little before, one a little behind and one further away, a different
     one at every call, that is kept from which this gait's own control would have come nearest in
     the legs. The amplitude sinks, twice as fast as `act` raises it, while a lower one comes nearer.
-    A robot that stands, though it shall step, is held at one phase: else the phase would run on
-    unseen, and the mean of what this gait does in that posture would be to stand.
 
     Args:
       control: Filtered control signal of the last control step [20], normalised.
@@ -190,8 +187,6 @@ class Gait:
     lower = self._amplitude - 2 * _TIMESTEP / self.settings.stop_time
     if mismatch(phase, lower) < present:
       self._amplitude = lower
-      if lower < _LOCKABLE:
-        self._phase = _START
 
   def _targets(self, phase: float, amplitude: float) -> np.ndarray:
     """Returns the position targets [20] that shall leave the action filter."""

@@ -201,25 +201,6 @@ def test_the_amplitude_sinks_where_the_robot_does_not_step():
   assert swing(gait) > 0 and last < first  # it begins to step gently, not in full swing
 
 
-def test_a_robot_that_stands_is_started_by_one_action():
-  gait, command = walk.Gait(), walk.Command(forward=1.0)
-  _march(gait, command, 80)
-  _, controls = _march(walk.Gait(), walk.Command(step=False), 80)
-  stand, labels = controls[-1], []
-  for _ in range(80):  # the robot stands, whatever the gait wants
-    labels.append(gait.act(command)[legs.COLUMNS])
-    gait.follow(stand)
-  labels = np.array(labels[40:])
-  away = np.abs(labels.mean(axis=0) - stand[legs.COLUMNS])
-  assert away.max() > 5 * labels.std(axis=0).mean()  # their mean is a step, no stand
-  control, travelled = stand, []
-  for _ in range(80):  # now it does as it is told
-    control = constants.ACTION_FILTER * control + (1 - constants.ACTION_FILTER) * gait.act(command)
-    gait.follow(control)
-    travelled.append(gait.phase)
-  assert np.sum(np.diff(np.unwrap(travelled))) > 4 * np.pi  # it steps
-
-
 def test_the_head_is_held_where_the_command_says():
   gait = walk.Gait()
   _, controls = _march(gait, walk.Command(step=False, head=(0.2, -0.3)), 80)
