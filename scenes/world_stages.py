@@ -18,7 +18,7 @@ from nerf2real.scenes.geometry import fusion
 from nerf2real.scenes.poses.localise import Localisation
 from nerf2real.scenes.stages import Made, Stages
 
-_OUTLOOK_VERSION = 2  # 2: no floor among the localised points is warned of
+_OUTLOOK_VERSION = 3  # 2: no floor is warned of; 3: markers' corners without rolling shutter
 _WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
@@ -68,8 +68,14 @@ def outlook(
     marker = None
     if marker_side is not None:
       images = [capture.value.folder / name for name in found.names]
+      seen = markers.detect(images, progress=part(progress, 0.0, 0.8))
+      if found.shutter is not None:
+        seen = [
+          d._replace(corners=found.shutter.straightened(d.corners, found.camera, d.view))
+          for d in seen
+        ]
       marker = markers.marker_scale(
-        markers.detect(images, progress=part(progress, 0.0, 0.8)),
+        seen,
         camera=found.camera,
         frame_from_camera=found.world_from_camera,
         side=marker_side,
