@@ -99,7 +99,7 @@ def _run_stages(
   )
   show = None if watcher is None else watcher.field
   field = image_stages.field(cache, pictures, settings.train, show=show)
-  depth = image_stages.depth(cache, field, poses, width=settings.depth_width)
+  depth = image_stages.depth(cache, field, capture, poses, width=settings.depth_width)
   figures = image_stages.figures(cache, field, pictures)
   world = world_stages.world(
     cache,

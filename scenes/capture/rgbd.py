@@ -123,6 +123,33 @@ def _camera(source: Path, nominal: Camera) -> Camera:
   return read_camera_info(path) if path.is_file() else nominal
 
 
+def _read(path: Path) -> np.ndarray:
+  """Reads a depth picture, uint16 [H, W]; what counts as not measured is 0."""
+  depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+  if depth is None or depth.ndim != 2:
+    raise CaptureError(f"{path} cannot be read as a depth picture: expected 16-bit grey.")
+  return np.where(depth == _INVALID, 0, depth)
+
+
+def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
+  """Reads a depth picture at a camera's size, the nearest pixel each.
+
+  Args:
+    path: 16-bit picture, z-depth in a unit, of the same view as the camera's.
+    unit: That unit [m].
+    camera: Of the pictures; may be smaller.
+
+  Returns:
+    z-depth float32 [H, W] [m]; 0 where nothing was measured.
+  """
+  depth = _read(path)
+  row, column = (
+    ((np.arange(size) + 0.5) * length / size).astype(int)
+    for size, length in zip((camera.height, camera.width), depth.shape, strict=True)
+  )
+  return (depth[row][:, column] * unit).astype(np.float32)
+
+
 def sightings(depth_files: Sequence[Path], unit: float, camera: Camera) -> np.ndarray:
   """Lifts a grid of pixels of depth pictures that are aligned with the colour pictures.
 
@@ -139,16 +166,14 @@ def sightings(depth_files: Sequence[Path], unit: float, camera: Camera) -> np.nd
   """
   found = []
   for index, path in enumerate(depth_files):
-    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if depth is None or depth.ndim != 2:
-      raise CaptureError(f"{path} cannot be read as a depth picture: expected 16-bit grey.")
+    depth = _read(path)
     height, width = depth.shape
     stride = max(1, int(np.sqrt(width * height / _SIGHTINGS)))
     row, column = (
       axis.ravel() for axis in np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride]
     )
     value = depth[row, column].astype(np.float64)
-    good = (value > 0) & (value < _INVALID)
+    good = value > 0
     pixel = np.stack(
       [(column + 0.5) * camera.width / width, (row + 0.5) * camera.height / height], -1
     )[good]

@@ -12,7 +12,7 @@ from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import Floor
 from nerf2real.scenes.alignment.overrides import Overrides
-from nerf2real.scenes.capture import keyframes
+from nerf2real.scenes.capture import keyframes, rgbd
 from nerf2real.scenes.capture.capture import (
   CaptureError,
   CaptureSettings,
@@ -109,6 +109,23 @@ def test_transforms_with_depth_give_points(tmp_path):
   about = {"w": 320, "h": 240, "fl_x": 280.0, "frames": frames}
   (tmp_path / "transforms.json").write_text(json.dumps(about))
   _check(read_capture(tmp_path, tmp_path / "images", settings=SETTINGS))
+
+
+def test_measured_depth_comes_at_the_size_of_the_pictures(tum, tmp_path):
+  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+  known = capture.known
+  camera = known.camera.resized(80, 60)
+  depth = rgbd.measured_depth(known.depth_files[3], known.depth_unit, camera)
+  points = (camera.rays() * depth[..., None])[depth > 0]
+  pose = known.world_from_camera[3]
+  assert (depth > 0).mean() > 0.5
+  # half a pixel of the sensor's: 2 mm a metre across, more where a surface is grazed
+  off = _off_the_planes(points @ pose[:3, :3].T + pose[:3, 3])
+  assert np.percentile(off, 90) < 0.02
+  spoilt = cv2.imread(str(known.depth_files[3]), cv2.IMREAD_UNCHANGED)
+  spoilt[:] = 65535
+  cv2.imwrite(str(tmp_path / "nothing.png"), spoilt)
+  assert not rgbd.measured_depth(tmp_path / "nothing.png", 1e-3, camera).any()
 
 
 def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path):
