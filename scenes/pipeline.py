@@ -11,7 +11,7 @@ from nerf2real.core import files
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages, world_stages
 from nerf2real.scenes.alignment import overrides, surroundings
-from nerf2real.scenes.capture.capture import source_kind
+from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.results import Measure, SceneResults, Source, Watcher
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import Stages

@@ -17,8 +17,8 @@ from nerf2real.scenes.capture.capture import (
   CaptureError,
   CaptureSettings,
   read_capture,
-  source_kind,
 )
+from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.poses import localise
 from tests.scenes import synthetic_capture as synthetic
 
@@ -96,6 +96,27 @@ def test_a_seven_scenes_sequence_gives_poses_and_depth(tmp_path):
   for row, pose in enumerate(POSES):
     np.savetxt(folder / f"frame-{row:06d}.pose.txt", pose)
   _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
+
+
+def test_a_scannet_scene_gives_poses_and_depth(tmp_path):
+  folder = tmp_path / "scene0000_00"
+  _pictures(folder, "color/{}.jpg", "depth/{}.png", 1e-3)
+  for name in ("pose", "intrinsic"):
+    (folder / name).mkdir()
+  matrix = np.diag([280.0, 280.0, 1.0, 1.0])
+  matrix[:2, 2] = 160.0, 120.0
+  np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+  for row, pose in enumerate(POSES):
+    np.savetxt(folder / "pose" / f"{row}.txt", pose)
+  assert source_kind(folder) == "rgbd"
+  with pytest.raises(CaptureError, match="give one of them, such as .*scene0000_00"):
+    source_kind(tmp_path)
+  _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
+  lost = np.full((4, 4), -np.inf)
+  for row in range(len(POSES)):
+    np.savetxt(folder / "pose" / f"{row}.txt", lost)
+  with pytest.raises(CaptureError, match="holds a finite pose"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
 
 
 def test_transforms_with_depth_give_points(tmp_path):
