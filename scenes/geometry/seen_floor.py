@@ -24,7 +24,8 @@ _REACH = 4  # pixels of a patch to each side; chosen: 5 cm of a floor at 2 m in 
 _STEP = 2  # pixels between patches
 _CONTRAST = 2.0  # grey levels; a patch with less deviation says nothing
 _ALIKE = 0.5  # least mean correlation of what is taken for the floor: that of noise is 0
-_NEIGHBOURS = (4, 6, 10, 16)  # views before and after that a view is compared with
+_NEAREST, _EVERY = 24, 3  # every third of the nearest views that look the same way is compared
+_SAME_WAY = 0.7  # cosine of the angle between optical axes
 _BASELINE = 0.1  # m between two cameras at least: less tells a height of 5 cm by half a pixel
 _SAME = 0.1  # m by which another view's surface may differ where it sees the same
 _LOWEST = 0.02  # m: lower surface is floor already
@@ -151,11 +152,14 @@ def _compare(index, others, images, depth, rays, poses, inverses, lens, found):
         found[i, j, 3], found[i, j, 4], found[i, j, 5] = surface, floor, count
 
 
-def _others(number: int, eyes: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-  """Views that the chosen view of a number is compared with: by place in the walk and baseline."""
-  near = [number + side * step for step in _NEIGHBOURS for side in (-1, 1)]
-  others = chosen[[k for k in near if 0 <= k < len(chosen)]]
-  return others[np.linalg.norm(eyes[others] - eyes[chosen[number]], axis=-1) > _BASELINE]
+def _others(number: int, poses: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+  """Views that the chosen view of a number is compared with: those that look the same way."""
+  own, others = poses[chosen[number]], poses[chosen]
+  baseline = np.linalg.norm(others[:, :3, 3] - own[:3, 3], axis=-1)
+  alike = (others[:, :3, 2] @ own[:3, 2] > _SAME_WAY) & (baseline > _BASELINE)
+  nearest = np.flatnonzero(alike)[np.argsort(baseline[alike])]
+  found: np.ndarray = chosen[nearest[:_NEAREST:_EVERY]]
+  return found
 
 
 def with_seen_floor(
@@ -170,7 +174,7 @@ def with_seen_floor(
   """Returns depth pictures whose surface is the floor where pictures show the floor.
 
   Args:
-    views: Depth pictures in the world frame (metres, floor at z = 0), in the order of the walk.
+    views: Depth pictures in the world frame (metres, floor at z = 0).
     pictures: Grey pictures of the same size and of one exposure, uint8 or float32 [N, H, W].
     chosen: Views whose pictures are looked at; the depth of all is corrected.
     lower: Lower corner of the extent [3].
@@ -208,7 +212,7 @@ def _compared(
   lens = tuple(float(getattr(views.camera, name)) for name in names)
   found = np.zeros((*depth.shape[1:], 6))
   for number, index in enumerate(chosen):
-    others = _others(number, views.positions, chosen)
+    others = _others(number, poses, chosen)
     if len(others):
       found[...] = 0
       _compare(index, others, images, depth, rays, poses, inverses, lens, found)
