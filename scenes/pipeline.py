@@ -112,13 +112,8 @@ def _run_stages(
     override=override,
     override_key=override_key,
   )
-  metric_depth = geometry_stages.floor(
-    cache,
-    world,
-    depth.value.transformed(world.value.world_from_unit),
-    pictures,
-    settings.collision,
-  )
+  rendered = depth.value.transformed(world.value.world_from_unit)
+  metric_depth = geometry_stages.floor(cache, world, rendered, pictures, settings.collision)
   surface = geometry_stages.surface(cache, world, metric_depth, settings.mesh)
   contact = geometry_stages.contact(
     cache, world, metric_depth, settings.collision, settings.free_space
@@ -134,6 +129,7 @@ def _run_stages(
     figures=figures,
     world=world,
     depth=metric_depth.value,
+    moved_to_floor=float((metric_depth.value.depth != rendered.depth).mean()),
     surface=surface,
     contact=contact,
     baseline=baseline,
