@@ -20,18 +20,18 @@ from nerf2real.core.cameras import PIXEL_CENTRE
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import fusion
 
-_REACH = 4  # pixels of a patch to each side; chosen: 5 cm of a floor at 2 m in a picture of 320
+_REACH = 4  # pixels of a patch to each side: 7 to 11 cm at 2 m in a picture of 320; chosen
 _STEP = 2  # pixels between patches
 _CONTRAST = 2.0  # grey levels; a patch with less deviation says nothing
 _ALIKE = 0.5  # least mean correlation of what is taken for the floor: that of noise is 0
 _NEAREST, _EVERY = 24, 3  # every third of the nearest views that look the same way is compared
 _SAME_WAY = 0.7  # cosine of the angle between optical axes
-_BASELINE = 0.1  # m between two cameras at least: less tells a height of 5 cm by half a pixel
+_BASELINE = 0.1  # m between two cameras; less moves 5 cm of height at 2 m by a third of a pixel
 _SAME = 0.1  # m by which another view's surface may differ where it sees the same
 _LOWEST = 0.02  # m: lower surface is floor already
 _CELL = 0.05  # m, edge of the cells that gather what the views find
-_SPREAD = 2.0  # cells, deviation of the Gaussian that joins textured patches; chosen: with 1 a
-# fifth more remains of what is wrong, and in a room of known truth 0.2 % are moved wrongly, not 0
+_SPREAD = 2.0  # cells, deviation of the Gaussian that joins textured patches; chosen: with 1, 0.2 %
+# of what was moved in a room of known truth had been true, with 2 none
 _FEWEST = 3.0  # comparisons in and around a cell that decides
 _FRONT = 0.2  # least cosine of a ray to the floor with its normal
 
