@@ -1,6 +1,8 @@
 """RGB-D sequences with known poses: TUM's and 7-Scenes' folders, transforms.json with depth."""
 
+import dataclasses
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.scenes import image_stages
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import Floor
@@ -20,6 +23,7 @@ from nerf2real.scenes.capture.capture import (
 )
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.poses import localise
+from nerf2real.scenes.stages import Made, StageResult, Stages
 from tests.scenes import synthetic_capture as synthetic
 
 SETTINGS = CaptureSettings(num_keyframes=8)
@@ -147,6 +151,35 @@ def test_measured_depth_comes_at_the_size_of_the_pictures(tum, tmp_path):
   spoilt[:] = 65535
   cv2.imwrite(str(tmp_path / "nothing.png"), spoilt)
   assert not rgbd.measured_depth(tmp_path / "nothing.png", 1e-3, camera).any()
+
+
+def test_measured_depth_stands_for_the_fields(tum, tmp_path):
+  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+  first, *others = capture.known.depth_files
+  gap = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
+  gap[:120] = 0
+  cv2.imwrite(str(tmp_path / "gap.png"), gap)
+  known = dataclasses.replace(capture.known, depth_files=(tmp_path / "gap.png", *others))
+  capture = dataclasses.replace(capture, known=known)
+  found = localise.localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
+
+  def made(value):
+    return Made(value, StageResult(tmp_path, "key", "made", 0.0, cached=False))
+
+  def render(camera, pose):
+    size = (camera.height, camera.width)
+    return np.zeros((*size, 3), np.uint8), np.full(size, 9.0, np.float32)
+
+  field = SimpleNamespace(renderer=SimpleNamespace(render=render))
+  cache = Stages(tmp_path / "stages", show_progress=False)
+  views = image_stages.depth(cache, made(field), made(capture), made(found), width=80).value
+  measured = views.depth != 9.0
+  assert not measured[0, :30].any() and measured[1:].mean() > 0.9
+  rays = views.camera.rays()
+  for depth, there, pose in zip(views.depth, measured, views.frame_from_camera, strict=True):
+    points = (rays * depth[..., None])[there] @ pose[:3, :3].T + pose[:3, 3]
+    off = _off_the_planes(found.unit_from_source.inverse().apply(points))
+    assert np.percentile(off, 90) < 0.03
 
 
 def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path):
