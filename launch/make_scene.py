@@ -31,7 +31,7 @@ class Arguments:
 
   capture: str
   """A video, a folder of pictures, a COLMAP model, a transforms.json, an RGB-D sequence with poses
-  (TUM's or 7-Scenes' layout), or "builtin" for the project's own room."""
+  (TUM's, 7-Scenes' or ScanNet's layout), or "builtin" for the project's own room."""
   out: Path
   """Folder of the bundle."""
   preset: Literal["fast", "quality", "demo", "tiny", "paper"] = "fast"

@@ -148,6 +148,7 @@ def _figures(results: SceneResults) -> dict[str, Any]:
     "collision_error": to_plain(contact.collision_error),
     "collision_parts": contact.collision_parts,
     "free_area_m2": contact.free_area_m2,
+    "moved_to_floor": results.moved_to_floor,
     "floor_tilt_from_cameras_deg": alignment.floor_tilt_from_cameras_deg,
     "scale_source": alignment.scale_source,
     "scale_spread": alignment.scale_spread,

@@ -5,7 +5,7 @@ from pathlib import Path
 from nerf2real.core import files
 from nerf2real.scenes import image_stages
 from nerf2real.scenes.bundle import STAGES
-from nerf2real.scenes.capture.capture import source_kind
+from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.localise import LocalisationError
 from nerf2real.scenes.quality import advice

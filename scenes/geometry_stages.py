@@ -1,187 +1,78 @@
-"""Stages that make geometry of depth: world frame, surface mesh, contact geometry with free floor.
+"""Stages that make geometry of depth: seen floor, surface mesh, contact geometry with free floor.
 
 Each runs, or finds done, one stage of the cache: a function of earlier results and settings.
 """
 
 import dataclasses
-import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from nerf2real.core.progress import Progress, part
 from nerf2real.core.serialization import read_json, write_json
-from nerf2real.scenes.alignment import markers, world_frame
-from nerf2real.scenes.alignment.evidence import Evidence
-from nerf2real.scenes.alignment.floor import FloorError
-from nerf2real.scenes.alignment.overrides import Overrides
-from nerf2real.scenes.capture.capture import Capture
-from nerf2real.scenes.geometry import collision, decomposition, floor_plan, fusion, map_server, mesh
-from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.alignment import world_frame
+from nerf2real.scenes.field.views import held_out_rows
+from nerf2real.scenes.geometry import (
+  collision,
+  decomposition,
+  floor_plan,
+  fusion,
+  map_server,
+  mesh,
+  seen_floor,
+)
+from nerf2real.scenes.pictures import PosedPictures
 from nerf2real.scenes.quality import collision_error
 from nerf2real.scenes.results import Contact
 from nerf2real.scenes.stages import Made, StageResult, Stages
 
-_OUTLOOK_VERSION = 2  # 2: no floor among the localised points is warned of
-_WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
 _CONTACT_VERSION = 2  # 2: unseen space is matter behind seen matter alone; no tolerance grows
-_NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 
-@dataclasses.dataclass(frozen=True)
-class Outlook:
-  """What is known of the world frame before the training."""
-
-  scale: markers.MarkerScale | None
-  """The scale that markers give; None without one."""
-  warnings: tuple[str, ...] = ()
-
-
-def outlook(
+def floor(
   cache: Stages,
-  capture: Made[Capture],
-  poses: Made[Localisation],
-  settings: world_frame.AlignSettings,
-  *,
-  voxel: float,
-  marker_side: float | None,
-  override: Overrides,
-  override_key: str,
-) -> Made[Outlook]:
-  """Finds markers, and refuses before the training what it could not help.
+  world: Made[world_frame.Alignment],
+  depth: fusion.DepthViews,
+  pictures: PosedPictures,
+  settings: collision.CollisionSettings,
+) -> Made[fusion.DepthViews]:
+  """Moves the surface of depth in the world frame to the floor where pictures show the floor.
 
-  A world frame is found from the sparse points alone: where the scale makes the cameras' walk
-  larger than a grid of voxels may be, the stages after the training would fail. A floor that shows
-  in no localised point may show in the field's depth: it is warned of, at once and in the report.
-
-  Args:
-    cache: The stages of the job.
-    capture: The keyframes, in which markers are looked for.
-    poses: Cameras and sparse points, unit frame.
-    settings: Of the alignment.
-    voxel: Edge of the surface mesh's voxels [m].
-    marker_side: Side of the black square of a marker in the room [m], or None.
-    override: What a person fixed.
-    override_key: Hash of the file that says so.
-
-  Raises:
-    ValueError: No direction is up, or the room is too large for its voxels.
+  The held-out pictures take no part: they judge the geometry.
   """
-  found = poses.value
+  place = world.value
 
   def write(folder: Path, progress: Progress) -> None:
-    marker = None
-    if marker_side is not None:
-      images = [capture.value.folder / name for name in found.names]
-      marker = markers.marker_scale(
-        markers.detect(images, progress=part(progress, 0.0, 0.8)),
-        camera=found.camera,
-        frame_from_camera=found.world_from_camera,
-        side=marker_side,
-      )
-    evidence = Evidence(
-      found.points,
-      found.world_from_camera,
-      marker=marker,
-      sensor_scale=_sensed_scale(capture.value, found),
-    )
-    try:
-      frame = world_frame.align(
-        evidence, settings=settings, override=override, progress=part(progress, 0.8, 1.0)
-      )
-    except FloorError as error:
-      write_json(folder / "outlook.json", Outlook(marker, (f"{_NO_FLOOR} {error}",)))
-      return
-    # Sparse points stray; but the extent will hold every camera, and the floor below it.
-    cameras = frame.world_from_unit.apply(evidence.positions)
-    top = min(frame.camera_height, settings.max_height)
-    try:
-      fusion.grid_shape([*cameras.min(0)[:2], 0.0], [*cameras.max(0)[:2], top], voxel)
-    except ValueError as error:
-      raise ValueError(
-        f"{error} That box holds the cameras alone; its scale is from {frame.scale_source}: give "
-        "lengths in metres."
-      ) from error
-    write_json(folder / "outlook.json", Outlook(marker))
-
-  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
-  everything["voxel"] = voxel
-  inputs = {"poses": poses.stamp}
-  stage = cache.run("outlook", write, settings=everything, inputs=inputs, version=_OUTLOOK_VERSION)
-  found_out = read_json(stage.folder / "outlook.json", Outlook)
-  for text in found_out.warnings:
-    warnings.warn(text, stacklevel=2)
-  return Made(found_out, stage)
-
-
-def _sensed_scale(capture: Capture, poses: Localisation) -> float | None:
-  """Metres a unit of length of poses that came with the capture; None where they are not metric."""
-  known = capture.known
-  return 1 / poses.unit_from_source.scale if known is not None and known.is_metric else None
-
-
-def world(
-  cache: Stages,
-  capture: Made[Capture],
-  poses: Made[Localisation],
-  outlook: Made[Outlook],
-  depth: Made[fusion.DepthViews],
-  settings: world_frame.AlignSettings,
-  *,
-  marker_side: float | None,
-  override: Overrides,
-  override_key: str,
-) -> Made[world_frame.Alignment]:
-  """Finds floor, scale, yaw and extent.
-
-  Args:
-    cache: The stages of the job.
-    capture: The keyframes, which may have come with metric poses.
-    poses: Cameras and sparse points, unit frame.
-    outlook: The scale that markers give, and warnings.
-    depth: Rendered depth, unit frame.
-    settings: Of the alignment.
-    marker_side: Side of the black square of a marker in the room [m], or None.
-    override: What a person fixed.
-    override_key: Hash of the file of overrides.
-  """
-  found = poses.value
-
-  def write(folder: Path, progress: Progress) -> None:
-    points, normals = depth.value.surface_points(stride=2)
-    sensed = _sensed_scale(capture.value, found)
-    result = world_frame.align(
-      Evidence(found.points, found.world_from_camera, points, normals, outlook.value.scale, sensed),
-      settings=settings,
-      override=override,
+    shown = dataclasses.replace(pictures, width=depth.camera.width).views().evened()
+    corrected = seen_floor.with_seen_floor(
+      depth,
+      np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in shown.images]),
+      np.flatnonzero(~held_out_rows(len(shown), pictures.held_out_every)),
+      lower=place.extent_lower,
+      upper=np.minimum(place.extent_upper, [np.inf, np.inf, settings.top]),
       progress=progress,
     )
-    if marker_side is not None and outlook.value.scale is None:
-      missing = (
-        f"No marker of side {marker_side} m was read consistently in three pictures or more: "
-        "print it larger, lay it flat, film it from nearer."
-      )
-      result = dataclasses.replace(result, warnings=(*result.warnings, missing))
-    result = dataclasses.replace(result, warnings=(*outlook.value.warnings, *result.warnings))
-    write_json(folder / "alignment.json", result)
+    np.save(folder / "depth.npy", corrected.depth)
 
-  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
-  inputs = {"depth": depth.stamp, "outlook": outlook.stamp}
-  stage = cache.run("world", write, settings=everything, inputs=inputs, version=_WORLD_VERSION)
-  return Made(read_json(stage.folder / "alignment.json", world_frame.Alignment), stage)
+  everything = [settings.top, pictures.held_out_every]
+  inputs = {"world": world.stamp}
+  stage = cache.run("floor", write, settings=everything, inputs=inputs)
+  corrected = np.load(stage.folder / "depth.npy")
+  return Made(dataclasses.replace(depth, depth=corrected), stage)
 
 
 def surface(
   cache: Stages,
   world: Made[world_frame.Alignment],
-  depth: fusion.DepthViews,
+  depth: Made[fusion.DepthViews],
   settings: mesh.MeshSettings,
 ) -> StageResult:
   """Makes the coloured surface mesh of depth in the world frame."""
 
   def write(folder: Path, progress: Progress) -> None:
     grid = fusion.fuse(
-      depth,
+      depth.value,
       lower=world.value.extent_lower,
       upper=world.value.extent_upper,
       voxel=settings.voxel,
@@ -193,15 +84,16 @@ def surface(
     progress(0.7, "fewer faces")
     found = mesh.simplify(found, faces=settings.visual_faces)
     progress(0.8, "colours")
-    mesh.save_glb(mesh.paint(found, depth), folder / "visual.glb")
+    mesh.save_glb(mesh.paint(found, depth.value), folder / "visual.glb")
 
-  return cache.run("surface", write, settings=settings, inputs={"world": world.stamp})
+  inputs = {"world": world.stamp, "depth": depth.stamp}
+  return cache.run("surface", write, settings=settings, inputs=inputs)
 
 
 def contact(
   cache: Stages,
   world: Made[world_frame.Alignment],
-  depth: fusion.DepthViews,
+  depth: Made[fusion.DepthViews],
   collision_settings: collision.CollisionSettings,
   floor_settings: floor_plan.FreeSpaceSettings,
 ) -> Made[Contact]:
@@ -211,7 +103,7 @@ def contact(
   def write(folder: Path, progress: Progress) -> None:
     shape = dataclasses.replace(collision_settings, floor_threshold=place.floor_threshold)
     grid = collision.solid_grid(
-      depth,
+      depth.value,
       lower=place.extent_lower,
       upper=place.extent_upper,
       settings=shape,
@@ -232,8 +124,8 @@ def contact(
     progress(0.85, "distance to the seen surface")
     error = collision_error.collision_error(
       parts,
-      depth.surface_points(stride=2)[0],
-      eyes=depth.positions,
+      depth.value.surface_points(stride=2)[0],
+      eyes=depth.value.positions,
       lower=place.extent_lower,
       upper=np.minimum(place.extent_upper, [np.inf, np.inf, shape.top]),
       floor_threshold=place.floor_threshold,
@@ -248,6 +140,6 @@ def contact(
     write_json(folder / "contact.json", figures)
 
   everything = [collision_settings, floor_settings]
-  inputs = {"world": world.stamp}
+  inputs = {"world": world.stamp, "depth": depth.stamp}
   stage = cache.run("contact", write, settings=everything, inputs=inputs, version=_CONTACT_VERSION)
   return Made(read_json(stage.folder / "contact.json", Contact), stage)

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress
 from nerf2real.core.serialization import write_json
 from nerf2real.scenes.capture import keyframes as keyframe_files
+from nerf2real.scenes.capture import rgbd
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, read_capture
 from nerf2real.scenes.field import photometry, training
 from nerf2real.scenes.field.settings import TrainSettings
@@ -92,13 +94,21 @@ def field(
 
 
 def depth(
-  cache: Stages, field: Made[TrainedField], poses: Made[localise.Localisation], *, width: int
+  cache: Stages,
+  field: Made[TrainedField],
+  capture: Made[Capture],
+  poses: Made[localise.Localisation],
+  *,
+  width: int,
 ) -> Made[fusion.DepthViews]:
   """Renders depth and colour of the field where the capture's cameras stood, in the unit frame.
+
+  Where a depth sensor measured, its depth takes the place of the field's.
 
   Args:
     cache: The stages of the job.
     field: The field.
+    capture: The keyframes, which may have come with measured depth.
     poses: The cameras.
     width: Of the pictures; at most that of the keyframes [pixel].
   """
@@ -114,10 +124,15 @@ def depth(
       pictures.append(field.value.renderer.render(camera, pose))
       total = len(found.world_from_camera)
       progress((index + 1) / total, f"picture {index + 1} of {total}")
-    color, distance = zip(*pictures, strict=True)
-    np.savez(folder / "depth.npz", color=np.stack(color), depth=np.stack(distance))
+    color, distance = (np.stack(part) for part in zip(*pictures, strict=True))
+    measured = _measured_depth(capture.value, found, camera)
+    if measured is not None:
+      distance = np.where(measured > 0, measured, distance)
+    np.savez(folder / "depth.npz", color=color, depth=distance)
 
   inputs = {"field": field.stamp, "poses": poses.stamp}
+  if capture.value.known is not None and capture.value.known.depth_files:
+    inputs["keyframes"] = capture.stamp
   stage = cache.run("depth", write, settings=width, inputs=inputs)
   arrays = np.load(stage.folder / "depth.npz")
   rows, columns = arrays["depth"].shape[1:]
@@ -128,6 +143,18 @@ def depth(
     color=arrays["color"],
   )
   return Made(views, stage)
+
+
+def _measured_depth(
+  capture: Capture, poses: localise.Localisation, camera: Camera
+) -> np.ndarray | None:
+  """Sensor's depth of the localised keyframes [N, H, W] [unit], 0 where none; None without one."""
+  known = capture.known
+  if known is None or not known.depth_files:
+    return None
+  files = {image.name: file for image, file in zip(capture.images, known.depth_files, strict=True)}
+  unit = known.depth_unit * poses.unit_from_source.scale
+  return np.stack([rgbd.measured_depth(files[name], unit, camera) for name in poses.names])
 
 
 def figures(

@@ -36,13 +36,8 @@ class PosedPictures:
     if camera.width > self.width:
       camera = camera.resized(self.width, round(camera.height * self.width / camera.width))
     images = []
-    for index, name in enumerate(found.names):
-      path = self.capture.value.folder / name
-      image = cv2.imread(str(path))
-      if image is None:
-        raise ValueError(f"The keyframe {path} cannot be read: delete {path.parent.parent}.")
-      if found.shutter is not None:
-        image = found.shutter.rectify(image, found.camera, index)
+    for index in range(len(found.names)):
+      image = found.read_picture(self.capture.value.folder, index)
       if image.shape[:2] != (camera.height, camera.width):
         image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
       images.append(image[..., ::-1])

@@ -1,16 +1,17 @@
 """Makes a scene bundle from a capture: structure from motion, radiance field, geometry.
 
-Every stage is a function of earlier results and settings (`image_stages`, `geometry_stages`) and is
-cached by the hash of both (`stages`), so that a second run continues where the first one stopped.
+Every stage is a function of earlier results and settings (`image_stages`, `world_stages`,
+`geometry_stages`) and is cached by the hash of both (`stages`), so that a second run continues
+where the first one stopped.
 """
 
 from pathlib import Path
 
 from nerf2real.core import files
 from nerf2real.core.folder_lock import lock_folder
-from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages
+from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages, world_stages
 from nerf2real.scenes.alignment import overrides, surroundings
-from nerf2real.scenes.capture.capture import source_kind
+from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.results import Measure, SceneResults, Source, Watcher
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import Stages
@@ -83,7 +84,7 @@ def _run_stages(
     watcher.poses(poses.value)
   if override.floor_points is None:
     surroundings.require_room(poses.value.world_from_camera, poses.value.points)
-  outlook = geometry_stages.outlook(
+  outlook = world_stages.outlook(
     cache,
     capture,
     poses,
@@ -98,9 +99,9 @@ def _run_stages(
   )
   show = None if watcher is None else watcher.field
   field = image_stages.field(cache, pictures, settings.train, show=show)
-  depth = image_stages.depth(cache, field, poses, width=settings.depth_width)
+  depth = image_stages.depth(cache, field, capture, poses, width=settings.depth_width)
   figures = image_stages.figures(cache, field, pictures)
-  world = geometry_stages.world(
+  world = world_stages.world(
     cache,
     capture,
     poses,
@@ -111,7 +112,8 @@ def _run_stages(
     override=override,
     override_key=override_key,
   )
-  metric_depth = depth.value.transformed(world.value.world_from_unit)
+  rendered = depth.value.transformed(world.value.world_from_unit)
+  metric_depth = geometry_stages.floor(cache, world, rendered, pictures, settings.collision)
   surface = geometry_stages.surface(cache, world, metric_depth, settings.mesh)
   contact = geometry_stages.contact(
     cache, world, metric_depth, settings.collision, settings.free_space
@@ -126,7 +128,8 @@ def _run_stages(
     field=field,
     figures=figures,
     world=world,
-    depth=metric_depth,
+    depth=metric_depth.value,
+    moved_to_floor=float((metric_depth.value.depth != rendered.depth).mean()),
     surface=surface,
     contact=contact,
     baseline=baseline,

@@ -75,6 +75,7 @@ class SceneResults(NamedTuple):
   figures: Made[dict[str, float]]
   world: Made[Alignment]
   depth: DepthViews  # in the world frame
+  moved_to_floor: float  # share of its pixels
   surface: StageResult
   contact: Made[Contact]
   baseline: Made[dict[str, float]] | None

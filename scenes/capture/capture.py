@@ -11,11 +11,10 @@ import numpy as np
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture.rgbd import find_rgbd
+from nerf2real.scenes.capture import stills
+from nerf2real.scenes.capture.kinds import list_images_below, source_kind
 from nerf2real.scenes.capture.sources import (
   KnownPoses,
-  find_colmap_model,
-  find_transforms,
   list_images,
   read_colmap,
   read_rgbd,
@@ -84,35 +83,6 @@ class Capture:
   """What may ruin the reconstruction, one line each."""
   known: KnownPoses | None = None
   """Cameras that came with the pictures."""
-
-
-def source_kind(source: Path) -> str:
-  """Returns the kind of a source: "video", "images", "colmap", "transforms" or "rgbd".
-
-  Raises:
-    CaptureError: If it does not exist or is none of these.
-  """
-  if not source.exists():
-    raise CaptureError(f"{source} does not exist.")
-  if find_transforms(source) is not None:
-    return "transforms"
-  if find_rgbd(source) is not None:
-    return "rgbd"
-  if source.is_dir():
-    if find_colmap_model(source) is not None:
-      return "colmap"
-    if list_images(source) or list_images_below(source):
-      return "images"
-    raise CaptureError(
-      f"{source} holds no pictures, no COLMAP model and no transforms.json: give a video, or a "
-      "folder with one of these."
-    )
-  return "video"
-
-
-def list_images_below(source: Path) -> list[Path]:
-  """Lists the pictures in source/images, the usual place beside a model."""
-  return list_images(source / "images") if (source / "images").is_dir() else []
 
 
 def read_capture(
@@ -188,8 +158,15 @@ def _read_pictures(
       f"{source} holds {len(files)} pictures, expected at least {settings.min_images} that "
       "overlap: take more, from different places in the room."
     )
+  warnings: list[str] = []
+  if known is None:
+    files, warnings = stills.of_one_camera(files)
+    if len(files) < settings.min_images:
+      raise CaptureError(
+        f"{source}: {warnings[0]} At least {settings.min_images} such pictures are needed."
+      )
   frames = _sharpest_pictures(files, settings, progress)
-  capture = _write(kind, frames, folder, settings, [])
+  capture = _write(kind, frames, folder, settings, warnings)
   if known is None:
     return dataclasses.replace(capture, times=None)
   indices = [int(path.stem.split("_")[-1]) for path in capture.images]

@@ -1,11 +1,12 @@
-"""Hand-held RGB-D sequences with known poses: TUM's and 7-Scenes' folders, and depth pictures.
+"""RGB-D sequences with known poses: TUM's, 7-Scenes' and ScanNet's folders, and depth pictures.
 
 Sources: Sturm et al. 2012, A benchmark for the evaluation of RGB-D SLAM systems (file formats and
 intrinsics on the benchmark's page); Shotton et al. 2013, Scene coordinate regression forests
-(7-Scenes' readme). Shapes: N pictures, A sightings.
+(7-Scenes' readme); Dai et al. 2017, ScanNet (what its SensReader writes). Shapes: N pictures, A
+sightings.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -27,12 +28,14 @@ MILLIMETRE = 1e-3  # m: 7-Scenes' and nerfstudio's depth
 
 
 def find_rgbd(source: Path) -> str | None:
-  """Returns the layout of an RGB-D sequence's folder, "tum" or "7scenes"; None if it is none."""
+  """Layout of an RGB-D sequence's folder: "tum", "7scenes" or "scannet"; None if it is none."""
   if not source.is_dir():
     return None
   if (source / "rgb.txt").is_file() and (source / "groundtruth.txt").is_file():
     return "tum"
-  return "7scenes" if any(source.glob("frame-*.pose.txt")) else None
+  if any(source.glob("frame-*.pose.txt")):
+    return "7scenes"
+  return "scannet" if any(source.glob("pose/*.txt")) and (source / "color").is_dir() else None
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:
@@ -95,32 +98,107 @@ def read_tum(source: Path) -> tuple[Camera, list[Path], np.ndarray, list[Path], 
   return _camera(source, _TUM_CAMERA), kept[0], matrices, kept[1], _TUM_DEPTH_UNIT
 
 
-def read_seven_scenes(source: Path) -> tuple[Camera, list[Path], np.ndarray, list[Path], float]:
-  """Reads a folder of frame-*.color.png, frame-*.depth.png and frame-*.pose.txt; as `read_tum`."""
-  files, depth, matrices = [], [], []
-  for path in sorted(source.glob("frame-*.pose.txt")):
-    stem = path.name.removesuffix(".pose.txt")
+def _posed(
+  poses: Sequence[Path], picture: Callable[[Path], Path], depth: Callable[[Path], Path]
+) -> tuple[list[Path], np.ndarray, list[Path]]:
+  """Reads files of one pose each; lost frames, whose pose is not finite, are left out.
+
+  Args:
+    poses: Files of 4 rows of 4 numbers, world from camera.
+    picture: Gives a pose's picture.
+    depth: Gives a pose's depth picture.
+
+  Returns:
+    Pictures, poses [N, 4, 4] and depth pictures (none where one is missing).
+
+  Raises:
+    CaptureError: A pose is damaged, or none is finite.
+  """
+  matrices = []
+  for path in poses:
     try:
       matrix = np.loadtxt(path)
     except ValueError as error:
       raise CaptureError(f"{path} is no pose: expected 4 rows of 4 numbers ({error}).") from error
     if matrix.shape != (4, 4):
       raise CaptureError(f"{path} is no pose: found shape {matrix.shape}, expected 4 rows of 4.")
-    if np.isfinite(matrix).all():  # lost frames have none
-      files.append(source / f"{stem}.color.png")
-      depth.append(source / f"{stem}.depth.png")
-      matrices.append(matrix)
-  if not files:
-    raise CaptureError(f"{source}: no frame-*.pose.txt holds a finite pose.")
-  has_depth = all(path.is_file() for path in depth)
-  camera = _camera(source, _SEVEN_SCENES_CAMERA)
-  return camera, files, np.stack(matrices), depth if has_depth else [], MILLIMETRE
+    matrices.append(matrix)
+  found = [path for path, matrix in zip(poses, matrices, strict=True) if np.isfinite(matrix).all()]
+  if not found:
+    raise CaptureError(f"{poses[0].parent}: no file such as {poses[0].name} holds a finite pose.")
+  measured = [depth(path) for path in found]
+  finite = np.stack([matrix for matrix in matrices if np.isfinite(matrix).all()])
+  has_depth = all(path.is_file() for path in measured)
+  return [picture(path) for path in found], finite, measured if has_depth else []
+
+
+def read_seven_scenes(source: Path) -> tuple[Camera, list[Path], np.ndarray, list[Path], float]:
+  """Reads a folder of frame-*.color.png, frame-*.depth.png and frame-*.pose.txt; as `read_tum`."""
+
+  def beside(path: Path, kind: str) -> Path:
+    return path.with_name(f"{path.name.removesuffix('.pose.txt')}.{kind}")
+
+  poses = sorted(source.glob("frame-*.pose.txt"))
+  suffix = "color.jpg" if beside(poses[0], "color.jpg").is_file() else "color.png"
+  files, matrices, depth = _posed(
+    poses, lambda path: beside(path, suffix), lambda path: beside(path, "depth.png")
+  )
+  return _camera(source, _SEVEN_SCENES_CAMERA), files, matrices, depth, MILLIMETRE
+
+
+def read_scannet(source: Path) -> tuple[Camera, list[Path], np.ndarray, list[Path], float]:
+  """Reads color/*.jpg, depth/*.png, pose/*.txt and intrinsic/intrinsic_color.txt; as `read_tum`."""
+  suffix = ".png" if any(source.glob("color/*.png")) else ".jpg"
+  files, matrices, depth = _posed(
+    sorted(source.glob("pose/*.txt"), key=lambda path: (len(path.stem), path.stem)),
+    lambda path: source / "color" / f"{path.stem}{suffix}",
+    lambda path: source / "depth" / f"{path.stem}.png",
+  )
+  given = source / "intrinsic" / "intrinsic_color.txt"
+  if (source / _INTRINSICS).is_file():
+    return read_camera_info(source / _INTRINSICS), files, matrices, depth, MILLIMETRE
+  picture = cv2.imread(str(files[0])) if given.is_file() else None
+  if picture is None:
+    raise CaptureError(f"{given} or {files[0].name} is missing or damaged: expected both.")
+  matrix = np.loadtxt(given)
+  height, width = picture.shape[:2]
+  camera = Camera(
+    width=width, height=height, fx=matrix[0, 0], fy=matrix[1, 1], cx=matrix[0, 2], cy=matrix[1, 2]
+  )
+  return camera, files, matrices, depth, MILLIMETRE
 
 
 def _camera(source: Path, nominal: Camera) -> Camera:
   """The camera of the optional camera_info.yaml, or else the data set's nominal one."""
   path = source / _INTRINSICS
   return read_camera_info(path) if path.is_file() else nominal
+
+
+def _read(path: Path) -> np.ndarray:
+  """Reads a depth picture, uint16 [H, W]; what counts as not measured is 0."""
+  depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+  if depth is None or depth.ndim != 2:
+    raise CaptureError(f"{path} cannot be read as a depth picture: expected 16-bit grey.")
+  return np.where(depth == _INVALID, 0, depth)
+
+
+def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
+  """Reads a depth picture at a camera's size, the nearest pixel each.
+
+  Args:
+    path: 16-bit picture, z-depth in a unit, of the same view as the camera's.
+    unit: That unit [m].
+    camera: Of the pictures; may be smaller.
+
+  Returns:
+    z-depth float32 [H, W] [m]; 0 where nothing was measured.
+  """
+  depth = _read(path)
+  row, column = (
+    ((np.arange(size) + 0.5) * length / size).astype(int)
+    for size, length in zip((camera.height, camera.width), depth.shape, strict=True)
+  )
+  return (depth[row][:, column] * unit).astype(np.float32)
 
 
 def sightings(depth_files: Sequence[Path], unit: float, camera: Camera) -> np.ndarray:
@@ -139,16 +217,14 @@ def sightings(depth_files: Sequence[Path], unit: float, camera: Camera) -> np.nd
   """
   found = []
   for index, path in enumerate(depth_files):
-    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if depth is None or depth.ndim != 2:
-      raise CaptureError(f"{path} cannot be read as a depth picture: expected 16-bit grey.")
+    depth = _read(path)
     height, width = depth.shape
     stride = max(1, int(np.sqrt(width * height / _SIGHTINGS)))
     row, column = (
       axis.ravel() for axis in np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride]
     )
     value = depth[row, column].astype(np.float64)
-    good = (value > 0) & (value < _INVALID)
+    good = value > 0
     pixel = np.stack(
       [(column + 0.5) * camera.width / width, (row + 0.5) * camera.height / height], -1
     )[good]
@@ -158,3 +234,6 @@ def sightings(depth_files: Sequence[Path], unit: float, camera: Camera) -> np.nd
   if not len(rows):
     raise CaptureError(f"{depth_files[0].parent}: the depth pictures hold no measured pixel.")
   return rows
+
+
+READERS = {"tum": read_tum, "7scenes": read_seven_scenes, "scannet": read_scannet}

@@ -288,12 +288,11 @@ def read_transforms(source: Path) -> KnownPoses:
 
 
 def read_rgbd(source: Path) -> KnownPoses:
-  """Reads an RGB-D sequence with known poses, in TUM's or 7-Scenes' layout."""
+  """Reads an RGB-D sequence with known poses, in TUM's, 7-Scenes' or ScanNet's layout."""
   layout = rgbd.find_rgbd(source)
   if layout is None:
     raise CaptureError(f"{source} holds no RGB-D sequence: expected rgb.txt and groundtruth.txt.")
-  read = rgbd.read_tum if layout == "tum" else rgbd.read_seven_scenes
-  camera, files, poses, depth, unit = read(source)
+  camera, files, poses, depth, unit = rgbd.READERS[layout](source)
   missing = [file for file in (*files, *depth) if not file.is_file()]
   if missing:
     raise CaptureError(f"{len(missing)} pictures of {source} are missing, as {missing[0].name}.")

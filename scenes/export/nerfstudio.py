@@ -16,6 +16,7 @@ from nerf2real.scenes.export import views
 from nerf2real.scenes.poses import localise
 
 _POINTS = "sparse_points.ply"
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)  # as the keyframes'
 
 
 def transforms(camera: Camera, world_from_camera: np.ndarray, names: list[str]) -> dict:
@@ -53,8 +54,8 @@ def transforms(camera: Camera, world_from_camera: np.ndarray, names: list[str]) 
 def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> str:
   """Writes transforms.json, images/ and the localised points; the folder appears whole.
 
-  The pictures are the capture's keyframes; where the bundle lacks one, all are rendered from the
-  field.
+  The pictures are the capture's keyframes, without rolling shutter as the poses are; where the
+  bundle lacks one, all are rendered from the field.
 
   Args:
     folder: Where to; an older one is replaced.
@@ -65,7 +66,7 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
     Where the pictures come from, for the user: "keyframes" or "rendered from the field".
   """
   camera, poses, names = views.capture_cameras(bundle)
-  points = localise.load(bundle.folder / "sfm")
+  localisation = localise.load(bundle.folder / "sfm")
   keyframes = bundle.keyframes_folder
   found = all((keyframes / name).is_file() for name in names)
   renderer = None if found else views.renderer_of(bundle)
@@ -74,13 +75,17 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
     (partial / "images").mkdir()
     for index, (name, pose) in enumerate(zip(names, poses, strict=True)):
       target = partial / "images" / name
-      if renderer is None:
+      if renderer is not None:
+        picture = renderer.render(camera, unit_from_world.apply_pose(pose))[0][..., ::-1]
+        cv2.imwrite(str(target), picture, _JPEG)
+      elif localisation.shutter is None:
         target.write_bytes((keyframes / name).read_bytes())
       else:
-        picture = renderer.render(camera, unit_from_world.apply_pose(pose))[0]
-        cv2.imwrite(str(target), picture[..., ::-1])
+        cv2.imwrite(str(target), localisation.read_picture(keyframes, index), _JPEG)
       progress((index + 1) / len(names), f"picture {index + 1} of {len(names)}")
-    cloud = trimesh.PointCloud(bundle.world_from_unit.apply(points.points), points.point_colors)
+    cloud = trimesh.PointCloud(
+      bundle.world_from_unit.apply(localisation.points), localisation.point_colors
+    )
     cloud.export(str(partial / _POINTS))
     content = transforms(camera, poses, [f"images/{name}" for name in names])
     (partial / "transforms.json").write_text(json.dumps(content, indent=1), encoding="utf-8")

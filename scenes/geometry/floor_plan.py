@@ -18,8 +18,9 @@ from nerf2real.scenes.geometry.free_space import FREE, OCCUPIED, UNKNOWN, FreeSp
 class FreeSpaceSettings:
   """The robot and the map; lengths in metres."""
 
-  resolution: float = 0.04
-  """Edge of a cell."""
+  resolution: float = 0.01
+  """Edge of a cell. A cell that matter touches is blocked whole: cells of 4 cm close a passage that
+  is 4 cm wider than the robot."""
   radius: float = 0.18
   """Of the robot: OP3's shoulders are 0.3 m apart, plus its sway."""
   low: float = 0.02

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from nerf2real.core import files
@@ -56,6 +57,22 @@ class Localisation:
   """What may ruin the reconstruction."""
   seconds: dict[str, float] = dataclasses.field(default_factory=dict)
   """Wall time of each step."""
+
+  def read_picture(self, keyframes: Path, index: int) -> np.ndarray:
+    """Reads a keyframe as if all lines were read at once: BGR uint8 [H, W, 3].
+
+    Args:
+      keyframes: Folder of the keyframes.
+      index: Row of `names`.
+
+    Raises:
+      ValueError: The keyframe is damaged.
+    """
+    path = keyframes / self.names[index]
+    image = cv2.imread(str(path))
+    if image is None:
+      raise ValueError(f"The keyframe {path} cannot be read: delete {path.parent.parent}.")
+    return image if self.shutter is None else self.shutter.rectify(image, self.camera, index)
 
 
 def reprojection_error(model: pycolmap.Reconstruction) -> float:

@@ -321,8 +321,11 @@ def _check_registered(
     why = "the camera hardly moved sideways, so depth cannot be seen"
     advice = "walk through the room instead of turning on the spot"
   else:
-    why = "the walk has gaps where successive pictures share too little (blur, plain walls, cuts)"
-    advice = "film slower and in one go, and come back to places that were seen before"
+    why = "they fall into groups that share too little (blur, plain walls, gaps)"
+    advice = (
+      "film slower and in one go, or take more pictures from places in between, and come back to "
+      "what was seen before"
+    )
   raise LocalisationError(
     f"{number} of {len(names)} keyframes were localised, expected at least {needed}: probably "
     f"{why}; {advice}."

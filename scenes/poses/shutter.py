@@ -82,6 +82,13 @@ class Shutter:
     )
     return found
 
+  def straightened(self, pixels: np.ndarray, camera: Camera, index: int) -> np.ndarray:
+    """Moves pixels [..., 2] of a picture as read to where `rectify` puts what they show."""
+    points = camera.rays(pixels) * self.depths[index]
+    shift = self.project(points, instants(pixels, camera), index, camera) - pixels
+    moved: np.ndarray = pixels - shift
+    return moved
+
 
 def instants(pixels: np.ndarray, camera: Camera) -> np.ndarray:
   """Instant [...] at which pixels [..., 2] are read: -0.5 the first line's, 0.5 the last's."""

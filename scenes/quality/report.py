@@ -87,6 +87,11 @@ FIGURES: Mapping[str, Meaning] = {
     "m", "95th percentile of their points' distance from parts or floor", "lower"
   ),
   "collision_parts": Meaning("", "convex parts that MuJoCo collides"),
+  "moved_to_floor": Meaning(
+    "",
+    "share of the field's depth that stood before a floor that the pictures show; it was moved",
+    "near 0",
+  ),
   "floor_tilt_deg": Meaning(
     "deg", "angle between the floor found and the true vertical's floor", "near 0"
   ),

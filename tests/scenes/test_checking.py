@@ -31,7 +31,7 @@ def test_pictures_of_several_cameras_are_one_clear_line(tmp_path):
   folder = tmp_path / "flat"
   folder.mkdir()
   for number in range(10):
-    size = (120, 160, 3) if number < 8 else (160, 120, 3)
+    size = (120, 160, 3) if number < 6 else (160, 120, 3)
     cv2.imwrite(str(folder / f"{number:02d}.jpg"), np.full(size, 90, np.uint8))
   with pytest.raises(CaptureError, match="expected one camera, one zoom and one orientation"):
     checking.check_capture(folder, tmp_path / "out", settings=preset("fast"), show_progress=False)

@@ -1,6 +1,8 @@
 """RGB-D sequences with known poses: TUM's and 7-Scenes' folders, transforms.json with depth."""
 
+import dataclasses
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,18 +10,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.scenes import image_stages
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import Floor
 from nerf2real.scenes.alignment.overrides import Overrides
-from nerf2real.scenes.capture import keyframes
+from nerf2real.scenes.capture import keyframes, rgbd
 from nerf2real.scenes.capture.capture import (
   CaptureError,
   CaptureSettings,
   read_capture,
-  source_kind,
 )
+from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.poses import localise
+from nerf2real.scenes.stages import Made, StageResult, Stages
 from tests.scenes import synthetic_capture as synthetic
 
 SETTINGS = CaptureSettings(num_keyframes=8)
@@ -98,6 +102,27 @@ def test_a_seven_scenes_sequence_gives_poses_and_depth(tmp_path):
   _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
 
 
+def test_a_scannet_scene_gives_poses_and_depth(tmp_path):
+  folder = tmp_path / "scene0000_00"
+  _pictures(folder, "color/{}.jpg", "depth/{}.png", 1e-3)
+  for name in ("pose", "intrinsic"):
+    (folder / name).mkdir()
+  matrix = np.diag([280.0, 280.0, 1.0, 1.0])
+  matrix[:2, 2] = 160.0, 120.0
+  np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+  for row, pose in enumerate(POSES):
+    np.savetxt(folder / "pose" / f"{row}.txt", pose)
+  assert source_kind(folder) == "rgbd"
+  with pytest.raises(CaptureError, match="give one of them, such as .*scene0000_00"):
+    source_kind(tmp_path)
+  _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
+  lost = np.full((4, 4), -np.inf)
+  for row in range(len(POSES)):
+    np.savetxt(folder / "pose" / f"{row}.txt", lost)
+  with pytest.raises(CaptureError, match="holds a finite pose"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+
+
 def test_transforms_with_depth_give_points(tmp_path):
   _pictures(tmp_path, "rgb/{:03d}.png", "depth/{:03d}.png", 1e-3)
   frames = []
@@ -109,6 +134,52 @@ def test_transforms_with_depth_give_points(tmp_path):
   about = {"w": 320, "h": 240, "fl_x": 280.0, "frames": frames}
   (tmp_path / "transforms.json").write_text(json.dumps(about))
   _check(read_capture(tmp_path, tmp_path / "images", settings=SETTINGS))
+
+
+def test_measured_depth_comes_at_the_size_of_the_pictures(tum, tmp_path):
+  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+  known = capture.known
+  camera = known.camera.resized(80, 60)
+  depth = rgbd.measured_depth(known.depth_files[3], known.depth_unit, camera)
+  points = (camera.rays() * depth[..., None])[depth > 0]
+  pose = known.world_from_camera[3]
+  assert (depth > 0).mean() > 0.5
+  # half a pixel of the sensor's: 2 mm a metre across, more where a surface is grazed
+  off = _off_the_planes(points @ pose[:3, :3].T + pose[:3, 3])
+  assert np.percentile(off, 90) < 0.02
+  spoilt = cv2.imread(str(known.depth_files[3]), cv2.IMREAD_UNCHANGED)
+  spoilt[:] = 65535
+  cv2.imwrite(str(tmp_path / "nothing.png"), spoilt)
+  assert not rgbd.measured_depth(tmp_path / "nothing.png", 1e-3, camera).any()
+
+
+def test_measured_depth_stands_for_the_fields(tum, tmp_path):
+  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+  first, *others = capture.known.depth_files
+  gap = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
+  gap[:120] = 0
+  cv2.imwrite(str(tmp_path / "gap.png"), gap)
+  known = dataclasses.replace(capture.known, depth_files=(tmp_path / "gap.png", *others))
+  capture = dataclasses.replace(capture, known=known)
+  found = localise.localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
+
+  def made(value):
+    return Made(value, StageResult(tmp_path, "key", "made", 0.0, cached=False))
+
+  def render(camera, pose):
+    size = (camera.height, camera.width)
+    return np.zeros((*size, 3), np.uint8), np.full(size, 9.0, np.float32)
+
+  field = SimpleNamespace(renderer=SimpleNamespace(render=render))
+  cache = Stages(tmp_path / "stages", show_progress=False)
+  views = image_stages.depth(cache, made(field), made(capture), made(found), width=80).value
+  measured = views.depth != 9.0
+  assert not measured[0, :30].any() and measured[1:].mean() > 0.9
+  rays = views.camera.rays()
+  for depth, there, pose in zip(views.depth, measured, views.frame_from_camera, strict=True):
+    points = (rays * depth[..., None])[there] @ pose[:3, :3].T + pose[:3, 3]
+    off = _off_the_planes(found.unit_from_source.inverse().apply(points))
+    assert np.percentile(off, 90) < 0.03
 
 
 def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path):

@@ -95,6 +95,19 @@ def test_rectified_pictures_show_points_where_the_middle_line_saw_them():
     np.testing.assert_allclose(centre, [x - round(x) + 8, y - round(y) + 8], atol=0.25)
 
 
+def test_pixels_are_straightened_as_pictures_are():
+  model, times = filmed(0.03)
+  found = shutter.motion(model, times, 0.03)
+  index = 7
+  points = np.array([[x, y, 1.0] for x in (-0.4, 0.1, 0.5) for y in (-0.25, 0.0, 0.28)])
+  points *= found.depths[index]
+  middle = CAMERA.project(points)
+  read = middle
+  for _ in range(6):
+    read = found.project(points, shutter.instants(read, CAMERA), index, CAMERA)
+  np.testing.assert_allclose(found.straightened(read, CAMERA, index), middle, atol=0.1)
+
+
 def test_a_picture_held_upright_is_read_along_its_width():
   upright = Camera(width=360, height=640, fx=500.0, fy=500.0, cx=180.0, cy=320.0)
   pixels = np.array([[0.0, 320.0], [180.0, 10.0], [360.0, 600.0]])

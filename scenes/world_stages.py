@@ -1,0 +1,172 @@
+"""Stages that find the world frame: before the training from sparse points, then from depth.
+
+Each runs, or finds done, one stage of the cache: a function of earlier results and settings.
+"""
+
+import dataclasses
+import warnings
+from pathlib import Path
+
+from nerf2real.core.progress import Progress, part
+from nerf2real.core.serialization import read_json, write_json
+from nerf2real.scenes.alignment import markers, world_frame
+from nerf2real.scenes.alignment.evidence import Evidence
+from nerf2real.scenes.alignment.floor import FloorError
+from nerf2real.scenes.alignment.overrides import Overrides
+from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.geometry import fusion
+from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.stages import Made, Stages
+
+_OUTLOOK_VERSION = 3  # 2: no floor is warned of; 3: markers' corners without rolling shutter
+_WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
+_NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
+
+
+@dataclasses.dataclass(frozen=True)
+class Outlook:
+  """What is known of the world frame before the training."""
+
+  scale: markers.MarkerScale | None
+  """The scale that markers give; None without one."""
+  warnings: tuple[str, ...] = ()
+
+
+def outlook(
+  cache: Stages,
+  capture: Made[Capture],
+  poses: Made[Localisation],
+  settings: world_frame.AlignSettings,
+  *,
+  voxel: float,
+  marker_side: float | None,
+  override: Overrides,
+  override_key: str,
+) -> Made[Outlook]:
+  """Finds markers, and refuses before the training what it could not help.
+
+  A world frame is found from the sparse points alone: where the scale makes the cameras' walk
+  larger than a grid of voxels may be, the stages after the training would fail. A floor that shows
+  in no localised point may show in the field's depth: it is warned of, at once and in the report.
+
+  Args:
+    cache: The stages of the job.
+    capture: The keyframes, in which markers are looked for.
+    poses: Cameras and sparse points, unit frame.
+    settings: Of the alignment.
+    voxel: Edge of the surface mesh's voxels [m].
+    marker_side: Side of the black square of a marker in the room [m], or None.
+    override: What a person fixed.
+    override_key: Hash of the file that says so.
+
+  Raises:
+    ValueError: No direction is up, or the room is too large for its voxels.
+  """
+  found = poses.value
+
+  def write(folder: Path, progress: Progress) -> None:
+    marker = None
+    if marker_side is not None:
+      images = [capture.value.folder / name for name in found.names]
+      seen = markers.detect(images, progress=part(progress, 0.0, 0.8))
+      if found.shutter is not None:
+        seen = [
+          d._replace(corners=found.shutter.straightened(d.corners, found.camera, d.view))
+          for d in seen
+        ]
+      marker = markers.marker_scale(
+        seen,
+        camera=found.camera,
+        frame_from_camera=found.world_from_camera,
+        side=marker_side,
+      )
+    evidence = Evidence(
+      found.points,
+      found.world_from_camera,
+      marker=marker,
+      sensor_scale=_sensed_scale(capture.value, found),
+    )
+    try:
+      frame = world_frame.align(
+        evidence, settings=settings, override=override, progress=part(progress, 0.8, 1.0)
+      )
+    except FloorError as error:
+      write_json(folder / "outlook.json", Outlook(marker, (f"{_NO_FLOOR} {error}",)))
+      return
+    # Sparse points stray; but the extent will hold every camera, and the floor below it.
+    cameras = frame.world_from_unit.apply(evidence.positions)
+    top = min(frame.camera_height, settings.max_height)
+    try:
+      fusion.grid_shape([*cameras.min(0)[:2], 0.0], [*cameras.max(0)[:2], top], voxel)
+    except ValueError as error:
+      raise ValueError(
+        f"{error} That box holds the cameras alone; its scale is from {frame.scale_source}: give "
+        "lengths in metres."
+      ) from error
+    write_json(folder / "outlook.json", Outlook(marker))
+
+  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
+  everything["voxel"] = voxel
+  inputs = {"poses": poses.stamp}
+  stage = cache.run("outlook", write, settings=everything, inputs=inputs, version=_OUTLOOK_VERSION)
+  found_out = read_json(stage.folder / "outlook.json", Outlook)
+  for text in found_out.warnings:
+    warnings.warn(text, stacklevel=2)
+  return Made(found_out, stage)
+
+
+def _sensed_scale(capture: Capture, poses: Localisation) -> float | None:
+  """Metres a unit of length of poses that came with the capture; None where they are not metric."""
+  known = capture.known
+  return 1 / poses.unit_from_source.scale if known is not None and known.is_metric else None
+
+
+def world(
+  cache: Stages,
+  capture: Made[Capture],
+  poses: Made[Localisation],
+  outlook: Made[Outlook],
+  depth: Made[fusion.DepthViews],
+  settings: world_frame.AlignSettings,
+  *,
+  marker_side: float | None,
+  override: Overrides,
+  override_key: str,
+) -> Made[world_frame.Alignment]:
+  """Finds floor, scale, yaw and extent.
+
+  Args:
+    cache: The stages of the job.
+    capture: The keyframes, which may have come with metric poses.
+    poses: Cameras and sparse points, unit frame.
+    outlook: The scale that markers give, and warnings.
+    depth: Rendered depth, unit frame.
+    settings: Of the alignment.
+    marker_side: Side of the black square of a marker in the room [m], or None.
+    override: What a person fixed.
+    override_key: Hash of the file of overrides.
+  """
+  found = poses.value
+
+  def write(folder: Path, progress: Progress) -> None:
+    points, normals = depth.value.surface_points(stride=2)
+    sensed = _sensed_scale(capture.value, found)
+    result = world_frame.align(
+      Evidence(found.points, found.world_from_camera, points, normals, outlook.value.scale, sensed),
+      settings=settings,
+      override=override,
+      progress=progress,
+    )
+    if marker_side is not None and outlook.value.scale is None:
+      missing = (
+        f"No marker of side {marker_side} m was read consistently in three pictures or more: "
+        "print it larger, lay it flat, film it from nearer."
+      )
+      result = dataclasses.replace(result, warnings=(*result.warnings, missing))
+    result = dataclasses.replace(result, warnings=(*outlook.value.warnings, *result.warnings))
+    write_json(folder / "alignment.json", result)
+
+  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
+  inputs = {"depth": depth.stamp, "outlook": outlook.stamp}
+  stage = cache.run("world", write, settings=everything, inputs=inputs, version=_WORLD_VERSION)
+  return Made(read_json(stage.folder / "alignment.json", world_frame.Alignment), stage)
