@@ -84,11 +84,11 @@ def propose(joint: JointLikelihood, chosen: Scored, rivals: list[Scored]) -> dic
 def _readings(plant: JointModel, item: Scored, command: Array) -> Array:
   """Returns simulated readings under a design, surroundings at the joint's mean."""
   p, loads, table = compose(plant, item.terms, item.fit.x)
-  around = plant.fields(loads, 0)
+  around = plant.forces(loads, 0)
   weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
   samples = np.arange(0.0, _DURATION - 0.02, 1.0 / _SAMPLES)
   count = int(_DURATION / plant.step) + 100
-  fields = [np.full(count, mean) for mean in (*around[:4].mean(axis=1), 0.0)]
+  fields = [np.full(count, mean) for mean in (*np.mean(around[:3], axis=1), 0.0)]
   out = np.zeros((4, len(samples)))
   kernel.simulate(  # type: ignore[call-arg]
     p,

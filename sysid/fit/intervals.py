@@ -11,7 +11,8 @@ import dataclasses
 import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fit, Fitter, deviations
+from nerf2real.sysid.fit.layout import Fit
+from nerf2real.sysid.fit.posterior import Fitter, deviations
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 
@@ -58,7 +59,9 @@ def central(joint: JointLikelihood, fit: Fit) -> Fit:
   in a thousand, or the difference looks like information.
   """
   fitter = Fitter([joint], fit.layout)
-  sides = [fitter.linearise(fit.x, width) for width in (_WIDTH, -_WIDTH)]
+  sides = [
+    fitter.linearise(fit.x, width, residuals=fit.residuals) for width in (_WIDTH, -_WIDTH)
+  ]
   (mean,) = np.mean([side.jacobian for side in sides], axis=0)
   weighted = 2.0 * joint.weights(joint.squares(sides[0].residuals[0])) * mean
   curvature = _resolved(np.einsum("icn,jcn->ij", weighted, mean))

@@ -22,7 +22,13 @@ _CROSS = 14
 """K, chosen: half waves down to a thirteenth of a joint's range, with 41 values."""
 _ORDERS = [(k, m) for k in range(_CROSS) for m in range(_CROSS) if (1 + k) * (1 + m) <= _CROSS]
 _GRID = 20
-"""Places of the table along each axis: as many as `suite.effects.residual_force` takes."""
+"""Places of the weights along each axis: as many as `suite.effects.residual_force` takes."""
+_FINE = 8
+"""Parts of a bump's width between places of the table: a cubic between them is right to 2e-5."""
+_WAVES = np.cos(np.pi * np.arange(_CROSS)[None] * np.linspace(0.0, 1.0, _GRID)[:, None])
+_PLACES = np.arange(-1.0, (_GRID - 1) * _FINE + 2) / _FINE
+_BUMPS = np.exp(-0.5 * (_PLACES[:, None] - np.arange(_GRID)[None]) ** 2)
+_BUMPS /= _BUMPS.sum(axis=1, keepdims=True)
 
 
 def free_force(plant: JointPlant) -> Term:
@@ -53,18 +59,21 @@ def free_force(plant: JointPlant) -> Term:
   )
 
 
+def weights(x: Array) -> Array:
+  """Returns the weights [P, V] of the suite's bumps."""
+  orders = np.zeros((_CROSS, _CROSS))
+  orders[tuple(np.array(_ORDERS).T)] = x
+  return _WAVES @ orders @ _WAVES.T
+
+
 def table(term: Term, x: Array) -> tuple[Array, Array]:
-  """Returns the kernel's table: weights [P, V] and bounds [4]."""
-  waves = np.cos(np.pi * np.arange(_CROSS)[None] * np.linspace(0.0, 1.0, _GRID)[:, None])
-  orders = zip(x, _ORDERS, strict=True)
-  weights = np.sum([c * np.outer(waves[:, k], waves[:, m]) for c, (k, m) in orders], axis=0)
-  return weights, np.array([value for _, value in term.fixed])
+  """Returns the kernel's table: forces at even places with a margin of one, and bounds [4]."""
+  return _BUMPS @ weights(x) @ _BUMPS.T, np.array([value for _, value in term.fixed])
 
 
 def effect(term: Term, x: Array) -> Effect:
   """Returns the force as an effect, of which nothing is left to fit."""
-  weights, _ = table(term, x)
   grid = {"num_positions": _GRID, "num_velocities": _GRID}
-  values: dict[str, Any] = {"weights": [float(w) for w in weights.ravel()]}
+  values: dict[str, Any] = {"weights": [float(w) for w in weights(x).ravel()]}
   values |= grid | dict(term.fixed)
   return Effect(FREE, term.target, values)

@@ -11,7 +11,7 @@ from nerf2real.core.pages.charts import Bars, Interval
 from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
-from nerf2real.sysid.fit.posterior import CONSTANTS
+from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import meanings, residual_plots
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE

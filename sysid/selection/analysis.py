@@ -11,7 +11,7 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.posterior import CONSTANTS
+from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction

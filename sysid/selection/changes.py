@@ -14,7 +14,8 @@ import numpy as np
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import CLOCKS, Fitter, Layout
+from nerf2real.sysid.fit.layout import CLOCKS, Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear, of_size
 from nerf2real.sysid.selection.naming import Explanation, conclude

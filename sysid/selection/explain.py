@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fit, Fitter, Layout
+from nerf2real.sysid.fit.layout import Fit, Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.free_force import free_force
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -15,6 +16,8 @@ Array = np.ndarray
 
 _PUSH = 0.2  # step of finite differences of a free force, of its values' deviations
 _ITERATIONS = 10  # of its fit
+_LOOKS = 2  # rounds of fitting constants in which other latencies are looked at
+_SCREENED = 2  # times as many kinds as are fitted to the end take a second step
 _SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
 
 
@@ -93,6 +96,16 @@ def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
   return [item for item in alone if len(item.names) == size]
 
 
+def _best_of_kinds(
+  tried: Sequence[tuple[Fitter, tuple[Term, ...], Fit]],
+) -> list[tuple[Fitter, tuple[Term, ...], Fit]]:
+  """Returns the best form of every set of kinds, the best first."""
+  chosen: dict[frozenset[str], tuple[Fitter, tuple[Term, ...], Fit]] = {}
+  for item in sorted(tried, key=lambda t: t[2].cost):
+    chosen.setdefault(named(item[1]), item)
+  return list(chosen.values())
+
+
 class Explainer:
   """Grows hypotheses of one joint."""
 
@@ -126,14 +139,16 @@ class Explainer:
     declared = joint.residuals((), np.zeros((1, 0)))[0]
     joint.rescale(declared)
     fitter = Fitter([joint], Layout([base]))
-    left = np.inf
-    for _ in range(self.settings.rounds):
-      fit = self._look_about(fitter, fitter.fit(x, iterations=2))
+    fit, left = fitter.fit(x, iterations=2), np.inf
+    for count in range(self.settings.rounds):
+      if count < _LOOKS:
+        fit = self._look_about(fitter, fit)
       joint.rescale(fit.residuals[0])
-      x, before, left = fit.x, left, float(np.log(joint.scale).sum())
+      before, left = left, float(np.log(joint.scale).sum())
       if left > before - 0.01:
         break
-    self.null = self._score(base, fitter.fit(x, iterations=4))
+      fit = fitter.fit(fit, iterations=2)
+    self.null = self._score(base, fitter.fit(fit, iterations=4))
     bare = Fitter([joint], Layout([()])).linearise(np.zeros(0), 0.0)
     self.declared = self._score((), bare, neutral=True)
     self._pushes: Array | None = None
@@ -164,35 +179,41 @@ class Explainer:
 
   def extend(self, parent: Scored, keep: int) -> list[Scored]:
     """Returns the best hypotheses that add one effect to a parent, fitted to the end."""
-    quick: list[tuple[float, tuple[Term, ...], Fit]] = []
+    tried: list[tuple[Fitter, tuple[Term, ...], Fit]] = []
     for terms, starts, stale, fresh in self._candidates(parent):
       fitter = Fitter([self.joint], Layout([terms]))
-      best = None
-      for start in self._begin(parent, fitter, starts):
-        fit = fitter.fit(start, iterations=2, known=stale, fresh=fresh, quick=True)
-        if best is None or fit.cost < best.cost:
-          best = fit
-      assert best is not None
-      quick.append((best.cost, terms, best))
-    quick.sort(key=lambda q: q[0])
-    chosen: dict[frozenset[str], tuple[float, tuple[Term, ...], Fit]] = {}
-    for q in quick:  # the best form of every kind
-      chosen.setdefault(named(q[1]), q)
-    results = []
-    for _, terms, fit in list(chosen.values())[:keep]:
-      done = Fitter([self.joint], Layout([terms])).fit(fit.x, iterations=4)
-      results.append((terms, done if done.cost < fit.cost + 1.0 else fit))
-    return [self._score(terms, fit) for terms, fit in results]
+      fits = [
+        fitter.fit(
+          fitter.linearise(x, known=stale, fresh=fresh, residuals=rows), iterations=1, quick=True
+        )
+        for x, rows in self._begin(parent, fitter, starts)
+      ]
+      tried.append((fitter, terms, min(fits, key=lambda f: f.cost)))
+    leading = _best_of_kinds(tried)[: _SCREENED * keep]  # halving: who leads takes another step
+    tried = [
+      (fitter, terms, fitter.fit(fit, iterations=1, quick=True))
+      for fitter, terms, fit in tried
+      if any(named(terms) == named(other) for _, other, _ in leading)
+    ]
+    chosen = _best_of_kinds(tried)
+    return [
+      self._score(terms, fitter.fit(fit, iterations=4))
+      for fitter, terms, fit in chosen[:keep]
+    ]
 
-  def _begin(self, parent: Scored, fitter: Fitter, starts: Array) -> list[Array]:
-    """Returns where descents begin: the best start, and without a first effect the best one with
-    the constants as they were declared, which what is missing may have bent."""
-    begin = [starts[int(np.argmin(fitter.costs(starts)))]]
+  def _begin(self, parent: Scored, fitter: Fitter, starts: Array) -> list[tuple[Array, list[Array]]]:
+    """Returns where descents begin, with the residuals there: the best start, and without a first
+    effect the best one with the constants as they were declared, which what is missing may have
+    bent."""
+    places = [starts]
     if not parent.names:
-      declared = starts.copy()
-      count = len(parent.fit.x)
-      declared[:, :count] = np.concatenate([t.centre for t in self.base])
-      begin.append(declared[int(np.argmin(fitter.costs(declared)))])
+      places.append(starts.copy())
+      places[-1][:, : len(parent.fit.x)] = np.concatenate([t.centre for t in self.base])
+    begin = []
+    for place in places:
+      costs, rows = fitter.simulated(place)
+      best = int(np.argmin(costs))
+      begin.append((place[best], [row[best] for row in rows]))
     return begin
 
   def _candidates(self, parent: Scored):
@@ -238,18 +259,21 @@ class Explainer:
     count = len(parent.fit.x)
     x = np.concatenate([parent.fit.x, force.starts[0]])
     if self._pushes is None:
-      self._pushes = fitter.linearise(x, _PUSH).jacobian[0][count:]
-    blank = np.zeros((count, *self._pushes.shape[1:]))
+      blank = np.zeros((len(x), *parent.fit.residuals[0].shape))
+      fresh, here = np.arange(len(x)) >= count, parent.fit.residuals
+      self._pushes = fitter.linearise(x, _PUSH, [blank], fresh, here).jacobian[0][count:]
+    known = [np.concatenate([parent.fit.jacobian[0], self._pushes])]
     fresh = np.arange(len(x)) < count
-    known = [np.concatenate([blank, self._pushes])]
-    fit = fitter.fit(x, iterations=_ITERATIONS, known=known, fresh=fresh)
+    begin = fitter.weighed(x, parent.fit.residuals, known, None)
+    fit = fitter.fit(begin, iterations=_ITERATIONS, known=known, fresh=fresh)
     return self._score(terms, fit)
 
   def constants_alone(self) -> list[Scored]:
     """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
     if self.freed is not None:
       terms = (self.freed, *self.null.terms[1:])
-      self._score(terms, Fitter([self.joint], Layout([terms])).fit(self.null.fit.x, iterations=4))
+      fitter = Fitter([self.joint], Layout([terms]))
+      self._score(terms, fitter.fit(self.null.fit.x, iterations=4))
     return self.ranked()
 
   def adopt(self, best: Scored) -> Scored:
@@ -257,7 +281,7 @@ class Explainer:
     fitter = Fitter([self.joint], Layout([best.terms]))
     for _ in range(self.settings.rounds):
       self.joint.rescale(best.fit.residuals[0])
-      before = float(fitter.costs(best.fit.x[None])[0])
+      before = fitter.again(best.fit).cost
       best = self.refit(best, 4)
       if best.fit.cost > before - _SETTLED:
         break
@@ -270,7 +294,7 @@ class Explainer:
 
   def refit(self, item: Scored, iterations: int = 6) -> Scored:
     """Returns a hypothesis fitted on under the present scale."""
-    fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit.x, iterations=iterations)
+    fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit, iterations=iterations)
     return self._score(item.terms, fit)
 
   def explain(

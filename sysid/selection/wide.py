@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import CLOCKS, Fit, Fitter, Layout
+from nerf2real.sysid.fit.layout import CLOCKS, Fit, Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
@@ -130,7 +131,7 @@ def screened(term: Term, members: Sequence[Subject]) -> Wide:
 def fitted(item: Wide) -> Wide:
   """Returns a screened effect fitted to the end, with its predictions of left-out blocks."""
   fitter = Fitter([m.now for m in item.members], item.fit.layout)
-  fit = fitter.fit(item.fit.x, iterations=_ENOUGH)
+  fit = fitter.fit(item.fit, iterations=_ENOUGH)
   near = [_replaced(fit.x, at, fit.x[at] + shift) for at in _late(item.term) for shift in _NEAR]
   if near:
     near = [np.clip(x, fit.layout.low, fit.layout.high) for x in near]

@@ -5,7 +5,7 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import intervals, whitening
-from nerf2real.sysid.fit.posterior import CONSTANTS
+from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.measured import fresh, quantum
