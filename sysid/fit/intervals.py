@@ -40,7 +40,7 @@ def intervals(
   joint: JointLikelihood, fit: Fit, term: Term, *, own_latency: bool
 ) -> dict[str, tuple[float, float]]:
   """Returns 95 % intervals of the values of a term of a fit; see `around`."""
-  spread = deviations(central(joint, fit), [joint], systematic=SYSTEMATIC)
+  spread = _spread(joint, fit)
   a, b = fit.layout.spans[fit.layout.terms.index(term)]
   return around(
     term,
@@ -50,6 +50,14 @@ def intervals(
     friction=float(joint.plant.declared[INDEX["friction"]]),
     relative=BESIDE_PLAY if any(t.kind == "backlash" for t in fit.layout.terms) else RELATIVE,
   )
+
+
+def _spread(joint: JointLikelihood, fit: Fit) -> Array:
+  """Returns standard deviations [n], which a fit keeps as long as the joint's scale stays."""
+  scale = joint.scale.tobytes() + joint.independent.tobytes()
+  if fit.spread is None or fit.spread[0] != scale:
+    fit.spread = scale, deviations(central(joint, fit), [joint], systematic=SYSTEMATIC)
+  return fit.spread[1]
 
 
 def central(joint: JointLikelihood, fit: Fit) -> Fit:

@@ -66,6 +66,8 @@ class Fit:
   """Mean squares [C, B] of left-out blocks, a joint."""
   held_x: list[Array] = dataclasses.field(default_factory=list)
   """Values without each fold."""
+  spread: tuple[bytes, Array] | None = None
+  """Standard deviations [n], and the residual's scale under which they hold."""
 
   def values(self, term: Term) -> dict[str, float]:
     """Returns the values of a term by name."""

@@ -127,6 +127,7 @@ class JointModel(JointPlant):
     *,
     table: Table | None = None,
     follow: bool = False,
+    readings: Array | None = None,
   ) -> Simulated:
     """Simulates one log.
 
@@ -136,11 +137,19 @@ class JointModel(JointPlant):
       index: of the log.
       table: a force over position and velocity.
       follow: whether the state is pulled to the readings.
+      readings: other ones [N] than the log's.
     """
-    return self.prepared(p, loads, index, table=table, follow=follow)()
+    return self.prepared(p, loads, index, table=table, follow=follow, readings=readings)()
 
   def prepared(
-    self, p: Array, loads: Sequence[Load], index: int, *, table: Table | None, follow: bool
+    self,
+    p: Array,
+    loads: Sequence[Load],
+    index: int,
+    *,
+    table: Table | None,
+    follow: bool,
+    readings: Array | None = None,
   ) -> Callable[[], Simulated]:
     """Returns a simulation of one log that may run beside others; see `run`."""
     if follow:
@@ -149,7 +158,7 @@ class JointModel(JointPlant):
     forces = self.forces(loads, index)
 
     def simulated() -> Simulated:
-      out = self._run(p, index, forces, table)
+      out = self._run(p, index, forces, table, readings)
       return Simulated(out.position, out.torque, out.jump)
 
     return simulated

@@ -176,7 +176,12 @@ class JointPlant:
     return np.abs(np.concatenate([o.torque for o in outputs]))
 
   def _run(
-    self, p: Array, index: int, grid: tuple[Array, ...], table: tuple[Array, Array] | None
+    self,
+    p: Array,
+    index: int,
+    grid: tuple[Array, ...],
+    table: tuple[Array, Array] | None,
+    readings: Array | None = None,
   ) -> Output:
     log, windows = self.logs[index], self.windows[index]
     out = np.zeros((4, len(log.time)))
@@ -193,7 +198,7 @@ class JointPlant:
       windows.start,
       windows.position,  # type: ignore
       windows.velocity,
-      self._readings[index],
+      self._readings[index] if readings is None else readings,
       weights,
       bounds,
       out[0],

@@ -3,7 +3,7 @@
 The baseline is the declared model with its tolerances, or what reference logs show: constants, and
 the effects that the machine has anyway. An effect is named where every tried hypothesis without it
 is clearly worse (`naming`), and where the reference logs are clearly worse with it than without.
-Where more remains, a name must also explain more than it leaves to a force of any form.
+Where more remains, a name must also be needed beside a force of any form.
 """
 
 import dataclasses
@@ -16,10 +16,11 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.layout import CLOCKS, Layout
 from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear, of_size
+from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear
 from nerf2real.sysid.selection.naming import Explanation, conclude
-from nerf2real.sysid.selection.remainder import grown, structured
+from nerf2real.sysid.selection.remainder import grown, scatter, structured
 from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -126,13 +127,20 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
   if usual is not None and not subject.paired:
     anyway = float(np.median(usual.fit.held[0][0]))
+  if now.follows:
+    anyway = max(anyway, scatter(now, found.best))
   left = float(np.median(found.left))
   over = float(np.sqrt(left / max(anyway, 1e-300)))
   if named and over > settings.more:
-    named = _supported(explainer, found, named, settings)
+    named = _supported(explainer, found.best, named, subject.beyond)
     ranked = explainer.ranked()
   verdict = _verdict(
-    found, named, len(own) < len(known), leaves(subject, found.best, settings), over, settings
+    found,
+    named,
+    any(t.wider for t in known),
+    leaves(subject, found.best, settings),
+    over,
+    settings,
   )
   off = _constants_off(subject, found.best, settings)
   return Changed(
@@ -162,36 +170,23 @@ def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
 
 
 def _supported(
-  explainer: Explainer, found: Explanation, named: Sequence[str], settings: Settings
+  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float
 ) -> tuple[str, ...]:
-  """Returns the names that explain more than they leave to a force of any form, one by one.
+  """Returns the names that are needed beside a force of any form.
 
-  Effects that together imitate what no library has each explain the smaller part of what a smooth
-  force over position and velocity explains of left-out motion; one that is there does not.
+  Where more remains, something is there that no name is for, and what is named may be a part of it:
+  half of a soft stop is a spring. A force of any form over position and velocity stands in for it;
+  a name is kept where hypotheses with that force are clearly worse without the name.
 
   Args:
     explainer: scores what has not been scored.
-    found: the best hypothesis, of which more remains than the machine leaves anyway.
+    best: the best hypothesis, of which more remains than the machine leaves anyway.
     named: kinds that are clear.
-    settings: limits.
+    beyond: standard errors that count as clear.
   """
-  kept: tuple[str, ...] = ()
-  base = explainer.null
-  while len(kept) < len(named):
-    wider = [
-      item
-      for item in of_size(explainer.scored.values(), len(kept) + 1)
-      if set(kept) < item.names <= set(named)
-    ]
-    if not wider:
-      break
-    best = max(wider, key=lambda item: item.evidence)
-    force = explainer.with_force(base)
-    gained, possible = (item.evidence - base.evidence for item in (best, force))
-    if gained < possible - gained:
-      break
-    base, kept = best, tuple(k for k in named if k in best.names)
-  return kept
+  beside = explainer.with_force(best)
+  rivals = {kind: explainer.with_force(explainer.lacking(best, kind), beside) for kind in named}
+  return tuple(kind for kind in named if clear(beside, rivals[kind]) > beyond)
 
 
 def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
@@ -212,9 +207,15 @@ def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
   """Tells whether an effect's values differ from those that do nothing, by their intervals.
 
   Of effects that have sizes only: where a shape is fitted, too, a size may be open that is surely
-  not nothing, as a payload's mass is where its moment is sure.
+  not nothing, as a payload's mass is where its moment is sure. What healthy machines have of an
+  effect is nothing where no reference shows it.
   """
   term = next(t for t in best.terms if t.name == kind)
+  own = OWN.get(kind, {}) if subject.before is None and subject.now.plant.hinge else {}
+  if own:
+    bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
+    if any(bounds[name][0] <= size for name, size in own.items()):
+      return False
   sizes = {} if term.freed else {p.name: p for p in kind_of(kind).parameters if not p.shape}
   if not term.names or any(n not in sizes for n in term.names):
     return True

@@ -96,6 +96,12 @@ def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
   return [item for item in alone if len(item.names) == size]
 
 
+def _alike(given: Sequence[Term], wanted: Sequence[Term]) -> list[Term]:
+  """Returns the given terms that are of the wanted ones' kinds and fitted there, in their order."""
+  by_kind = {t.kind: t for t in given}
+  return [by_kind[t.kind] for t in wanted if t.names]
+
+
 def _best_of_kinds(
   tried: Sequence[tuple[Fitter, tuple[Term, ...], Fit]],
 ) -> list[tuple[Fitter, tuple[Term, ...], Fit]]:
@@ -249,8 +255,23 @@ class Explainer:
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
-  def with_force(self, parent: Scored) -> Scored:
-    """Returns a hypothesis with a force of any form beside it, whose derivatives are taken once."""
+  def lacking(self, item: Scored, kind: str) -> Scored:
+    """Returns a hypothesis without one of its effects, the constants as tight as they were."""
+    instead = {t.kind: t for t in self.base}
+    terms = tuple(instead.get(t.kind) if t.name == kind else t for t in item.terms)
+    kept = tuple(t for t in terms if t is not None)
+    if kept not in self.scored:
+      x = np.concatenate([list(item.fit.values(t).values()) for t in _alike(item.terms, kept)])
+      self._score(kept, Fitter([self.joint], Layout([kept])).fit(x, iterations=4))
+    return self.scored[kept]
+
+  def with_force(self, parent: Scored, near: Scored | None = None) -> Scored:
+    """Returns a hypothesis with a force of any form beside it, whose derivatives are taken once.
+
+    Args:
+      parent: the hypothesis.
+      near: another one with a force, from whose values is begun, too.
+    """
     force = free_force(self.joint.plant)
     terms = (*parent.terms, force)
     if terms in self.scored:
@@ -266,6 +287,12 @@ class Explainer:
     fresh = np.arange(len(x)) < count
     begin = fitter.weighed(x, parent.fit.residuals, known, None)
     fit = fitter.fit(begin, iterations=_ITERATIONS, known=known, fresh=fresh)
+    if near is not None:
+      x = np.concatenate([list(near.fit.values(t).values()) for t in _alike(near.terms, terms)])
+      here = fitter.simulated(x[None])[1]
+      begin = fitter.weighed(x, [rows[0] for rows in here], known, None)
+      other = fitter.fit(begin, iterations=_ITERATIONS, known=known, fresh=fresh)
+      fit = min(fit, other, key=lambda f: f.cost)
     return self._score(terms, fit)
 
   def constants_alone(self) -> list[Scored]:

@@ -107,7 +107,8 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   most = max(range(len(single)), key=lambda at: single[at].total)
   rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
   clear = min(mine.clear, *((mine - r).clear for r in rivals))
-  spread = deviations(best.fit, [m.now for m in best.members])[: len(best.x)]
+  joints = [m.now for m in best.members]
+  spread = deviations(best.fit, joints, systematic=intervals.SYSTEMATIC)[: len(best.x)]
   if clear < beyond or _is_nothing(best.term, best.x, spread, own_latency=own_latency):
     return None
   origin = best.members[most]
