@@ -25,7 +25,7 @@ from nerf2real.sysid.design import excitation
 from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.model.simulation import Clocks, Member
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.changes import Changed
@@ -115,6 +115,7 @@ def _identify(
     found.verdict = "effects" if found.verdict == "none" else found.verdict
   progress(_SENSORS, "errors on the logs")
   whole = [*found.calibration, *found.objects]
+  near = found.near
   content: dict[str, Any] = {
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else found.effects,
@@ -122,8 +123,8 @@ def _identify(
     "alternatives": _alternatives(found),
     "residual_at": residual_at(found),
     "error": {
-      "train": _errors(found, logs, whole, settings),
-      "held": _errors(found, held, whole, settings) if held else None,
+      "train": _errors(found, logs, near, settings),
+      "held": _errors(found, held, near, settings) if held else None,
       "floor": _floor(held or logs, [j.joint for j in found.joints]),
     },
     "window_s": None if _holds(found) else settings.window_s,
@@ -158,7 +159,7 @@ def _identify(
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
-  details = _details(found, model, whole, sensed)
+  details = _details(found, model, near, sensed)
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
   progress(_ERRORS, "report")
   content["seconds"] = round(time.perf_counter() - began, 1)
@@ -189,14 +190,14 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
 
 
 def _details(
-  found: Identified, model: Path, extended: Sequence[Effect], sensed: sensing.Sensed
+  found: Identified, model: Path, near: Sequence[Member], sensed: sensing.Sensed
 ) -> dict[str, Any]:
   """Returns what the findings rest on, and what `evaluate` needs."""
   first = found.least_explained
   return {
     "model": str(model.resolve()),
-    "extended": to_list(extended),
-    "clocks": {j: {"skew": c.skew, "latency": c.latency} for j, c in found.clocks.items()},
+    **_written(near[0]),
+    "near": [_written(member) for member in near[1:]],
     "calibration": {
       e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
       for e in found.calibration
@@ -229,8 +230,7 @@ def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
   content = json.loads((folder / "report.json").read_text())
   details = json.loads((folder / "details.json").read_text())
   model = load_model(Path(details["model"]))
-  effects = from_list(details["extended"])
-  clocks = {joint: Clocks(**values) for joint, values in details["clocks"].items()}
+  near = [_read(item) for item in (details, *details.get("near", []))]
   rows = []
   for log in read_logs(held, model):
     window = content["window_s"] or 0.5
@@ -238,10 +238,22 @@ def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
       {
         "log": log.name,
         "before": evaluation.error(model, [log], window_s=window),
-        "after": evaluation.error(model, [log], effects, clocks=clocks, window_s=window),
+        **evaluation.errors(model, [log], near, window_s=window),
       }
     )
   return rows
+
+
+def _written(member: Member) -> dict[str, Any]:
+  """Returns what is simulated with as data."""
+  clocks = {j: {"skew": c.skew, "latency": c.latency} for j, c in member.clocks.items()}
+  return {"extended": to_list(member.effects), "clocks": clocks}
+
+
+def _read(item: dict[str, Any]) -> Member:
+  """Returns what was written by `_written`."""
+  clocks = {joint: Clocks(**values) for joint, values in item["clocks"].items()}
+  return Member(from_list(item["extended"]), clocks)
 
 
 def _claimed(found: Identified) -> list[Effect]:
@@ -258,14 +270,12 @@ def _claimed(found: Identified) -> list[Effect]:
 
 
 def _errors(
-  found: Identified, logs: Sequence[Log], effects: Sequence[Effect], settings: Settings
+  found: Identified, logs: Sequence[Log], near: Sequence[Member], settings: Settings
 ) -> dict[str, float]:
   """Returns RMSE before and after, over the joints that the logs command."""
   window = settings.window_s
-  return {
-    "before": evaluation.error(found.model, logs, window_s=window),
-    "after": evaluation.error(found.model, logs, effects, clocks=found.clocks, window_s=window),
-  }
+  before = evaluation.error(found.model, logs, window_s=window)
+  return {"before": before} | evaluation.errors(found.model, logs, near, window_s=window)
 
 
 def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:

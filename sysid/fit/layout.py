@@ -1,4 +1,4 @@
-"""Values of a hypothesis of some joints: whose they are, their bounds and priors, and a fit of them.
+"""Values of a hypothesis of some joints: whose they are, bounds and priors, and a fit of them.
 
 Shapes: n values, C channels, N samples, B blocks, F folds.
 """
@@ -67,7 +67,7 @@ class Fit:
   held_x: list[Array] = dataclasses.field(default_factory=list)
   """Values without each fold."""
   spread: tuple[bytes, Array] | None = None
-  """Standard deviations [n], and the residual's scale under which they hold."""
+  """Covariance [n, n], and the residual's scale under which it holds."""
 
   def values(self, term: Term) -> dict[str, float]:
     """Returns the values of a term by name."""

@@ -11,7 +11,7 @@ are predicted by one further step from the mode without their share of gradient 
 infinitesimal jackknife). Shapes: n values, C channels, N samples, B blocks, X sets of values.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -34,6 +34,8 @@ _AS_EXPECTED = 0.5  # share of the gain that the linearisation promises, chosen
 _CARRIED = 3  # steps at most between Jacobians of finite differences, chosen
 _LEAST_CARRIED = 0.03  # scales that a step must be long to correct a Jacobian: costs are rough
 _WIDTH, _FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
+_SHIFTS = tuple(0.0005 * k for k in (-8, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 8))
+"""s by which latencies are shifted to look about."""
 _GENERATIONS, _DRAWN, _ELITE = 12, 40, 8  # of values that are drawn where costs are rough, chosen
 _SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least, chosen
 _CONVERGED = 0.05  # nats that a step gains at which a fit ends
@@ -206,6 +208,27 @@ class Fitter:
       result.append(jacobian)
     return result
 
+  def look_about(self, fit: Fit, names: Collection[str], *, iterations: int = 2) -> Fit:
+    """Returns a fit from near other latencies where that is better: held commands make stairs of
+    them, in which steps end.
+
+    Args:
+      fit: where steps have ended.
+      names: of the latencies to shift.
+      iterations: Jacobians at most of the fit from the best shifted values.
+    """
+    layout = self.layout
+    kinds = [n for t in layout.terms for n in t.names]
+    moved = [at for at, name in enumerate(kinds) if name in names]
+    if not moved:
+      return fit
+    tried = fit.x + np.array([s * np.eye(len(kinds))[at] for at in moved for s in _SHIFTS])
+    tried = np.clip(tried, layout.low, layout.high)
+    costs, rows = self.simulated(tried)
+    k = int(np.argmin(costs))
+    begin = self.weighed(tried[k], [row[k] for row in rows], fit.jacobian, None)
+    return min(fit, self.fit(begin, iterations=iterations), key=lambda f: f.cost)
+
   def draw(self, fit: Fit) -> Fit:
     """Returns a better fit where costs are too rough for derivatives: values are drawn about the
     best so far (cross-entropy method, Rubinstein 1999)."""
@@ -289,8 +312,8 @@ def _bounded(
   return np.clip(result, layout.low, layout.high)
 
 
-def deviations(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float = 1.0) -> Array:
-  """Returns the standard deviations [n] of a fit's values, by the gradient's scatter over blocks.
+def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float = 1.0) -> Array:
+  """Returns the covariance [n, n] of a fit's values, by the gradient's scatter over blocks.
 
   H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
   blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
@@ -308,6 +331,4 @@ def deviations(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float
     scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
   inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
   prior = np.diag(fit.layout.sigma**-2.0)
-  return np.sqrt(
-    np.maximum(np.diag(inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse), 0.0)
-  )
+  return inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse

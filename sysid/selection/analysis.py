@@ -104,7 +104,7 @@ def _explained(
 
 def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:
   """Adds an effect of a body or of the machine."""
-  bounds = intervals.around(shared.term, shared.x, shared.spread, own_latency=own_latency)
+  bounds = intervals.around(shared.term, shared.x, *shared.reach, own_latency=own_latency)
   evidence = {
     "clear_by_standard_errors": round(shared.clear, 2),
     "held_out_gain_nats": round(shared.nats, 2),

@@ -13,11 +13,12 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.layout import CLOCKS, Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.selection.elaboration import elaborated
 from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear
 from nerf2real.sysid.selection.naming import Explanation, conclude
 from nerf2real.sysid.selection.remainder import grown, scatter, structured
@@ -44,6 +45,8 @@ class Changed:
   """The same of the logs, under the best hypothesis."""
   constants_off: bool
   """Whether declared constants are off by more than machines of one kind differ."""
+  elaborated: list[Scored] = dataclasses.field(default_factory=list)
+  """Fits with richer friction that are near the best of them, the best first."""
 
   @property
   def extended(self) -> Scored:
@@ -51,7 +54,13 @@ class Changed:
     if self.verdict not in ("partly", "unexplained"):
       return self.found.best
     fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
-    return max(fitting, key=lambda s: s.evidence, default=self.found.best)
+    return max([*fitting, *self.elaborated[:1]], key=lambda s: s.evidence, default=self.found.best)
+
+  @property
+  def near(self) -> list[Scored]:
+    """The hypotheses whose mean is predicted with: fits near the best, which is the first."""
+    best = self.extended
+    return self.elaborated if any(best is s for s in self.elaborated) else [best]
 
   @property
   def likelihood(self) -> JointLikelihood:
@@ -143,6 +152,9 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     settings,
   )
   off = _constants_off(subject, found.best, settings)
+  near = []
+  if verdict in ("partly", "unexplained") and not now.follows:
+    near = elaborated(explainer, found.best, named)
   return Changed(
     subject,
     ranked,
@@ -152,6 +164,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
     off,
+    near,
   )
 
 

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.layout import Fit, Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.free_force import free_force
 from nerf2real.sysid.hypotheses.terms import FREE, Term
@@ -148,7 +148,7 @@ class Explainer:
     fit, left = fitter.fit(x, iterations=2), np.inf
     for count in range(self.settings.rounds):
       if count < _LOOKS:
-        fit = self._look_about(fitter, fit)
+        fit = fitter.look_about(fit, ("latency", "skew"), iterations=1)
       joint.rescale(fit.residuals[0])
       before, left = left, float(np.log(joint.scale).sum())
       if left > before - 0.01:
@@ -159,18 +159,6 @@ class Explainer:
     self.declared = self._score((), bare, neutral=True)
     self._pushes: Array | None = None
 
-  def _look_about(self, fitter: Fitter, fit: Fit) -> Fit:
-    """Returns a fit from a better place if there is one: held commands make stairs of latencies."""
-    tried = []
-    for at, name in enumerate(self.constants.names):
-      if name in ("latency", "skew"):
-        for value in np.arange(-3, 5) * 0.002:
-          tried.append(fit.x.copy())
-          tried[-1][at] = np.clip(value, fitter.layout.low[at], fitter.layout.high[at])
-    costs = fitter.costs(np.array(tried))
-    best = int(np.argmin(costs))
-    return fitter.fit(tried[best], iterations=1) if costs[best] < fit.cost - 1.0 else fit
-
   def _score(self, terms: tuple[Term, ...], fit: Fit, *, neutral: bool = False) -> Scored:
     fitter = Fitter([self.joint], Layout([terms]))
     fitter.leave_out(fit)
@@ -178,10 +166,15 @@ class Explainer:
     self.scored[terms] = result
     return result
 
-  def _rescore(self) -> None:
+  def rescore(self) -> None:
     """Scores all hypotheses anew after the scale has changed."""
     for s in self.scored.values():
       s.nats = self.joint.loglik(s.fit.held[0])
+
+  def cost(self, item: Scored) -> float:
+    """Returns the negative log posterior of a hypothesis under the present scale."""
+    nats = self.joint.loglik(self.joint.squares(item.fit.residuals[0]))
+    return item.prior - float(nats.sum())
 
   def extend(self, parent: Scored, keep: int) -> list[Scored]:
     """Returns the best hypotheses that add one effect to a parent, fitted to the end."""
@@ -203,11 +196,13 @@ class Explainer:
     ]
     chosen = _best_of_kinds(tried)
     return [
-      self._score(terms, fitter.fit(fit, iterations=4))
+      self._score(terms, fitter.look_about(fitter.fit(fit, iterations=4), ("delay",)))
       for fitter, terms, fit in chosen[:keep]
     ]
 
-  def _begin(self, parent: Scored, fitter: Fitter, starts: Array) -> list[tuple[Array, list[Array]]]:
+  def _begin(
+    self, parent: Scored, fitter: Fitter, starts: Array
+  ) -> list[tuple[Array, list[Array]]]:
     """Returns where descents begin, with the residuals there: the best start, and without a first
     effect the best one with the constants as they were declared, which what is missing may have
     bent."""
@@ -309,14 +304,16 @@ class Explainer:
     for _ in range(self.settings.rounds):
       self.joint.rescale(best.fit.residuals[0])
       before = fitter.again(best.fit).cost
-      best = self.refit(best, 4)
+      best = self._score(
+        best.terms, fitter.look_about(fitter.fit(best.fit, iterations=4), ("delay",))
+      )
       if best.fit.cost > before - _SETTLED:
         break
     if self.joint.follows and best.names & set(UNREPEATED):
       fitter = Fitter([self.joint], Layout([best.terms]))
       best = self._score(best.terms, fitter.fit(fitter.draw(best.fit).x, iterations=8))
       self.joint.rescale(best.fit.residuals[0])
-    self._rescore()
+    self.rescore()
     return best
 
   def refit(self, item: Scored, iterations: int = 6) -> Scored:
@@ -368,7 +365,7 @@ class Explainer:
     top = max(forced, key=lambda item: item.evidence)
     if top.evidence > best.evidence:
       self.joint.rescale(top.fit.residuals[0])
-      self._rescore()
+      self.rescore()
 
   def _neutralise(self, item: Scored) -> None:
     """Scores an item with each of its effects at the values that do nothing, all else fitted.
@@ -387,12 +384,12 @@ class Explainer:
         ]
       )
       fit = Fitter([self.joint], Layout([terms])).fit(x, iterations=4)
-      if terms not in self.scored or self.scored[terms].fit.cost > fit.cost:
+      if terms not in self.scored or self.cost(self.scored[terms]) > fit.cost:
         self._score(terms, fit, neutral=before is None)
       plain = self.scored.get(tuple(t for t in item.terms if t is not term))
-      if plain is not None and before is None and fit.cost < plain.fit.cost - _SETTLED:
+      if plain is not None and before is None and fit.cost < self.cost(plain) - _SETTLED:
         again = Fitter([self.joint], Layout([plain.terms])).fit(fit.x, iterations=4)
-        if again.cost < plain.fit.cost:
+        if again.cost < self.cost(plain):
           self._score(plain.terms, again)
 
   def ranked(self) -> list[Scored]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.posterior import deviations
+from nerf2real.sysid.fit.posterior import covariance
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import wide
 from nerf2real.sysid.selection.changes import Changed, leaves
@@ -32,8 +32,8 @@ class Shared:
   term: Term
   x: Array
   """Values [n]."""
-  spread: Array
-  """Their standard deviations [n]."""
+  reach: tuple[Array, Array]
+  """How far they may be below and above [n]."""
   origin: Subject
   """The joint that shows it most."""
   members: tuple[Subject, ...]
@@ -108,17 +108,18 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
   clear = min(mine.clear, *((mine - r).clear for r in rivals))
   joints = [m.now for m in best.members]
-  spread = deviations(best.fit, joints, systematic=intervals.SYSTEMATIC)[: len(best.x)]
-  if clear < beyond or _is_nothing(best.term, best.x, spread, own_latency=own_latency):
+  spread = covariance(best.fit, joints, systematic=intervals.SYSTEMATIC)
+  reach = intervals.reaches(best.fit, spread, (0, len(best.x)))
+  if clear < beyond or _is_nothing(best.term, best.x, reach, own_latency=own_latency):
     return None
   origin = best.members[most]
-  return Shared(best.term, best.x, spread, origin, best.members, clear, mine.total)
+  return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total)
 
 
-def _is_nothing(term: Term, x: Array, spread: Array, *, own_latency: bool) -> bool:
+def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency: bool) -> bool:
   """Tells whether an effect has sizes only, whose intervals hold the values that do nothing."""
   sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
-  bounds = intervals.around(term, x, spread, own_latency=own_latency)
+  bounds = intervals.around(term, x, *reach, own_latency=own_latency)
   return all(n in sizes and low <= sizes[n] <= high for n, (low, high) in bounds.items())
 
 
