@@ -99,18 +99,19 @@ def central(joint: JointLikelihood, fit: Fit) -> Fit:
   fitter = Fitter([joint], fit.layout)
   sides = [fitter.linearise(fit.x, width, residuals=fit.residuals) for width in (_WIDTH, -_WIDTH)]
   (mean,) = np.mean([side.jacobian for side in sides], axis=0)
-  weighted = 2.0 * joint.weights(joint.squares(sides[0].residuals[0])) * mean
-  curvature = _resolved(np.einsum("icn,jcn->ij", weighted, mean))
+  weights = 2.0 * joint.weights(joint.squares(sides[0].residuals[0]))
+  mean = np.tensordot(_resolved(np.einsum("icn,jcn->ij", weights * mean, mean)), mean, 1)
+  curvature = np.einsum("icn,jcn->ij", weights * mean, mean)
   return dataclasses.replace(sides[0], jacobian=[mean], curvature=curvature[None])
 
 
 def _resolved(curvature: Array) -> Array:
-  """Returns a curvature [n, n] without the directions that finite differences cannot tell from
-  flat ones."""
+  """Returns what takes the directions out of a Jacobian [n, n] that finite differences cannot tell
+  from flat ones: neither curvature nor scatter is known along them."""
   size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
   values, vectors = np.linalg.eigh(curvature / size / size[:, None])
-  kept = np.where(values > _RESOLVED, values, 0.0)
-  return (vectors * kept) @ vectors.T * size * size[:, None]
+  kept = vectors * (values > _RESOLVED)
+  return kept @ vectors.T / size * size[:, None]
 
 
 def around(

@@ -36,6 +36,7 @@ _LEAST_CARRIED = 0.03  # scales that a step must be long to correct a Jacobian: 
 _WIDTH, _FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
 _SHIFTS = tuple(0.0005 * k for k in (-8, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 8))
 """s by which latencies are shifted to look about."""
+_WORTH = 0.5  # nats that other latencies must be better by, chosen
 _GENERATIONS, _DRAWN, _ELITE = 12, 40, 8  # of values that are drawn where costs are rough, chosen
 _SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least, chosen
 _CONVERGED = 0.05  # nats that a step gains at which a fit ends
@@ -227,7 +228,8 @@ class Fitter:
     costs, rows = self.simulated(tried)
     k = int(np.argmin(costs))
     begin = self.weighed(tried[k], [row[k] for row in rows], fit.jacobian, None)
-    return min(fit, self.fit(begin, iterations=iterations), key=lambda f: f.cost)
+    other = self.fit(begin, iterations=iterations)
+    return other if other.cost < fit.cost - _WORTH else fit
 
   def draw(self, fit: Fit) -> Fit:
     """Returns a better fit where costs are too rough for derivatives: values are drawn about the
