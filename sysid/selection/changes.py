@@ -28,6 +28,10 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 Array = np.ndarray
 
 
+_MOMENTS = ("payload",)
+"""Kinds of which a product of values shows: the product is sure where none of them is."""
+
+
 @dataclasses.dataclass
 class Changed:
   """What is new at a joint."""
@@ -217,23 +221,21 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
 
 
 def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
-  """Tells whether an effect's values differ from those that do nothing, by their intervals.
+  """Tells whether an effect's sizes differ from those that do nothing, by their intervals.
 
-  Of effects that have sizes only: where a shape is fitted, too, a size may be open that is surely
-  not nothing, as a payload's mass is where its moment is sure. What healthy machines have of an
-  effect is nothing where no reference shows it.
+  What healthy machines have of an effect is nothing, too, where no reference shows it. A payload's
+  mass may be open where its moment is sure.
   """
   term = next(t for t in best.terms if t.name == kind)
-  own = OWN.get(kind, {}) if subject.before is None and subject.now.plant.hinge else {}
-  if own:
-    bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
-    if any(bounds[name][0] <= size for name, size in own.items()):
-      return False
-  sizes = {} if term.freed else {p.name: p for p in kind_of(kind).parameters if not p.shape}
-  if not term.names or any(n not in sizes for n in term.names):
+  if term.freed or not term.names or kind in _MOMENTS:
     return True
-  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=subject.before is None)
-  return any(not low <= sizes[n].nominal <= high for n, (low, high) in bounds.items())
+  alone = subject.before is None
+  sizes = {p.name: p.nominal for p in kind_of(kind).parameters if not p.shape}
+  own = OWN.get(kind, {}) if alone and subject.now.plant.hinge else {}
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=alone)
+  return any(
+    not low - own.get(n, 0.0) <= sizes[n] <= high for n, (low, high) in bounds.items() if n in sizes
+  )
 
 
 def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:
