@@ -156,6 +156,8 @@ def _identify(
       f"At {joints} more remains than the machine leaves anyway: the names are certain, not all."
     )
     content["notes"] = [*content["notes"], text]
+  if len(near) > 1:
+    content["notes"] = [*content["notes"], _spread(content["error"])]
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
@@ -276,6 +278,17 @@ def _errors(
   window = settings.window_s
   before = evaluation.error(found.model, logs, window_s=window)
   return {"before": before} | evaluation.errors(found.model, logs, near, window_s=window)
+
+
+def _spread(error: dict[str, Any]) -> str:
+  """Returns a sentence on the errors of fits near the best."""
+  name = "held" if error["held"] else "train"
+  found = error[name]
+  return (
+    f"Errors after are of the mean of {found['models']} fits near the best, which differ:"
+    f" {found['median']:.3g} rad (or m) in the median, {found['least']:.3g} to {found['most']:.3g}"
+    f" on the {name} logs; the model that is written alone has {found['single']:.3g}."
+  )
 
 
 def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:

@@ -214,7 +214,8 @@ class JointLikelihood:
   def rescale(self, residuals: Array) -> None:
     """Sets the scale and the number of independent samples by the residuals [C, N] of a fit.
 
-    Channels show one misfit: where courses go together for long, efforts count no more often.
+    Channels show one misfit: where courses go together for long, efforts count no more often. A
+    duty is of the servo's law alone, which the measured positions feed: its misfit is another.
     """
     squares = self.squares(residuals)
     self.scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
@@ -222,7 +223,7 @@ class JointLikelihood:
       _correlation_time(row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts)
       for c, row in enumerate(residuals)
     ]
-    self.independent[:] = 1.0 / max(times)
+    self.independent[:] = 1.0 / np.array(times if self.is_duty else [max(times)] * len(times))
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

@@ -31,19 +31,35 @@ _BUMPS = np.exp(-0.5 * (_PLACES[:, None] - np.arange(_GRID)[None]) ** 2)
 _BUMPS /= _BUMPS.sum(axis=1, keepdims=True)
 
 
-def free_force(plant: JointPlant) -> Term:
-  """Returns the force with its prior, as large as the torque that the joint works at."""
+VARIABLE = {
+  **dict.fromkeys(("spring", "cogging", "gravity_tilt"), "position"),
+  **dict.fromkeys(
+    ("viscous_friction", "quadratic_drag", "coulomb_friction", "asymmetric_friction"), "velocity"
+  ),
+  "stribeck_friction": "velocity",
+}
+"""Kinds that are a force over one variable alone."""
+
+
+def free_force(plant: JointPlant, along: str | None = None) -> Term:
+  """Returns the force with its prior, as large as the torque that the joint works at.
+
+  Args:
+    plant: the joint.
+    along: "position" or "velocity" for a force over that alone.
+  """
+  orders = [o for o in _ORDERS if along is None or o[1 if along == "position" else 0] == 0]
   q = np.concatenate([log.position for log in plant.logs])
   v = np.concatenate([log.velocity for log in plant.logs])
   fast = max(float(np.quantile(np.abs(v), 0.995)), 1e-6)
   low, high = float(q.min()), float(max(q.max(), q.min() + 1e-6))
   size = typical_torque(plant)
-  sigma = tuple(size / (1.0 + k + m) for k, m in _ORDERS)
-  count = len(_ORDERS)
+  sigma = tuple(size / (1.0 + k + m) for k, m in orders)
+  count = len(orders)
   return Term(
     FREE,
     plant.joint,
-    tuple(f"c{k}_{m}" for k, m in _ORDERS),
+    tuple(f"c{k}_{m}" for k, m in orders),
     (-5.0 * size,) * count,
     (5.0 * size,) * count,
     sigma,
@@ -59,21 +75,21 @@ def free_force(plant: JointPlant) -> Term:
   )
 
 
-def weights(x: Array) -> Array:
+def weights(term: Term, x: Array) -> Array:
   """Returns the weights [P, V] of the suite's bumps."""
   orders = np.zeros((_CROSS, _CROSS))
-  orders[tuple(np.array(_ORDERS).T)] = x
+  orders[tuple(np.array([[int(part) for part in n[1:].split("_")] for n in term.names]).T)] = x
   return _WAVES @ orders @ _WAVES.T
 
 
 def table(term: Term, x: Array) -> tuple[Array, Array]:
   """Returns the kernel's table: forces at even places with a margin of one, and bounds [4]."""
-  return _BUMPS @ weights(x) @ _BUMPS.T, np.array([value for _, value in term.fixed])
+  return _BUMPS @ weights(term, x) @ _BUMPS.T, np.array([value for _, value in term.fixed])
 
 
 def effect(term: Term, x: Array) -> Effect:
   """Returns the force as an effect, of which nothing is left to fit."""
   grid = {"num_positions": _GRID, "num_velocities": _GRID}
-  values: dict[str, Any] = {"weights": [float(w) for w in weights(x).ravel()]}
+  values: dict[str, Any] = {"weights": [float(w) for w in weights(term, x).ravel()]}
   values |= grid | dict(term.fixed)
   return Effect(FREE, term.target, values)

@@ -3,7 +3,7 @@
 The baseline is the declared model with its tolerances, or what reference logs show: constants, and
 the effects that the machine has anyway. An effect is named where every tried hypothesis without it
 is clearly worse (`naming`), and where the reference logs are clearly worse with it than without.
-Where more remains, a name must also be needed beside a force of any form.
+Where more remains, a name must also stand beside a force of any form.
 """
 
 import dataclasses
@@ -17,6 +17,7 @@ from nerf2real.sysid.fit.layout import CLOCKS, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.constants import OWN
+from nerf2real.sysid.hypotheses.free_force import VARIABLE
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.elaboration import elaborated
 from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear
@@ -129,7 +130,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
-  if subject.alone or leaves(subject, explainer.null, settings):
+  if leaves(subject, explainer.null, settings):
     ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
@@ -189,11 +190,11 @@ def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
 def _supported(
   explainer: Explainer, best: Scored, named: Sequence[str], beyond: float
 ) -> tuple[str, ...]:
-  """Returns the names that are needed beside a force of any form.
+  """Returns the names that stand where something is left that no name is for.
 
-  Where more remains, something is there that no name is for, and what is named may be a part of it:
-  half of a soft stop is a spring. A force of any form over position and velocity stands in for it;
-  a name is kept where hypotheses with that force are clearly worse without the name.
+  What is named may then be a part of that: half of a soft stop is a spring. A kind that is a force
+  over one variable stands unless a force of any form over that variable does clearly better; any
+  other where hypotheses with a force of any form over both are clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
@@ -201,9 +202,17 @@ def _supported(
     named: kinds that are clear.
     beyond: standard errors that count as clear.
   """
-  beside = explainer.with_force(best)
-  rivals = {kind: explainer.with_force(explainer.lacking(best, kind), beside) for kind in named}
-  return tuple(kind for kind in named if clear(beside, rivals[kind]) > beyond)
+  kept = []
+  for kind in named:
+    without = explainer.lacking(best, kind)
+    if kind in VARIABLE:
+      rival = explainer.with_force(without, VARIABLE[kind])
+      stands = clear(rival, best) <= beyond
+    else:
+      stands = clear(explainer.with_force(best), explainer.with_force(without)) > beyond
+    if stands:
+      kept.append(kind)
+  return tuple(kept)
 
 
 def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:

@@ -157,7 +157,7 @@ class Explainer:
     self.null = self._score(base, fitter.fit(fit, iterations=4))
     bare = Fitter([joint], Layout([()])).linearise(np.zeros(0), 0.0)
     self.declared = self._score((), bare, neutral=True)
-    self._pushes: Array | None = None
+    self._pushes: dict[str, Array] = {}
 
   def _score(self, terms: tuple[Term, ...], fit: Fit, *, neutral: bool = False) -> Scored:
     fitter = Fitter([self.joint], Layout([terms]))
@@ -260,35 +260,32 @@ class Explainer:
       self._score(kept, Fitter([self.joint], Layout([kept])).fit(x, iterations=4))
     return self.scored[kept]
 
-  def with_force(self, parent: Scored, near: Scored | None = None) -> Scored:
-    """Returns a hypothesis with a force of any form beside it, whose derivatives are taken once.
+  def with_force(self, parent: Scored, along: str | None = None) -> Scored:
+    """Returns a hypothesis with a force of any form beside it, whose derivatives are taken once at
+    first.
 
     Args:
       parent: the hypothesis.
-      near: another one with a force, from whose values is begun, too.
+      along: "position" or "velocity" for a force over that alone.
     """
-    force = free_force(self.joint.plant)
+    force = free_force(self.joint.plant, along)
     terms = (*parent.terms, force)
     if terms in self.scored:
       return self.scored[terms]
     fitter = Fitter([self.joint], Layout([terms]))
     count = len(parent.fit.x)
     x = np.concatenate([parent.fit.x, force.starts[0]])
-    if self._pushes is None:
+    if not set(force.names) <= self._pushes.keys():
       blank = np.zeros((len(x), *parent.fit.residuals[0].shape))
       fresh, here = np.arange(len(x)) >= count, parent.fit.residuals
-      self._pushes = fitter.linearise(x, _PUSH, [blank], fresh, here).jacobian[0][count:]
-    known = [np.concatenate([parent.fit.jacobian[0], self._pushes])]
+      pushed = fitter.linearise(x, _PUSH, [blank], fresh, here).jacobian[0][count:]
+      self._pushes = dict(zip(force.names, pushed, strict=True))
+    pushes = np.array([self._pushes[name] for name in force.names])
+    known = [np.concatenate([parent.fit.jacobian[0], pushes])]
     fresh = np.arange(len(x)) < count
     begin = fitter.weighed(x, parent.fit.residuals, known, None)
     fit = fitter.fit(begin, iterations=_ITERATIONS, known=known, fresh=fresh)
-    if near is not None:
-      x = np.concatenate([list(near.fit.values(t).values()) for t in _alike(near.terms, terms)])
-      here = fitter.simulated(x[None])[1]
-      begin = fitter.weighed(x, [rows[0] for rows in here], known, None)
-      other = fitter.fit(begin, iterations=_ITERATIONS, known=known, fresh=fresh)
-      fit = min(fit, other, key=lambda f: f.cost)
-    return self._score(terms, fit)
+    return self._score(terms, fitter.fit(fitter.linearise(fit.x, _PUSH), iterations=2))
 
   def constants_alone(self) -> list[Scored]:
     """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
