@@ -51,7 +51,7 @@ class Changed:
   constants_off: bool
   """Whether declared constants are off by more than machines of one kind differ."""
   elaborated: list[Scored] = dataclasses.field(default_factory=list)
-  """Fits with richer friction that are near the best of them, the best first."""
+  """Fits with richer friction that predict left-out logs about as well as the best of them."""
 
   @property
   def extended(self) -> Scored:
@@ -59,7 +59,9 @@ class Changed:
     if self.verdict not in ("partly", "unexplained"):
       return self.found.best
     fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
-    return max([*fitting, *self.elaborated[:1]], key=lambda s: s.evidence, default=self.found.best)
+    if self.elaborated:
+      return self.elaborated[0]
+    return max(fitting, key=lambda s: s.evidence, default=self.found.best)
 
   @property
   def near(self) -> list[Scored]:

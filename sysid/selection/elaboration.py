@@ -4,12 +4,14 @@ Fits of equal cost differ several times over on other motions, as where a joint 
 differences of friction. All that are near the best are kept; their mean predicts better than one.
 """
 
+import copy
 from collections.abc import Collection
 
 import numpy as np
 from scipy.stats import chi2
 
 from nerf2real.sysid.fit.layout import CONSTANTS, Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.rich_friction import FORMS, REPLACED, rich_friction
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING, Term
@@ -20,11 +22,16 @@ Array = np.ndarray
 _NEAR = 0.95
 """Share of a posterior that lies within so much of the least cost: half a quantile of chi square
 with as many degrees as values."""
+_MOST = 10  # fits that are fitted anew without each log, chosen
+_REFITTED = 3  # Jacobians at most of a fit without a fold
 _ROUNDS = 2  # of fitting and setting the scale by the best
 
 
 def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> list[Scored]:
-  """Returns the fits with richer friction that are near the best of them, the best first.
+  """Returns the fits with richer friction that are near the best of them, the best first; none
+  where one without predicts logs better that it was not fitted to.
+
+  Near are those whose cost is, and of them those whose left-out logs are predicted as well.
 
   Args:
     explainer: of the joint; its scale is set by the best fit, all is scored anew.
@@ -47,11 +54,27 @@ def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> li
   tried.sort(key=lambda t: t[1].fit.cost)
   least = tried[0][1].fit
   reach = 0.5 * float(chi2.ppf(_NEAR, least.layout.count))
-  near = [(fitter, s) for fitter, s in tried if s.fit.cost < least.cost + reach]
+  near = [(fitter, s) for fitter, s in tried[:_MOST] if s.fit.cost < least.cost + reach]
   for fitter, item in near:
     item.nats = joint.loglik(fitter.leave_out(item.fit).held[0])
   explainer.rescore()
-  return [item for _, item in near]
+  left_out = sorted(((crossed(joint, s), s) for _, s in near), key=lambda pair: -pair[0])
+  plain = next(s for s in explainer.ranked() if not s.neutral and s.names >= set(named))
+  if crossed(joint, plain) > left_out[0][0]:
+    return []
+  return [s for nats, s in left_out if nats > left_out[0][0] - reach]
+
+
+def crossed(joint: JointLikelihood, item: Scored) -> float:
+  """Returns the nats of blocks that a hypothesis was fitted anew without, fold by fold."""
+  fitter, total = Fitter([joint], item.fit.layout), 0.0
+  for fold in np.unique(joint.fold):
+    part = copy.copy(joint)
+    part.gain = joint.gain * (joint.fold != fold)[joint.block_of]
+    x = Fitter([part], item.fit.layout).fit(item.fit.x, iterations=_REFITTED).x
+    nats = joint.loglik(joint.squares(fitter.simulated(x[None])[1][0][0]))
+    total += float(nats[joint.fold == fold].sum())
+  return total
 
 
 def _bases(

@@ -6,8 +6,8 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.expectation import Expectation
-from nerf2real.sysid.fit.likelihood import JointLikelihood, _correlation_time, _same_commands
 from nerf2real.sysid.fit.layout import Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood, _correlation_time, _same_commands
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
