@@ -111,7 +111,7 @@ class JointModel(JointPlant):
     if key not in kept:
       while len(kept) >= _KEPT:
         kept.pop(next(iter(kept)), None)
-      kept[key] = turning(self.fields(loads, index), self.hinge)
+      kept[key] = turning(list(self.fields(loads, index)), self.hinge)
     return kept[key]
 
   def at_samples(self, loads: Sequence[Load], index: int) -> Array:

@@ -13,10 +13,12 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.posterior import covariance
+from nerf2real.sysid.fit.layout import Layout
+from nerf2real.sysid.fit.posterior import Fitter, covariance
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import wide
 from nerf2real.sysid.selection.changes import Changed, leaves
+from nerf2real.sysid.selection.explain import Scored
 from nerf2real.sysid.selection.naming import USUAL
 from nerf2real.sysid.selection.subject import Subject
 from nerf2real.sysid.selection.wide import Evidence, Wide
@@ -110,7 +112,8 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   joints = [m.now for m in best.members]
   spread = covariance(best.fit, joints, systematic=intervals.SYSTEMATIC)
   reach = intervals.reaches(best.fit, spread, (0, len(best.x)))
-  if clear < beyond or _is_nothing(best.term, best.x, reach, own_latency=own_latency):
+  nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
+  if clear < beyond or nothing or not _is_new(best, beyond):
     return None
   origin = best.members[most]
   return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total)
@@ -121,6 +124,23 @@ def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency
   sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
   bounds = intervals.around(term, x, *reach, own_latency=own_latency)
   return all(n in sizes and low <= sizes[n] <= high for n, (low, high) in bounds.items())
+
+
+def _is_new(item: Wide, beyond: float) -> bool:
+  """Tells whether references, of other commands, are clearly worse with an effect of these values
+  than without: else it is theirs, too."""
+  rows, prior = {}, 0.0
+  held = item.term.held_at(item.x)
+  for member in item.members:
+    before, usual = member.before, member.usual
+    if before is None or usual is None or member.paired:
+      return True
+    terms = (*usual.terms, held)
+    fitter = Fitter([before], Layout([terms]))
+    fit = fitter.leave_out(fitter.fit(usual.fit.x, iterations=3))
+    beside = Scored(terms, fit, before.loglik(fit.held[0]))
+    rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
+  return Evidence(rows, prior).clear > beyond
 
 
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
