@@ -37,8 +37,9 @@ _WIDTH, _FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
 _SHIFTS = tuple(0.0005 * k for k in (-8, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 8))
 """s by which latencies are shifted to look about."""
 _WORTH = 0.5  # nats that other latencies must be better by, chosen
-_GENERATIONS, _DRAWN, _ELITE = 12, 40, 8  # of values that are drawn where costs are rough, chosen
+_GENERATIONS, _DRAWN, _ELITE = 12, 120, 20  # of values that are drawn where costs are rough, chosen
 _SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least, chosen
+_FAR = 3.0  # the same of the values of effects alone, at first
 _CONVERGED = 0.05  # nats that a step gains at which a fit ends
 
 
@@ -233,17 +234,19 @@ class Fitter:
 
   def draw(self, fit: Fit) -> Fit:
     """Returns a better fit where costs are too rough for derivatives: values are drawn about the
-    best so far (cross-entropy method, Rubinstein 1999)."""
+    best so far (cross-entropy method, Rubinstein 1999), those of effects from far about first."""
     random, layout = np.random.default_rng(0), self.layout
-    mean, spread = fit.x.copy(), _SHAKEN * layout.scale
     best, least = fit.x, fit.cost
-    for _ in range(_GENERATIONS):
-      tried = random.normal(mean, spread, (_DRAWN, len(mean)))
-      tried = np.clip(np.vstack([best, tried]), layout.low, layout.high)
-      costs = self.costs(tried)
-      elite = tried[np.argsort(costs)[:_ELITE]]
-      best, least = elite[0], float(costs.min())
-      mean, spread = elite.mean(axis=0), np.maximum(elite.std(axis=0), _LEAST_SHAKEN * layout.scale)
+    for moving, shaken in ((layout.is_effect, _FAR), (np.ones(len(fit.x), bool), _SHAKEN)):
+      mean, spread = best.copy(), shaken * layout.scale * moving
+      for _ in range(_GENERATIONS):
+        tried = random.normal(mean, spread, (_DRAWN, len(mean)))
+        tried = np.clip(np.vstack([best, tried]), layout.low, layout.high)
+        costs = self.costs(tried)
+        elite = tried[np.argsort(costs)[:_ELITE]]
+        best, least = elite[0], float(costs.min())
+        narrow = _LEAST_SHAKEN * layout.scale * moving
+        mean, spread = elite.mean(axis=0), np.maximum(elite.std(axis=0), narrow)
     return self.linearise(best, _FINE) if least < fit.cost else fit
 
   def _step(self, fit: Fit, damping: float, share: float, clocks: bool) -> Array:
