@@ -1,6 +1,6 @@
 """How sure the values of a fit are: a sandwich estimate that allows for correlated residuals.
 
-The sandwich is `posterior.covariance`. It is widened by a systematic share: a model that is
+The sandwich is `covariance`. It is widened by a systematic share: a model that is
 slightly wrong moves its values by more than noise does. Priors count with the spread that they
 state: a friction that was added cannot be known better than the damping that was declared. So do
 bounds: a late command can only be later by what another latency is less, and that is not below
@@ -8,12 +8,13 @@ zero. Shapes: n values, k values of a term.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from nerf2real.sysid.fit.layout import Fit
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fitter, covariance
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 
@@ -88,6 +89,28 @@ def _spread(joint: JointLikelihood, fit: Fit) -> Array:
   if fit.spread is None or fit.spread[0] != scale:
     fit.spread = scale, covariance(central(joint, fit), [joint], systematic=SYSTEMATIC)
   return fit.spread[1]
+
+
+def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float = 1.0) -> Array:
+  """Returns the covariance [n, n] of a fit's values, by the gradient's scatter over blocks.
+
+  H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
+  blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
+
+  Args:
+    fit: at its mode.
+    joints: what was fitted.
+    systematic: factor on the scatter of blocks; priors count with the spread that they state.
+  """
+  scores = np.zeros((len(joints[0].starts), fit.layout.count))
+  for joint, index, residual, jacobian in zip(
+    joints, fit.layout.index, fit.residuals, fit.jacobian, strict=True
+  ):
+    weighted = 2.0 * joint.weights(joint.squares(residual)) * residual * jacobian
+    scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
+  inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
+  prior = np.diag(fit.layout.sigma**-2.0)
+  return inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse
 
 
 def central(joint: JointLikelihood, fit: Fit) -> Fit:

@@ -97,9 +97,11 @@ class Fitter:
         new = np.flatnonzero(fresh[index])
       tried = own + np.diag(steps[index])[new]
       if residuals is None:
-        first, *rows = joint.residuals(terms, np.vstack([own, tried]))
+        both = joint.residuals(terms, np.vstack([own, tried]))
+        first, rows = both[0], both[1:]
       else:
-        first, rows = residuals[at], joint.residuals(terms, tried) if len(tried) else []
+        first = residuals[at]
+        rows = joint.residuals(terms, tried) if len(tried) else np.zeros((0, *first.shape))
       jacobian = np.empty((len(index), *first.shape))
       if known is not None:
         jacobian[:] = known[at]
@@ -315,25 +317,3 @@ def _bounded(
     block += damping * np.diag(np.diag(block))
     result[free] -= share * np.linalg.solve(block, (g * s)[free]) * s[free]
   return np.clip(result, layout.low, layout.high)
-
-
-def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float = 1.0) -> Array:
-  """Returns the covariance [n, n] of a fit's values, by the gradient's scatter over blocks.
-
-  H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
-  blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
-
-  Args:
-    fit: at its mode.
-    joints: what was fitted.
-    systematic: factor on the scatter of blocks; priors count with the spread that they state.
-  """
-  scores = np.zeros((len(joints[0].starts), fit.layout.count))
-  for joint, index, residual, jacobian in zip(
-    joints, fit.layout.index, fit.residuals, fit.jacobian, strict=True
-  ):
-    weighted = 2.0 * joint.weights(joint.squares(residual)) * residual * jacobian
-    scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
-  inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
-  prior = np.diag(fit.layout.sigma**-2.0)
-  return inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse

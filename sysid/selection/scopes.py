@@ -14,7 +14,7 @@ import numpy as np
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import Layout
-from nerf2real.sysid.fit.posterior import Fitter, covariance
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import wide
 from nerf2real.sysid.selection.changes import Changed, leaves
@@ -110,7 +110,7 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
   clear = min(mine.clear, *((mine - r).clear for r in rivals))
   joints = [m.now for m in best.members]
-  spread = covariance(best.fit, joints, systematic=intervals.SYSTEMATIC)
+  spread = intervals.covariance(best.fit, joints, systematic=intervals.SYSTEMATIC)
   reach = intervals.reaches(best.fit, spread, (0, len(best.x)))
   nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
   if clear < beyond or nothing or not _is_new(best, beyond):
