@@ -223,7 +223,7 @@ class JointLikelihood:
       _correlation_time(row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts)
       for c, row in enumerate(residuals)
     ]
-    self.independent[:] = 1.0 / np.array(times if self.is_duty else [max(times)] * len(times))
+    self.independent[:] = 1.0 / np.array(times if self.is_duty else np.maximum(times, times[0]))
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

@@ -111,7 +111,7 @@ def test_what_a_reference_leaves_comes_as_late_as_what_it_goes_with(viscous, clo
   np.testing.assert_allclose(later[inner], shifted[inner], atol=3e-4)
 
 
-def test_channels_count_as_often_as_the_one_that_goes_together_longest(viscous):
+def test_efforts_count_no_more_often_than_courses(viscous):
   _, joint = viscous
   random = np.random.default_rng(0)
   smooth = np.convolve(random.normal(size=joint.size + 40), np.ones(41) / 41, "valid")
@@ -121,6 +121,8 @@ def test_channels_count_as_often_as_the_one_that_goes_together_longest(viscous):
     joint.gain, joint.floor = np.ones((2, joint.size)), np.full(2, 1e-9)
     joint.counts, joint.independent = np.repeat(joint.counts, 2, axis=0), np.ones(2)
     joint.rescale(two)
+    assert joint.independent[0] == joint.independent[1] < 0.1
+    joint.rescale(two[::-1])
+    assert joint.independent[1] < 0.1 < 0.5 < joint.independent[0]
   finally:
     joint.channels.pop()
-  assert joint.independent[0] == joint.independent[1] < 0.1
