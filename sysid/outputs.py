@@ -20,7 +20,6 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import Effect, write_effects
-from nerf2real.suite.effects.files import to_list
 from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import excitation, identifiability
 from nerf2real.sysid.design.identifiability import Identifiability
@@ -28,6 +27,7 @@ from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
+from nerf2real.sysid.model.simulation import Member
 from nerf2real.sysid.report import capability
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
@@ -125,6 +125,7 @@ def _identify(
     found.verdict = "effects" if found.verdict == "none" else found.verdict
   progress(_SENSORS, "errors on the logs")
   whole = [*found.calibration, *found.objects]
+  near = found.near
   content: dict[str, Any] = {
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else found.effects,
@@ -132,8 +133,8 @@ def _identify(
     "alternatives": _alternatives(found),
     "residual_at": residual_at(found),
     "error": {
-      "train": _errors(found, logs, whole, settings),
-      "held": _errors(found, held, whole, settings) if held else None,
+      "train": _errors(found, logs, near, settings),
+      "held": _errors(found, held, near, settings) if held else None,
       "floor": _floor(held or logs, [j.joint for j in found.joints]),
     },
     "window_s": None if _holds(found) else settings.window_s,
@@ -165,10 +166,12 @@ def _identify(
       f"At {joints} more remains than the machine leaves anyway: the names are certain, not all."
     )
     content["notes"] = [*content["notes"], text]
+  if len(near) > 1:
+    content["notes"] = [*content["notes"], _spread(content["error"])]
   content["alternatives"] += sensed.alternatives
   write_effects(out / "effects.json", _claimed(found))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
-  details = _details(found, model, whole, sensed)
+  details = _details(found, model, near, sensed)
   details["identifiability"] = [to_plain(item) for item in shown]
   details["joints"] = stored.to_json(stored.remembered(found, held, settings))
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
@@ -203,14 +206,14 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
 
 
 def _details(
-  found: Identified, model: Path, extended: Sequence[Effect], sensed: sensing.Sensed
+  found: Identified, model: Path, near: Sequence[Member], sensed: sensing.Sensed
 ) -> dict[str, Any]:
   """Returns what the findings rest on, and what the extended model is simulated with."""
   first = found.least_explained
   return {
     "model": str(model.resolve()),
-    "extended": to_list(extended),
-    "clocks": {j: {"skew": c.skew, "latency": c.latency} for j, c in found.clocks.items()},
+    **stored.member_to_json(near[0]),
+    "near": [stored.member_to_json(member) for member in near[1:]],
     "calibration": {
       e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
       for e in found.calibration
@@ -241,14 +244,23 @@ def _claimed(found: Identified) -> list[Effect]:
 
 
 def _errors(
-  found: Identified, logs: Sequence[Log], effects: Sequence[Effect], settings: Settings
+  found: Identified, logs: Sequence[Log], near: Sequence[Member], settings: Settings
 ) -> dict[str, float]:
   """Returns RMSE before and after, over the joints that the logs command."""
   window = settings.window_s
-  return {
-    "before": evaluation.error(found.model, logs, window_s=window),
-    "after": evaluation.error(found.model, logs, effects, clocks=found.clocks, window_s=window),
-  }
+  before = evaluation.error(found.model, logs, window_s=window)
+  return {"before": before} | evaluation.errors(found.model, logs, near, window_s=window)
+
+
+def _spread(error: dict[str, Any]) -> str:
+  """Returns a sentence on the errors of fits near the best."""
+  name = "held" if error["held"] else "train"
+  found = error[name]
+  return (
+    f"Errors after are of the mean of {found['models']} fits near the best, which differ:"
+    f" {found['median']:.3g} rad (or m) in the median, {found['least']:.3g} to {found['most']:.3g}"
+    f" on the {name} logs; the model that is written alone has {found['single']:.3g}."
+  )
 
 
 def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:

@@ -130,10 +130,10 @@ def _quantities(position: Array, velocity: Array, torque: Array, duration: float
 def readings(plant: JointModel, terms: Sequence[Term], x: Array, command: Array) -> Simulated:
   """Returns readings [S] under a design at TIMES, surroundings at the joint's mean."""
   p, loads, table = compose(plant, terms, x)
-  around = plant.fields(loads, 0)
+  around = plant.forces(loads, 0)
   weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
   count = int(_DURATION / plant.step) + 100
-  fields = [np.full(count, mean) for mean in (*around[:4].mean(axis=1), 0.0)]
+  fields = [np.full(count, mean) for mean in (*np.mean(around[:3], axis=1), 0.0)]
   out = np.zeros((4, len(TIMES)))
   kernel.simulate(  # type: ignore[call-arg]
     p,

@@ -33,11 +33,9 @@ def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
   window = stored.content["window_s"] or SETTINGS.window_s
   rows = []
   for log in read_logs(held, stored.model):
-    after = simulation.error(
-      stored.model, [log], stored.effects, clocks=stored.clocks, window_s=window
-    )
     before = simulation.error(stored.model, [log], window_s=window)
-    rows.append({"log": log.name, "before": before, "after": after})
+    errors = simulation.errors(stored.model, [log], stored.near, window_s=window)
+    rows.append({"log": log.name, "before": before, **errors})
   return rows
 
 

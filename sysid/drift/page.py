@@ -109,12 +109,13 @@ def _values(found: Drift) -> Section:
 
 def _residuals(found: Drift, stored: Stored, logs: Sequence[Log]) -> Section:
   window = stored.content["window_s"] or 0.5
+  best = stored.near[0]
   shown = sorted(found.errors, key=lambda e: -e.later / e.expected)[:_SHOWN]
   figures = []
   for log in logs:
     assert log.states.position is not None
     left = log.states.position - simulation.simulate(
-      stored.model, log, stored.effects, clocks=stored.clocks, window_s=window
+      stored.model, log, best.effects, clocks=best.clocks, window_s=window
     )
     for error in shown:
       row = 1e3 * left[:, log.states.column(error.joint)]

@@ -11,14 +11,13 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.serialization import from_plain, to_plain
-from nerf2real.suite.effects import Effect
-from nerf2real.suite.effects.files import from_list
+from nerf2real.suite.effects.files import from_list, to_list
 from nerf2real.sysid.data.opening import load_model
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.model.simulation import Clocks, Member
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.settings import Settings
 
@@ -66,9 +65,8 @@ class Stored:
   content: dict[str, Any]
   """Of report.json."""
   model: mujoco.MjModel
-  effects: list[Effect]
-  """Of the extended model."""
-  clocks: dict[str, Clocks]
+  near: list[Member]
+  """The extended model, and others whose fits are near the best."""
   joints: list[StoredJoint]
 
 
@@ -141,6 +139,18 @@ def _plain(term: Term, values: Array) -> Term:
   return dataclasses.replace(term, prior=prior, starts=(tuple(map(float, values)),))
 
 
+def member_to_json(member: Member) -> dict[str, Any]:
+  """Returns what is simulated with as details.json has it."""
+  clocks = {j: {"skew": c.skew, "latency": c.latency} for j, c in member.clocks.items()}
+  return {"extended": to_list(member.effects), "clocks": clocks}
+
+
+def _member(item: dict[str, Any]) -> Member:
+  """Returns what was written by `member_to_json`."""
+  clocks = {joint: Clocks(**values) for joint, values in item["clocks"].items()}
+  return Member(from_list(item["extended"]), clocks)
+
+
 def to_json(joints: Sequence[StoredJoint]) -> list[dict[str, Any]]:
   """Returns joints as details.json has them."""
   return [to_plain(joint) for joint in joints]
@@ -169,7 +179,6 @@ def read(folder: Path) -> Stored:
   return Stored(
     content,
     load_model(Path(details["model"])),
-    from_list(details["extended"]),
-    {joint: Clocks(**values) for joint, values in details["clocks"].items()},
+    [_member(item) for item in (details, *details.get("near", []))],
     [from_plain(joint, StoredJoint, source=folder / "details.json") for joint in details["joints"]],
   )

@@ -20,8 +20,9 @@ from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.design.information import Place, information
 from nerf2real.sysid.drift.stored import Stored, StoredJoint
 from nerf2real.sysid.fit import intervals
+from nerf2real.sysid.fit.layout import CONSTANTS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import CONSTANTS, Fit, Fitter, Layout, deviations
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import FREE, Term
@@ -189,8 +190,9 @@ def _shared(
   layout = Layout([terms for terms, _ in own_terms], [term])
   x = np.concatenate([values, *[own for _, own in own_terms]])
   fit = _fitted(joints, layout, x, layout.spans[0], term)
-  spread = deviations(fit, joints, systematic=intervals.SYSTEMATIC)[: len(values)]
-  bounds = intervals.around(term, fit.x[: len(values)], spread)
+  spread = intervals.covariance(fit, joints, systematic=intervals.SYSTEMATIC)
+  reaches = intervals.reaches(fit, spread, layout.spans[0])
+  bounds = intervals.around(term, fit.x[: len(values)], *reaches)
   return _Refit(row, where, term.effect(fit.x[: len(values)], bounds))
 
 

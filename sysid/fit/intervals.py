@@ -1,17 +1,20 @@
 """How sure the values of a fit are: a sandwich estimate that allows for correlated residuals.
 
-The sandwich is `posterior.deviations`. It is widened by a systematic share: a model that is
+The sandwich is `covariance`. It is widened by a systematic share: a model that is
 slightly wrong moves its values by more than noise does. Priors count with the spread that they
-state: a friction that was added cannot be known better than the damping that was declared. Shapes:
-n values.
+state: a friction that was added cannot be known better than the damping that was declared. So do
+bounds: a late command can only be later by what another latency is less, and that is not below
+zero. Shapes: n values, k values of a term.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
+from nerf2real.sysid.fit.layout import Fit
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fit, Fitter, deviations
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 
@@ -32,6 +35,8 @@ _Z = 1.96
 _RESOLVED = 1e-4
 """Of a curvature scaled to 1 for each value: twins whose derivatives agree to a hundredth have
 less."""
+_DRAWS, _FEW = 4000, 200  # of the normal distribution, and least that must be within bounds
+_EDGE = 1e-6  # scales by which a value may be beyond its bound
 _WIDTH = 0.004  # of finite differences, of a value's scale
 
 
@@ -39,16 +44,73 @@ def intervals(
   joint: JointLikelihood, fit: Fit, term: Term, *, own_latency: bool
 ) -> dict[str, tuple[float, float]]:
   """Returns 95 % intervals of the values of a term of a fit; see `around`."""
-  spread = deviations(central(joint, fit), [joint], systematic=SYSTEMATIC)
-  a, b = fit.layout.spans[fit.layout.terms.index(term)]
+  span = fit.layout.spans[fit.layout.terms.index(term)]
   return around(
     term,
-    fit.x[a:b],
-    spread[a:b],
+    fit.x[slice(*span)],
+    *reaches(fit, _spread(joint, fit), span),
     own_latency=own_latency,
     friction=float(joint.plant.declared[INDEX["friction"]]),
     relative=BESIDE_PLAY if any(t.kind == "backlash" for t in fit.layout.terms) else RELATIVE,
   )
+
+
+def reaches(fit: Fit, spread: Array, span: tuple[int, int]) -> tuple[Array, Array]:
+  """Returns how far values [k] may be below and above a fit's, all others within their bounds.
+
+  Ends of 95 % of a normal distribution that is cut off where other values have their bounds.
+
+  Args:
+    fit: the values.
+    spread: their covariance [n, n].
+    span: which ones.
+  """
+  own = slice(*span)
+  half = _Z * np.sqrt(np.maximum(np.diag(spread)[own], 0.0))
+  random = np.random.default_rng(0)
+  draws = random.multivariate_normal(fit.x, spread, _DRAWS, check_valid="ignore", method="eigh")
+  others = np.ones(len(fit.x), bool)
+  others[own] = False
+  inside = (draws >= fit.layout.low - _EDGE * fit.layout.scale) & (
+    draws <= fit.layout.high + _EDGE * fit.layout.scale
+  )
+  kept = draws[inside[:, others].all(axis=1)]
+  if not _DRAWS > len(kept) > _FEW:
+    return half, half
+  low, high = np.quantile(kept[:, own], (0.025, 0.975), axis=0)
+  return np.minimum(np.maximum(fit.x[own] - low, 0.0), half), np.minimum(
+    np.maximum(high - fit.x[own], 0.0), half
+  )
+
+
+def _spread(joint: JointLikelihood, fit: Fit) -> Array:
+  """Returns a covariance [n, n], which a fit keeps as long as the joint's scale stays."""
+  scale = joint.scale.tobytes() + joint.independent.tobytes()
+  if fit.spread is None or fit.spread[0] != scale:
+    fit.spread = scale, covariance(central(joint, fit), [joint], systematic=SYSTEMATIC)
+  return fit.spread[1]
+
+
+def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float = 1.0) -> Array:
+  """Returns the covariance [n, n] of a fit's values, by the gradient's scatter over blocks.
+
+  H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
+  blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
+
+  Args:
+    fit: at its mode.
+    joints: what was fitted.
+    systematic: factor on the scatter of blocks; priors count with the spread that they state.
+  """
+  scores = np.zeros((len(joints[0].starts), fit.layout.count))
+  for joint, index, residual, jacobian in zip(
+    joints, fit.layout.index, fit.residuals, fit.jacobian, strict=True
+  ):
+    weighted = 2.0 * joint.weights(joint.squares(residual)) * residual * jacobian
+    scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
+  inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
+  prior = np.diag(fit.layout.sigma**-2.0)
+  return inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse
 
 
 def central(joint: JointLikelihood, fit: Fit) -> Fit:
@@ -58,26 +120,28 @@ def central(joint: JointLikelihood, fit: Fit) -> Fit:
   in a thousand, or the difference looks like information.
   """
   fitter = Fitter([joint], fit.layout)
-  sides = [fitter.linearise(fit.x, width) for width in (_WIDTH, -_WIDTH)]
+  sides = [fitter.linearise(fit.x, width, residuals=fit.residuals) for width in (_WIDTH, -_WIDTH)]
   (mean,) = np.mean([side.jacobian for side in sides], axis=0)
-  weighted = 2.0 * joint.weights(joint.squares(sides[0].residuals[0])) * mean
-  curvature = _resolved(np.einsum("icn,jcn->ij", weighted, mean))
+  weights = 2.0 * joint.weights(joint.squares(sides[0].residuals[0]))
+  mean = np.tensordot(_resolved(np.einsum("icn,jcn->ij", weights * mean, mean)), mean, 1)
+  curvature = np.einsum("icn,jcn->ij", weights * mean, mean)
   return dataclasses.replace(sides[0], jacobian=[mean], curvature=curvature[None])
 
 
 def _resolved(curvature: Array) -> Array:
-  """Returns a curvature [n, n] without the directions that finite differences cannot tell from
-  flat ones."""
+  """Returns what takes the directions out of a Jacobian [n, n] that finite differences cannot tell
+  from flat ones: neither curvature nor scatter is known along them."""
   size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
   values, vectors = np.linalg.eigh(curvature / size / size[:, None])
-  kept = np.where(values > _RESOLVED, values, 0.0)
-  return (vectors * kept) @ vectors.T * size * size[:, None]
+  kept = vectors * (values > _RESOLVED)
+  return kept @ vectors.T / size * size[:, None]
 
 
 def around(
   term: Term,
   x: Array,
-  spread: Array,
+  down: Array,
+  up: Array,
   *,
   own_latency: bool = False,
   friction: float = 0.0,
@@ -87,22 +151,24 @@ def around(
 
   Args:
     term: the effect.
-    x: its values [n].
-    spread: their standard deviations [n].
+    x: its values [k].
+    down: how far the values may be below [k].
+    up: the same above.
     own_latency: whether nothing tells what latency the machine had before: then a delay is all
       that it has now, and its interval reaches down by what healthy machines have.
     friction: the declared dry friction, N m or N.
     relative: share of a value that no model of the joint holds.
   """
   result = {}
-  for name, value, sigma, lowest in zip(term.names, x, spread, term.low, strict=True):
+  for name, value, less, more, lowest in zip(term.names, x, down, up, term.low, strict=True):
     own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
     known = LATE if name == "delay" else 0.0
     known = RUBS * friction if name in _DRY and term.kind != "calibration" else known
     share = PEAK if name == "breakaway" else relative
-    reach = _Z * float(np.sqrt(sigma**2 + (share * own) ** 2 + known**2))
+    model = _Z * float(np.hypot(share * own, known))
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
-    low, high = max(value - reach - below, lowest), value + reach
+    low = max(value - float(np.hypot(less, model)) - below, lowest)
+    high = value + float(np.hypot(more, model))
     if term.kind == "backlash":
       low, high = min(low, _PLAY[name][0] * value), max(high, _PLAY[name][1] * value)
     result[name] = (float(low), float(high))

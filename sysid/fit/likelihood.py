@@ -17,11 +17,12 @@ import numpy as np
 
 from nerf2real.sysid.fit.expectation import Expectation
 from nerf2real.sysid.fit.noise import effort_noise, timing
-from nerf2real.sysid.hypotheses.composition import Composed, compose
+from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured
+from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
@@ -85,23 +86,38 @@ class JointLikelihood:
     self.counts = np.maximum(np.add.reduceat(self.gain**2, self.starts, axis=1), 1.0)
     lengths = np.diff(np.append(self.starts, offset))
     self.block_of = np.repeat(np.arange(len(self.starts)), lengths)
+    ends = np.append(self.starts, offset)[1:]
+    self._parts: dict[int, list[slice]] = {int(fold): [] for fold in self.fold}
+    for fold, start, end in zip(self.fold, self.starts, ends, strict=True):
+      spans = self._parts[int(fold)]
+      if spans and spans[-1].stop == start:
+        start = spans.pop().start
+      spans.append(slice(int(start), int(end)))
+
+  def parts_of(self, fold: int) -> list[slice]:
+    """Returns where the samples of a fold are."""
+    return self._parts.get(int(fold), [])
 
   def simulate(
     self, terms: Sequence[Term], xs: Array, logs: Sequence[int] | None = None
   ) -> list[list[tuple[Simulated, Simulated | None]]]:
     """Returns every log's open-loop run, and its run along the readings where efforts are known."""
-    chosen = range(len(self.plant.logs)) if logs is None else logs
-    rows = []
+    chosen = list(range(len(self.plant.logs)) if logs is None else logs)
+    ways = [self.follows] + [True] * (self.effort is not None and not self.follows)
+    runs = []
     for x in np.atleast_2d(xs):
-      composed = compose(self.plant, terms, x)
-      rows.append([self._pair(composed, i) for i in chosen])
-    return rows
-
-  def _pair(self, c: Composed, index: int) -> tuple[Simulated, Simulated | None]:
-    open_loop = self.plant.run(c.p, c.loads, index, table=c.table, follow=self.follows)
-    if self.effort is None:
-      return open_loop, None
-    return open_loop, self.plant.run(c.p, c.loads, index, table=c.table, follow=True)
+      c = compose(self.plant, terms, x)
+      runs += [
+        self.plant.prepared(c.p, c.loads, i, table=c.table, follow=way)
+        for i in chosen
+        for way in ways
+      ]
+    done = at_once(runs)
+    pairs = [
+      (done[k], done[k + len(ways) - 1] if self.effort is not None else None)
+      for k in range(0, len(done), len(ways))
+    ]
+    return [pairs[k : k + len(chosen)] for k in range(0, len(pairs), len(chosen))]
 
   def residuals(self, terms: Sequence[Term], xs: Array) -> Array:
     """Returns measured minus simulated [X, C, N]; masked samples are 0."""
@@ -173,7 +189,7 @@ class JointLikelihood:
       spread, nominal = self.settings.effort_scale, 1.0
       if self.speed_matters:
         both = np.array([torque, self.speed * self.mask])
-        scale = float(np.linalg.lstsq(both.T, measured, rcond=None)[0][0])
+        scale = float(np.linalg.lstsq(both @ both.T, both @ measured, rcond=None)[0][0])
     elif np.isfinite(full):
       spread, nominal = self.settings.duty_scale, 1.0 / full
     else:
@@ -196,13 +212,18 @@ class JointLikelihood:
     return w[:, self.block_of]
 
   def rescale(self, residuals: Array) -> None:
-    """Sets the scale and the number of independent samples by the residuals [C, N] of a fit."""
+    """Sets the scale and the number of independent samples by the residuals [C, N] of a fit.
+
+    Channels show one misfit: where courses go together for long, efforts count no more often. A
+    duty is of the servo's law alone, which the measured positions feed: its misfit is another.
+    """
     squares = self.squares(residuals)
     self.scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
-    for c, row in enumerate(residuals):
-      self.independent[c] = 1.0 / _correlation_time(
-        row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts
-      )
+    times = [
+      _correlation_time(row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts)
+      for c, row in enumerate(residuals)
+    ]
+    self.independent[:] = 1.0 / np.array(times if self.is_duty else np.maximum(times, times[0]))
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

@@ -21,6 +21,9 @@ number."""
 _WIND_UP = 0.004
 """rad; ours: about what a gear of metal gives way under the torque that it works at."""
 
+_TEETH = 0.5
+"""Share that the stiffness of teeth differs from what is usual; a gap and soft teeth are alike."""
+
 _BOUNCY = 0.15
 """Damping ratio of teeth that meet; ours: they bounce."""
 
@@ -209,6 +212,8 @@ def _play(plant: JointPlant, *, encoder_on_motor: bool) -> Term:
       (gap * reach, stiffness, times * damping)
       for gap, times in ((0.01, 1.0), (0.04, 1.0), (0.04, 3.0))
     ),
+    (_INF, _TEETH * stiffness, 2.0 * _TEETH * damping),
+    (0.0, stiffness, damping),
     fixed=(("encoder_on_motor", float(encoder_on_motor)),),
   )
 

@@ -9,6 +9,10 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 
 NAME = "calibration"
 
+OWN = {"backlash": {"gap": 0.0044}}
+"""What healthy machines have of an effect that models leave out, and that is therefore not named
+without a reference: 0.25 degrees of play (data sheet of the XM430-W350)."""
+
 
 def constants(plant: JointModel, settings: Settings = SETTINGS) -> Term:
   """Returns the constants of a joint that its model has, with their tolerances as prior."""

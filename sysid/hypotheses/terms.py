@@ -57,6 +57,12 @@ class Term:
       return "parameter_error" if self.freed else None
     return None if self.known or self.kind in (FREE, STICKING) else self.kind
 
+  @property
+  def wider(self) -> bool:
+    """Whether it is an effect of a body or of the machine that has been found: its values are
+    held."""
+    return not self.names and self.kind != STICKING
+
   def apply(self, plant: JointPlant, p: Array, x: Array) -> None:
     """Changes the kernel's parameters [P] in place."""
     values = dict(zip(self.names, x, strict=True)) | dict(self.fixed)

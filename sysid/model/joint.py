@@ -5,7 +5,7 @@ What masses and gravity add is linear and kept on the step grid, so that a hypot
 arrays, not a pass over the model. Shapes: N samples of a log, T grid points, P kernel parameters.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -14,7 +14,7 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
-from nerf2real.sysid.model.plant import JointPlant
+from nerf2real.sysid.model.plant import JointPlant, turning
 from nerf2real.sysid.model.reduction import Reduction, Surroundings
 
 Array = np.ndarray
@@ -22,6 +22,9 @@ I = kernel.INDEX  # noqa: E741
 
 FOLLOWED_S = 0.02
 """s in which a state that follows the readings makes up for a difference."""
+
+
+_KEPT = 2  # sets of loads of a log whose fields are kept: a fit's and that of a difference to it
 
 
 class Load(NamedTuple):
@@ -59,6 +62,7 @@ class JointModel(JointPlant):
     super().__init__(model, joint, logs, reductions=reductions, window_s=window_s)
     self._bases: dict[str, list[Array]] = {}
     self._fields = [np.array(fields) for fields in self._nominal]  # inertia, here, across, at, bias
+    self._turned: dict[int, dict[tuple, tuple[Array, ...]]] = {}
     periods = np.concatenate([np.diff(log.time) for log in self.logs])
     period = max(float(np.median(periods)), 1e-6)
     share = 1.0 - float(np.exp(-period / FOLLOWED_S))
@@ -100,6 +104,16 @@ class JointModel(JointPlant):
         fields[[0, 1, 2, 4]] += np.tensordot(load.factors, self.basis(load.key)[index], 1)
     return fields
 
+  def forces(self, loads: Sequence[Load], index: int) -> tuple[Array, ...]:
+    """Returns the same fields as the kernel takes them; those of the last loads are kept."""
+    key = tuple((load.key, load.factors.tobytes()) for load in loads)
+    kept = self._turned.setdefault(index, {})
+    if key not in kept:
+      while len(kept) >= _KEPT:
+        kept.pop(next(iter(kept)), None)
+      kept[key] = turning(list(self.fields(loads, index)), self.hinge)
+    return kept[key]
+
   def at_samples(self, loads: Sequence[Load], index: int) -> Array:
     """Returns the same fields at the samples [5, N]."""
     grid, time = self._grids[index], self.logs[index].time
@@ -113,6 +127,7 @@ class JointModel(JointPlant):
     *,
     table: Table | None = None,
     follow: bool = False,
+    readings: Array | None = None,
   ) -> Simulated:
     """Simulates one log.
 
@@ -122,10 +137,28 @@ class JointModel(JointPlant):
       index: of the log.
       table: a force over position and velocity.
       follow: whether the state is pulled to the readings.
+      readings: other ones [N] than the log's.
     """
-    fields = self.fields(loads, index)
+    return self.prepared(p, loads, index, table=table, follow=follow, readings=readings)()
+
+  def prepared(
+    self,
+    p: Array,
+    loads: Sequence[Load],
+    index: int,
+    *,
+    table: Table | None,
+    follow: bool,
+    readings: Array | None = None,
+  ) -> Callable[[], Simulated]:
+    """Returns a simulation of one log that may run beside others; see `run`."""
     if follow:
       p = p.copy()
       p[I["follow"]], p[I["follow_speed"]] = self._follow
-    out = self._run(p, index, tuple(fields), table)
-    return Simulated(out.position, out.torque, out.jump)
+    forces = self.forces(loads, index)
+
+    def simulated() -> Simulated:
+      out = self._run(p, index, forces, table, readings)
+      return Simulated(out.position, out.torque, out.jump)
+
+    return simulated

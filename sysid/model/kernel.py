@@ -69,38 +69,54 @@ NEUTRAL = {
 }
 """Values that do nothing, where that is not zero."""
 
+_LITTLE = 0.03  # rad; beyond it series of three terms are no longer exact to rounding
 _LEAST_STRENGTH = 0.1  # as suite.effects.actuation
 _CACHE = discard_stale(Path(__file__).parent, ("kernel",), (Path(gear_train.__file__),))
 
 
-@numba.njit(cache=_CACHE, nogil=True, fastmath=False)
+@numba.njit(cache=_CACHE, nogil=True, fastmath=False, error_model="numpy")
+def _cubic(x: float, a: float, b: float, c: float, d: float) -> float:
+  """Returns the value x of the way from b to c on a cubic through four neighbours (Catmull-Rom)."""
+  bend = 2.0 * a - 5.0 * b + 4.0 * c - d + x * (3.0 * (b - c) + d - a)
+  return b + 0.5 * x * (c - a + x * bend)
+
+
+@numba.njit(cache=_CACHE, nogil=True, fastmath=False, error_model="numpy")
 def force_at(q: float, v: float, weights: Array, bounds: Array) -> float:
-  """Returns the force of `suite.effects.residual`; bounds: position low, high, velocity."""
+  """Returns the force of a table with a margin of one place around its bounds, bicubic between.
+
+  Args:
+    q: position.
+    v: velocity.
+    weights: [P, V] forces.
+    bounds: [4] position low, high, velocity low, high; beyond them the value at the end is taken.
+  """
   nq, nv = weights.shape
-  pq = (q - bounds[0]) * (nq - 1) / (bounds[1] - bounds[0])
-  pv = (v - bounds[2]) * (nv - 1) / (bounds[3] - bounds[2])
-  pq = min(max(pq, 0.0), nq - 1.0)
-  pv = min(max(pv, 0.0), nv - 1.0)
-  # Bumps of neighbours follow from each other: exp(-(p - j - 1)^2 / 2) is that of j times
-  # exp(p - j - 1/2); those beyond six spacings are nothing.
-  first_q, last_q = max(int(pq) - 6, 0), min(int(pq) + 7, nq - 1)
-  first_v, last_v = max(int(pv) - 6, 0), min(int(pv) + 7, nv - 1)
-  begin_v, begin_ratio = math.exp(-0.5 * (pv - first_v) ** 2), math.exp(pv - first_v - 0.5)
-  along_q, ratio_q = math.exp(-0.5 * (pq - first_q) ** 2), math.exp(pq - first_q - 0.5)
-  shrink = math.exp(-1.0)
-  total, norm = 0.0, 0.0
-  for i in range(first_q, last_q + 1):
-    row, row_norm, along_v, ratio_v = 0.0, 0.0, begin_v, begin_ratio
-    for j in range(first_v, last_v + 1):
-      row += along_v * weights[i, j]
-      row_norm += along_v
-      along_v *= ratio_v
-      ratio_v *= shrink
-    total += along_q * row
-    norm += along_q * row_norm
-    along_q *= ratio_q
-    ratio_q *= shrink
-  return total / norm
+  pq = (q - bounds[0]) * (nq - 3) / (bounds[1] - bounds[0])
+  pv = (v - bounds[2]) * (nv - 3) / (bounds[3] - bounds[2])
+  pq = min(max(pq, 0.0), nq - 3.0)
+  pv = min(max(pv, 0.0), nv - 3.0)
+  i, j = min(int(pq), nq - 4), min(int(pv), nv - 4)
+  x, y = pq - i, pv - j
+  w = weights
+  return _cubic(
+    x,
+    _cubic(y, w[i, j], w[i, j + 1], w[i, j + 2], w[i, j + 3]),
+    _cubic(y, w[i + 1, j], w[i + 1, j + 1], w[i + 1, j + 2], w[i + 1, j + 3]),
+    _cubic(y, w[i + 2, j], w[i + 2, j + 1], w[i + 2, j + 2], w[i + 2, j + 3]),
+    _cubic(y, w[i + 3, j], w[i + 3, j + 1], w[i + 3, j + 2], w[i + 3, j + 3]),
+  )
+
+
+@numba.njit(cache=_CACHE, nogil=True, fastmath=False, error_model="numpy")
+def _turned(cosine: float, sine: float, angle: float, by: float) -> tuple[float, float]:
+  """Returns cosine and sine of an angle that has turned by a little since those that are given."""
+  if abs(by) > _LITTLE:
+    return math.cos(angle), math.sin(angle)
+  square = by * by
+  s = by * (1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0)))
+  c = 1.0 - 0.5 * square * (1.0 - square / 12.0 * (1.0 - square / 30.0))
+  return cosine * c - sine * s, sine * c + cosine * s
 
 
 def table_force(q: Array, v: Array, weights: Array, bounds: Array) -> Array:
@@ -108,7 +124,7 @@ def table_force(q: Array, v: Array, weights: Array, bounds: Array) -> Array:
   return np.array([force_at(a, b, weights, bounds) for a, b in zip(q, v, strict=True)])
 
 
-@numba.njit(cache=_CACHE, nogil=True, fastmath=False)
+@numba.njit(cache=_CACHE, nogil=True, fastmath=False, error_model="numpy")
 def simulate(
   p: Array,
   step: float,
@@ -116,9 +132,8 @@ def simulate(
   command: Array,
   sample_time: Array,
   inertia: Array,
-  gravity_here: Array,
-  gravity_across: Array,
-  gravity_at: Array,
+  gravity_cos: Array,
+  gravity_sin: Array,
   bias: Array,
   load: Array,
   hinge: bool,
@@ -142,9 +157,8 @@ def simulate(
     command: [C] held until the next.
     sample_time: [S] s, stamps of the samples, increasing.
     inertia: [T] kg m^2 without armature.
-    gravity_here: [T] gravity's torque at position gravity_at (to be overcome), N m.
-    gravity_across: [T] the same a quarter turn further (hinge).
-    gravity_at: [T] rad.
+    gravity_cos: [T] gravity's torque (to be overcome) at position 0, N m; a slide's everywhere, N.
+    gravity_sin: [T] the same a quarter turn further (hinge).
     bias: [T] what the other joints' motion demands, N m.
     load: [T] sum of the other actuators' |torque|, N m.
     hinge: whether gravity turns with the joint.
@@ -182,6 +196,8 @@ def simulate(
   last = inertia.size - 1
   rotor = armature * (1.0 - LINK_SHARE)
   keep_cool = 1.0 - step / max(cooling, step)
+  rate_of_steps, true_time = 1.0 / step, 1.0 / (1.0 + rate)
+  stamped = (1.0 + rate) / step
 
   s = 0
   for w in range(windows):
@@ -189,7 +205,7 @@ def simulate(
     s = window_start[w]
     e = s
     # True time of a sample: its stamp, less clock drift and latency.
-    first = sample_time[s] / (1.0 + rate) - late
+    first = sample_time[s] * true_time - late
     n = math.floor(first / step)
     n = min(max(n, 0), last)
     first_n = n
@@ -215,15 +231,16 @@ def simulate(
     gap_offset = 0.0
     motor_speed = v
     passed = 0.0
+    cosine, sine = math.cos(q), math.sin(q)
     link_freely = 0.0  # acceleration of a link by all but the gear, in the last step
     while s < end:
-      when = sample_time[s] / (1.0 + rate) - late
+      when = sample_time[s] * true_time - late
       while s < end and when < time and n == 0:
         out_position[s] = q + encoder + on_motor * gap_offset
         out_velocity[s] = v
         s += 1
         if s < end:
-          when = sample_time[s] / (1.0 + rate) - late
+          when = sample_time[s] * true_time - late
       if s >= end:
         break
       # The command during this step.
@@ -233,9 +250,9 @@ def simulate(
       u = command[pointer]
       later, share = u, 0.0
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + step:
-        share = (reach + step - command_time[pointer + 1]) / step
+        share = (reach + step - command_time[pointer + 1]) * rate_of_steps
         later = command[pointer + 1]
-      i = min(int(time * (1.0 + rate) / step), last)  # surroundings were measured: stamped time
+      i = min(int(time * stamped), last)  # surroundings were measured: stamped time
       seen_v = motor_speed if half > 0.0 else v
       seen_q = q + encoder + on_motor * gap_offset
       before = torque  # of the last step
@@ -262,18 +279,16 @@ def simulate(
         coming = abs(strength * slope * (command[pointer + 1] - command[pointer]))
       # Torque between steps is interpolated: a jump would make errors jump with latencies.
       while e < end:
-        x = (sample_time[e] / (1.0 + rate) - late_effort - time) / step + 1.0
+        x = (sample_time[e] * true_time - late_effort - time) * rate_of_steps + 1.0
         if x > 1.0:
           break
         out_torque[e] = told if n == 0 else told_before + max(x, 0.0) * (told - told_before)
         out_jump[e] = max(jump, abs(told - told_before), coming)
         e += 1
       jump = abs(told - told_before)
+      demand = gravity_cos[i]
       if hinge:
-        turn = q - gravity_at[i]
-        demand = gravity_here[i] * math.cos(turn) + gravity_across[i] * math.sin(turn)
-      else:
-        demand = gravity_here[i]
+        demand = demand * cosine + gravity_sin[i] * sine
       passive = -demand - bias[i] + offset_force - stiffness * (q - reference)
       if amplitude != 0.0:
         passive += amplitude * math.sin(periods * q + phase)
@@ -333,25 +348,31 @@ def simulate(
       slope_v = slowed + 2.0 * drag * abs(v)
       if half == 0.0:
         slope_v -= back_emf
-      rubbed = (force - resist * v) / mass + stopping_rate * v
-      rubbed = min(max(rubbed / (1.0 / mass + softness), -dry), dry)
-      speed = v + step * (force - resist * v - rubbed) / (mass + step * slope_v)
-      acceleration = (speed - v) / step
+      freely = 1.0 / mass
+      yielding, pace = 1.0 / (freely + softness), step / (mass + step * slope_v)
+      pushed = force - resist * v
+      rubbed = (pushed * freely + stopping_rate * v) * yielding
+      rubbed = min(max(rubbed, -dry), dry)
+      speed = v + pace * (pushed - rubbed)
+      acceleration = (speed - v) * rate_of_steps
       if half > 0.0:
-        link_freely = acceleration - passed / mass
+        link_freely = acceleration - passed * freely
       after = q + step * speed
       ahead = time + step
       apart = 0.0  # the last reading within the step, less what is simulated of it
       while s < end and when < ahead:
-        x = max((when - time) / step, 0.0)
+        x = max((when - time) * rate_of_steps, 0.0)
         out_position[s] = q + x * (after - q) + encoder + on_motor * gap_offset
         out_velocity[s] = v + x * (speed - v)
         if follow > 0.0 and not math.isnan(reading[s]):
           apart = reading[s] - out_position[s]
         s += 1
         if s < end:
-          when = sample_time[s] / (1.0 + rate) - late
-      q = after + follow * apart
+          when = sample_time[s] * true_time - late
+      turned = after + follow * apart - q
+      q += turned
+      if hinge:
+        cosine, sine = _turned(cosine, sine, q, turned)
       v = speed + follow_speed * apart
       time = ahead
       n += 1

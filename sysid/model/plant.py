@@ -169,11 +169,19 @@ class JointPlant:
 
   def declared_torque(self) -> Array:
     """Returns the size of the declared actuator's torque over all logs [N]."""
-    outputs = [self._run(self.declared, i, self._nominal[i], None) for i in range(len(self.logs))]
+    outputs = [
+      self._run(self.declared, i, turning(self._nominal[i], self.hinge), None)
+      for i in range(len(self.logs))
+    ]
     return np.abs(np.concatenate([o.torque for o in outputs]))
 
   def _run(
-    self, p: Array, index: int, grid: tuple[Array, ...], table: tuple[Array, Array] | None
+    self,
+    p: Array,
+    index: int,
+    grid: tuple[Array, ...],
+    table: tuple[Array, Array] | None,
+    readings: Array | None = None,
   ) -> Output:
     log, windows = self.logs[index], self.windows[index]
     out = np.zeros((4, len(log.time)))
@@ -190,7 +198,7 @@ class JointPlant:
       windows.start,
       windows.position,  # type: ignore
       windows.velocity,
-      self._readings[index],
+      self._readings[index] if readings is None else readings,
       weights,
       bounds,
       out[0],
@@ -199,6 +207,20 @@ class JointPlant:
       out[3],
     )
     return Output(out[0], out[1], out[2], out[3])
+
+
+def turning(fields: Sequence[Array], hinge: bool) -> tuple[Array, Array, Array, Array]:
+  """Returns inertia, gravity's torque at position 0 and a quarter turn further, and bias, each [T].
+
+  Args:
+    fields: inertia, gravity here, across, the position where that is, and bias, each [T].
+    hinge: whether gravity turns with the joint; a slide has the same everywhere.
+  """
+  inertia, here, across, at, bias = fields
+  if not hinge:
+    return inertia, here, across, bias
+  cosine, sine = np.cos(at), np.sin(at)
+  return inertia, here * cosine - across * sine, here * sine + across * cosine, bias
 
 
 def _other_load(log: Log, joint: str, time: Array) -> Array:

@@ -6,6 +6,7 @@ state. Shapes: N samples, J joints of the log, U actuators.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -37,6 +38,13 @@ class Clocks:
   """s that a position is older than its stamp."""
   latency: float = 0.0
   """s that a command takes to the actuator."""
+
+
+class Member(NamedTuple):
+  """A model to simulate with: effects and latencies."""
+
+  effects: Sequence[Effect]
+  clocks: dict[str, Clocks]
 
 
 def merge_delays(
@@ -203,13 +211,46 @@ def error(
 ) -> float:
   """Returns the RMSE of positions over logs and joints, rad (or m); readings that were repeated
   while the joint moved are left out: they measure nothing."""
+  courses = [simulate(model, log, effects, clocks=clocks, window_s=window_s) for log in logs]
+  return _rmse(logs, courses, joints)
+
+
+def errors(
+  model: mujoco.MjModel, logs: Sequence[Log], members: Sequence[Member], *, window_s: float = 0.5
+) -> dict[str, float]:
+  """Returns the RMSE of the mean of several models' predictions, rad (or m).
+
+  Args:
+    model: compiled model.
+    logs: measured.
+    members: models; the first one alone is written as MJCF.
+    window_s: length of windows where an actuator does not hold position.
+
+  Returns:
+    "after", and where there are several models "single", that of the first, "median", "least" and
+    "most" of them, and "models", how many they are.
+  """
+  courses = [
+    [simulate(model, log, m.effects, clocks=m.clocks, window_s=window_s) for log in logs]
+    for m in members
+  ]
+  result = {"after": _rmse(logs, [np.mean(c, axis=0) for c in zip(*courses, strict=True)])}
+  if len(members) > 1:
+    each = [_rmse(logs, c) for c in courses]
+    result |= {"single": each[0], "median": float(np.median(each)), "least": min(each)}
+    result |= {"most": max(each), "models": len(each)}
+  return result
+
+
+def _rmse(
+  logs: Sequence[Log], courses: Sequence[Array], joints: Sequence[str] | None = None
+) -> float:
+  """Returns the RMSE of simulated courses [N, J] a log over new readings."""
   squares = []
-  for log in logs:
+  for log, positions in zip(logs, courses, strict=True):
     assert log.states.position is not None
-    positions = simulate(model, log, effects, clocks=clocks, window_s=window_s)
-    columns = [log.states.column(j) for j in (joints or log.joints)]
     measured, speeds = log.states.position, smooth_motion(log).velocity
-    for column in columns:
+    for column in (log.states.column(j) for j in (joints or log.joints)):
       kept = fresh(log.states.stamp, measured[:, column], speeds[:, column])
       squares.append(np.square((measured - positions)[kept, column]))
   return float(np.sqrt(np.mean(np.concatenate(squares))))

@@ -12,7 +12,7 @@ from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.design.identifiability import Identifiability
-from nerf2real.sysid.fit.posterior import CONSTANTS
+from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import capability, meanings, residual_plots, summary
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE

@@ -11,7 +11,7 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.posterior import CONSTANTS
+from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
@@ -104,7 +104,7 @@ def _explained(
 
 def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:
   """Adds an effect of a body or of the machine."""
-  bounds = intervals.around(shared.term, shared.x, shared.spread, own_latency=own_latency)
+  bounds = intervals.around(shared.term, shared.x, *shared.reach, own_latency=own_latency)
   evidence = {
     "clear_by_standard_errors": round(shared.clear, 2),
     "held_out_gain_nats": round(shared.nats, 2),

@@ -3,7 +3,7 @@
 The baseline is the declared model with its tolerances, or what reference logs show: constants, and
 the effects that the machine has anyway. An effect is named where every tried hypothesis without it
 is clearly worse (`naming`), and where the reference logs are clearly worse with it than without.
-Where more remains, a name must also explain more than it leaves to a force of any form.
+Where more remains, a name must also stand beside a force of any form.
 """
 
 import dataclasses
@@ -13,16 +13,24 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
+from nerf2real.sysid.fit.layout import CLOCKS, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import CLOCKS, Fitter, Layout
+from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.hypotheses.constants import OWN
+from nerf2real.sysid.hypotheses.free_force import VARIABLE
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear, of_size
+from nerf2real.sysid.selection.elaboration import elaborated
+from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear
 from nerf2real.sysid.selection.naming import Explanation, conclude
-from nerf2real.sysid.selection.remainder import grown, structured
+from nerf2real.sysid.selection.remainder import grown, scatter, structured
 from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
+
+
+_MOMENTS = ("payload",)
+"""Kinds of which a product of values shows: the product is sure where none of them is."""
 
 
 @dataclasses.dataclass
@@ -42,6 +50,8 @@ class Changed:
   """The same of the logs, under the best hypothesis."""
   constants_off: bool
   """Whether declared constants are off by more than machines of one kind differ."""
+  elaborated: list[Scored] = dataclasses.field(default_factory=list)
+  """Fits with richer friction that predict left-out logs about as well as the best of them."""
 
   @property
   def extended(self) -> Scored:
@@ -49,7 +59,15 @@ class Changed:
     if self.verdict not in ("partly", "unexplained"):
       return self.found.best
     fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
+    if self.elaborated:
+      return self.elaborated[0]
     return max(fitting, key=lambda s: s.evidence, default=self.found.best)
+
+  @property
+  def near(self) -> list[Scored]:
+    """The hypotheses whose mean is predicted with: fits near the best, which is the first."""
+    best = self.extended
+    return self.elaborated if any(best is s for s in self.elaborated) else [best]
 
   @property
   def likelihood(self) -> JointLikelihood:
@@ -114,7 +132,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
-  if subject.alone or leaves(subject, explainer.null, settings):
+  if leaves(subject, explainer.null, settings):
     ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
@@ -125,15 +143,25 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
   if usual is not None and not subject.paired:
     anyway = float(np.median(usual.fit.held[0][0]))
+  if now.follows:
+    anyway = max(anyway, scatter(now, found.best))
   left = float(np.median(found.left))
   over = float(np.sqrt(left / max(anyway, 1e-300)))
   if named and over > settings.more:
-    named = _supported(explainer, found, named, settings)
+    named = _supported(explainer, found.best, named, subject.beyond)
     ranked = explainer.ranked()
   verdict = _verdict(
-    found, named, len(own) < len(known), leaves(subject, found.best, settings), over, settings
+    found,
+    named,
+    any(t.wider for t in known),
+    leaves(subject, found.best, settings),
+    over,
+    settings,
   )
   off = _constants_off(subject, found.best, settings)
+  near = []
+  if verdict in ("partly", "unexplained") and not now.follows:
+    near = elaborated(explainer, found.best, named)
   return Changed(
     subject,
     ranked,
@@ -143,6 +171,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
     off,
+    near,
   )
 
 
@@ -161,36 +190,31 @@ def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
 
 
 def _supported(
-  explainer: Explainer, found: Explanation, named: Sequence[str], settings: Settings
+  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float
 ) -> tuple[str, ...]:
-  """Returns the names that explain more than they leave to a force of any form, one by one.
+  """Returns the names that stand where something is left that no name is for.
 
-  Effects that together imitate what no library has each explain the smaller part of what a smooth
-  force over position and velocity explains of left-out motion; one that is there does not.
+  What is named may then be a part of that: half of a soft stop is a spring. A kind that is a force
+  over one variable stands unless a force of any form over that variable does clearly better; any
+  other where hypotheses with a force of any form over both are clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
-    found: the best hypothesis, of which more remains than the machine leaves anyway.
+    best: the best hypothesis, of which more remains than the machine leaves anyway.
     named: kinds that are clear.
-    settings: limits.
+    beyond: standard errors that count as clear.
   """
-  kept: tuple[str, ...] = ()
-  base = explainer.null
-  while len(kept) < len(named):
-    wider = [
-      item
-      for item in of_size(explainer.scored.values(), len(kept) + 1)
-      if set(kept) < item.names <= set(named)
-    ]
-    if not wider:
-      break
-    best = max(wider, key=lambda item: item.evidence)
-    force = explainer.with_force(base)
-    gained, possible = (item.evidence - base.evidence for item in (best, force))
-    if gained < possible - gained:
-      break
-    base, kept = best, tuple(k for k in named if k in best.names)
-  return kept
+  kept = []
+  for kind in named:
+    without = explainer.lacking(best, kind)
+    if kind in VARIABLE:
+      rival = explainer.with_force(without, VARIABLE[kind])
+      stands = clear(rival, best) <= beyond
+    else:
+      stands = clear(explainer.with_force(best), explainer.with_force(without)) > beyond
+    if stands:
+      kept.append(kind)
+  return tuple(kept)
 
 
 def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
@@ -208,17 +232,21 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
 
 
 def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
-  """Tells whether an effect's values differ from those that do nothing, by their intervals.
+  """Tells whether an effect's sizes differ from those that do nothing, by their intervals.
 
-  Of effects that have sizes only: where a shape is fitted, too, a size may be open that is surely
-  not nothing, as a payload's mass is where its moment is sure.
+  What healthy machines have of an effect is nothing, too, where no reference shows it. A payload's
+  mass may be open where its moment is sure.
   """
   term = next(t for t in best.terms if t.name == kind)
-  sizes = {} if term.freed else {p.name: p for p in kind_of(kind).parameters if not p.shape}
-  if not term.names or any(n not in sizes for n in term.names):
+  if term.freed or not term.names or kind in _MOMENTS:
     return True
-  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=subject.before is None)
-  return any(not low <= sizes[n].nominal <= high for n, (low, high) in bounds.items())
+  alone = subject.before is None
+  sizes = {p.name: p.nominal for p in kind_of(kind).parameters if not p.shape}
+  own = OWN.get(kind, {}) if alone and subject.now.plant.hinge else {}
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=alone)
+  return any(
+    not low - own.get(n, 0.0) <= sizes[n] <= high for n, (low, high) in bounds.items() if n in sizes
+  )
 
 
 def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:

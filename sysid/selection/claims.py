@@ -6,7 +6,7 @@ import numpy as np
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.posterior import CONSTANTS
+from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import free_force
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.changes import Changed

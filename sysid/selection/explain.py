@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fit, Fitter, Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.free_force import free_force
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -15,6 +16,8 @@ Array = np.ndarray
 
 _PUSH = 0.2  # step of finite differences of a free force, of its values' deviations
 _ITERATIONS = 10  # of its fit
+_LOOKS = 2  # rounds of fitting constants in which other latencies are looked at
+_SCREENED = 2  # times as many kinds as are fitted to the end take a second step
 _SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
 
 
@@ -93,6 +96,22 @@ def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
   return [item for item in alone if len(item.names) == size]
 
 
+def _alike(given: Sequence[Term], wanted: Sequence[Term]) -> list[Term]:
+  """Returns the given terms that are of the wanted ones' kinds and fitted there, in their order."""
+  by_kind = {t.kind: t for t in given}
+  return [by_kind[t.kind] for t in wanted if t.names]
+
+
+def _best_of_kinds(
+  tried: Sequence[tuple[Fitter, tuple[Term, ...], Fit]],
+) -> list[tuple[Fitter, tuple[Term, ...], Fit]]:
+  """Returns the best form of every set of kinds, the best first."""
+  chosen: dict[frozenset[str], tuple[Fitter, tuple[Term, ...], Fit]] = {}
+  for item in sorted(tried, key=lambda t: t[2].cost):
+    chosen.setdefault(named(item[1]), item)
+  return list(chosen.values())
+
+
 class Explainer:
   """Grows hypotheses of one joint."""
 
@@ -126,29 +145,19 @@ class Explainer:
     declared = joint.residuals((), np.zeros((1, 0)))[0]
     joint.rescale(declared)
     fitter = Fitter([joint], Layout([base]))
-    left = np.inf
-    for _ in range(self.settings.rounds):
-      fit = self._look_about(fitter, fitter.fit(x, iterations=2))
+    fit, left = fitter.fit(x, iterations=2), np.inf
+    for count in range(self.settings.rounds):
+      if count < _LOOKS:
+        fit = fitter.look_about(fit, ("latency", "skew"), iterations=1)
       joint.rescale(fit.residuals[0])
-      x, before, left = fit.x, left, float(np.log(joint.scale).sum())
+      before, left = left, float(np.log(joint.scale).sum())
       if left > before - 0.01:
         break
-    self.null = self._score(base, fitter.fit(x, iterations=4))
+      fit = fitter.fit(fit, iterations=2)
+    self.null = self._score(base, fitter.fit(fit, iterations=4))
     bare = Fitter([joint], Layout([()])).linearise(np.zeros(0), 0.0)
     self.declared = self._score((), bare, neutral=True)
-    self._pushes: Array | None = None
-
-  def _look_about(self, fitter: Fitter, fit: Fit) -> Fit:
-    """Returns a fit from a better place if there is one: held commands make stairs of latencies."""
-    tried = []
-    for at, name in enumerate(self.constants.names):
-      if name in ("latency", "skew"):
-        for value in np.arange(-3, 5) * 0.002:
-          tried.append(fit.x.copy())
-          tried[-1][at] = np.clip(value, fitter.layout.low[at], fitter.layout.high[at])
-    costs = fitter.costs(np.array(tried))
-    best = int(np.argmin(costs))
-    return fitter.fit(tried[best], iterations=1) if costs[best] < fit.cost - 1.0 else fit
+    self._pushes: dict[str, Array] = {}
 
   def _score(self, terms: tuple[Term, ...], fit: Fit, *, neutral: bool = False) -> Scored:
     fitter = Fitter([self.joint], Layout([terms]))
@@ -157,42 +166,55 @@ class Explainer:
     self.scored[terms] = result
     return result
 
-  def _rescore(self) -> None:
+  def rescore(self) -> None:
     """Scores all hypotheses anew after the scale has changed."""
     for s in self.scored.values():
       s.nats = self.joint.loglik(s.fit.held[0])
 
+  def cost(self, item: Scored) -> float:
+    """Returns the negative log posterior of a hypothesis under the present scale."""
+    nats = self.joint.loglik(self.joint.squares(item.fit.residuals[0]))
+    return item.prior - float(nats.sum())
+
   def extend(self, parent: Scored, keep: int) -> list[Scored]:
     """Returns the best hypotheses that add one effect to a parent, fitted to the end."""
-    quick: list[tuple[float, tuple[Term, ...], Fit]] = []
+    tried: list[tuple[Fitter, tuple[Term, ...], Fit]] = []
     for terms, starts, stale, fresh in self._candidates(parent):
       fitter = Fitter([self.joint], Layout([terms]))
-      best = None
-      for start in self._begin(parent, fitter, starts):
-        fit = fitter.fit(start, iterations=2, known=stale, fresh=fresh, quick=True)
-        if best is None or fit.cost < best.cost:
-          best = fit
-      assert best is not None
-      quick.append((best.cost, terms, best))
-    quick.sort(key=lambda q: q[0])
-    chosen: dict[frozenset[str], tuple[float, tuple[Term, ...], Fit]] = {}
-    for q in quick:  # the best form of every kind
-      chosen.setdefault(named(q[1]), q)
-    results = []
-    for _, terms, fit in list(chosen.values())[:keep]:
-      done = Fitter([self.joint], Layout([terms])).fit(fit.x, iterations=4)
-      results.append((terms, done if done.cost < fit.cost + 1.0 else fit))
-    return [self._score(terms, fit) for terms, fit in results]
+      fits = [
+        fitter.fit(
+          fitter.linearise(x, known=stale, fresh=fresh, residuals=rows), iterations=1, quick=True
+        )
+        for x, rows in self._begin(parent, fitter, starts)
+      ]
+      tried.append((fitter, terms, min(fits, key=lambda f: f.cost)))
+    leading = _best_of_kinds(tried)[: _SCREENED * keep]  # halving: who leads takes another step
+    tried = [
+      (fitter, terms, fitter.fit(fit, iterations=1, quick=True))
+      for fitter, terms, fit in tried
+      if any(named(terms) == named(other) for _, other, _ in leading)
+    ]
+    chosen = _best_of_kinds(tried)
+    return [
+      self._score(terms, fitter.look_about(fitter.fit(fit, iterations=4), ("delay",)))
+      for fitter, terms, fit in chosen[:keep]
+    ]
 
-  def _begin(self, parent: Scored, fitter: Fitter, starts: Array) -> list[Array]:
-    """Returns where descents begin: the best start, and without a first effect the best one with
-    the constants as they were declared, which what is missing may have bent."""
-    begin = [starts[int(np.argmin(fitter.costs(starts)))]]
+  def _begin(
+    self, parent: Scored, fitter: Fitter, starts: Array
+  ) -> list[tuple[Array, list[Array]]]:
+    """Returns where descents begin, with the residuals there: the best start, and without a first
+    effect the best one with the constants as they were declared, which what is missing may have
+    bent."""
+    places = [starts]
     if not parent.names:
-      declared = starts.copy()
-      count = len(parent.fit.x)
-      declared[:, :count] = np.concatenate([t.centre for t in self.base])
-      begin.append(declared[int(np.argmin(fitter.costs(declared)))])
+      places.append(starts.copy())
+      places[-1][:, : len(parent.fit.x)] = np.concatenate([t.centre for t in self.base])
+    begin = []
+    for place in places:
+      costs, rows = fitter.simulated(place)
+      best = int(np.argmin(costs))
+      begin.append((place[best], [row[best] for row in rows]))
     return begin
 
   def _candidates(self, parent: Scored):
@@ -228,28 +250,49 @@ class Explainer:
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
-  def with_force(self, parent: Scored) -> Scored:
-    """Returns a hypothesis with a force of any form beside it, whose derivatives are taken once."""
-    force = free_force(self.joint.plant)
+  def lacking(self, item: Scored, kind: str) -> Scored:
+    """Returns a hypothesis without one of its effects, the constants as tight as they were."""
+    instead = {t.kind: t for t in self.base}
+    terms = tuple(instead.get(t.kind) if t.name == kind else t for t in item.terms)
+    kept = tuple(t for t in terms if t is not None)
+    if kept not in self.scored:
+      x = np.concatenate([list(item.fit.values(t).values()) for t in _alike(item.terms, kept)])
+      self._score(kept, Fitter([self.joint], Layout([kept])).fit(x, iterations=4))
+    return self.scored[kept]
+
+  def with_force(self, parent: Scored, along: str | None = None) -> Scored:
+    """Returns a hypothesis with a force of any form beside it, whose derivatives are taken once at
+    first.
+
+    Args:
+      parent: the hypothesis.
+      along: "position" or "velocity" for a force over that alone.
+    """
+    force = free_force(self.joint.plant, along)
     terms = (*parent.terms, force)
     if terms in self.scored:
       return self.scored[terms]
     fitter = Fitter([self.joint], Layout([terms]))
     count = len(parent.fit.x)
     x = np.concatenate([parent.fit.x, force.starts[0]])
-    if self._pushes is None:
-      self._pushes = fitter.linearise(x, _PUSH).jacobian[0][count:]
-    blank = np.zeros((count, *self._pushes.shape[1:]))
+    if not set(force.names) <= self._pushes.keys():
+      blank = np.zeros((len(x), *parent.fit.residuals[0].shape))
+      fresh, here = np.arange(len(x)) >= count, parent.fit.residuals
+      pushed = fitter.linearise(x, _PUSH, [blank], fresh, here).jacobian[0][count:]
+      self._pushes = dict(zip(force.names, pushed, strict=True))
+    pushes = np.array([self._pushes[name] for name in force.names])
+    known = [np.concatenate([parent.fit.jacobian[0], pushes])]
     fresh = np.arange(len(x)) < count
-    known = [np.concatenate([blank, self._pushes])]
-    fit = fitter.fit(x, iterations=_ITERATIONS, known=known, fresh=fresh)
-    return self._score(terms, fit)
+    begin = fitter.weighed(x, parent.fit.residuals, known, None)
+    fit = fitter.fit(begin, iterations=_ITERATIONS, known=known, fresh=fresh)
+    return self._score(terms, fitter.fit(fitter.linearise(fit.x, _PUSH), iterations=2))
 
   def constants_alone(self) -> list[Scored]:
     """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
     if self.freed is not None:
       terms = (self.freed, *self.null.terms[1:])
-      self._score(terms, Fitter([self.joint], Layout([terms])).fit(self.null.fit.x, iterations=4))
+      fitter = Fitter([self.joint], Layout([terms]))
+      self._score(terms, fitter.fit(self.null.fit.x, iterations=4))
     return self.ranked()
 
   def adopt(self, best: Scored) -> Scored:
@@ -257,20 +300,22 @@ class Explainer:
     fitter = Fitter([self.joint], Layout([best.terms]))
     for _ in range(self.settings.rounds):
       self.joint.rescale(best.fit.residuals[0])
-      before = float(fitter.costs(best.fit.x[None])[0])
-      best = self.refit(best, 4)
+      before = fitter.again(best.fit).cost
+      best = self._score(
+        best.terms, fitter.look_about(fitter.fit(best.fit, iterations=4), ("delay",))
+      )
       if best.fit.cost > before - _SETTLED:
         break
     if self.joint.follows and best.names & set(UNREPEATED):
       fitter = Fitter([self.joint], Layout([best.terms]))
       best = self._score(best.terms, fitter.fit(fitter.draw(best.fit).x, iterations=8))
       self.joint.rescale(best.fit.residuals[0])
-    self._rescore()
+    self.rescore()
     return best
 
   def refit(self, item: Scored, iterations: int = 6) -> Scored:
     """Returns a hypothesis fitted on under the present scale."""
-    fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit.x, iterations=iterations)
+    fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit, iterations=iterations)
     return self._score(item.terms, fit)
 
   def explain(
@@ -317,7 +362,7 @@ class Explainer:
     top = max(forced, key=lambda item: item.evidence)
     if top.evidence > best.evidence:
       self.joint.rescale(top.fit.residuals[0])
-      self._rescore()
+      self.rescore()
 
   def _neutralise(self, item: Scored) -> None:
     """Scores an item with each of its effects at the values that do nothing, all else fitted.
@@ -336,12 +381,12 @@ class Explainer:
         ]
       )
       fit = Fitter([self.joint], Layout([terms])).fit(x, iterations=4)
-      if terms not in self.scored or self.scored[terms].fit.cost > fit.cost:
+      if terms not in self.scored or self.cost(self.scored[terms]) > fit.cost:
         self._score(terms, fit, neutral=before is None)
       plain = self.scored.get(tuple(t for t in item.terms if t is not term))
-      if plain is not None and before is None and fit.cost < plain.fit.cost - _SETTLED:
+      if plain is not None and before is None and fit.cost < self.cost(plain) - _SETTLED:
         again = Fitter([self.joint], Layout([plain.terms])).fit(fit.x, iterations=4)
-        if again.cost < plain.fit.cost:
+        if again.cost < self.cost(plain):
           self._score(plain.terms, again)
 
   def ranked(self) -> list[Scored]:

@@ -4,11 +4,39 @@ import dataclasses
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.fit.layout import CONSTANTS
+from nerf2real.sysid.hypotheses import free_force
+from nerf2real.sysid.hypotheses.terms import FREE
+from nerf2real.sysid.model.simulation import Clocks, Member
 from nerf2real.sysid.selection.changes import Changed
+from nerf2real.sysid.selection.explain import Scored
+
+_MOST = 8  # fits near the best that are simulated, chosen
+
+
+def effects_of(joint: str, item: Scored) -> tuple[list[Effect], Clocks]:
+  """Returns the effects of a joint's hypothesis that are its own, and its latencies."""
+  effects, clocks, offset = [], Clocks(), 0.0
+  for term in item.terms:
+    values = item.fit.values(term)
+    x = np.array(list(values.values()))
+    if term.kind == CONSTANTS:
+      clocks = Clocks(values.get("skew", 0.0), values.get("latency", 0.0))
+      offset += values.get("zero", 0.0)
+      effects.append(dataclasses.replace(term.effect(x), target=joint))
+    elif term.kind == FREE:
+      effects.append(free_force.effect(term, x))
+    elif term.kind == "encoder_offset":
+      offset += values["offset"]
+    elif term.names:
+      effects.append(term.effect(x))
+  if offset:
+    effects.append(Effect("encoder_offset", joint, {"offset": offset}))
+  return effects, clocks
 
 
 @dataclasses.dataclass
@@ -32,6 +60,23 @@ class Identified:
   clocks: dict[str, Clocks] = dataclasses.field(default_factory=dict)
   in_reference: list[dict[str, Any]] = dataclasses.field(default_factory=list)
   """Entries of effects that reference logs show, too: the model lacks them, nothing has changed."""
+
+  @property
+  def near(self) -> list[Member]:
+    """What to simulate with: the extended model, and others whose fits are near its own."""
+    count = min(max((len(j.near) for j in self.joints), default=1), _MOST)
+    own = Member([*self.calibration, *self.objects], self.clocks)
+    return [own, *(self._member(own, k) for k in range(1, count))]
+
+  def _member(self, own: Member, at: int) -> Member:
+    """Returns the extended model with other fits near the best at joints that have several."""
+    effects, clocks = list(own.effects), dict(own.clocks)
+    for item in (j for j in self.joints if len(j.near) > 1):
+      theirs = {(e.kind, e.target) for e in effects_of(item.joint, item.near[0])[0]}
+      effects = [e for e in effects if (e.kind, e.target) not in theirs]
+      other, clocks[item.joint] = effects_of(item.joint, item.near[at % len(item.near)])
+      effects += other
+    return Member(effects, clocks)
 
   @property
   def found(self) -> list[Changed]:

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model.measured import quantum
 from nerf2real.sysid.selection.explain import Scored
 from nerf2real.sysid.settings import Settings
@@ -22,6 +23,23 @@ def structured(joint: JointLikelihood, item: Scored, settings: Settings) -> bool
   rounding = recordings * step**2 / 12.0
   large = size > (settings.structured * joint.position_noise) ** 2 + rounding
   return int(np.sum((certain > rare) & large)) >= 2
+
+
+def scatter(joint: JointLikelihood, item: Scored) -> float:
+  """Returns the mean square that a hypothesis leaves in the median block of readings made by
+  itself: where a course does not repeat, a simulation that follows them strays all the same."""
+  random = np.random.default_rng(0)
+  c = compose(joint.plant, item.terms, item.fit.x)
+  residual = []
+  for index, log in enumerate(joint.plant.logs):
+    made = joint.plant.run(c.p, c.loads, index, table=c.table).position
+    read = made + random.normal(0.0, joint.position_noise, len(made))
+    read = np.where(log.valid, read, np.nan)
+    near = joint.plant.run(c.p, c.loads, index, table=c.table, follow=True, readings=read)
+    residual.append(np.nan_to_num(read - near.position))
+  rows = np.zeros((len(joint.channels), joint.size))
+  rows[0] = np.concatenate(residual)
+  return float(np.median(joint.squares(rows * joint.gain)[0]))
 
 
 def grown(best: Scored, usual: Scored, beyond: float, settings: Settings) -> bool:

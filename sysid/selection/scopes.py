@@ -13,10 +13,12 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.posterior import deviations
+from nerf2real.sysid.fit.layout import Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import wide
 from nerf2real.sysid.selection.changes import Changed, leaves
+from nerf2real.sysid.selection.explain import Scored
 from nerf2real.sysid.selection.naming import USUAL
 from nerf2real.sysid.selection.subject import Subject
 from nerf2real.sysid.selection.wide import Evidence, Wide
@@ -32,8 +34,8 @@ class Shared:
   term: Term
   x: Array
   """Values [n]."""
-  spread: Array
-  """Their standard deviations [n]."""
+  reach: tuple[Array, Array]
+  """How far they may be below and above [n]."""
   origin: Subject
   """The joint that shows it most."""
   members: tuple[Subject, ...]
@@ -107,18 +109,38 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   most = max(range(len(single)), key=lambda at: single[at].total)
   rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
   clear = min(mine.clear, *((mine - r).clear for r in rivals))
-  spread = deviations(best.fit, [m.now for m in best.members])[: len(best.x)]
-  if clear < beyond or _is_nothing(best.term, best.x, spread, own_latency=own_latency):
+  joints = [m.now for m in best.members]
+  spread = intervals.covariance(best.fit, joints, systematic=intervals.SYSTEMATIC)
+  reach = intervals.reaches(best.fit, spread, (0, len(best.x)))
+  nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
+  if clear < beyond or nothing or not _is_new(best, beyond):
     return None
   origin = best.members[most]
-  return Shared(best.term, best.x, spread, origin, best.members, clear, mine.total)
+  return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total)
 
 
-def _is_nothing(term: Term, x: Array, spread: Array, *, own_latency: bool) -> bool:
+def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency: bool) -> bool:
   """Tells whether an effect has sizes only, whose intervals hold the values that do nothing."""
   sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
-  bounds = intervals.around(term, x, spread, own_latency=own_latency)
+  bounds = intervals.around(term, x, *reach, own_latency=own_latency)
   return all(n in sizes and low <= sizes[n] <= high for n, (low, high) in bounds.items())
+
+
+def _is_new(item: Wide, beyond: float) -> bool:
+  """Tells whether references, of other commands, are clearly worse with an effect of these values
+  than without: else it is theirs, too."""
+  rows, prior = {}, 0.0
+  held = item.term.held_at(item.x)
+  for member in item.members:
+    before, usual = member.before, member.usual
+    if before is None or usual is None or member.paired:
+      return True
+    terms = (*usual.terms, held)
+    fitter = Fitter([before], Layout([terms]))
+    fit = fitter.leave_out(fitter.fit(usual.fit.x, iterations=3))
+    beside = Scored(terms, fit, before.loglik(fit.held[0]))
+    rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
+  return Evidence(rows, prior).clear > beyond
 
 
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:

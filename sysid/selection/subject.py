@@ -160,7 +160,7 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   known = [sticking(before.plant)]
   first = Explainer(before, own, library, settings=settings, known=known)
   usual = conclude(before, first.explain(settings.reference_depth), subject.beyond).best
-  shared = [t for t in subject.known if not t.names]
+  shared = [t for t in subject.known if t.wider]
   subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
   subject.paired = subject.now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   subject.freed = freed_constants(subject.known[0], settings)

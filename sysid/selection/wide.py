@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from nerf2real.sysid.fit.layout import CLOCKS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import CLOCKS, Fit, Fitter, Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
@@ -25,7 +26,6 @@ Array = np.ndarray
 _LATE = ("command_delay", "measurement_delay")
 """Kinds that are a joint's or the bus's."""
 _ENOUGH = 20  # steps of a fit, which ends by itself: a bound on time
-_NEAR = tuple(0.001 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))  # s from a delay to look about
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,26 +130,15 @@ def screened(term: Term, members: Sequence[Subject]) -> Wide:
 def fitted(item: Wide) -> Wide:
   """Returns a screened effect fitted to the end, with its predictions of left-out blocks."""
   fitter = Fitter([m.now for m in item.members], item.fit.layout)
-  fit = fitter.fit(item.fit.x, iterations=_ENOUGH)
-  near = [_replaced(fit.x, at, fit.x[at] + shift) for at in _late(item.term) for shift in _NEAR]
-  if near:
-    near = [np.clip(x, fit.layout.low, fit.layout.high) for x in near]
-    best = near[int(np.argmin(fitter.costs(np.array(near))))]
-    other = fitter.fit(best, iterations=_ENOUGH)
-    fit = min(fit, other, key=lambda f: f.cost)
+  fit = fitter.fit(item.fit, iterations=_ENOUGH)
+  if _late(item.term):
+    fit = fitter.look_about(fit, ("delay",), iterations=_ENOUGH)
   return dataclasses.replace(item, fit=fitter.leave_out(fit))
 
 
 def _late(term: Term) -> list[int]:
   """Returns the indices of a term's delays."""
   return [at for at, name in enumerate(term.names) if name in CLOCKS]
-
-
-def _replaced(x: Array, at: int, value: float) -> Array:
-  """Returns a copy of values [n] with one replaced."""
-  result = x.copy()
-  result[at] = value
-  return result
 
 
 def adopted(item: Wide, others: Sequence[Subject]) -> Wide:

@@ -6,8 +6,9 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.expectation import Expectation
+from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood, _correlation_time, _same_commands
-from nerf2real.sysid.fit.posterior import Fitter, Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model import kernel
@@ -108,3 +109,20 @@ def test_what_a_reference_leaves_comes_as_late_as_what_it_goes_with(viscous, clo
   inner = np.concatenate([t > 0.05 for t in stamps])
   shifted = np.sin(3.0 * (np.concatenate(stamps) - 0.03))
   np.testing.assert_allclose(later[inner], shifted[inner], atol=3e-4)
+
+
+def test_efforts_count_no_more_often_than_courses(viscous):
+  _, joint = viscous
+  random = np.random.default_rng(0)
+  smooth = np.convolve(random.normal(size=joint.size + 40), np.ones(41) / 41, "valid")
+  joint.channels.append("effort")
+  two = np.array([smooth, random.normal(size=joint.size)])
+  try:
+    joint.gain, joint.floor = np.ones((2, joint.size)), np.full(2, 1e-9)
+    joint.counts, joint.independent = np.repeat(joint.counts, 2, axis=0), np.ones(2)
+    joint.rescale(two)
+    assert joint.independent[0] == joint.independent[1] < 0.1
+    joint.rescale(two[::-1])
+    assert joint.independent[1] < 0.1 < 0.5 < joint.independent[0]
+  finally:
+    joint.channels.pop()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.fit.posterior import Fit, Layout
+from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.selection import analysis, naming, subject

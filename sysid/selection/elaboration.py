@@ -1,0 +1,97 @@
+"""Fits near the best with a richer friction, where more remains than names explain.
+
+Fits of equal cost differ several times over on other motions, as where a joint stops hangs on small
+differences of friction. All that are near the best are kept; their mean predicts better than one.
+"""
+
+import copy
+from collections.abc import Collection
+
+import numpy as np
+from scipy.stats import chi2
+
+from nerf2real.sysid.fit.layout import CONSTANTS, Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.hypotheses.rich_friction import FORMS, REPLACED, rich_friction
+from nerf2real.sysid.hypotheses.terms import FREE, STICKING, Term
+from nerf2real.sysid.selection.explain import Explainer, Scored
+
+Array = np.ndarray
+
+_NEAR = 0.95
+"""Share of a posterior that lies within so much of the least cost: half a quantile of chi square
+with as many degrees as values."""
+_MOST = 10  # fits that are fitted anew without each log, chosen
+_REFITTED = 3  # Jacobians at most of a fit without a fold
+_ROUNDS = 2  # of fitting and setting the scale by the best
+
+
+def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> list[Scored]:
+  """Returns the fits with richer friction that are near the best of them, the best first; none
+  where one without predicts logs better that it was not fitted to.
+
+  Near are those whose cost is, and of them those whose left-out logs are predicted as well.
+
+  Args:
+    explainer: of the joint; its scale is set by the best fit, all is scored anew.
+    best: the best hypothesis without.
+    named: kinds that every one must have.
+  """
+  joint = explainer.joint
+  tried: list[tuple[Fitter, Scored]] = []
+  for terms, x in _bases(explainer, best, named):
+    for carried in FORMS:
+      term = rich_friction(joint.plant, carried)
+      fitter = Fitter([joint], Layout([(*terms, term)]))
+      for start in term.starts:
+        fit = fitter.fit(np.concatenate([x, start]), iterations=3)
+        tried.append((fitter, Scored((*terms, term), fit, np.zeros(0))))
+  for _ in range(_ROUNDS):
+    joint.rescale(min(tried, key=lambda t: t[1].fit.cost)[1].fit.residuals[0])
+    for fitter, item in tried:
+      item.fit = fitter.fit(item.fit, iterations=3)
+  tried.sort(key=lambda t: t[1].fit.cost)
+  least = tried[0][1].fit
+  reach = 0.5 * float(chi2.ppf(_NEAR, least.layout.count))
+  near = [(fitter, s) for fitter, s in tried[:_MOST] if s.fit.cost < least.cost + reach]
+  for fitter, item in near:
+    item.nats = joint.loglik(fitter.leave_out(item.fit).held[0])
+  explainer.rescore()
+  left_out = sorted(((crossed(joint, s), s) for _, s in near), key=lambda pair: -pair[0])
+  plain = next(s for s in explainer.ranked() if not s.neutral and s.names >= set(named))
+  if crossed(joint, plain) > left_out[0][0]:
+    return []
+  return [s for nats, s in left_out if nats > left_out[0][0] - reach]
+
+
+def crossed(joint: JointLikelihood, item: Scored) -> float:
+  """Returns the nats of blocks that a hypothesis was fitted anew without, fold by fold."""
+  fitter, total = Fitter([joint], item.fit.layout), 0.0
+  for fold in np.unique(joint.fold):
+    part = copy.copy(joint)
+    part.gain = joint.gain * (joint.fold != fold)[joint.block_of]
+    x = Fitter([part], item.fit.layout).fit(item.fit.x, iterations=_REFITTED).x
+    nats = joint.loglik(joint.squares(fitter.simulated(x[None])[1][0][0]))
+    total += float(nats[joint.fold == fold].sum())
+  return total
+
+
+def _bases(
+  explainer: Explainer, best: Scored, named: Collection[str]
+) -> list[tuple[tuple[Term, ...], Array]]:
+  """Returns what richer friction is added to: the named effects on constants within tolerances, and
+  on freed ones."""
+  gone = {FREE, STICKING, "load_friction", *(k for k in REPLACED if k not in named)}
+  kept = [
+    t
+    for t in best.terms
+    if t.kind == CONSTANTS or (t.kind not in gone and (t.name is None or t.name in named))
+  ]
+  x = np.concatenate([list(best.fit.values(t).values()) for t in kept])
+  own = {t.kind: t for t in explainer.base}
+  tight = tuple(own.get(t.kind, t) if t.kind == CONSTANTS else t for t in kept)
+  bases = [(tight, x)]
+  if explainer.freed is not None:
+    bases.append((tuple(explainer.freed if t.kind == CONSTANTS else t for t in kept), x))
+  return bases

@@ -1,0 +1,71 @@
+"""Fits near the best with a richer friction."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.model import simulation
+from nerf2real.sysid.model.simulation import Member
+from nerf2real.sysid.selection.baseline import widened
+from nerf2real.sysid.selection.elaboration import crossed, elaborated
+from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.findings import effects_of
+from tests.sysid.fit.test_likelihood import joint_of
+from tests.sysid.synthetic import PENDULUM, log_of
+
+RICH = Effect(
+  "load_friction",
+  "joint",
+  {"coefficient": 0.05, "quadratic": 0.3, "rest": 0.5, "velocity": 0.2, "carried": 2.0},
+)
+
+
+@pytest.fixture(scope="module")
+def near():
+  _, joint = joint_of(("sweep", "slow", "steps"), [RICH])
+  own = constants(joint.plant)
+  explainer = Explainer(joint, own, (), freed=widened(own))
+  return elaborated(explainer, explainer.null, ()), joint
+
+
+def test_fits_near_the_best_come_in_order_and_are_of_richer_friction(near):
+  fits, joint = near
+  nats = [crossed(joint, item) for item in fits]
+  assert nats == sorted(nats, reverse=True)
+  costs = [item.fit.cost for item in fits]
+  assert max(costs) - min(costs) < 15.0  # half of the 95 % quantile of chi square, 13 values
+  for item in fits:
+    assert item.names >= {"load_friction"}
+    assert item.values("load_friction").keys() == {"coefficient", "quadratic", "rest", "velocity"}
+
+
+def test_their_mean_predicts_a_motion_that_was_not_fitted(near):
+  fits, _ = near
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  held = log_of(PENDULUM, "sweep", [RICH], seed=9)
+  members = [Member(*_simulated(item)) for item in fits[:4]]
+  errors = simulation.errors(model, [held], members)
+  assert errors["after"] < 0.3 * simulation.error(model, [held])
+  if len(members) > 1:
+    assert errors["least"] <= errors["median"] <= errors["most"]
+    assert errors["after"] <= errors["most"]
+    assert errors["models"] == len(members)
+
+
+def _simulated(item):
+  effects, clocks = effects_of("joint", item)
+  return effects, {"joint": clocks}
+
+
+def test_the_error_of_one_model_is_its_own():
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "slow", [RICH], duration=3.0)
+  errors = simulation.errors(model, [log], [Member([], {})])
+  assert errors == {"after": pytest.approx(simulation.error(model, [log]))}
+  both = simulation.errors(model, [log], [Member([RICH], {}), Member([], {})])
+  course = [simulation.simulate(model, log, e)[:, 0] for e in ([RICH], [])]
+  mean = np.sqrt(np.mean((np.mean(course, axis=0) - log.states.position[:, 0]) ** 2))
+  assert both["after"] == pytest.approx(float(mean), rel=1e-6)
+  assert both["single"] < both["after"] < both["most"]
