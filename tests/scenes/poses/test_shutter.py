@@ -73,7 +73,8 @@ def test_the_readout_time_is_found(readout):
   assert corrected.compute_mean_reprojection_error() < 0.45  # of noise 0.3 in two directions
 
 
-def test_rectified_pictures_show_points_where_the_middle_line_saw_them():
+def seen_while_turning():
+  """Returns a motion, a picture of it, and where it shows points: at its middle line, as read."""
   model, times = filmed(0.03)
   found = shutter.motion(model, times, 0.03)
   index = 7
@@ -83,6 +84,11 @@ def test_rectified_pictures_show_points_where_the_middle_line_saw_them():
   read = middle
   for _ in range(6):
     read = found.project(points, shutter.instants(read, CAMERA), index, CAMERA)
+  return found, index, middle, read
+
+
+def test_rectified_pictures_show_points_where_the_middle_line_saw_them():
+  found, index, middle, read = seen_while_turning()
   assert np.abs(read - middle).max() > 2
   picture = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
   for x, y in read:
@@ -96,15 +102,7 @@ def test_rectified_pictures_show_points_where_the_middle_line_saw_them():
 
 
 def test_pixels_are_straightened_as_pictures_are():
-  model, times = filmed(0.03)
-  found = shutter.motion(model, times, 0.03)
-  index = 7
-  points = np.array([[x, y, 1.0] for x in (-0.4, 0.1, 0.5) for y in (-0.25, 0.0, 0.28)])
-  points *= found.depths[index]
-  middle = CAMERA.project(points)
-  read = middle
-  for _ in range(6):
-    read = found.project(points, shutter.instants(read, CAMERA), index, CAMERA)
+  found, index, middle, read = seen_while_turning()
   np.testing.assert_allclose(found.straightened(read, CAMERA, index), middle, atol=0.1)
 
 
