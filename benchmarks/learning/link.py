@@ -49,15 +49,17 @@ def make_trajectory(number: int) -> dict[str, np.ndarray]:
 
 
 class _Count:
-  """Numbers that arrived, and when (the machine's monotonic clock)."""
+  """Numbers that arrived, when (the machine's monotonic clock), and how many, for the sender."""
 
-  def __init__(self) -> None:
+  def __init__(self, arrived: Any) -> None:
     self.numbers: list[int] = []
     self.times: list[float] = []
+    self._arrived = arrived
 
   def add(self, number: int) -> None:
     self.numbers.append(number)
     self.times.append(time.monotonic())
+    self._arrived.value = len(self.numbers)
 
 
 def _report(count: _Count, pipe: Connection) -> None:
@@ -68,9 +70,9 @@ def _report(count: _Count, pipe: Connection) -> None:
   pipe.send((count.numbers, count.times))
 
 
-def receive_link(endpoint: str, pipe: Connection) -> None:
+def receive_link(endpoint: str, pipe: Connection, arrived: Any) -> None:
   """The receiver with this project's link."""
-  settings, count = sessions.LinkSettings(), _Count()
+  settings, count = sessions.LinkSettings(), _Count(arrived)
   limiter = RateLimiter(
     LimiterSettings(steps_per_update=1e9, min_replay_steps=10**9, trajectory_steps=STEPS - 1)
   )
@@ -87,9 +89,9 @@ def receive_link(endpoint: str, pipe: Connection) -> None:
   session.close()
 
 
-def receive_raw(endpoint: str, pipe: Connection) -> None:
+def receive_raw(endpoint: str, pipe: Connection, arrived: Any) -> None:
   """The receiver with a plain subscriber."""
-  count = _Count()
+  count = _Count(arrived)
   session = zenoh.open(_raw_config("peer", "listen", endpoint))
 
   def take(sample: zenoh.Sample) -> None:
@@ -135,7 +137,8 @@ def send_raw(endpoint: str, messages: int, half: Any) -> None:
   publisher = session.declare_publisher(
     "trajectory", congestion_control=zenoh.CongestionControl.BLOCK
   )
-  time.sleep(0.5)  # until the subscription is known
+  while not publisher.matching_status.matching:  # a put before that reaches nobody
+    time.sleep(0.01)
   for number in range(messages):
     if number == messages // 2:
       half()
@@ -145,12 +148,13 @@ def send_raw(endpoint: str, messages: int, half: Any) -> None:
 
 
 def run(name: str, messages: int, stall: float) -> dict[str, harness.Value]:
-  """Runs one of the two; rates are those before the stall."""
+  """Runs one of the two; rates are those of the first half, which has arrived when it stalls."""
   receive, send = {"zenoh": (receive_raw, send_raw), "link": (receive_link, send_link)}[name]
   endpoint = f"tcp/127.0.0.1:{free_port()}"
   context = multiprocessing.get_context("spawn")
   ours, theirs = context.Pipe()
-  receiver = context.Process(target=receive, args=(endpoint, theirs), daemon=True)
+  arrived = context.Value("q", 0)
+  receiver = context.Process(target=receive, args=(endpoint, theirs, arrived), daemon=True)
   receiver.start()
   assert ours.recv() == "ready"
   pid = receiver.pid or 0
@@ -159,6 +163,7 @@ def run(name: str, messages: int, stall: float) -> dict[str, harness.Value]:
 
   def half() -> None:
     nonlocal waker, stopped
+    _settle(arrived, messages // 2)
     if stall:
       stopped = time.monotonic()
       os.kill(pid, signal.SIGSTOP)
@@ -181,6 +186,15 @@ def run(name: str, messages: int, stall: float) -> dict[str, harness.Value]:
     "messages_per_s": rate,
     "mb_per_s": rate * size / 1e6,
   }
+
+
+def _settle(arrived: Any, expected: int) -> None:
+  """Waits until `expected` messages have arrived, or none came for a while."""
+  seen, since = -1, time.monotonic()
+  while arrived.value < expected and time.monotonic() - since < _QUIET:
+    if arrived.value != seen:
+      seen, since = arrived.value, time.monotonic()
+    time.sleep(0.01)
 
 
 def _wake(pid: int, seconds: float) -> None:
