@@ -66,6 +66,9 @@ class WalkerSettings:
   """And of its steering."""
   head_pan_limit: float | None = None
   """As the task's robot has it [rad]; None: the paper's table."""
+  entrained: bool = False
+  """Whether the gait's phase is a function of what was applied, as a student observes it, in place
+  of a clock (`suite.gaits.entrained`)."""
 
 
 def _steady() -> WalkerSettings:
@@ -136,7 +139,10 @@ def _ball() -> WalkerSettings:
   """The quick gait, pushing the ball; the head looks for the ball and follows it."""
   steering = SteeringSettings(head_tilt=_HEAD_TILT, watches_ball=True)
   return WalkerSettings(
-    gait=_quick().gait, steering=steering, head_pan_limit=constants.BALL_PUSHING_HEAD_PAN
+    gait=_quick().gait,
+    steering=steering,
+    head_pan_limit=constants.BALL_PUSHING_HEAD_PAN,
+    entrained=True,
   )
 
 
@@ -158,6 +164,7 @@ class WalkerTeacher:
       gait=settings.gait,
       steering=settings.steering,
       head_pan_limit=settings.head_pan_limit,
+      entrained=settings.entrained,
     )
     self._begun = False
 

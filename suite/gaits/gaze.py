@@ -2,7 +2,8 @@
 
 All that it does while the ball is out of view can be told from the head's own motion, so that a
 policy with the same sensors can learn it: a sweep goes on where the head moves, one of a head that
-rests goes to the farther side.
+rests goes to the farther side. The robot turns on the spot meanwhile, always to the left: if it
+stood, a policy that is unsure whether it sees the ball would stand, too, and find nothing.
 """
 
 import dataclasses
@@ -24,8 +25,9 @@ _REACHED = 0.1  # rad from that angle at which it does
 _LEAD = 0.4  # rad that a sweep's target is ahead of the head; chosen: some 2 rad/s
 _SWEEP_TILT = -0.3  # rad: from 0.4 m ahead to the walls
 _LOST = 2.0  # s without a view after which the head sweeps; chosen
-_RESTS = 0.01  # rad in a control step below which the head rests; chosen: a fifth of a sweep's
-_SWEEPS = 3  # turns of a sweep after which the robot turns, too: the ball is behind it
+_RESTS = (
+  0.0025  # rad in a control step below which the head rests; chosen: two of the encoder's steps
+)
 
 
 class View(NamedTuple):
@@ -64,35 +66,30 @@ class Gaze:
   def reset(self) -> None:
     """Begins an episode: nothing has been seen."""
     self._unseen = np.inf  # s since the ball was in view
-    self._pan: float | None = None  # rad, of the last control step
-    self._outward = 0.0  # side of the end that a sweep has turned back at: 1 left, 0 none
-    self._sweeps = 0
 
   @property
   def searches(self) -> bool:
     """Whether the ball's place is unknown."""
     return self._unseen > _LOST
 
-  def apply(self, command: Command, view: View, *, pan: float, tilt: float) -> Command:
-    """Returns a command with the head's part; a search stops the walk.
+  def apply(
+    self, command: Command, view: View, *, pan: float, tilt: float, moved: float
+  ) -> Command:
+    """Returns a command with the head's part; a search turns on the spot.
 
     Args:
       command: What the legs shall do where the ball's place is known.
       view: Where the ball is.
       pan: The head's pan now [rad].
       tilt: And its tilt [rad].
+      moved: By how much the pan has changed in the last control step [rad].
     """
     self._unseen = 0.0 if is_seen(view, pan=pan, tilt=tilt) else self._unseen + _TIMESTEP
-    moved, self._pan = 0.0 if self._pan is None else pan - self._pan, pan
     if not self.searches:
-      self._outward, self._sweeps = 0.0, 0
       bearing = float(np.clip(view.bearing, -_PAN, _PAN))
       return dataclasses.replace(command, head=(bearing, _LEAN - depression(view.distance)))
     side = 1.0 if pan > 0 else -1.0
     at_end = abs(pan) > _PAN - _REACHED
-    if at_end and side != self._outward:
-      self._outward, self._sweeps = side, self._sweeps + 1
     onward = np.sign(moved) if abs(moved) > _RESTS and not at_end else -side
     target = float(np.clip(pan + onward * _LEAD, -_PAN, _PAN))
-    behind = self._sweeps >= _SWEEPS
-    return Command(turn=float(behind), step=behind, head=(target, _SWEEP_TILT))
+    return Command(turn=1.0, head=(target, _SWEEP_TILT))

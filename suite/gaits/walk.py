@@ -97,6 +97,7 @@ class Gait:
       head_pan_limit: As the task's robot has it; see `suite.op3.constants.joint_limits`.
     """
     self.settings = settings or GaitSettings()
+    self._head_pan_limit = head_pan_limit
     lower, upper = constants.joint_limits(head_pan=head_pan_limit)
     self._middle, self._half_range = (lower + upper) / 2, (upper - lower) / 2
     self._standing = constants.standing_targets()
@@ -123,6 +124,12 @@ class Gait:
     """Phase of the gait [rad]; the left foot swings about pi / 2, the right about 3 pi / 2."""
     return self._phase
 
+  @property
+  def control(self) -> np.ndarray:
+    """Control signal [20], normalised, that the last action leads to, or that was applied since."""
+    assert self._filter.value is not None
+    return self._filter.value
+
   def act(
     self,
     command: Command,
@@ -141,7 +148,7 @@ class Gait:
     change = _TIMESTEP / settings.stop_time
     self._crouched = min(1.0, self._crouched + change)
     ready = self._crouched >= 1.0 and command.step
-    self._amplitude += float(np.clip(ready - self._amplitude, -change, change))
+    self._amplitude = self._next_amplitude(ready, change)
     self._forward += float(np.clip(command.forward - self._forward, -change, change))
     self._turn += float(np.clip(command.turn - self._turn, -change, change))
     if self._amplitude > 0:
@@ -150,6 +157,9 @@ class Gait:
       self._phase = 0.0
     self._head, self._feedback = command.head, (gyroscope, gravity)
     return self._invert(self._targets(self._phase, self._amplitude))
+
+  def _next_amplitude(self, ready: bool, change: float) -> float:
+    return self._amplitude + float(np.clip(ready - self._amplitude, -change, change))
 
   def follow(self, control: np.ndarray) -> None:
     """Sets the hidden state to a control that was applied in place of this gait's own.
@@ -162,9 +172,8 @@ class Gait:
     Args:
       control: Filtered control signal of the last control step [20], normalised.
     """
-    control = np.asarray(control, np.float64)
-    before, self._before = self._before, control
-    self._filter.reset(control)
+    before = self._before
+    control = self._set_filter(control)
     if self._amplitude < _LOCKABLE:
       return
 
@@ -187,6 +196,11 @@ class Gait:
     lower = self._amplitude - 2 * _TIMESTEP / self.settings.stop_time
     if mismatch(phase, lower) < present:
       self._amplitude = lower
+
+  def _set_filter(self, control: np.ndarray) -> np.ndarray:
+    self._before = np.asarray(control, np.float64)
+    self._filter.reset(self._before)
+    return self._before
 
   def _targets(self, phase: float, amplitude: float) -> np.ndarray:
     """Returns the position targets [20] that shall leave the action filter."""
@@ -251,8 +265,7 @@ class Gait:
 
   def _invert(self, targets: np.ndarray) -> np.ndarray:
     """Returns the action whose filtered value comes nearest to the targets."""
-    assert self._filter.value is not None
-    self._before = self._filter.value
+    self._before = self.control
     action = self._inverse(self._wanted(targets), self._before).astype(np.float32)
     self._filter(action)
     return action

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.suite.gaits.entrained import EntrainedGait
 from nerf2real.suite.gaits.gaze import Gaze, view_of
 from nerf2real.suite.gaits.planner import Planner
 from nerf2real.suite.gaits.pushing import Push, PushSettings
@@ -58,6 +59,7 @@ class Walker:
     gait: GaitSettings | None = None,
     steering: SteeringSettings | None = None,
     head_pan_limit: float | None = None,
+    entrained: bool = False,
   ):
     """Creates a walker.
 
@@ -66,9 +68,12 @@ class Walker:
       gait: Parameters of the gait.
       steering: Parameters of the steering.
       head_pan_limit: As the task's robot has it.
+      entrained: Whether the gait's phase follows the control signals that were applied instead of a
+        clock; then `follow` is to be called after every `act`.
     """
     self._planner = Planner(scene)
-    self._gait = Gait(gait, head_pan_limit=head_pan_limit)
+    kind = EntrainedGait if entrained else Gait
+    self._gait = kind(gait, head_pan_limit=head_pan_limit)
     self.steering = steering or SteeringSettings()
     self._gaze = Gaze()
     self._ball_push = Push(self._planner, self.steering.push)
@@ -118,9 +123,11 @@ class Walker:
     else:
       self._command = self._push(np.asarray(ball, np.float64)[:2], goal)
     if ball is not None and self.steering.watches_ball:
-      pan, tilt = observation["joint_positions"][-1][_HEAD]
+      before, (pan, tilt) = np.asarray(observation["joint_positions"])[-2:, _HEAD]
       view = view_of(self.pose, ball)
-      self._command = self._gaze.apply(self._command, view, pan=float(pan), tilt=float(tilt))
+      self._command = self._gaze.apply(
+        self._command, view, pan=float(pan), tilt=float(tilt), moved=float(pan - before[0])
+      )
     elif self.steering.head_tilt is not None:
       self._command = dataclasses.replace(self._command, head=(0.0, self.steering.head_tilt))
     self._time += _TIMESTEP

@@ -47,6 +47,19 @@ def relative_ball(
   return np.array([ahead, left, observation["joint_positions"][-1][_HEAD_PAN]])
 
 
+def believed_ball(relative: np.ndarray, pose: Pose) -> np.ndarray:
+  """Returns a ball [2] [m] as seen from a believed pose: its place from the robot, as pictures show
+  it, is true whatever the pose is.
+
+  Args:
+    relative: from `relative_ball` [3].
+    pose: the robot's, believed.
+  """
+  cosine, sine = np.cos(pose.yaw), np.sin(pose.yaw)
+  ahead, left = relative[:2]
+  return pose.xy + np.array([cosine * ahead - sine * left, sine * ahead + cosine * left])
+
+
 def likeliest_pose(policy: Policy, embedding: np.ndarray) -> Pose:
   """Returns the mean of the likeliest component of a student's belief."""
   logits, means, _ = policy.belief(embedding)
@@ -118,12 +131,14 @@ class EpisodeRunner:
       goal = np.asarray(observation["goal"], np.float64)
       truth = pose = pose_of(self._layout, flat)
       ball = ball_of(self._layout, flat)
+      relative = relative_ball(observation, truth, ball)
       student: np.ndarray | None = None
       if agent is not None:
         with self.times.stage("student"):
           student = np.clip(agent.act(flat), -1.0, 1.0)
           if by_belief and agent.policy.has_belief:
             pose = likeliest_pose(agent.policy, agent.embedding)
+            ball = None if relative is None else believed_ball(relative, pose)
       with self.times.stage("teacher"):
         if segment.left <= 0:
           segment = self._draw_segment(policy is not None, mixture)
@@ -140,7 +155,7 @@ class EpisodeRunner:
         "pose": np.array(truth),
         "goal_distance": float(np.linalg.norm(goal - truth.xy)),
         "driver": segment.driver,
-        "ball": relative_ball(observation, truth, ball),
+        "ball": relative,
         "action": action,
         "reward": float(timestep.reward or 0.0),
         "discount": 1.0 if timestep.discount is None else float(timestep.discount),

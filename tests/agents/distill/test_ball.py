@@ -44,6 +44,16 @@ def test_a_ball_from_the_robot_and_in_its_picture():
   assert episodes.relative_ball(observation, Pose(0.0, 0.0, 0.0), None) is None
 
 
+def test_a_ball_is_as_far_from_a_believed_pose_as_from_the_true_one():
+  observation = {"joint_positions": np.zeros((5, 20))}
+  ball, truth, belief = np.array([1.0, 3.0]), Pose(0.8, 1.0, 1.2), Pose(1.5, 0.4, -0.7)
+  relative = episodes.relative_ball(observation, truth, ball)
+  believed = episodes.believed_ball(relative, belief)
+  assert episodes.relative_ball(observation, belief, believed) == pytest.approx(relative)
+  assert np.hypot(*(believed - ball)) > 0.5
+  assert episodes.believed_ball(relative, truth) == pytest.approx(ball)
+
+
 def test_only_balls_in_view_count_for_a_picture():
   predicted = np.zeros((2, 2), np.float32)
   target = np.array([[1.0, 0.5], [9.0, 9.0]], np.float32)

@@ -27,58 +27,71 @@ def test_a_head_that_points_at_the_ball_sees_it_and_one_that_points_away_does_no
   assert not is_seen(ball, pan=0.7, tilt=tilt - 0.9)
 
 
-def _step(gaze, head, ball):
-  """Moves an ideal head a little towards its target, as in a control step."""
-  command = gaze.apply(WALK, view_of((0.0, 0.0, 0.0), ball), pan=head[0], tilt=head[1])
-  return command, head + np.clip(np.array(command.head) - head, -0.06, 0.06)
+def _step(gaze, heads, ball):
+  """Moves an ideal head a little towards its target, as in a control step.
+
+  Args:
+    heads: Pan and tilt of the last two steps [2, 2] [rad].
+  """
+  (pan, tilt), moved = heads[-1], heads[-1, 0] - heads[0, 0]
+  view = view_of((0.0, 0.0, 0.0), ball)
+  command = gaze.apply(WALK, view, pan=pan, tilt=tilt, moved=moved)
+  head = heads[-1] + np.clip(np.array(command.head) - heads[-1], -0.06, 0.06)
+  return command, np.vstack([heads[1:], head])
+
+
+def _heads(pan, tilt):
+  return np.tile([pan, tilt], (2, 1))
 
 
 @pytest.mark.parametrize("bearing", [0.0, 1.5, -1.5, 2.6, -2.6])
 def test_a_search_finds_the_ball_and_the_head_stays_on_it(bearing):
   ball = 1.2 * np.array([np.cos(bearing), np.sin(bearing)])
-  gaze, head, standing = Gaze(), np.array([0.0, -0.47]), 0
+  gaze, head, searching = Gaze(), _heads(0.0, -0.47), 0
   for _ in range(400):
     command, head = _step(gaze, head, ball)
     if gaze.searches:
-      assert not command.step and command.forward == 0
-      standing += 1
-  assert standing * 0.025 < 5.0 and not gaze.searches
+      assert command.turn == 1 and command.forward == 0
+      searching += 1
+  assert searching * 0.025 < 5.0 and not gaze.searches
   assert command == Command(forward=1.0, turn=0.2, head=command.head)
-  assert head[0] == pytest.approx(np.clip(bearing, -2.3, 2.3), abs=0.02)
-  assert head[1] == pytest.approx(0.08 - depression(1.2), abs=0.02)
+  assert head[-1, 0] == pytest.approx(np.clip(bearing, -2.3, 2.3), abs=0.02)
+  assert head[-1, 1] == pytest.approx(0.08 - depression(1.2), abs=0.02)
 
 
-def test_a_ball_behind_the_robot_makes_it_turn():
-  gaze, head = Gaze(), np.array([0.0, -0.3])
-  commands = []
+def test_a_ball_behind_the_robot_makes_it_turn_on_the_spot_all_the_time():
+  gaze, head = Gaze(), _heads(0.0, -0.3)
   for _ in range(400):
     command, head = _step(gaze, head, np.array([-1.0, 0.0]))
-    commands.append(command)
-  assert not commands[0].step
-  assert commands[-1].step and commands[-1].turn == 1.0 and commands[-1].forward == 0.0
+    assert command == Command(turn=1.0, head=command.head)
 
 
 @pytest.mark.parametrize("pan", [-1.4, 0.6])
-def test_the_sweep_of_a_head_that_rests_is_told_by_where_it_points(pan):
+def test_a_sweep_goes_on_where_the_head_moves_and_at_rest_to_the_farther_side(pan):
   behind = view_of((0.0, 0.0, 0.0), np.array([-1.0, 0.0]))
-  targets = []
-  for begin in (-0.5, 0.5):  # two heads that came from either side
-    gaze = Gaze()
-    for place in [*np.linspace(pan + begin, pan, 10), pan, pan]:
-      command = gaze.apply(WALK, behind, pan=place, tilt=-0.3)
-    targets.append(command.head[0])
-  assert targets[0] == targets[1] == pytest.approx(pan - 0.4 * np.sign(pan))
+  for moved, onward in ((0.02, 1), (-0.02, -1), (0.0, -np.sign(pan)), (0.002, -np.sign(pan))):
+    command = Gaze().apply(WALK, behind, pan=pan, tilt=-0.3, moved=moved)
+    assert command.head[0] == pytest.approx(pan + 0.4 * onward)
+
+
+def test_a_slow_sweep_goes_through_the_middle():
+  behind, pan, moved = view_of((0.0, 0.0, 0.0), np.array([-1.0, 0.0])), 0.5, 0.0
+  for _ in range(400):  # a head that does a hundredth of what it is told
+    command = Gaze().apply(WALK, behind, pan=pan, tilt=-0.3, moved=moved)
+    moved = 0.01 * (command.head[0] - pan)
+    pan += moved
+  assert pan < -0.8
 
 
 def test_a_ball_that_is_out_of_sight_for_a_moment_is_not_lost():
-  gaze, head = Gaze(), np.array([0.0, -0.2])
+  gaze, head = Gaze(), _heads(0.0, -0.2)
   _, head = _step(gaze, head, np.array([1.0, 0.0]))
   assert not gaze.searches
   aside = np.array([np.cos(1.2), np.sin(1.2)])
   for step in range(100):
-    command = gaze.apply(WALK, view_of((0.0, 0.0, 0.0), aside), pan=-0.5, tilt=-0.2)
+    command = gaze.apply(WALK, view_of((0.0, 0.0, 0.0), aside), pan=-0.5, tilt=-0.2, moved=0.0)
     assert gaze.searches == (step >= 80)  # 2 s
-  assert not command.step
+  assert command.forward == 0
   gaze.reset()
   assert gaze.searches
 
