@@ -5,11 +5,11 @@
 
 Learner, collectors and evaluator are supervised processes; those that die are replaced. Ctrl-C ends
 the run with its state saved; --resume goes on, also with more --minutes. Arguments that are not
-listed here go to the learner (see `launch/distill_learner.py --help`), such as --teacher steady, or
---init-from runs/walk/policy/newest to train a policy on.
+listed here go to the learner (see `launch/distill_learner.py --help`).
 """
 
 import dataclasses
+import itertools
 import sys
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from nerf2real.agents.supervision import training
 from nerf2real.launch import command
 from nerf2real.launch.local_distributed import supervised
 
+_OF_LEARNER = ("teacher", "init_from", "minutes")  # arguments that are the learner's alone
 _HERE = Path(__file__).resolve().parent
 SCRIPTS = training.Scripts(
   learner=_HERE / "distill_learner.py", actor=_HERE / "distill_collector.py"
@@ -36,6 +37,13 @@ class Arguments(training.TrainingSettings):
   preset: str | None = None
   """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push, adapt to train a policy on
   (with --init-from), or tiny to try the machinery; "nerf_nav" if not given."""
+  teacher: str | None = None
+  """quick, swift, steady, ball, a walker's settings as JSON, or an exported policy's folder; the
+  preset's if not given."""
+  init_from: Path | None = None
+  """Folder of an exported policy that the student begins with; its networks are taken along."""
+  minutes: float | None = None
+  """Training time over all parts of the run [min]; 60 if not given."""
 
 
 def run(arguments: Arguments, forwarded: list[str]) -> None:
@@ -44,7 +52,9 @@ def run(arguments: Arguments, forwarded: list[str]) -> None:
   Raises:
     CommandError: The run cannot start, or it failed.
   """
-  supervised(training.train, arguments, SCRIPTS, forwarded)
+  given = {name: getattr(arguments, name) for name in _OF_LEARNER}
+  own = [(f"--{n.replace('_', '-')}", str(v)) for n, v in given.items() if v is not None]
+  supervised(training.train, arguments, SCRIPTS, [*itertools.chain(*own), *forwarded])
 
 
 def main() -> int:

@@ -37,7 +37,8 @@ class Arguments:
   env: str | None = None
   """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
   teacher: str | None = None
-  """quick, swift, steady, ball, or the folder of an exported policy; the preset's if not given."""
+  """quick, swift, steady, ball, a walker's settings as JSON, or an exported policy's folder; the
+  preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
   max_env_steps: int | None = None
