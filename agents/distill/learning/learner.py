@@ -37,7 +37,8 @@ _log = logging.getLogger(__name__)
 POLICY = Path("policy") / "newest"
 _WAIT = 0.5  # s between looks for the first frames
 _SLACK = 10_000  # frames that collectors may be on the way with when the run has all
-_VALIDATION_PERIOD = 120.0  # s
+_VALIDATION_PERIOD = 120.0  # s, at least
+_VALIDATION_REST = 10.0  # times as long as a validation took, at least, until the next
 
 
 class Learner:
@@ -108,6 +109,7 @@ class Learner:
     self._log = MetricsLog(run, tensorboard=False)
     self._stop = threading.Event()
     self._periods = Periods()
+    self._validation_period = _VALIDATION_PERIOD
     self._evaluation: dict[str, Any] = {}  # the last one
     self._is_fit = bool(settings.init_from)  # whether encoder and policy belong together now
     self._compiled: set[str] = set()  # kinds of stages whose update was called
@@ -228,9 +230,12 @@ class Learner:
       self._write("learner", values | figures | self._times.take(len(self._recent)))
       self._set_status()
       self._recent.clear()
-    if self._periods.due("validate", _VALIDATION_PERIOD):
+    if self._periods.due("validate", self._validation_period):
+      begin = time.monotonic()
       with self._times.stage("validation"):
         found = self._trainer.validate()
+      taken = time.monotonic() - begin
+      self._validation_period = max(_VALIDATION_PERIOD, _VALIDATION_REST * taken)
       self._write("validation", found)
 
   def _check_link(self) -> None:
