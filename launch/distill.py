@@ -17,7 +17,12 @@ from nerf2real.agents.supervision import training
 from nerf2real.launch import command
 from nerf2real.launch.local_distributed import supervised
 
-_OF_LEARNER = ("teacher", "init_from", "minutes")  # arguments that are the learner's alone
+_OF_LEARNER = (
+  "teacher",
+  "init_from",
+  "relabel",
+  "minutes",
+)  # arguments that are the learner's alone
 _HERE = Path(__file__).resolve().parent
 SCRIPTS = training.Scripts(
   learner=_HERE / "distill_learner.py", actor=_HERE / "distill_collector.py"
@@ -42,6 +47,9 @@ class Arguments(training.TrainingSettings):
   preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
+  relabel: Path | None = None
+  """Folder `data` of an earlier run: a new run begins with its episodes, labelled by the teacher of
+  now."""
   minutes: float | None = None
   """Training time over all parts of the run [min]; 60 if not given."""
 

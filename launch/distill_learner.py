@@ -41,6 +41,9 @@ class Arguments:
   preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
+  relabel: Path | None = None
+  """Folder `data` of an earlier run in such an environment: a new run begins with its episodes,
+  labelled by the teacher of now."""
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   minutes: float = 60.0
@@ -93,11 +96,16 @@ def run(arguments: Arguments) -> None:
 
 
 def _distil(arguments: Arguments) -> None:
+  from nerf2real.agents.distill.learning.checkpoint import STATE
   from nerf2real.agents.distill.learning.learner import Learner
+  from nerf2real.agents.distill.relabelling import relabel_for
 
   try:
+    settings = settings_of(arguments)
+    if arguments.relabel is not None and not (arguments.run / STATE).exists():
+      relabel_for(settings, arguments.relabel, arguments.run / "data", seed=arguments.seed)
     learner = Learner(
-      settings_of(arguments),
+      settings,
       arguments.run,
       endpoint=arguments.listen,
       link=arguments.link,
