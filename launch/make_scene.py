@@ -19,8 +19,8 @@ from nerf2real.launch import command
 
 if TYPE_CHECKING:
   from nerf2real.scenes.bundle import Bundle
-  from nerf2real.scenes.results import Watcher
   from nerf2real.scenes.settings import SceneSettings
+  from nerf2real.scenes.stages.results import Watcher
 
 FILM_AGAIN = 3  # exit status of --check
 
@@ -117,7 +117,7 @@ def _watched(arguments: Arguments) -> Iterator["Watcher | None"]:
   if not arguments.viewer:
     yield None
     return
-  from nerf2real.scenes.training_viewer import TrainingViewer
+  from nerf2real.scenes.viewing.training_viewer import TrainingViewer
 
   viewer = TrainingViewer(host=arguments.host, port=arguments.port)
   print(f"watch it grow: {viewer.address}")

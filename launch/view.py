@@ -62,7 +62,7 @@ def run(arguments: Arguments) -> None:
   else:
     from nerf2real.scenes.bundle import Bundle
     from nerf2real.scenes.export.splats.splats import Splats
-    from nerf2real.scenes.viewer import view_bundle
+    from nerf2real.scenes.viewing.bundle_viewer import view_bundle
 
     splats = None if arguments.splats is None else Splats.load_ply(arguments.splats)
     server = view_bundle(Bundle.load(arguments.bundle), host=host, port=port, splats=splats)

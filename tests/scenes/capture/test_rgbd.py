@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
-from nerf2real.scenes import image_stages
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import Floor
@@ -23,7 +22,8 @@ from nerf2real.scenes.capture.capture import (
 )
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.poses import localise
-from nerf2real.scenes.stages import Made, StageResult, Stages
+from nerf2real.scenes.stages import radiance_field
+from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from tests.scenes import synthetic_capture as synthetic
 
 SETTINGS = CaptureSettings(num_keyframes=8)
@@ -172,7 +172,7 @@ def test_measured_depth_stands_for_the_fields(tum, tmp_path):
 
   field = SimpleNamespace(renderer=SimpleNamespace(render=render))
   cache = Stages(tmp_path / "stages", show_progress=False)
-  views = image_stages.depth(cache, made(field), made(capture), made(found), width=80).value
+  views = radiance_field.depth(cache, made(field), made(capture), made(found), width=80).value
   measured = views.depth != 9.0
   assert not measured[0, :30].any() and measured[1:].mean() > 0.9
   rays = views.camera.rays()

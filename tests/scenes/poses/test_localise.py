@@ -14,7 +14,8 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
 from nerf2real.scenes.poses import localise as localise_module
 from nerf2real.scenes.poses import mapping, matching
-from nerf2real.scenes.poses.localise import LocalisationError, LocaliseSettings, load, localise
+from nerf2real.scenes.poses.localisation import LocalisationError, load
+from nerf2real.scenes.poses.localise import LocaliseSettings, localise
 from nerf2real.scenes.poses.matching import FeatureSettings
 from nerf2real.scenes.poses.unit_frame import mean_up
 from tests.scenes import synthetic_capture as synthetic

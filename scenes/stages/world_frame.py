@@ -15,8 +15,8 @@ from nerf2real.scenes.alignment.floor import FloorError
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.geometry import fusion
-from nerf2real.scenes.poses.localise import Localisation
-from nerf2real.scenes.stages import Made, Stages
+from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.stages.cache import Made, Stages
 
 _OUTLOOK_VERSION = 3  # 2: no floor is warned of; 3: markers' corners without rolling shutter
 _WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before

@@ -5,10 +5,10 @@ import types
 import numpy as np
 import pytest
 
-from nerf2real.scenes import world_stages
 from nerf2real.scenes.alignment import overrides, world_frame
 from nerf2real.scenes.settings import SceneSettings
-from nerf2real.scenes.stages import Made, Stages
+from nerf2real.scenes.stages import world_frame as world_frame_stages
+from nerf2real.scenes.stages.cache import Made, Stages
 from tests.scenes import furnished_room
 
 
@@ -27,7 +27,7 @@ def _floor(rng, height=0.0):
 
 
 def _outlook(tmp_path, points, **changes) -> Made:
-  return world_stages.outlook(
+  return world_frame_stages.outlook(
     Stages(tmp_path / ".stages", show_progress=False),
     types.SimpleNamespace(value=types.SimpleNamespace(known=None)),
     _poses(points),
@@ -42,7 +42,7 @@ def _outlook(tmp_path, points, **changes) -> Made:
 def test_a_room_with_a_floor_passes_and_is_done_once(tmp_path):
   points = _floor(np.random.default_rng(0))
   made = _outlook(tmp_path, points, camera_height=1.4)
-  assert made.value == world_stages.Outlook(None) and not made.stage.cached
+  assert made.value == world_frame_stages.Outlook(None) and not made.stage.cached
   assert _outlook(tmp_path, points, camera_height=1.4).stage.cached
 
 
