@@ -1,4 +1,4 @@
-"""Any policy as the driver of an environment that is shown: viewers, films."""
+"""Chooses the driver of an environment that is shown (viewer, film) by a policy's name."""
 
 from collections.abc import Mapping
 from pathlib import Path

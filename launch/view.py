@@ -46,8 +46,8 @@ def run(arguments: Arguments) -> None:
   wait: Callable[[], object] = never.wait
   if arguments.task is not None:
     from nerf2real.evaluation.driving import choose_driver
-    from nerf2real.suite.viewer.task_viewer import view_task
     from nerf2real.suite.views.drivers import SCRIPTED
+    from nerf2real.suite.views.task_viewer import view_task
 
     chosen = choose_driver(arguments.policy, task=arguments.task)
     viewer = view_task(

@@ -9,7 +9,7 @@ from pathlib import Path
 from nerf2real.core import files
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.scenes import assembly, bundle
-from nerf2real.scenes.alignment import overrides, surroundings
+from nerf2real.scenes.alignment import overrides, room_check
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import geometry, judging, localising, radiance_field, world_frame
@@ -84,7 +84,7 @@ def _run_stages(
   if watcher is not None:
     watcher.poses(poses.value)
   if override.floor_points is None:
-    surroundings.require_room(poses.value.world_from_camera, poses.value.points)
+    room_check.require_room(poses.value.world_from_camera, poses.value.points)
   outlook = world_frame.outlook(
     cache,
     capture,

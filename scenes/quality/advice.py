@@ -13,7 +13,7 @@ import numpy as np
 
 from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
-from nerf2real.scenes.alignment import surroundings, world_frame
+from nerf2real.scenes.alignment import room_check, world_frame
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.poses.localisation import Localisation
@@ -215,7 +215,7 @@ def judge(
     return Verdict([Finding("poses", False, reason), *findings])
   findings += judge_poses(capture, poses)
   try:
-    surroundings.require_room(poses.world_from_camera, poses.points)
+    room_check.require_room(poses.world_from_camera, poses.points)
     frame = world_frame.align(Evidence(poses.points, poses.world_from_camera), settings=align)
   except ValueError as error:
     return Verdict([*findings, Finding("floor", False, str(error))])

@@ -9,7 +9,7 @@ from pathlib import Path
 from nerf2real.core.progress import Progress
 from nerf2real.scenes.capture import keyframes as keyframe_files
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, read_capture
-from nerf2real.scenes.poses import localisation, localise
+from nerf2real.scenes.poses import localisation, structure_from_motion
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Source
@@ -29,7 +29,7 @@ def keyframes(cache: Stages, source: Source, settings: CaptureSettings) -> Made[
 
 
 def poses(
-  cache: Stages, capture: Made[Capture], settings: localise.LocaliseSettings
+  cache: Stages, capture: Made[Capture], settings: structure_from_motion.LocaliseSettings
 ) -> Made[Localisation]:
   """Estimates the camera, its poses and sparse points by structure from motion."""
 
@@ -38,7 +38,7 @@ def poses(
     times = None
     if taken.times is not None:
       times = dict(zip([path.name for path in taken.images], taken.times.tolist(), strict=True))
-    localise.localise(
+    structure_from_motion.localise(
       taken.folder, folder, settings=settings, known=taken.known, times=times, progress=progress
     )
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large

@@ -1,4 +1,4 @@
-"""Reads the keyframes with their poses, for training and scoring."""
+"""Reads the localised keyframes at training size, with exposures, known points and split."""
 
 import dataclasses
 
