@@ -133,11 +133,8 @@ def _copy_files(results: SceneResults, out: Path) -> None:
 
 def _figures(results: SceneResults) -> dict[str, Any]:
   capture, poses, alignment = results.capture.value, results.poses.value, results.world.value
-  quality, contact, error = (
-    results.figures.value,
-    results.contact.value,
-    results.errors.value.distances,
-  )
+  quality, contact = results.figures.value, results.contact.value
+  error = results.errors.value.distances
   return {
     "keyframes": len(capture.images),
     "registered_fraction": poses.registered_fraction,

@@ -15,7 +15,7 @@ from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import geometry, judging, localising, radiance_field, world_frame
 from nerf2real.scenes.stages.cache import Stages
 from nerf2real.scenes.stages.pictures import PosedPictures
-from nerf2real.scenes.stages.results import Measure, SceneResults, Source, Watcher
+from nerf2real.scenes.stages.results import Given, Measure, SceneResults, Source, Watcher
 
 STAGES = bundle.STAGES
 
@@ -59,8 +59,7 @@ def make_scene(
       out,
       Stages(out / STAGES, show_progress=show_progress),
       settings=settings,
-      override=fixed,
-      override_key=files.hash_path(override) if override else "",
+      given=Given(fixed, files.hash_path(override) if override else "", settings.marker_side),
       name=name or out.name,
       measure=measure,
       watcher=watcher,
@@ -73,8 +72,7 @@ def _run_stages(
   cache: Stages,
   *,
   settings: SceneSettings,
-  override: overrides.Overrides,
-  override_key: str,
+  given: Given,
   name: str,
   measure: Measure | None,
   watcher: Watcher | None,
@@ -83,34 +81,17 @@ def _run_stages(
   poses = localising.poses(cache, capture, settings.localise)
   if watcher is not None:
     watcher.poses(poses.value)
-  if override.floor_points is None:
+  if given.override.floor_points is None:
     room_check.require_room(poses.value.world_from_camera, poses.value.points)
   outlook = world_frame.outlook(
-    cache,
-    capture,
-    poses,
-    settings.align,
-    voxel=settings.mesh.voxel,
-    marker_side=settings.marker_side,
-    override=override,
-    override_key=override_key,
+    cache, capture, poses, settings.align, given, voxel=settings.mesh.voxel
   )
   pictures = PosedPictures(capture, poses, settings.train_width, settings.held_out_every)
   show = None if watcher is None else watcher.field
   field = radiance_field.field(cache, pictures, settings.train, show=show)
   depth = radiance_field.depth(cache, field, capture, poses, width=settings.depth_width)
   figures = judging.figures(cache, field, pictures)
-  world = world_frame.world(
-    cache,
-    capture,
-    poses,
-    outlook,
-    depth,
-    settings.align,
-    marker_side=settings.marker_side,
-    override=override,
-    override_key=override_key,
-  )
+  world = world_frame.world(cache, capture, poses, outlook, depth, settings.align, given)
   rendered = depth.value.transformed(world.value.world_from_unit)
   metric_depth = geometry.floor(cache, world, rendered, pictures, settings.collision)
   surface = geometry.surface(cache, world, metric_depth, settings.mesh)

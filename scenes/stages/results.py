@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field.field import Field
@@ -29,6 +30,14 @@ class Source(NamedTuple):
 
   path: Path
   sha256: str
+
+
+class Given(NamedTuple):
+  """What a person gave for the world frame."""
+
+  override: Overrides
+  override_key: str  # hash of the file of overrides
+  marker_side: float | None  # of the black square of a marker in the room [m]
 
 
 class Watcher(Protocol):

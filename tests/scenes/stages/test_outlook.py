@@ -9,6 +9,7 @@ from nerf2real.scenes.alignment import overrides, world_frame
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages import world_frame as world_frame_stages
 from nerf2real.scenes.stages.cache import Made, Stages
+from nerf2real.scenes.stages.results import Given
 from tests.scenes import furnished_room
 
 
@@ -32,10 +33,8 @@ def _outlook(tmp_path, points, **changes) -> Made:
     types.SimpleNamespace(value=types.SimpleNamespace(known=None)),
     _poses(points),
     world_frame.AlignSettings(**changes),
+    Given(overrides.Overrides(), "", None),
     voxel=0.02,
-    marker_side=None,
-    override=overrides.Overrides(),
-    override_key="",
   )
 
 
