@@ -45,7 +45,7 @@ def run(arguments: Arguments) -> None:
   never = threading.Event()
   wait: Callable[[], object] = never.wait
   if arguments.task is not None:
-    from nerf2real.evaluation.driving import choose_driver
+    from nerf2real.evaluation.policies.driving import choose_driver
     from nerf2real.suite.views.drivers import SCRIPTED
     from nerf2real.suite.views.task_viewer import view_task
 

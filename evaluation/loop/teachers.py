@@ -20,7 +20,7 @@ from nerf2real.evaluation import runner
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.plant import Plant, Trial
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
-from nerf2real.evaluation.policies import GaitPolicy
+from nerf2real.evaluation.policies.policy import GaitPolicy
 from nerf2real.evaluation.session import choose
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite.gaits.evolution import Evolution

@@ -12,7 +12,7 @@ from nerf2real.evaluation.plants import making, operated, perturbations
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
-from nerf2real.evaluation.policies import GaitPolicy
+from nerf2real.evaluation.policies.policy import GaitPolicy
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
