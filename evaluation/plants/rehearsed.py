@@ -22,7 +22,7 @@ from nerf2real.suite.protocols import BALL, NavigationTrial
 
 
 class CoveredCamera:
-  """A camera that somebody may cover with a hand."""
+  """A camera that can be covered: the paper's blocked camera."""
 
   def __init__(self, camera: Any):
     self._camera = camera

@@ -96,7 +96,7 @@ class Limiter:
 
 
 class Monitor:
-  """Decides when the torque must be off. Times are the loop's clock [s]."""
+  """Safety limits on readings, pictures and actions: a stop for each violation. Times [s]: loop's."""
 
   def __init__(self, settings: SafetySettings, *, camera: bool):
     """Starts unarmed.

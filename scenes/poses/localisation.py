@@ -109,6 +109,7 @@ def poses_of(images: list[pycolmap.Image]) -> np.ndarray:
 
 
 def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Localisation:
+  """Returns the camera, poses, points and tracks of a COLMAP model, with the figures given."""
   images = mapping.registered(model)
   points = list(model.points3D.values())
   return Localisation(

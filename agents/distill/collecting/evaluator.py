@@ -1,4 +1,4 @@
-"""The evaluator of a distillation: success of the student alone, on trials that nobody reports.
+"""The evaluator of a distillation: success rate of the student alone, on trials kept for it.
 
 Its trials are those of the protocol with the robot turned half way between the protocol's headings
 and with other draws; what is published is measured on the protocol itself (`launch/evaluate.py`).
