@@ -96,7 +96,7 @@ class Limiter:
 
 
 class Monitor:
-  """Safety limits on readings, pictures and actions: a stop for each violation. Times [s]: loop's."""
+  """Safety limits on readings, pictures and actions; times are the loop's clock [s]."""
 
   def __init__(self, settings: SafetySettings, *, camera: bool):
     """Starts unarmed.
