@@ -19,8 +19,11 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.selection import rivals
 from nerf2real.sysid.selection.elaboration import elaborated
-from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear
+from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear
+from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import Explanation, conclude
 from nerf2real.sysid.selection.remainder import grown, scatter, structured
 from nerf2real.sysid.selection.subject import Subject, following
@@ -31,6 +34,9 @@ Array = np.ndarray
 
 _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
+_REST = 0.1
+"""Of the squares that all joints leave: less is left to joints that are not elaborated, chosen (5 %
+of the error)."""
 
 
 @dataclasses.dataclass
@@ -133,7 +139,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
   if leaves(subject, explainer.null, settings):
-    ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
+    ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
@@ -159,9 +165,6 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     settings,
   )
   off = _constants_off(subject, found.best, settings)
-  near = []
-  if verdict in ("partly", "unexplained") and not now.follows:
-    near = elaborated(explainer, found.best, named)
   return Changed(
     subject,
     ranked,
@@ -171,8 +174,23 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
     off,
-    near,
   )
+
+
+def elaborate(found: Sequence[Changed]) -> None:
+  """Adds fits with richer friction where more remains than names explain.
+
+  They make predictions better by what is left. Joints come in the order of that, until all others
+  together leave no more than a tenth of the squares.
+  """
+  left = sorted(found, key=lambda c: -c.left)
+  most = np.cumsum([c.left**2 for c in left])
+  before = np.append(0.0, most[:-1])
+  for item, sum_before in zip(left, before, strict=True):
+    if sum_before > (1.0 - _REST) * most[-1]:
+      break
+    if item.verdict in ("partly", "unexplained") and not item.likelihood.follows:
+      item.elaborated = elaborated(item.subject.explainer, item.found.best, item.named)
 
 
 def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
@@ -206,12 +224,13 @@ def _supported(
   """
   kept = []
   for kind in named:
-    without = explainer.lacking(best, kind)
+    without = rivals.lacking(explainer, best, kind)
     if kind in VARIABLE:
-      rival = explainer.with_force(without, VARIABLE[kind])
+      rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond
     else:
-      stands = clear(explainer.with_force(best), explainer.with_force(without)) > beyond
+      forced = (rivals.with_force(explainer, s) for s in (best, without))
+      stands = clear(*forced) > beyond
     if stands:
       kept.append(kind)
   return tuple(kept)

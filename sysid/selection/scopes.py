@@ -18,7 +18,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import wide
 from nerf2real.sysid.selection.changes import Changed, leaves
-from nerf2real.sysid.selection.explain import Scored
+from nerf2real.sysid.selection.evidence import Scored
 from nerf2real.sysid.selection.naming import USUAL
 from nerf2real.sysid.selection.subject import Subject
 from nerf2real.sysid.selection.wide import Evidence, Wide
@@ -110,8 +110,7 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
   clear = min(mine.clear, *((mine - r).clear for r in rivals))
   joints = [m.now for m in best.members]
-  spread = intervals.covariance(best.fit, joints, systematic=intervals.SYSTEMATIC)
-  reach = intervals.reaches(best.fit, spread, (0, len(best.x)))
+  reach = intervals.reaches(best.fit, intervals.spread(best.fit, joints), (0, len(best.x)))
   nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
   if clear < beyond or nothing or not _is_new(best, beyond):
     return None

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from nerf2real.sysid.fit import rough
 from nerf2real.sysid.fit.layout import CLOCKS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
@@ -18,7 +19,7 @@ from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.point_mass import carrying
-from nerf2real.sysid.selection.explain import Scored, variance
+from nerf2real.sysid.selection.evidence import Scored, variance
 from nerf2real.sysid.selection.subject import WHOLE, Subject
 
 Array = np.ndarray
@@ -132,7 +133,7 @@ def fitted(item: Wide) -> Wide:
   fitter = Fitter([m.now for m in item.members], item.fit.layout)
   fit = fitter.fit(item.fit, iterations=_ENOUGH)
   if _late(item.term):
-    fit = fitter.look_about(fit, ("delay",), iterations=_ENOUGH)
+    fit = rough.look_about(fitter, fit, ("delay",), iterations=_ENOUGH)
   return dataclasses.replace(item, fit=fitter.leave_out(fit))
 
 
