@@ -176,13 +176,14 @@ class Fitter:
 
   def _stepped(self, fit: Fit, quick: bool) -> Fit | None:
     """Returns a fit after the step that gains most; None where none gains."""
-    steps = np.array([self._step(fit, *d) for d in _DAMPINGS])
-    by = steps[0] - fit.x
-    possible = -float(fit.slope @ by + 0.5 * by @ fit.precision @ by)
+    possible = self.promised(fit)
     if possible < _CONVERGED:
       return None
+    steps = np.array([self._step(fit, *d) for d in _DAMPINGS])
     gained, found = _CONVERGED, None
-    for tried in (steps[:_FIRST],) if quick else (steps[:_FIRST], steps[_FIRST:]):
+    for tried in (steps[:_FIRST], steps[_FIRST:]):
+      if quick and found is not None:
+        break
       costs, rows = self.simulated(tried)
       k = int(np.argmin(costs))
       if fit.cost - costs[k] > gained:
@@ -192,6 +193,11 @@ class Fitter:
     if found is None:
       return None
     return self.weighed(*found, self._carried(fit, *found), None)
+
+  def promised(self, fit: Fit) -> float:
+    """Returns the nats that a full step from a fit gains by its own linearisation."""
+    by = self._step(fit, *_DAMPINGS[0]) - fit.x
+    return -float(fit.slope @ by + 0.5 * by @ fit.precision @ by)
 
   def _carried(self, fit: Fit, x: Array, residuals: list[Array]) -> list[Array]:
     """Returns the Jacobian that also tells what a step from a fit has changed (Broyden 1965)."""

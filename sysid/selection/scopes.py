@@ -91,15 +91,15 @@ def shared_effects(
 def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   """Returns the best of the screened effects if it is clear of all that lack it."""
   forms: dict[tuple[str, str | None], Wide] = {}
-  for item in sorted(tried, key=lambda w: -w.evidence().total):
+  for item in sorted(tried, key=lambda w: -w.possible().total):
     forms.setdefault(item.key, item)
   if not forms:
     return None
   beyond = max(m.beyond for item in forms.values() for m in item.members)
   top, *others = forms.values()
-  if top.evidence().clear < beyond:
+  if top.possible().clear < beyond:
     return None
-  near = [w for w in others if (top.evidence() - w.evidence()).clear < beyond]
+  near = [w for w in others if (top.evidence() - w.possible()).clear < beyond]
   top = wide.adopted(wide.fitted(top), [m for w in near for m in w.members])
   items = sorted([top, *map(wide.fitted, near)], key=lambda w: -w.evidence().total)
   alike = [w for w in items if wide.same(items[0], w)]

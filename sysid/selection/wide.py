@@ -1,8 +1,8 @@
 """Hypotheses of a body or of the whole machine, fitted to all joints that they concern.
 
 Every hypothesis is screened over all its joints: from where its values and the joints' constants
-cost least, two Gauss-Newton steps of the shared values with the constants following. What the best
-of them is not clearly better than is fitted to the end. Shapes: B blocks, n shared values.
+cost least, two rounds of Gauss-Newton steps of the shared values with the constants following. What
+the best of them is not clearly better than, with what its next step promises, is fitted to the end. Shapes: B blocks, n shared values.
 """
 
 import dataclasses
@@ -55,6 +55,12 @@ class Wide:
   def evidence(self) -> "Evidence":
     """Returns the gain over the joints without it."""
     return _evidence(self.members, self.fit)
+
+  def possible(self) -> "Evidence":
+    """Returns the gain with what a further step promises: screened effects have not settled."""
+    promised = Fitter([m.now for m in self.members], self.fit.layout).promised(self.fit)
+    found = self.evidence()
+    return dataclasses.replace(found, prior=found.prior - promised)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +120,8 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
 
 
 def screened(term: Term, members: Sequence[Subject]) -> Wide:
-  """Returns an effect after two steps from its best start, constants' derivatives taken over."""
+  """Returns an effect after two rounds of steps from its best start, the constants' derivatives
+  taken over."""
   layout = Layout([m.explainer.null.terms for m in members], [term])
   joints = [m.now for m in members]
   begin = _begin(term, members)
@@ -124,7 +131,7 @@ def screened(term: Term, members: Sequence[Subject]) -> Wide:
     jacobian = m.explainer.null.fit.jacobian[0]
     known.append(np.concatenate([jacobian, np.zeros((count, *jacobian.shape[1:]))]))
   fresh = np.arange(layout.count) < count
-  fit = Fitter(joints, layout).fit(begin, iterations=2, known=known, fresh=fresh, quick=True)
+  fit = Fitter(joints, layout).fit(begin, iterations=2, known=known, fresh=fresh)
   return Wide(term, tuple(members), fit)
 
 
