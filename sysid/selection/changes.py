@@ -54,6 +54,8 @@ class Changed:
   """What the machine leaves anyway in the median block, rad (m)."""
   left: float
   """The same of the logs, under the best hypothesis."""
+  more_remains: bool
+  """Whether that is more than the machine leaves anyway, by the limit of what counts as more."""
   constants_off: bool
   """Whether declared constants are off by more than machines of one kind differ."""
   elaborated: list[Scored] = dataclasses.field(default_factory=list)
@@ -138,7 +140,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
-  if leaves(subject, explainer.null, settings):
+  if _may_leave(subject, explainer.null, settings):
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
@@ -152,17 +154,16 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   if now.follows:
     anyway = max(anyway, scatter(now, found.best))
   left = float(np.median(found.left))
-  over = float(np.sqrt(left / max(anyway, 1e-300)))
-  if named and over > settings.more:
+  more = left > settings.more**2 * anyway
+  if named and more:
     named = _supported(explainer, found.best, named, subject.beyond)
     ranked = explainer.ranked()
   verdict = _verdict(
     found,
     named,
     any(t.wider for t in known),
-    leaves(subject, found.best, settings),
-    over,
-    settings,
+    more or leaves(subject, found.best, settings),
+    more,
   )
   off = _constants_off(subject, found.best, settings)
   return Changed(
@@ -173,6 +174,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     "effects" if off and verdict == "none" else verdict,
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
+    more,
     off,
   )
 
@@ -250,6 +252,14 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   return left > settings.more * subject.now.position_noise
 
 
+def _may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
+  """Tells whether a hypothesis may leave more than the machine does anyway: effects are tried then,
+  and names must be clear by themselves."""
+  if subject.usual is not None and not subject.paired:
+    return grown(item, subject.usual, settings.suspected, settings)
+  return leaves(subject, item, settings)
+
+
 def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
   """Tells whether an effect's sizes differ from those that do nothing, by their intervals.
 
@@ -287,8 +297,7 @@ def _verdict(
   named: Sequence[str],
   shared: bool,
   remains: bool,
-  over: float,
-  settings: Settings,
+  more: bool,
 ) -> str:
   """Returns the graded verdict of a joint.
 
@@ -296,12 +305,11 @@ def _verdict(
     found: the best hypothesis.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
-    remains: whether more remains than the machine leaves anyway.
-    over: what the median block leaves, over what the machine leaves anyway.
-    settings: limits.
+    remains: whether more is left than the machine leaves anyway, by a test or by that limit.
+    more: whether it is by the limit.
   """
   if not named and not shared:
     return "unexplained" if remains or found.best.names else "none"
   if not named and not remains:
     return "none"
-  return "effects" if over <= settings.more else "partly"
+  return "partly" if more else "effects"

@@ -66,6 +66,14 @@ def with_force(explainer: Explainer, parent: Scored, along: str | None = None) -
   return explainer.score(terms, fitter.fit(fitter.linearise(fit.x, _PUSH), iterations=2))
 
 
+def beside(explainer: Explainer, parent: Scored) -> Scored:
+  """Returns a hypothesis with a force of any form, which is not kept among those of the joint."""
+  kept = dict(explainer.scored)
+  found = with_force(explainer, parent)
+  explainer.scored = kept
+  return found
+
+
 def beside_force(explainer: Explainer, best: Scored) -> None:
   """Scores a force of any form alone and beside the best set of effects, and the scale anew."""
   parents = {id(i): i for i in (explainer.null, best)}.values()

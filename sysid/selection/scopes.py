@@ -16,7 +16,7 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection import wide
+from nerf2real.sysid.selection import rivals, wide
 from nerf2real.sysid.selection.changes import Changed, leaves
 from nerf2real.sysid.selection.evidence import Scored
 from nerf2real.sysid.selection.naming import USUAL
@@ -145,7 +145,9 @@ def _is_new(item: Wide, beyond: float) -> bool:
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
   """Returns the shared effects without which the joints' explanations do about as well.
 
-  What joints have of their own may look like one effect of all of them.
+  What joints have of their own may look like one effect of all of them. Where more remains at a
+  joint than the machine leaves anyway, both have a force of any form beside them there: what is
+  named may be a part of what remains.
 
   Args:
     found: the shared effects.
@@ -157,6 +159,8 @@ def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared
     for item in (c for c in changed if c.subject in shared.members):
       best = item.found.best
       without = wide.without(item.subject, best, shared.held)
+      if item.more_remains:
+        best, without = (rivals.beside(item.subject.explainer, s) for s in (best, without))
       rows[item.joint], prior = best.nats - without.nats, prior + best.prior - without.prior
     if Evidence(rows, prior).clear < shared.origin.beyond:
       result.append(shared)

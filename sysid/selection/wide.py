@@ -2,7 +2,8 @@
 
 Every hypothesis is screened over all its joints: from where its values and the joints' constants
 cost least, two rounds of Gauss-Newton steps of the shared values with the constants following. What
-the best of them is not clearly better than, with what its next step promises, is fitted to the end. Shapes: B blocks, n shared values.
+the best of them is not clearly better than, with what its next step promises, is fitted to the end.
+Shapes: B blocks, n shared values.
 """
 
 import dataclasses
