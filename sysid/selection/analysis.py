@@ -16,7 +16,7 @@ from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
-from nerf2real.sysid.selection import changes, claims, scopes
+from nerf2real.sysid.selection import changes, claims, scopes, wide
 from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.evidence import clear
 from nerf2real.sysid.selection.findings import Identified
@@ -113,7 +113,8 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   }
   effect, row = claims.shared(shared.term, shared.x, bounds, evidence)
   if shared.term.kind == "payload":
-    row |= {"joint": shared.origin.joint, "body": shared.term.target}
+    body = result.model.body(str(shared.term.target)).id
+    row |= {"joint": wide.ancestors(result.model, body)[0], "body": shared.term.target}
   result.objects.append(effect)
   result.effects.append(row)
 

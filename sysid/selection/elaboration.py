@@ -69,7 +69,7 @@ def _begun(
   """Returns every form from every start after a few steps, the derivatives of what it is added to
   taken over."""
   joint, tried = explainer.joint, []
-  for terms, x in _bases(explainer, best, named):
+  for terms, x in bases(explainer, best, named):
     known = Fitter([joint], Layout([terms])).linearise(x).jacobian[0]
     for carried in FORMS:
       term = rich_friction(joint.plant, carried)
@@ -95,7 +95,7 @@ def crossed(joint: JointLikelihood, item: Scored) -> float:
   return total
 
 
-def _bases(
+def bases(
   explainer: Explainer, best: Scored, named: Collection[str]
 ) -> list[tuple[tuple[Term, ...], Array]]:
   """Returns what richer friction is added to: the named effects on constants within tolerances, and

@@ -85,7 +85,25 @@ def shared_effects(
     found.append(best)
     for member in best.members:
       member.take(best.held)
-  return found
+  return _settled(found)
+
+
+def _settled(found: Sequence[Shared]) -> list[Shared]:
+  """Returns the effects with values that hold beside all others: they were found in turn."""
+  settled = list(found)
+  for at, item in enumerate(found if len(found) > 1 else ()):
+    for member in item.members:
+      member.known = tuple(t for t in member.known if t != item.held)
+    again = wide.resumed(item.term, item.members, item.x)
+    settled[at] = dataclasses.replace(item, x=again.x, reach=_reach(again))
+    for member in item.members:
+      member.take(settled[at].held)
+  return settled
+
+
+def _reach(item: Wide) -> tuple[Array, Array]:
+  spread = intervals.spread(item.fit, [m.now for m in item.members])
+  return intervals.reaches(item.fit, spread, (0, len(item.x)))
 
 
 def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
@@ -109,8 +127,7 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   most = max(range(len(single)), key=lambda at: single[at].total)
   rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
   clear = min(mine.clear, *((mine - r).clear for r in rivals))
-  joints = [m.now for m in best.members]
-  reach = intervals.reaches(best.fit, intervals.spread(best.fit, joints), (0, len(best.x)))
+  reach = _reach(best)
   nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
   if clear < beyond or nothing or not _is_new(best, beyond):
     return None

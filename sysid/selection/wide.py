@@ -145,6 +145,14 @@ def fitted(item: Wide) -> Wide:
   return dataclasses.replace(item, fit=fitter.leave_out(fit))
 
 
+def resumed(term: Term, members: Sequence[Subject], x: Array) -> Wide:
+  """Returns an effect fitted to the end from known values, beside what its joints have by now."""
+  layout = Layout([m.known for m in members], [term])
+  start = np.concatenate([x, *[m.explainer.null.fit.x for m in members]])
+  fit = Fitter([m.now for m in members], layout).linearise(start)
+  return fitted(Wide(term, tuple(members), fit))
+
+
 def _late(term: Term) -> list[int]:
   """Returns the indices of a term's delays."""
   return [at for at, name in enumerate(term.names) if name in CLOCKS]
