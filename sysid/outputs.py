@@ -32,7 +32,7 @@ from nerf2real.sysid.report import capability
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.explain import Scored, clear
+from nerf2real.sysid.selection.evidence import Scored, clear
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.sensors import sensing
 from nerf2real.sysid.settings import SETTINGS, Settings

@@ -190,8 +190,7 @@ def _shared(
   layout = Layout([terms for terms, _ in own_terms], [term])
   x = np.concatenate([values, *[own for _, own in own_terms]])
   fit = _fitted(joints, layout, x, layout.spans[0], term)
-  spread = intervals.covariance(fit, joints, systematic=intervals.SYSTEMATIC)
-  reaches = intervals.reaches(fit, spread, layout.spans[0])
+  reaches = intervals.reaches(fit, intervals.spread(fit, joints), layout.spans[0])
   bounds = intervals.around(term, fit.x[: len(values)], *reaches)
   return _Refit(row, where, term.effect(fit.x[: len(values)], bounds))
 

@@ -48,27 +48,27 @@ def intervals(
   return around(
     term,
     fit.x[slice(*span)],
-    *reaches(fit, _spread(joint, fit), span),
+    *reaches(fit, spread(fit, [joint]), span),
     own_latency=own_latency,
     friction=float(joint.plant.declared[INDEX["friction"]]),
     relative=BESIDE_PLAY if any(t.kind == "backlash" for t in fit.layout.terms) else RELATIVE,
   )
 
 
-def reaches(fit: Fit, spread: Array, span: tuple[int, int]) -> tuple[Array, Array]:
+def reaches(fit: Fit, covariance: Array, span: tuple[int, int]) -> tuple[Array, Array]:
   """Returns how far values [k] may be below and above a fit's, all others within their bounds.
 
   Ends of 95 % of a normal distribution that is cut off where other values have their bounds.
 
   Args:
     fit: the values.
-    spread: their covariance [n, n].
+    covariance: of all [n, n].
     span: which ones.
   """
   own = slice(*span)
-  half = _Z * np.sqrt(np.maximum(np.diag(spread)[own], 0.0))
+  half = _Z * np.sqrt(np.maximum(np.diag(covariance)[own], 0.0))
   random = np.random.default_rng(0)
-  draws = random.multivariate_normal(fit.x, spread, _DRAWS, check_valid="ignore", method="eigh")
+  draws = random.multivariate_normal(fit.x, covariance, _DRAWS, check_valid="ignore", method="eigh")
   others = np.ones(len(fit.x), bool)
   others[own] = False
   inside = (draws >= fit.layout.low - _EDGE * fit.layout.scale) & (
@@ -83,11 +83,14 @@ def reaches(fit: Fit, spread: Array, span: tuple[int, int]) -> tuple[Array, Arra
   )
 
 
-def _spread(joint: JointLikelihood, fit: Fit) -> Array:
-  """Returns a covariance [n, n], which a fit keeps as long as the joint's scale stays."""
-  scale = joint.scale.tobytes() + joint.independent.tobytes()
+def spread(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
+  """Returns the covariance [n, n] of a fit's values, widened by the systematic share.
+
+  A fit keeps it as long as the joints' scales stay.
+  """
+  scale = b"".join(j.scale.tobytes() + j.independent.tobytes() for j in joints)
   if fit.spread is None or fit.spread[0] != scale:
-    fit.spread = scale, covariance(central(joint, fit), [joint], systematic=SYSTEMATIC)
+    fit.spread = scale, covariance(central(fit, joints), joints, systematic=SYSTEMATIC)
   return fit.spread[1]
 
 
@@ -113,19 +116,25 @@ def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float
   return inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse
 
 
-def central(joint: JointLikelihood, fit: Fit) -> Fit:
+def central(fit: Fit, joints: Sequence[JointLikelihood]) -> Fit:
   """Returns a fit linearised by central differences.
 
   Where two values do the same (damping and added friction), their derivatives must agree to a part
   in a thousand, or the difference looks like information.
   """
-  fitter = Fitter([joint], fit.layout)
+  fitter = Fitter(joints, fit.layout)
   sides = [fitter.linearise(fit.x, width, residuals=fit.residuals) for width in (_WIDTH, -_WIDTH)]
-  (mean,) = np.mean([side.jacobian for side in sides], axis=0)
-  weights = 2.0 * joint.weights(joint.squares(sides[0].residuals[0]))
-  mean = np.tensordot(_resolved(np.einsum("icn,jcn->ij", weights * mean, mean)), mean, 1)
-  curvature = np.einsum("icn,jcn->ij", weights * mean, mean)
-  return dataclasses.replace(sides[0], jacobian=[mean], curvature=curvature[None])
+  jacobians, curvature = [], np.zeros((fit.layout.count, fit.layout.count))
+  for joint, index, residual, *both in zip(
+    joints, fit.layout.index, fit.residuals, *[side.jacobian for side in sides], strict=True
+  ):
+    mean = np.mean(both, axis=0)
+    weights = 2.0 * joint.weights(joint.squares(residual))
+    resolved = _resolved(np.einsum("icn,jcn->ij", weights * mean, mean))
+    jacobians.append(np.tensordot(resolved, mean, 1))
+    part = np.einsum("icn,jcn->ij", weights * jacobians[-1], jacobians[-1])
+    curvature[np.ix_(index, index)] += part
+  return dataclasses.replace(sides[0], jacobian=jacobians, curvature=curvature[None])
 
 
 def _resolved(curvature: Array) -> Array:

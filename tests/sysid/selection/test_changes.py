@@ -9,7 +9,7 @@ from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.selection import analysis, naming, subject
-from nerf2real.sysid.selection.explain import Scored, standardised
+from nerf2real.sysid.selection.evidence import Scored, standardised
 from tests.sysid.synthetic import PENDULUM, log_of
 
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
