@@ -23,6 +23,8 @@ class ParameterError(Operator):
     gain = np.where(driven, factors["gain"][np.maximum(binding.actuator_joint, 0)], 1.0)
     model.actuator_gainprm[:, 0] *= gain
     model.actuator_biasprm[:, :3] *= gain[:, None]
+    limit = np.where(driven, factors["limit"][np.maximum(binding.actuator_joint, 0)], 1.0)
+    model.actuator_forcerange *= limit[:, None]
     for joint, factor in zip(binding.joint_ids, factors["mass"], strict=True):
       if factor != 1:
         body = model.jnt_bodyid[joint]
@@ -110,6 +112,7 @@ KINDS = (
       _factor("armature", "true over declared armature"),
       _factor("friction", "true over declared dry friction"),
       _factor("gain", "true over declared actuator gain and bias"),
+      _factor("limit", "true over declared limits of the actuator's force"),
       _factor("mass", "true over declared mass and inertia of the joint's body"),
     ),
     ParameterError,

@@ -160,7 +160,7 @@ def library(plant: JointPlant) -> list[Term]:
 def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   """Returns a weakened actuator in its forms: whether its limit falls too, whether efforts tell."""
   limited = np.isfinite(plant.declared[INDEX["highest"]])
-  told = all(log.effort is not None or log.duty is not None for log in plant.logs)
+  told = all(log.effort is not None for log in plant.logs) and not plant.logs_duty
   told = told and term.kind != "motor_gain"
   return [
     dataclasses.replace(

@@ -53,6 +53,8 @@ NAMES = (
   *("follow", "follow_speed"),
   # the same of the supply as of heat
   *("sag_scales_limit", "sag_tells"),
+  # torque at a duty over the declared: nothing here needs it, what is told of the duty does
+  "strength",
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 
@@ -60,6 +62,7 @@ NEUTRAL = {
   "heat_tells": 1.0,
   "sag_tells": 1.0,
   "gain": 1.0,
+  "strength": 1.0,
   "stribeck_velocity": 0.1,
   "load_velocity": 0.1,
   "time_constant": 300.0,
