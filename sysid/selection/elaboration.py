@@ -22,8 +22,8 @@ Array = np.ndarray
 _NEAR = 0.95
 """Share of a posterior that lies within so much of the least cost: half a quantile of chi square
 with as many degrees as values."""
-_MOST = 10  # fits that are fitted anew without each log, chosen
-_REFITTED = 3  # Jacobians at most of a fit without a fold
+_MOST = 10  # fits that are judged by logs that they were not fitted to, chosen
+_REFITTED = 6  # Jacobians at most of a fit without a fold
 _ROUNDS = 2  # of fitting and setting the scale by the best
 
 
@@ -58,20 +58,32 @@ def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> li
   for fitter, item in near:
     item.nats = joint.loglik(fitter.leave_out(item.fit).held[0])
   explainer.rescore()
-  left_out = sorted(((crossed(joint, s), s) for _, s in near), key=lambda pair: -pair[0])
+  nats = {terms: crossed(joint, terms) for terms in dict.fromkeys(s.terms for _, s in near)}
+  left_out = sorted(((nats[s.terms], s) for _, s in near), key=lambda pair: -pair[0])
   plain = next(s for s in explainer.ranked() if not s.neutral and s.names >= set(named))
-  if crossed(joint, plain) > left_out[0][0]:
+  best_left_out = left_out[0][0]
+  if crossed(joint, plain.terms) > best_left_out:
     return []
-  return [s for nats, s in left_out if nats > left_out[0][0] - reach]
+  return [s for left, s in left_out if left > best_left_out - reach]
 
 
-def crossed(joint: JointLikelihood, item: Scored) -> float:
-  """Returns the nats of blocks that a hypothesis was fitted anew without, fold by fold."""
-  fitter, total = Fitter([joint], item.fit.layout), 0.0
+def crossed(joint: JointLikelihood, terms: tuple[Term, ...]) -> float:
+  """Returns the nats of blocks that a hypothesis was fitted without, fold by fold.
+
+  Every fold's fit begins where the search for its terms does: one that begins at a fit to all of
+  the logs, and ends there as costs are rough, has seen what it is left out of.
+  """
+  layout = Layout([terms])
+  fitter, total = Fitter([joint], layout), 0.0
+  starts = [
+    np.concatenate([t.starts[min(k, len(t.starts) - 1)] for t in terms])
+    for k in range(max(len(t.starts) for t in terms))
+  ]
   for fold in np.unique(joint.fold):
     part = copy.copy(joint)
     part.gain = joint.gain * (joint.fold != fold)[joint.block_of]
-    x = Fitter([part], item.fit.layout).fit(item.fit.x, iterations=_REFITTED).x
+    fits = [Fitter([part], layout).fit(start, iterations=_REFITTED) for start in starts]
+    x = min(fits, key=lambda fit: fit.cost).x
     nats = joint.loglik(joint.squares(fitter.simulated(x[None])[1][0][0]))
     total += float(nats[joint.fold == fold].sum())
   return total

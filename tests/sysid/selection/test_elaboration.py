@@ -32,7 +32,7 @@ def near():
 
 def test_fits_near_the_best_come_in_order_and_are_of_richer_friction(near):
   fits, joint = near
-  nats = [crossed(joint, item) for item in fits]
+  nats = [crossed(joint, item.terms) for item in fits]
   assert nats == sorted(nats, reverse=True)
   costs = [item.fit.cost for item in fits]
   assert max(costs) - min(costs) < 15.0  # half of the 95 % quantile of chi square, 13 values
