@@ -14,7 +14,6 @@ from benchmarks import harness
 from benchmarks.ledger.records import ROOT
 from nerf2real import sysid
 
-
 _SIDES = ("before", "after", "single", "median", "least", "most")
 
 

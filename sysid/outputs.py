@@ -28,7 +28,7 @@ from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.simulation import Member
-from nerf2real.sysid.report import capability, servo
+from nerf2real.sysid.report import capability, samples, servo
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.changes import Changed
@@ -170,7 +170,8 @@ def _identify(
   if len(near) > 1:
     content["notes"] = [*content["notes"], _spread(content["error"])]
   content["alternatives"] += sensed.alternatives
-  write_effects(out / "effects.json", servo.apart(_claimed(found), by_duty))
+  drawn = samples.with_samples(found, _claimed(found), np.random.default_rng(0))
+  write_effects(out / "effects.json", servo.apart(drawn, by_duty))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
   details = _details(found, model, near, sensed)
   details["identifiability"] = [to_plain(item) for item in shown]

@@ -104,6 +104,8 @@ class Effect:
   """Values in the units of the kind; those left out are nominal."""
   intervals: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
   """Lower and upper bound of a parameter's value, where known."""
+  samples: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
+  """Values of joint draws: the k-th of all values of all effects belong together."""
 
   def replace(self, **parameters: Value) -> "Effect":
     """Returns a copy with some parameter values changed."""
