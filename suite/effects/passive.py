@@ -5,9 +5,12 @@ import math
 import numpy as np
 
 from nerf2real.core.rotations import matrix_from_rotvec
+from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Kind, Operator, Parameter
 from nerf2real.suite.randomisation import inertia
+
+_COGGING = laws.over(laws.cogging)
 
 
 class ParameterError(Operator):
@@ -73,19 +76,14 @@ class Spring(Operator):
 
 
 class Cogging(Operator):
-  """A torque that repeats with position: amplitude * sin(periods * q + phase)."""
+  """A torque that repeats with position (`laws.cogging`)."""
 
   def bind(self, binding: Binding) -> None:
     parameters = self.per_joint(binding)
-    self._amplitude, self._periods = parameters["amplitude"], parameters["periods"]
-    self._phase = parameters["phase"]
+    self._law = tuple(parameters[name] for name in ("amplitude", "periods", "phase"))
 
   def step(self, binding: Binding) -> None:
-    angle = self._periods * binding.position
-    angle += self._phase
-    np.sin(angle, out=angle)
-    angle *= self._amplitude
-    binding.force += angle
+    binding.force += _COGGING(binding.position, *self._law)
 
 
 class GravityTilt(Operator):
