@@ -9,7 +9,7 @@ Shapes: J joints of the binding, U actuators of the model.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -77,6 +77,8 @@ class Kind:
   "command", "force", "actuator" or "measurement"."""
   parameters: tuple[Parameter, ...]
   operator: "type[Operator]"
+  law: Callable | None = None
+  """A force of (position, velocity, *parameters), of a kind that is nothing else; `force_law`."""
 
   def nominal(self) -> dict[str, Value]:
     """Returns parameters with which the kind does nothing."""

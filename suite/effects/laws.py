@@ -21,7 +21,7 @@ law = numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 @functools.cache
 def over(function: Callable) -> Callable:
   """Returns a law as a function of arrays that broadcast."""
-  return numba.vectorize(nopython=True, cache=True)(function.py_func)
+  return numba.vectorize(nopython=True, cache=True)(function.py_func)  # type: ignore[attr-defined]
 
 
 @law

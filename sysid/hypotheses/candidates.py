@@ -8,6 +8,8 @@ import dataclasses
 
 import numpy as np
 
+from nerf2real.suite.effects.registry import KINDS
+from nerf2real.sysid.hypotheses import force_law
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.plant import JointPlant
@@ -154,7 +156,7 @@ def library(plant: JointPlant) -> list[Term]:
       ((0.9 * limit,), (0.7 * limit,), (0.45 * limit,)),
     )
   )
-  return terms
+  return terms + [force_law.term_of(plant, kind) for kind in KINDS.values() if kind.law is not None]
 
 
 def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
