@@ -41,7 +41,7 @@ def force_kind(name: str, summary: str, law: Callable, parameters: Sequence[Para
     law: of (position, velocity, *values of the parameters in their order), compiled by `laws.law`.
     parameters: with ranges in which a search begins; without sizes, the law must give 0.
   """
-  operator = type(f"Force_{name}", (ForceLaw,), {"__doc__": summary})
+  operator: type[ForceLaw] = type(f"Force_{name}", (ForceLaw,), {"__doc__": summary})
   kind = Kind(name, summary, "joint", "force", tuple(parameters), operator, law)
   operator.kind = kind
   return kind

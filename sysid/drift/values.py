@@ -119,8 +119,10 @@ def _refit(
   members = row.get("evidence", {}).get("joints")
   if "servo_law" in row.get("evidence", {}):  # by the duty alone
     law = now[row["joint"]].law
-    again = law and Effect(row["kind"], row["joint"], {"gain": law.gain}, {"gain": law.interval})
-    return _Refit(row, row["joint"], again)
+    if law is None:
+      return _Refit(row, row["joint"], None)
+    gain = {"gain": law.gain}, {"gain": law.interval}
+    return _Refit(row, row["joint"], Effect(row["kind"], row["joint"], *gain))
   if row["kind"] == "parameter_error" and members:  # medians over joints
     return None
   if members:

@@ -40,7 +40,8 @@ def add(plant: JointPlant, term: Term, values: dict[str, float], table: Table | 
   """Returns the kernel's table of an effect's force, with another's force in it."""
   kind = kind_of(term.kind)
   weights, bounds = _blank(plant) if table is None else table
-  q, v = (_places(*bounds[at : at + 2], weights.shape[at // 2]) for at in (0, 2))
+  q = _places(bounds[0], bounds[1], weights.shape[0])
+  v = _places(bounds[2], bounds[3], weights.shape[1])
   law = laws.over(kind.law)
   force = law(q[:, None], v[None], *(values[p.name] for p in kind.parameters))
   return weights + force, bounds

@@ -138,7 +138,7 @@ def _calibration(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["damping"]] *= 1.0 + v.get("damping", 0.0)
   p[I["armature"]] *= 1.0 + v.get("armature", 0.0)
   p[I["friction"]] *= 1.0 + v.get("friction", 0.0)
-  names = ("input", "constant", "position", "velocity")
+  names: tuple[str, ...] = ("input", "constant", "position", "velocity")
   if v.get("scales_limit", 0.0) > 0:  # the torque at a duty; else limits stay
     names = (*names, "lowest", "highest", "strength")
   for name in names:
