@@ -117,6 +117,12 @@ def _refit(
 ) -> _Refit | None:
   """Returns an entry of the report fitted anew; None if it is of no joint's hypothesis."""
   members = row.get("evidence", {}).get("joints")
+  if "servo_law" in row.get("evidence", {}):  # by the duty alone
+    law = now[row["joint"]].law
+    if law is None:
+      return _Refit(row, row["joint"], None)
+    gain = {"gain": law.gain}, {"gain": law.interval}
+    return _Refit(row, row["joint"], Effect(row["kind"], row["joint"], *gain))
   if row["kind"] == "parameter_error" and members:  # medians over joints
     return None
   if members:

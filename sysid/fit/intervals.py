@@ -15,7 +15,7 @@ import numpy as np
 from nerf2real.sysid.fit.layout import Fit
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.model.kernel import INDEX
 
 Array = np.ndarray
@@ -36,6 +36,7 @@ _RESOLVED = 1e-4
 """Of a curvature scaled to 1 for each value: twins whose derivatives agree to a hundredth have
 less."""
 _DRAWS, _FEW = 4000, 200  # of the normal distribution, and least that must be within bounds
+_AGAIN = 20  # times at most that draws beyond a bound are taken anew
 _EDGE = 1e-6  # scales by which a value may be beyond its bound
 _WIDTH = 0.004  # of finite differences, of a value's scale
 
@@ -53,6 +54,43 @@ def intervals(
     friction=float(joint.plant.declared[INDEX["friction"]]),
     relative=BESIDE_PLAY if any(t.kind == "backlash" for t in fit.layout.terms) else RELATIVE,
   )
+
+
+def unmodelled(
+  term: Term, name: str, value: float, *, friction: float = 0.0, relative: float = RELATIVE
+) -> float:
+  """Returns the standard deviation of a value by what no model of the joint holds; see `around`."""
+  own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
+  known = LATE if name == "delay" else 0.0
+  known = RUBS * friction if name in _DRY and term.kind != "calibration" else known
+  return float(np.hypot((PEAK if name == "breakaway" else relative) * own, known))
+
+
+def draws(joint: JointLikelihood, fit: Fit, count: int, random: np.random.Generator) -> Array:
+  """Returns joint draws [count, n] of a fit's values, within their bounds.
+
+  Of the normal distribution whose ends intervals are: what goes together in the fit does in the
+  draws; what no model holds is independent. Draws beyond a bound are taken anew, and at the last
+  put on it.
+  """
+  layout, own = fit.layout, np.zeros(len(fit.x))
+  friction = float(joint.plant.declared[INDEX["friction"]])
+  for term, (a, b) in zip(layout.terms, layout.spans, strict=True):
+    if term.kind == FREE:
+      continue
+    for at, name in zip(range(a, b), term.names, strict=True):
+      share = 0.0 if name in ("zero", "skew", "latency") else RELATIVE
+      own[at] = unmodelled(term, name, fit.x[at], friction=friction, relative=share)
+  wide = spread(fit, [joint]) + np.diag(own**2)
+  result = random.multivariate_normal(fit.x, wide, count, check_valid="ignore", method="eigh")
+  for _ in range(_AGAIN):
+    out = ((result < layout.low) | (result > layout.high)).any(axis=1)
+    if not out.any():
+      break
+    result[out] = random.multivariate_normal(
+      fit.x, wide, int(out.sum()), check_valid="ignore", method="eigh"
+    )
+  return np.clip(result, layout.low, layout.high)
 
 
 def reaches(fit: Fit, covariance: Array, span: tuple[int, int]) -> tuple[Array, Array]:
@@ -170,11 +208,7 @@ def around(
   """
   result = {}
   for name, value, less, more, lowest in zip(term.names, x, down, up, term.low, strict=True):
-    own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
-    known = LATE if name == "delay" else 0.0
-    known = RUBS * friction if name in _DRY and term.kind != "calibration" else known
-    share = PEAK if name == "breakaway" else relative
-    model = _Z * float(np.hypot(share * own, known))
+    model = _Z * unmodelled(term, name, value, friction=friction, relative=relative)
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     low = max(value - float(np.hypot(less, model)) - below, lowest)
     high = value + float(np.hypot(more, model))

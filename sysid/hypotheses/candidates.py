@@ -8,6 +8,8 @@ import dataclasses
 
 import numpy as np
 
+from nerf2real.suite.effects.registry import KINDS
+from nerf2real.sysid.hypotheses import force_law
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.plant import JointPlant
@@ -154,13 +156,13 @@ def library(plant: JointPlant) -> list[Term]:
       ((0.9 * limit,), (0.7 * limit,), (0.45 * limit,)),
     )
   )
-  return terms
+  return terms + [force_law.term_of(plant, kind) for kind in KINDS.values() if kind.law is not None]
 
 
 def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   """Returns a weakened actuator in its forms: whether its limit falls too, whether efforts tell."""
   limited = np.isfinite(plant.declared[INDEX["highest"]])
-  told = all(log.effort is not None or log.duty is not None for log in plant.logs)
+  told = all(log.effort is not None for log in plant.logs) and not plant.logs_duty
   told = told and term.kind != "motor_gain"
   return [
     dataclasses.replace(
