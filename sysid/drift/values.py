@@ -175,7 +175,7 @@ def _shared(
   own_terms = [_held(m, settings, without=held) for m in members]
   term = next(
     (
-      dataclasses.replace(t if not j.plant.hinge else plausible(t), target=held.target)
+      dataclasses.replace(t if not j.plant.hinge else plausible(t, j.plant), target=held.target)
       for j in joints
       for t in library(j.plant)
       if t.kind == held.kind

@@ -143,8 +143,8 @@ def library(plant: JointPlant) -> list[Term]:
     )
   else:
     terms.append(_payload(plant))
-  strongest = _strongest(plant)
-  limit = strongest if not np.isfinite(top) else min(top, strongest)
+  most = strongest(plant)
+  limit = most if not np.isfinite(top) else min(top, most)
   terms.append(
     Term(
       "torque_limit",
@@ -274,5 +274,6 @@ def typical_torque(plant: JointPlant) -> float:
   return max(float(np.quantile(plant.declared_torque(), 0.95)), 1e-6)
 
 
-def _strongest(plant: JointPlant) -> float:
+def strongest(plant: JointPlant) -> float:
+  """Returns the largest torque that the declared model needs in the logs [N m, or N of a slide]."""
   return max(float(plant.declared_torque().max()), 1e-6)

@@ -191,4 +191,4 @@ def own_library(plant: JointModel, *, alone: bool) -> list[Term]:
   waves = signatures.waves(plant)
   terms = [*candidates.library(plant), candidates.cogging(plant, waves)]
   terms = [t for t in terms if alone or t.kind not in WHOLE]
-  return [plausible(term) for term in terms] if plant.hinge else terms
+  return [plausible(term, plant) for term in terms] if plant.hinge else terms

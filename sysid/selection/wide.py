@@ -100,7 +100,7 @@ def hypotheses(
   machine: dict[tuple, Term] = {}
   for subject in subjects:
     plant = subject.now.plant
-    terms = [plausible(t) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
+    terms = [plausible(t, plant) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
     late = [dataclasses.replace(t, target=None) for t in subject.library if t.kind in _LATE]
     for term in (*terms, *late):
       known = machine.get((term.kind, term.fixed))
