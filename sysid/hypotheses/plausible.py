@@ -7,22 +7,25 @@ import numpy as np
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.hypotheses.candidates import strongest
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.plant import JointPlant
 
 _SLACK = 1.25
 """Times the ends of the registry's ranges, which are where a search may start."""
 _CYCLIC = ("phase",)
 _SERVO = 2.5
-"""N m; stall torque of the OP3's MX-28 (Robotis): the registry's ranges are those of such servos."""
+"""N m; stall torque of the OP3's MX-28 (Robotis), of whose kind the registry's ranges are."""
 
 
 def plausible(term: Term, plant: JointPlant) -> Term:
   """Returns a term of a hinge whose bounds lie within the registry's ranges.
 
-  A machine whose motion takes more torque than such a servo has rubs, springs and carries more: the
-  ranges of torques, masses and what is torque per something grow with it.
+  A machine with more torque than such a servo rubs, springs and carries more: ranges of torques, of
+  masses and of what is torque per something grow with it.
   """
-  larger = max(1.0, strongest(plant) / _SERVO)
+  limit = plant.declared[INDEX["highest"]]
+  torque = max(strongest(plant), limit if np.isfinite(limit) else 0.0)
+  larger = max(1.0, torque / _SERVO)
   low, high = list(term.low), list(term.high)
   for at, name in enumerate(term.names):
     if name in _CYCLIC or name not in {p.name for p in kind_of(term.kind).parameters}:
