@@ -14,9 +14,10 @@ import numpy as np
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress
 from nerf2real.core.serialization import write_json
+from nerf2real.scenes.capture import depth_pictures
 from nerf2real.scenes.capture import keyframes as keyframe_files
-from nerf2real.scenes.capture import rgbd
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, read_capture
+from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.field import photometry, training
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.geometry import fusion
@@ -28,6 +29,7 @@ from nerf2real.scenes.results import Source, TrainedField
 from nerf2real.scenes.stages import Made, Stages
 
 _POSES_VERSION = 3  # 2: the unit frame's yaw; 3: the rolling shutter is taken out
+_PICTURES_VERSION = 2  # 2: stills turned and without copies; depth checked with the pictures
 _FIELD_VERSION = 2  # 2: the lens's falloff is taken out of the pictures
 
 
@@ -38,7 +40,9 @@ def keyframes(cache: Stages, source: Source, settings: CaptureSettings) -> Made[
     taken = read_capture(source.path, folder / "images", settings=settings, progress=progress)
     keyframe_files.save(taken, folder)
 
-  stage = cache.run("keyframes", write, settings=settings, inputs={"source": source.sha256})
+  version = 1 if source_kind(source.path) == "video" else _PICTURES_VERSION
+  inputs = {"source": source.sha256}
+  stage = cache.run("keyframes", write, settings=settings, inputs=inputs, version=version)
   return Made(keyframe_files.load(stage.folder, stage.folder / "images"), stage)
 
 
@@ -52,8 +56,16 @@ def poses(
     times = None
     if taken.times is not None:
       times = dict(zip([path.name for path in taken.images], taken.times.tolist(), strict=True))
+    names = [path.name for path in taken.images]
+    turned = [] if taken.turned is None else taken.turned
     localise.localise(
-      taken.folder, folder, settings=settings, known=taken.known, times=times, progress=progress
+      taken.folder,
+      folder,
+      settings=settings,
+      known=taken.known,
+      times=times,
+      turned=frozenset(name for name, is_so in zip(names, turned, strict=False) if is_so),
+      progress=progress,
     )
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large
 
@@ -154,7 +166,9 @@ def _measured_depth(
     return None
   files = {image.name: file for image, file in zip(capture.images, known.depth_files, strict=True)}
   unit = known.depth_unit * poses.unit_from_source.scale
-  return np.stack([rgbd.measured_depth(files[name], unit, camera) for name in poses.names])
+  return np.stack(
+    [depth_pictures.measured_depth(files[name], unit, camera) for name in poses.names]
+  )
 
 
 def figures(

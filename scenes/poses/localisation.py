@@ -78,6 +78,7 @@ class Localisation:
 def reprojection_error(model: pycolmap.Reconstruction) -> float:
   """Mean over the observations [pixel]; over the points where there are no observations."""
   points = list(model.points3D.values())
+  points = [point for point in points if point.track.length()] or points
   if not points:
     return float("nan")
   weights = np.array([max(p.track.length(), 1) for p in points])

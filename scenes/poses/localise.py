@@ -18,9 +18,11 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.serialization import to_plain
+from nerf2real.scenes.capture import agreement
 from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap, to_opencv
+from nerf2real.scenes.capture.stills import upright_poses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, matching, shutter
+from nerf2real.scenes.poses import mapping, matching, refinement, shutter
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -69,6 +71,8 @@ class LocaliseSettings:
   """Fewer are an error, unless there are fewer keyframes."""
   min_parallax: float = 0.08
   """Share of matches off a homography below which a warning is given."""
+  refine_known: bool = True
+  """Whether poses that came with measured depth are adjusted to the pictures."""
   seed: int = 0
   """Of RANSAC and of the mappers."""
 
@@ -80,6 +84,7 @@ def localise(
   settings: LocaliseSettings | None = None,
   known: KnownPoses | None = None,
   times: Mapping[str, float] | None = None,
+  turned: frozenset[str] = frozenset(),
   progress: Progress = no_progress,
 ) -> Localisation:
   """Localises the pictures of a folder.
@@ -90,6 +95,7 @@ def localise(
     settings: How.
     known: Poses that came with the pictures, in the order of their sorted names; they are kept.
     times: When each picture of a film was taken [s]: its rolling shutter is taken out.
+    turned: Pictures that were turned counter-clockwise by a quarter.
     progress: Called with the fraction done and a text.
 
   Raises:
@@ -105,7 +111,12 @@ def localise(
       f"{len(known.world_from_camera)} known poses for {len(names)} pictures: expected one each."
     )
   steps = _Steps(progress)
-  if known is not None and len(known.points):
+  refined = None
+  if known is not None and known.is_metric and settings.refine_known:
+    refined = _refined(images_folder, out_folder / _WORK_FOLDER, names, settings, known, steps)
+  if refined is not None:
+    result = refined
+  elif known is not None and len(known.points):
     model = mapping.model_from_poses(known, names)
     for point, error in zip(model.points3D.values(), known.point_errors, strict=True):
       point.error = error
@@ -115,9 +126,61 @@ def localise(
     result = _map(database, images_folder, names, settings, known, steps)
     if times is not None and known is None:
       result = _without_shutter(result, times, steps)
-  localisation = _describe(result, len(names), known, images_folder, steps)
+  localisation = _describe(result, len(names), known, images_folder, turned, steps)
   save(result.model, localisation, out_folder / _MODEL_FOLDER)
   return localisation
+
+
+def _refined(
+  images_folder: Path,
+  work: Path,
+  names: list[str],
+  settings: LocaliseSettings,
+  known: KnownPoses,
+  steps: "_Steps",
+) -> "_Mapped | None":
+  """Metric poses adjusted to the pictures; None where the pictures then agree less with the depth.
+
+  Poses say what overlaps, and small steps lie between: plain features of few pairs do.
+  """
+  plain = dataclasses.replace(settings.features, affine_shape=False, guided_matching=False)
+  database = _prepare_work(
+    images_folder, work, names, dataclasses.replace(settings, features=plain), known
+  )
+  steps.begin("features")
+  matching.extract_features(
+    database,
+    images_folder,
+    names,
+    settings=plain,
+    report=steps.report,
+    camera=to_colmap(known.camera),
+  )
+  steps.begin("matching")
+  matching.match_pairs(
+    database,
+    refinement.pairs_of(known),
+    settings=plain,
+    seed=settings.seed,
+    report=steps.report,
+  )
+  steps.begin("refining")
+  found = refinement.refine_known(database, images_folder, known, names, report=steps.report)
+  if found is None:
+    return None
+  refined, model = found
+  images = [images_folder / name for name in names]
+  before, after = agreement.distances([known, refined], images)
+  if not after < before:
+    return None
+  model.update_point_3d_errors()
+  model.extract_colors_for_all_images(str(images_folder))
+  refinement.with_sensor(refined, model, names)
+  words = (
+    f"poses of the {known.kind} source, adjusted with the lens to the pictures: measured depth "
+    f"then lies {after:.1f} pixels off in neighbouring pictures, before {before:.1f}"
+  )
+  return _Mapped(model, words, ())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,7 +396,12 @@ def _check_registered(
 
 
 def _describe(
-  result: _Mapped, total: int, known: KnownPoses | None, images_folder: Path, steps: _Steps
+  result: _Mapped,
+  total: int,
+  known: KnownPoses | None,
+  images_folder: Path,
+  turned: frozenset[str],
+  steps: _Steps,
 ) -> Localisation:
   """Moves the model into the unit frame (in place) and gathers the figures."""
   steps.end()
@@ -341,7 +409,8 @@ def _describe(
   if known is None or not len(known.points):
     model.update_point_3d_errors()
     model.extract_colors_for_all_images(str(images_folder))
-  poses = poses_of(mapping.registered(model))
+  images = mapping.registered(model)
+  poses = upright_poses(poses_of(images), np.array([i.name in turned for i in images], bool))
   solid = [p.xyz for p in model.points3D.values() if p.track.length() >= 3]
   if not solid:
     solid = [p.xyz for p in model.points3D.values()]

@@ -224,7 +224,8 @@ def judge(
   findings += judge_poses(capture, poses, model)
   try:
     surroundings.require_room(poses.world_from_camera, poses.points)
-    frame = world_frame.align(Evidence(poses.points, poses.world_from_camera), settings=align)
+    evidence = Evidence(poses.points, poses.world_from_camera, up=capture.unit_up)
+    frame = world_frame.align(evidence, settings=align)
   except ValueError as error:
     return Verdict([*findings, Finding("floor", False, str(error))])
   world = frame.world_from_unit.apply_pose(poses.world_from_camera)
