@@ -58,15 +58,21 @@ def poses(
       times = dict(zip([path.name for path in taken.images], taken.times.tolist(), strict=True))
     names = [path.name for path in taken.images]
     turned = [] if taken.turned is None else taken.turned
-    localise.localise(
-      taken.folder,
-      folder,
-      settings=settings,
-      known=taken.known,
-      times=times,
-      turned=frozenset(name for name, is_so in zip(names, turned, strict=False) if is_so),
-      progress=progress,
-    )
+    try:
+      localise.localise(
+        taken.folder,
+        folder,
+        settings=settings,
+        known=taken.known,
+        times=times,
+        turned=frozenset(name for name, is_so in zip(names, turned, strict=False) if is_so),
+        progress=progress,
+      )
+    except localise.LocalisationError as error:
+      if taken.origins is None or not error.missing:
+        raise
+      lost = taken.called(np.isin(names, sorted(error.missing)), most=4)
+      raise localise.LocalisationError(f"{error} Without a place: {lost}.") from error
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large
 
   inputs = {"keyframes": capture.stamp}

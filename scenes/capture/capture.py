@@ -86,6 +86,16 @@ class Capture:
   turned: np.ndarray | None = None
   """Keyframes that were turned counter-clockwise to lie as the others, bool [N]; None: none."""
 
+  origins: list[str] | None = None
+  """Names of the files that the keyframes were made of; None for a video."""
+
+  def called(self, chosen: np.ndarray, *, most: int) -> str:
+    """Names up to `most` of chosen keyframes (bool [N]) as whoever took them knows them."""
+    names = self.origins or [path.name for path in self.images]
+    found = [name for name, wanted in zip(names, chosen, strict=True) if wanted]
+    rest = f" and {len(found) - most} more" if len(found) > most else ""
+    return ", ".join(found[:most]) + rest
+
   @property
   def unit_up(self) -> np.ndarray | None:
     """Up in the unit frame [3] where the cameras' axes do not show it, as some were turned."""
@@ -177,7 +187,8 @@ def _read_pictures(
   known = known.selected(_numbers(capture), _written_camera(camera, capture))
   known, warnings = agreement.settled(known, capture.images)
   capture.warnings.extend(warnings)
-  return dataclasses.replace(capture, times=None, known=known.lifted())
+  origins = [path.name for path in known.files]
+  return dataclasses.replace(capture, times=None, known=known.lifted(), origins=origins)
 
 
 def _read_stills(
@@ -198,8 +209,14 @@ def _read_stills(
 
   frames = _sharpest_pictures(len(found.files), read, settings, progress)
   capture = _write("images", frames, folder, settings, found.warnings)
-  turned = found.turned[_numbers(capture)]
-  return dataclasses.replace(capture, times=None, turned=turned if turned.any() else None)
+  numbers = _numbers(capture)
+  turned = found.turned[numbers]
+  return dataclasses.replace(
+    capture,
+    times=None,
+    turned=turned if turned.any() else None,
+    origins=[found.files[k].name for k in numbers],
+  )
 
 
 def _numbers(capture: Capture) -> list[int]:

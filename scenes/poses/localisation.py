@@ -26,6 +26,9 @@ _FIGURES = "localisation.json"
 class LocalisationError(ValueError):
   """The keyframes do not connect; the message holds how many did, why, and what to film."""
 
+  missing: frozenset[str] = frozenset()
+  """Keyframes that have no place."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Localisation:

@@ -41,6 +41,10 @@ from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_fr
 __all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "localise"]
 
 
+_BETWEEN = (
+  "take pictures from places in between, a step apart, so that each shows two thirds of what the "
+  "one before shows, with textured things in view"
+)
 _MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
 _STAGE_SHARES = {
   "features": 0.25,
@@ -123,7 +127,7 @@ def localise(
     result = _Mapped(model, f"poses and points of the {known.kind} source", ())
   else:
     database = _prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
-    result = _map(database, images_folder, names, settings, known, steps)
+    result = _map(database, images_folder, names, settings, known, steps, film=times is not None)
     if times is not None and known is None:
       result = _without_shutter(result, times, steps)
   localisation = _describe(result, len(names), known, images_folder, turned, steps)
@@ -252,6 +256,8 @@ def _map(
   settings: LocaliseSettings,
   known: KnownPoses | None,
   steps: _Steps,
+  *,
+  film: bool,
 ) -> _Mapped:
   """Features, pairs, matches, a model, repairs, refinement."""
   steps.begin("features")
@@ -303,12 +309,12 @@ def _map(
       if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
         model, mapper = again, mapper_again
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
-  _check_registered(model, names, settings, share)
+  _check_registered(model, names, settings, share, film=film)
   assert model is not None  # for the type checker: _check_registered has raised
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
   if mapping.drop_weak_images(model):
-    _check_registered(model, names, settings, share)
+    _check_registered(model, names, settings, share, film=film)
   if not lens.principal:
     warnings.append(f"Lens: estimated {lens.words}.")
   return _Mapped(model, f"{words}, {mapper} mapper; lens: {lens.words}", tuple(warnings), lens)
@@ -369,6 +375,8 @@ def _check_registered(
   names: list[str],
   settings: LocaliseSettings,
   share: float | None,
+  *,
+  film: bool,
 ) -> None:
   """Raises LocalisationError if too few keyframes have a place."""
   number = 0 if model is None else model.num_reg_images()
@@ -379,7 +387,11 @@ def _check_registered(
     return
   if share is None:
     why = "hardly any two pictures show the same textured surface (blur, plain walls, fast turns)"
-    advice = "film slower, with more light, and keep textured things in view while turning"
+    advice = (
+      "film slower, with more light, and keep textured things in view while turning"
+      if film
+      else _BETWEEN
+    )
   elif share < settings.min_parallax:
     why = "the camera hardly moved sideways, so depth cannot be seen"
     advice = "walk through the room instead of turning on the spot"
@@ -388,11 +400,16 @@ def _check_registered(
     advice = (
       "film slower and in one go, or take more pictures from places in between, and come back to "
       "what was seen before"
+      if film
+      else _BETWEEN
     )
-  raise LocalisationError(
+  error = LocalisationError(
     f"{number} of {len(names)} keyframes were localised, expected at least {needed}: probably "
     f"{why}; {advice}."
   )
+  placed = set() if model is None else {image.name for image in mapping.registered(model)}
+  error.missing = frozenset(names) - placed
+  raise error
 
 
 def _describe(

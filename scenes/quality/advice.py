@@ -82,8 +82,7 @@ def _where(capture: Capture, chosen: np.ndarray) -> str:
   """Which keyframes, by their time in the film or their names."""
   if capture.times is not None:
     return f"at {_spans(capture.times, chosen)}"
-  names = [path.name for path, wanted in zip(capture.images, chosen, strict=True) if wanted]
-  return f"as {', '.join(names[:3])}"
+  return f"as {capture.called(chosen, most=3)}"
 
 
 def judge_pictures(capture: Capture, settings: CaptureSettings) -> list[Finding]:

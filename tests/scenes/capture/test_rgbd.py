@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.similarity import Similarity
 from nerf2real.scenes import image_stages
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
@@ -183,7 +184,7 @@ def test_measured_depth_stands_for_the_fields(tum, tmp_path):
     assert np.percentile(off, 90) < 0.03
 
 
-def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path):
+def test_known_poses_and_depth_keep_the_scale(tum, tmp_path):
   capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
   found = localise.localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
   assert found.registered_fraction == 1.0 and "rgbd" in found.strategy
@@ -200,6 +201,48 @@ def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path
     max_marker_spread=0.05,
   )
   assert chosen.source == "depth_sensor" and chosen.value.metres_per_unit == metres.scale
+
+
+def test_metric_poses_are_adjusted_to_the_pictures(tum, tmp_path):
+  """Poses with the noise of a tracker, a nominal lens: both are better afterwards, and metric."""
+  folder = _copied(tum, tmp_path / "tum")
+  rng = np.random.default_rng(0)
+  rows = []
+  for k, pose in enumerate(POSES):
+    turn = Rotation.from_rotvec(rng.normal(0, np.radians(0.4), 3))
+    numbers = [*(pose[:3, 3] + rng.normal(0, 0.008, 3))]
+    numbers += [*(turn * Rotation.from_matrix(pose[:3, :3])).as_quat()]
+    rows.append(f"{100 + k / 30:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
+  (folder / "groundtruth.txt").write_text("\n".join(rows))
+  (folder / "camera_info.yaml").write_text(INFO.replace("280.0", "286.0"))
+  settings = dataclasses.replace(SETTINGS, num_keyframes=16)
+  capture = read_capture(folder, tmp_path / "images", settings=settings)
+
+  def off(found):
+    metres = found.unit_from_source.inverse()
+    poses = metres.apply_pose(found.world_from_camera)
+    best = Similarity.fit(poses[:, :3, 3], POSES[:, :3, 3], with_scale=False)
+    place = np.linalg.norm(best.apply(poses[:, :3, 3]) - POSES[:, :3, 3], axis=-1)
+    steps, true = (
+      Rotation.from_matrix(np.swapaxes(p[:-1, :3, :3], 1, 2) @ p[1:, :3, :3])
+      for p in (poses, POSES)
+    )
+    angle = (steps.inv() * true).magnitude()
+    return np.median(place), np.degrees(np.median(angle)), abs(found.camera.fx / 280 - 1)
+
+  def located(name, refine_known):
+    return localise.localise(
+      tmp_path / "images",
+      tmp_path / name,
+      known=capture.known,
+      settings=localise.LocaliseSettings(refine_known=refine_known),
+    )
+
+  plain, refined = located("plain", False), located("refined", True)
+  assert "adjusted" in refined.strategy and "adjusted" not in plain.strategy
+  assert refined.registered_fraction == 1.0 and refined.reprojection_error_px < 1.0
+  for after, before in zip(off(refined), off(plain), strict=True):
+    assert after < 0.5 * before
 
 
 def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
