@@ -13,16 +13,71 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture.sources import KnownPoses, to_opencv
+from nerf2real.scenes.capture import agreement
+from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses import mapping, matching
 from nerf2real.scenes.poses.localisation import poses_of
 from nerf2real.scenes.poses.pairs import Pair
+from nerf2real.scenes.poses.settings import LocaliseSettings
+from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
 
 _PARTNERS = 10  # pictures each is matched with; chosen: as COLMAP's sequence of ten
 _SAME_VIEW = np.cos(np.radians(60.0))  # of the optical axes of a pair
 _LOOSE = 16.0  # pixels that poses of a degree may be off at first, in a view of a thousand
 _FEWEST = 0.5  # of the pictures must see enough points, or the poses stay as they came
+
+
+def localise_known(
+  images_folder: Path,
+  work: Path,
+  names: list[str],
+  settings: LocaliseSettings,
+  known: KnownPoses,
+  steps: Steps,
+) -> Mapped | None:
+  """Metric poses adjusted to the pictures; None where the pictures then agree less with the depth.
+
+  Poses say what overlaps, and small steps lie between: plain features of few pairs do.
+  """
+  plain = dataclasses.replace(settings.features, affine_shape=False, guided_matching=False)
+  database = prepare_work(
+    images_folder, work, names, dataclasses.replace(settings, features=plain), known
+  )
+  steps.begin("features")
+  matching.extract_features(
+    database,
+    images_folder,
+    names,
+    settings=plain,
+    report=steps.report,
+    camera=to_colmap(known.camera),
+  )
+  steps.begin("matching")
+  matching.match_pairs(
+    database,
+    pairs_of(known),
+    settings=plain,
+    seed=settings.seed,
+    report=steps.report,
+  )
+  steps.begin("refining")
+  found = refine_known(database, images_folder, known, names, report=steps.report)
+  if found is None:
+    return None
+  refined, model = found
+  images = [images_folder / name for name in names]
+  before, after = agreement.distances([known, refined], images)
+  if not after < before:
+    return None
+  model.update_point_3d_errors()
+  model.extract_colors_for_all_images(str(images_folder))
+  with_sensor(refined, model, names)
+  words = (
+    f"poses of the {known.kind} source, adjusted with the lens to the pictures: measured depth "
+    f"then lies {after:.1f} pixels off in neighbouring pictures, before {before:.1f}"
+  )
+  return Mapped(model, words, ())
 
 
 def pairs_of(known: KnownPoses) -> list[Pair]:

@@ -12,7 +12,8 @@ from nerf2real.scenes.capture import keyframes, stills
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.video import CaptureError
-from nerf2real.scenes.poses.localise import localise
+from nerf2real.scenes.poses.localise import LocaliseSettings, localise
+from nerf2real.scenes.poses.matching import FeatureSettings
 from nerf2real.scenes.poses.unit_frame import mean_up
 from tests.scenes import synthetic_capture as synthetic
 
@@ -81,7 +82,10 @@ def test_upright_stills_are_localised_with_wide_ones(tmp_path):
   capture = read_capture(tmp_path / "photos", tmp_path / "images")
   assert capture.turned.sum() == 4 and len(capture.images) == 12
   turned = [path.name for path, is_so in zip(capture.images, capture.turned, strict=True) if is_so]
-  found = localise(tmp_path / "images", tmp_path / "poses", turned=frozenset(turned))
+  plain = LocaliseSettings(features=FeatureSettings(affine_shape=False, guided_matching=False))
+  found = localise(
+    tmp_path / "images", tmp_path / "poses", settings=plain, turned=frozenset(turned)
+  )
   assert found.registered_fraction == 1.0
   upright = stills.upright_poses(found.world_from_camera, capture.turned)
   up = mean_up(upright)

@@ -198,8 +198,12 @@ def test_unrelated_pictures_are_told_so(tmp_path):
     cv2.imwrite(str(folder / f"{number}.png"), synthetic.texture(100 + number, 160))
   with pytest.raises(LocalisationError, match=r"0 of 8 keyframes were localised") as error:
     localise(folder, tmp_path / "out", settings=FEW)
-  assert "film slower" in str(error.value)
+  assert "take pictures from places in between" in str(error.value)
   assert "\n" not in str(error.value)
+  assert error.value.missing == {f"{number}.png" for number in range(8)}
+  times = {f"{number}.png": float(number) for number in range(8)}
+  with pytest.raises(LocalisationError, match="film slower"):
+    localise(folder, tmp_path / "out", settings=FEW, times=times)
   assert not (tmp_path / "out" / "sfm").exists()
 
 
