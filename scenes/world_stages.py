@@ -19,7 +19,7 @@ from nerf2real.scenes.poses.localise import Localisation
 from nerf2real.scenes.stages import Made, Stages
 
 _OUTLOOK_VERSION = 3  # 2: no floor is warned of; 3: markers' corners without rolling shutter
-_WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
+_WORLD_VERSION = 4  # 2: unique axes; 3: markers are looked for before; 4: all tilts are searched
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 

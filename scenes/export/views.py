@@ -29,15 +29,15 @@ def capture_cameras(bundle: Bundle) -> tuple[Camera, np.ndarray, tuple[str, ...]
   return found.camera, poses, found.names
 
 
-def overlooking_pose(bundle: Bundle) -> np.ndarray:
-  """Pose [4, 4] of the capture's camera that had most of the room before it, world frame.
+def overlooking_view(bundle: Bundle) -> tuple[Camera, np.ndarray]:
+  """The capture's camera and its pose [4, 4], world frame, with the most points before the lens.
 
-  From where nothing was filmed the field is fog.
+  Raises:
+    LocalisationError: The bundle's folder sfm/ is missing or damaged.
   """
-  _, poses, _ = capture_cameras(bundle)
-  depth = np.einsum("ni,ni->n", 0.5 * sum(bundle.extent) - poses[:, :3, 3], poses[:, :3, 2])
-  pose: np.ndarray = poses[int(np.argmax(depth))]
-  return pose
+  found = localise.load(bundle.folder / "sfm")
+  pose = found.world_from_camera[found.overlooking()]
+  return found.camera, bundle.world_from_unit.apply_pose(pose)
 
 
 def render_views(

@@ -61,6 +61,19 @@ class Localisation:
   seconds: dict[str, float] = dataclasses.field(default_factory=dict)
   """Wall time of each step."""
 
+  def overlooking(self) -> int:
+    """Row of the keyframe with the most points before its lens: where a viewer should begin.
+
+    From where nothing was filmed a field is fog.
+    """
+    from_world = np.linalg.inv(self.world_from_camera)
+    edge = np.array([self.camera.width / self.camera.fx, self.camera.height / self.camera.fy]) / 2
+    counts = []
+    for rotation, offset in zip(from_world[:, :3, :3], from_world[:, :3, 3], strict=True):
+      x, y, z = rotation @ self.points.T + offset[:, None]
+      counts.append(((z > 0) & (abs(x) < edge[0] * z) & (abs(y) < edge[1] * z)).sum())
+    return int(np.argmax(counts))
+
   def read_picture(self, keyframes: Path, index: int) -> np.ndarray:
     """Reads a keyframe as if all lines were read at once: BGR uint8 [H, W, 3].
 
