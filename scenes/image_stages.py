@@ -57,7 +57,7 @@ def poses(
     if taken.times is not None:
       times = dict(zip([path.name for path in taken.images], taken.times.tolist(), strict=True))
     names = [path.name for path in taken.images]
-    turned = [] if taken.turned is None else taken.turned
+    turned = np.zeros(len(names), bool) if taken.turned is None else taken.turned
     try:
       localise.localise(
         taken.folder,
@@ -65,7 +65,7 @@ def poses(
         settings=settings,
         known=taken.known,
         times=times,
-        turned=frozenset(name for name, is_so in zip(names, turned, strict=False) if is_so),
+        turned=frozenset(name for name, is_so in zip(names, turned, strict=True) if is_so),
         progress=progress,
       )
     except localise.LocalisationError as error:

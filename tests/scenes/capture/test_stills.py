@@ -82,7 +82,9 @@ def test_upright_stills_are_localised_with_wide_ones(tmp_path):
   capture = read_capture(tmp_path / "photos", tmp_path / "images")
   assert capture.turned.sum() == 4 and len(capture.images) == 12
   turned = [path.name for path, is_so in zip(capture.images, capture.turned, strict=True) if is_so]
-  plain = LocaliseSettings(features=FeatureSettings(affine_shape=False, guided_matching=False))
+  plain = LocaliseSettings(
+    features=FeatureSettings(affine_shape=False, guided_matching=False, few_num_features=400)
+  )
   found = localise(
     tmp_path / "images", tmp_path / "poses", settings=plain, turned=frozenset(turned)
   )
