@@ -204,8 +204,12 @@ def test_known_poses_and_depth_keep_the_scale(tum, tmp_path):
 
 
 def test_metric_poses_are_adjusted_to_the_pictures(tum, tmp_path):
-  """Poses with the noise of a tracker, a nominal lens: both are better afterwards, and metric."""
+  """Poses with the noise of a tracker, a nominal lens: both are better afterwards, and metric.
+
+  A picture of nothing keeps its pose.
+  """
   folder = _copied(tum, tmp_path / "tum")
+  cv2.imwrite(str(folder / "rgb" / "005.png"), np.full((240, 320, 3), 128, np.uint8))
   rng = np.random.default_rng(0)
   rows = []
   for k, pose in enumerate(POSES):
@@ -243,6 +247,8 @@ def test_metric_poses_are_adjusted_to_the_pictures(tum, tmp_path):
   assert refined.registered_fraction == 1.0 and refined.reprojection_error_px < 1.0
   for after, before in zip(off(refined), off(plain), strict=True):
     assert after < 0.5 * before
+  kept = refined.unit_from_source.inverse().apply_pose(refined.world_from_camera)[5]
+  np.testing.assert_allclose(kept, capture.known.world_from_camera[5], atol=1e-6)
 
 
 def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
