@@ -18,9 +18,7 @@ from nerf2real.launch import command
 from nerf2real.launch.local_distributed import supervised
 
 _HERE = Path(__file__).resolve().parent
-SCRIPTS = training.Scripts(
-  learner=_HERE / "distill_learner.py", actor=_HERE / "distill_collector.py"
-)
+SCRIPTS = training.Scripts(learner=_HERE / "distill_learner.py", actor=_HERE / "actor.py")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

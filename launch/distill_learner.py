@@ -3,7 +3,7 @@
   python launch/distill_learner.py --run runs/walk --preset nerf_nav --minutes 120
 
 Listens on this machine only, unless --listen names another address; then --users is needed.
-Collectors join with `launch/distill_collector.py --connect`.
+Collectors join with `launch/actor.py --connect`.
 """
 
 import dataclasses

@@ -12,6 +12,7 @@ from nerf2real.agents.dmpo.config import AugmentationConfig, DmpoConfig, Network
 ENCODER, POLICY, END_TO_END = "encoder", "policy", "end_to_end"
 STAGES = (ENCODER, POLICY, END_TO_END)
 SETTINGS = "settings.json"  # in a run's folder
+KIND = "distillation"  # of run, in the learner's description
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

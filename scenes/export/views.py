@@ -10,7 +10,7 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.geometry import fusion
-from nerf2real.scenes.poses import localise
+from nerf2real.scenes.poses import localisation
 
 
 def renderer_of(bundle: Bundle) -> Renderer:
@@ -24,7 +24,7 @@ def capture_cameras(bundle: Bundle) -> tuple[Camera, np.ndarray, tuple[str, ...]
   Raises:
     LocalisationError: The bundle's folder sfm/ is missing or damaged.
   """
-  found = localise.load(bundle.folder / "sfm")
+  found = localisation.load(bundle.folder / "sfm")
   poses = bundle.world_from_unit.apply_pose(found.world_from_camera)
   return found.camera, poses, found.names
 
@@ -35,7 +35,7 @@ def overlooking_view(bundle: Bundle) -> tuple[Camera, np.ndarray]:
   Raises:
     LocalisationError: The bundle's folder sfm/ is missing or damaged.
   """
-  found = localise.load(bundle.folder / "sfm")
+  found = localisation.load(bundle.folder / "sfm")
   pose = found.world_from_camera[found.overlooking()]
   return found.camera, bundle.world_from_unit.apply_pose(pose)
 

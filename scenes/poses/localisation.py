@@ -19,6 +19,7 @@ from nerf2real.scenes.capture.sources import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.shutter import Shutter
+from nerf2real.scenes.poses.tracks import Tracks
 
 _FIGURES = "localisation.json"
 
@@ -54,6 +55,8 @@ class Localisation:
   """Which pairs were matched and which mapper was used."""
   unit_from_source: Similarity
   """From the source's frame (COLMAP's, or that of the known poses)."""
+  tracks: Tracks
+  """Which keyframes see which points."""
   shutter: Shutter | None = None
   """Motion while a picture was read, unit frame; None where all lines count as read at once."""
   warnings: tuple[str, ...] = ()
@@ -110,6 +113,7 @@ def poses_of(images: list[pycolmap.Image]) -> np.ndarray:
 
 
 def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Localisation:
+  """Returns the camera, poses, points and tracks of a COLMAP model, with the figures given."""
   images = mapping.registered(model)
   points = list(model.points3D.values())
   return Localisation(
@@ -119,6 +123,7 @@ def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Locali
     points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
     point_colors=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
     point_errors=np.array([p.error for p in points], np.float64),
+    tracks=Tracks.of_model(model, images),
     **values,
   )
 

@@ -12,10 +12,9 @@ class LocaliseSettings:
 
   features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
   pairs: PairSettings = dataclasses.field(default_factory=PairSettings)
-  mapper: str = (
-    "auto"  # "global", "incremental", or "auto": incremental for stills (few keyframes),
-  )
-  # else global; the other one where the first leaves too many keyframes out
+  mapper: str = "auto"
+  """"global", "incremental", or "auto": incremental for stills (few keyframes), else global; the
+  other one where the first leaves too many keyframes out."""
   few_keyframes: int = 40
   """Up to this many are mapped incrementally."""
   repair_below: float = 0.95

@@ -17,7 +17,7 @@ from nerf2real.real.virtual.process import VirtualRobotProcess
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.wire.bus import Bus, BusError
 from nerf2real.real.wire.servos import Servos
-from nerf2real.scenes.builtin.eye import EglMissingError
+from nerf2real.scenes.builtin.mujoco_renderer import EglMissingError
 from nerf2real.suite.op3 import constants
 
 _ROOT = Path(__file__).parents[3]

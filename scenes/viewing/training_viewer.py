@@ -13,13 +13,13 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.field.render.browser import FieldView, begin_as, serve_field
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.training import Snapshot
-from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.poses.localisation import Localisation
 
 _POINT_SIZE = 0.004  # [unit], 1 cm in a room of 5 m
 
 
 class TrainingViewer:
-  """A page of a scene that is being made; a `scenes.results.Watcher`."""
+  """A page of a scene that is being made; a `scenes.stages.results.Watcher`."""
 
   def __init__(self, *, host: str, port: int):
     """Serves the page; see `address`."""

@@ -15,7 +15,7 @@ from nerf2real.scenes.export.views import capture_cameras, overlooking_view, ren
 from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 from nerf2real.scenes.geometry.mesh import load_glb
-from nerf2real.scenes.override_panel import OverridePanel
+from nerf2real.scenes.viewing.override_panel import OverridePanel
 
 _CAMERA_STEP = 3  # every third camera is drawn
 _FLOOR_LIFT = 0.02  # of the free floor above the floor, or it would flicker with it [m]

@@ -21,7 +21,6 @@ from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
   from_model,
-  load,
   poses_of,
   reprojection_error,
   save,
@@ -33,9 +32,6 @@ from nerf2real.scenes.poses.registered import check_registered
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
 from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
-
-__all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "localise"]
-
 
 _MODEL_FOLDER, _WORK_FOLDER = "sfm", "work"
 
