@@ -59,7 +59,7 @@ def check_render(settings: Settings) -> Figures:
   from nerf2real.core.cameras import Camera
   from nerf2real.core.serialization import from_plain
   from nerf2real.core.similarity import Similarity
-  from nerf2real.scenes.builtin import yardstick
+  from nerf2real.scenes.builtin import ground_truth
   from nerf2real.scenes.bundle import Bundle
   from nerf2real.scenes.field.field import Field
   from nerf2real.scenes.field.render.renderer import Renderer
@@ -70,13 +70,13 @@ def check_render(settings: Settings) -> Figures:
   cpu = Renderer(field)
   device = Renderer(field, device=settings.device, occupancy=cpu.occupancy)
   views, rounds, batches = (2, 2, (2,)) if settings.tiny else (24, 100, (16, 64, 256))
-  arrays = np.load(yardstick.ROBOT_VIEWS)
+  arrays = np.load(ground_truth.ROBOT_VIEWS)
   room_from_world = from_plain(bundle.figures["room_from_world"], Similarity)
   room_from_unit = room_from_world @ bundle.world_from_unit
   poses = room_from_unit.inverse().apply_pose(arrays["world_from_camera"][:views])
   figures: Figures = {}
   for height, width in SIZES[: 1 if settings.tiny else None]:
-    camera: Camera = yardstick.robot_camera(height, width)
+    camera: Camera = ground_truth.robot_camera(height, width)
     expected = [cpu.render(camera, pose)[0] for pose in poses]
     found = [device.render(camera, pose)[0] for pose in poses]
     pairs = list(zip(found, expected, strict=True))

@@ -92,6 +92,15 @@ class Camera:
       cy=self.cy * sy,
     )
 
+  def at_most(self, width: int) -> "Camera":
+    """Returns this camera with its picture reduced to a width if it is wider [pixel]."""
+    width = min(width, self.width)
+    return self.resized(width, round(self.height * width / self.width))
+
+  def size_ratio(self, other: "Camera") -> np.ndarray:
+    """Returns what pixels [..., 2] of another size of this picture are multiplied with [2]."""
+    return np.array([self.width / other.width, self.height / other.height])
+
   def distort(self, points: np.ndarray) -> np.ndarray:
     """Maps ideal image-plane points (x/z, y/z) [..., 2] to distorted ones [..., 2]."""
     x, y = points[..., 0], points[..., 1]

@@ -13,8 +13,8 @@ from nerf2real.core import palette
 from nerf2real.core.pages import pictures
 from nerf2real.core.serialization import from_plain
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.builtin import room, yardstick
-from nerf2real.scenes.builtin.eye import Eye
+from nerf2real.scenes.builtin import ground_truth, room
+from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render.renderer import Renderer
@@ -22,7 +22,7 @@ from nerf2real.scenes.geometry import collision
 
 _SIZE = (360, 480)  # height, width of a picture
 _SUPERSAMPLE = 3
-_POSES = (7, 11)  # of the yardstick's robot poses
+_POSES = (7, 11)  # of the truth's robot poses
 
 
 def _contact_model(bundle: Bundle) -> mujoco.MjModel:
@@ -46,8 +46,8 @@ def main() -> None:
   world_from_truth = from_plain(bundle.figures["room_from_world"], Similarity).inverse()
   unit_from_truth = bundle.world_from_unit.inverse() @ world_from_truth
   renderer = Renderer(Field.load(bundle.field_path), threads=2)
-  camera = yardstick.robot_camera(*_SIZE)
-  poses = [yardstick.robot_poses()[index] for index in _POSES]
+  camera = ground_truth.robot_camera(*_SIZE)
+  poses = [ground_truth.robot_poses()[index] for index in _POSES]
   with room.room_eye() as eye:
     true = [room.true_view(camera, pose, eye=eye)[0] for pose in poses]
   with Eye(_contact_model(bundle)) as eye:  # one GL context at a time

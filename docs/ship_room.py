@@ -11,7 +11,7 @@ from pathlib import Path
 
 from nerf2real.scenes.bundle import BUILT_IN, Bundle
 from nerf2real.scenes.capture.sources import KnownPoses
-from nerf2real.scenes.poses import localise, mapping
+from nerf2real.scenes.poses import localisation, mapping
 
 _ITEMS = ("collision", "field.safetensors", "visual.glb", "free_space.pgm", "free_space.yaml")
 
@@ -24,7 +24,7 @@ def main(folder: Path) -> None:
   for item in _ITEMS:
     source = bundle.folder / item
     (shutil.copytree if source.is_dir() else shutil.copyfile)(source, BUILT_IN / item)
-  found = localise.load(bundle.folder / "sfm")
+  found = localisation.load(bundle.folder / "sfm")
   known = KnownPoses(
     kind="colmap",
     camera=found.camera,

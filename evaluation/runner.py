@@ -11,7 +11,7 @@ from nerf2real.evaluation import episodes
 from nerf2real.evaluation.episodes import Episode, Moment, Setting
 from nerf2real.evaluation.plants.operated import RepeatError
 from nerf2real.evaluation.plants.plant import Plant, Sight, Trial
-from nerf2real.evaluation.policies import EvaluatedPolicy, resolution
+from nerf2real.evaluation.policies.policy import EvaluatedPolicy, resolution
 from nerf2real.suite.op3 import constants
 
 _STEP = constants.CONTROL_TIMESTEP

@@ -17,14 +17,14 @@ import numpy as np
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.evaluation import episodes, runner
-from nerf2real.evaluation.controls import under_control
-from nerf2real.evaluation.driving import density
-from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.making import free_name, make_plant
 from nerf2real.evaluation.plants.plant import Plant
-from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy
-from nerf2real.evaluation.policy_names import WALKERS, policy_folder
+from nerf2real.evaluation.policies.controls import under_control
+from nerf2real.evaluation.policies.driving import density
+from nerf2real.evaluation.policies.learned import LearnedPolicy
+from nerf2real.evaluation.policies.names import WALKERS, policy_folder
+from nerf2real.evaluation.policies.policy import EvaluatedPolicy, GaitPolicy
 from nerf2real.evaluation.report import page as report
 from nerf2real.evaluation.report import tables
 from nerf2real.evaluation.settings import EvaluationSettings

@@ -8,7 +8,7 @@ In the browser instead: `python launch/view.py --task nerf_nav --policy walker`.
 import argparse
 import pathlib
 
-from nerf2real.evaluation.driving import choose_driver
+from nerf2real.evaluation.policies.driving import choose_driver
 from nerf2real.suite.views.rollout import run_episodes
 
 

@@ -1,17 +1,17 @@
-"""Starts an actor, or the evaluator.
+"""Starts an actor of a run, a collector of a distillation, or the evaluator of either.
 
   python launch/actor.py --connect tcp/host:7447
 
-The environment is in the learner's description. --evaluate makes it the evaluator.
+What it runs is in the learner's description. --evaluate makes it the evaluator.
 """
 
 import dataclasses
 import logging
 import signal
 import sys
+import threading
 import uuid
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -21,9 +21,10 @@ from nerf2real.launch import command
 
 if TYPE_CHECKING:  # NumPy is loaded after the environment is set
   from nerf2real.agents.link.client import ActorLink
+  from nerf2real.agents.processes.joining import JoinedProcess
 
 _EVALUATOR_SEED = 1_000_000  # far from the actors' seeds
-ENVIRONMENT = {
+_ENVIRONMENT = {
   **command.NOT_DRAWING,
   **command.ONE_THREAD,
   "JAX_PLATFORMS": "cpu",  # the accelerator is the learner's
@@ -31,8 +32,8 @@ ENVIRONMENT = {
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Joining:
-  """How a process joins a learner."""
+class Arguments:
+  """Starts an actor of a run, a collector of a distillation, or the evaluator of either."""
 
   connect: str
   """The learner or router to join, such as tcp/127.0.0.1:7447."""
@@ -48,32 +49,8 @@ class Joining:
   """The link's settings."""
 
 
-class Arguments(Joining):
-  """Starts an actor, or the evaluator."""
-
-
-class Process(Protocol):
-  """What joins a learner."""
-
-  def run(self) -> None:
-    """Works until the run is over or `stop` is called."""
-
-  def stop(self) -> None:
-    """Ends `run`; safe in a signal handler."""
-
-
-def join(
-  arguments: Joining,
-  *,
-  actor: Callable[["ActorLink"], Process],
-  evaluator: Callable[["ActorLink"], Process],
-) -> None:
+def run(arguments: Arguments) -> None:
   """Joins a learner and works until the run is over or a signal stops the process.
-
-  Args:
-    arguments: how to join.
-    actor: makes the process without --evaluate.
-    evaluator: makes the process with --evaluate.
 
   Raises:
     CommandError: It cannot join with these arguments (only this ends with `REFUSED`), the learner
@@ -86,7 +63,7 @@ def join(
   role = "evaluator" if arguments.evaluate else "actor"
   name = f"{role}-{arguments.index}-{uuid.uuid4().hex[:8]}"
   logging.basicConfig(level=logging.INFO, format=f"%(asctime)s {name}: %(message)s", force=True)
-  process: Process | None = None
+  process: JoinedProcess | None = None
 
   def stop(*_: object) -> None:
     if process is None:
@@ -98,7 +75,7 @@ def join(
   try:
     session = sessions.connect(arguments.connect, arguments.link, timeout=arguments.wait)
     link = ActorLink(session, arguments.link, actor=name, role=role)
-    process = (evaluator if arguments.evaluate else actor)(link)
+    process = _process(link, arguments)
   except (sessions.LinkError, MessageError, ValueError) as error:
     raise command.CommandError(error, status=REFUSED) from error
   try:
@@ -109,25 +86,31 @@ def join(
     link.close()
 
 
-def run(arguments: Arguments) -> None:
-  """Acts or evaluates until the run is over or it is stopped.
+def _process(link: "ActorLink", arguments: Arguments) -> "JoinedProcess":
+  """Returns what the learner's run needs: its description names the kind of run."""
+  from nerf2real.agents.distill.settings import KIND
+  from nerf2real.agents.processes.joining import wait_for
 
-  Raises:
-    CommandError: As `join`.
-  """
+  seed, index = arguments.seed, arguments.index
+  description = wait_for(link.status, threading.Event())["description"]
+  if description.get("kind") == KIND:
+    from nerf2real.agents.distill.collecting.collector import Collector
+    from nerf2real.agents.distill.collecting.evaluator import Evaluator
+
+    return (
+      Evaluator(link, seed=seed) if arguments.evaluate else Collector(link, seed=seed, index=index)
+    )
   from nerf2real.agents.processes.actor import ActorProcess
   from nerf2real.agents.processes.evaluator import EvaluatorProcess
 
-  join(
-    arguments,
-    actor=lambda link: ActorProcess(link, seed=arguments.seed, index=arguments.index),
-    evaluator=lambda link: EvaluatorProcess(link, seed=arguments.seed + _EVALUATOR_SEED),
-  )
+  if arguments.evaluate:
+    return EvaluatorProcess(link, seed=seed + _EVALUATOR_SEED)
+  return ActorProcess(link, seed=seed, index=index)
 
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
-  return command.main(Arguments, run, environment=ENVIRONMENT, errors=())
+  return command.main(Arguments, run, environment=_ENVIRONMENT, errors=())
 
 
 if __name__ == "__main__":

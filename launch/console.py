@@ -23,7 +23,7 @@ SCRIPTS = {
   "actor": "actor",
   "router": "router",
   "distill-learner": "distill_learner",
-  "distill-collector": "distill_collector",
+  "distill-collector": "actor",
   "belief": "show_belief",
   "evaluate": "evaluate",
   "robot": "check_robot",

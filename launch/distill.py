@@ -18,9 +18,7 @@ from nerf2real.launch import command
 from nerf2real.launch.local_distributed import supervised
 
 _HERE = Path(__file__).resolve().parent
-SCRIPTS = training.Scripts(
-  learner=_HERE / "distill_learner.py", actor=_HERE / "distill_collector.py"
-)
+SCRIPTS = training.Scripts(learner=_HERE / "distill_learner.py", actor=_HERE / "actor.py")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,8 +32,9 @@ class Arguments(training.TrainingSettings):
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   preset: str | None = None
-  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push, adapt to train a policy on
-  (with --init-from), or tiny to try the machinery; "nerf_nav" if not given."""
+  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push, adapt to train a policy on,
+  room to train it on in another room (both with --init-from), or tiny to try the machinery;
+  "nerf_nav" if not given."""
 
 
 def run(arguments: Arguments, forwarded: list[str]) -> None:

@@ -32,7 +32,7 @@ def run(arguments: Arguments) -> None:
   import rich.console
 
   from nerf2real.core.progress import progress_bar
-  from nerf2real.scenes.builtin.eye import EglMissingError
+  from nerf2real.scenes.builtin.mujoco_renderer import EglMissingError
 
   console = rich.console.Console(stderr=True)
   try:

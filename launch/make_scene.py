@@ -19,8 +19,8 @@ from nerf2real.launch import command
 
 if TYPE_CHECKING:
   from nerf2real.scenes.bundle import Bundle
-  from nerf2real.scenes.results import Watcher
   from nerf2real.scenes.settings import SceneSettings
+  from nerf2real.scenes.stages.results import Watcher
 
 FILM_AGAIN = 3  # exit status of --check
 
@@ -117,7 +117,7 @@ def _watched(arguments: Arguments) -> Iterator["Watcher | None"]:
   if not arguments.viewer:
     yield None
     return
-  from nerf2real.scenes.training_viewer import TrainingViewer
+  from nerf2real.scenes.viewing.training_viewer import TrainingViewer
 
   viewer = TrainingViewer(host=arguments.host, port=arguments.port)
   print(f"watch it grow: {viewer.address}")
@@ -130,14 +130,14 @@ def _watched(arguments: Arguments) -> Iterator["Watcher | None"]:
 def run(arguments: Arguments) -> int:
   """Makes the scene and prints its figures; returns the exit status."""
   from nerf2real.scenes import pipeline
-  from nerf2real.scenes.builtin import yardstick
+  from nerf2real.scenes.builtin import ground_truth
 
   settings = settings_of(arguments)
   source, measure = Path(arguments.capture), None
   if arguments.capture == "builtin":
-    source, measure = yardstick.VIDEO, yardstick.measure
+    source, measure = ground_truth.VIDEO, ground_truth.measure
     if settings.marker_side is None:
-      settings = dataclasses.replace(settings, marker_side=yardstick.MARKER_SIDE)
+      settings = dataclasses.replace(settings, marker_side=ground_truth.MARKER_SIDE)
   if arguments.check:
     return _check(arguments, source, settings)
   with _watched(arguments) as watcher:

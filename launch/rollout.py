@@ -41,7 +41,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> None:
   """Runs the episodes and prints how they ended."""
-  from nerf2real.evaluation.driving import choose_driver
+  from nerf2real.evaluation.policies.driving import choose_driver
   from nerf2real.suite.views.film import check_film
   from nerf2real.suite.views.rollout import run_episodes
 

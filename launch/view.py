@@ -45,9 +45,9 @@ def run(arguments: Arguments) -> None:
   never = threading.Event()
   wait: Callable[[], object] = never.wait
   if arguments.task is not None:
-    from nerf2real.evaluation.driving import choose_driver
-    from nerf2real.suite.viewer.task_viewer import view_task
+    from nerf2real.evaluation.policies.driving import choose_driver
     from nerf2real.suite.views.drivers import SCRIPTED
+    from nerf2real.suite.views.task_viewer import view_task
 
     chosen = choose_driver(arguments.policy, task=arguments.task)
     viewer = view_task(
@@ -62,7 +62,7 @@ def run(arguments: Arguments) -> None:
   else:
     from nerf2real.scenes.bundle import Bundle
     from nerf2real.scenes.export.splats.splats import Splats
-    from nerf2real.scenes.viewer import view_bundle
+    from nerf2real.scenes.viewing.bundle_viewer import view_bundle
 
     splats = None if arguments.splats is None else Splats.load_ply(arguments.splats)
     server = view_bundle(Bundle.load(arguments.bundle), host=host, port=port, splats=splats)

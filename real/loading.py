@@ -8,7 +8,7 @@ import numpy as np
 
 from nerf2real.core import errors
 from nerf2real.core.camera_info import read_camera_info
-from nerf2real.real.camera.source import CameraSource
+from nerf2real.real.camera.source import CameraSource, check_shape
 from nerf2real.real.clock import Clock
 from nerf2real.real.loop.environment import RobotEnvironment
 from nerf2real.real.loop.settings import RobotSettings, TaskSpec
@@ -127,4 +127,10 @@ def _open_camera(source: Any, image_size: tuple[int, int]) -> CameraSource:
     return source
   from nerf2real.real.camera.device import Camera
 
-  return Camera.open(source, size=image_size)
+  camera = Camera.open(source)
+  try:
+    check_shape(camera.read()[0], image_size)
+  except ValueError:
+    camera.close()
+    raise
+  return camera

@@ -10,13 +10,11 @@ import trimesh
 from nerf2real.core import files
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
-from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.field.views import held_out_rows
-from nerf2real.scenes.geometry import collision, convex, floor_picture, map_server, mesh
+from nerf2real.scenes.geometry import convex, floor_picture, map_server, mesh
 from nerf2real.scenes.quality import held_out, report, sight_lines
-from nerf2real.scenes.results import Measure, Reconstruction, SceneResults
 from nerf2real.scenes.settings import SceneSettings
-from nerf2real.scenes.stages import StageResult
+from nerf2real.scenes.stages.cache import StageResult
+from nerf2real.scenes.stages.results import Measure, Reconstruction, SceneResults
 
 _NOTICEABLE_EXPOSURE = 1.25  # a ratio above this is warned of
 _ROBOT_VIEWS = 8  # held-out views shown at robot resolution where no truth gives better ones
@@ -44,9 +42,8 @@ def assemble(
   """
   (out / "scene.json").unlink(missing_ok=True)
   _copy_files(results, out)
-  parts = collision.read_parts(out / "collision")
+  parts, judged = results.contact.value.parts, results.errors.value.judgement
   figures = _figures(results)
-  judged = _judge(results, parts, settings)
   if judged is not None:
     figures |= _sight_line_figures(judged)
   if measure is not None:
@@ -70,7 +67,7 @@ def assemble(
     )
   if judged is not None and judged.unfit is not None:
     warnings.append(judged.unfit)
-  goals = results.contact.value.goals
+  goals = results.contact.value.floor.goals
   path = alignment.world_from_unit.apply(poses.world_from_camera[:, :3, 3])
   report.write(
     out / "report.html",
@@ -137,6 +134,7 @@ def _copy_files(results: SceneResults, out: Path) -> None:
 def _figures(results: SceneResults) -> dict[str, Any]:
   capture, poses, alignment = results.capture.value, results.poses.value, results.world.value
   quality, contact = results.figures.value, results.contact.value
+  error = results.errors.value.distances
   return {
     "keyframes": len(capture.images),
     "registered_fraction": poses.registered_fraction,
@@ -144,31 +142,15 @@ def _figures(results: SceneResults) -> dict[str, Any]:
     "focal_length_px": 0.5 * (poses.camera.fx + poses.camera.fy),
     **quality,
     "robot_psnr_db": quality["held_out_psnr_30x40_db"],
-    "collision_error_m": contact.collision_error_m,
-    "collision_error": to_plain(contact.collision_error),
-    "collision_parts": contact.collision_parts,
-    "free_area_m2": contact.free_area_m2,
+    "collision_error_m": error.p95,
+    "collision_error": to_plain(error),
+    "collision_parts": len(contact.parts),
+    "free_area_m2": contact.floor.area_m2,
     "moved_to_floor": results.moved_to_floor,
     "floor_tilt_from_cameras_deg": alignment.floor_tilt_from_cameras_deg,
     "scale_source": alignment.scale_source,
     "scale_spread": alignment.scale_spread,
   }
-
-
-def _judge(
-  results: SceneResults, parts: list[convex.Part], settings: SceneSettings
-) -> sight_lines.Judgement | None:
-  """Judges the parts by sight lines of held-out pictures; None where points have no pictures."""
-  place, names = results.world.value, np.array(results.poses.value.names)
-  upper = np.minimum(place.extent_upper, [np.inf, np.inf, settings.collision.top])
-  lines = sight_lines.sight_lines(
-    pycolmap.Reconstruction(str(results.poses.stage.folder / "sfm")),
-    names[held_out_rows(len(names), settings.held_out_every)].tolist(),
-    place.world_from_unit,
-    lower=place.extent_lower,
-    upper=upper,
-  )
-  return sight_lines.judge_parts(lines, parts)
 
 
 def _sight_line_figures(found: sight_lines.Judgement) -> dict[str, float]:

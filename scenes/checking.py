@@ -3,15 +3,14 @@
 from pathlib import Path
 
 from nerf2real.core import files
-from nerf2real.scenes import image_stages
 from nerf2real.scenes.bundle import STAGES
 from nerf2real.scenes.capture.kinds import source_kind
-from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses.localise import LocalisationError
+from nerf2real.scenes.poses.localisation import LocalisationError
 from nerf2real.scenes.quality import advice
-from nerf2real.scenes.results import Source
 from nerf2real.scenes.settings import SceneSettings
-from nerf2real.scenes.stages import Stages
+from nerf2real.scenes.stages import localising
+from nerf2real.scenes.stages.cache import Stages
+from nerf2real.scenes.stages.results import Source
 
 
 def check_capture(
@@ -32,15 +31,14 @@ def check_capture(
   source_kind(source)  # raises where it cannot be used
   film = Source(source, files.hash_path(source))
   cache = Stages(out / STAGES, show_progress=show_progress)
-  capture = image_stages.keyframes(cache, film, settings.capture)
+  capture = localising.keyframes(cache, film, settings.capture)
   try:
-    poses = image_stages.poses(cache, capture, settings.localise)
+    poses = localising.poses(cache, capture, settings.localise)
   except LocalisationError as error:
     return advice.judge(capture.value, settings.capture, reason=str(error))
   return advice.judge(
     capture.value,
     settings.capture,
     poses=poses.value,
-    model=pycolmap.Reconstruction(str(poses.stage.folder / "sfm")),
     align=settings.align,
   )

@@ -1,20 +1,21 @@
 """Makes a scene bundle from a capture: structure from motion, radiance field, geometry.
 
-Every stage is a function of earlier results and settings (`image_stages`, `world_stages`,
-`geometry_stages`) and is cached by the hash of both (`stages`), so that a second run continues
-where the first one stopped.
+Every stage is a function of earlier results and settings and is cached by the hash of both
+(`scenes.stages`), so that a second run continues where the first one stopped.
 """
 
 from pathlib import Path
 
 from nerf2real.core import files
 from nerf2real.core.folder_lock import lock_folder
-from nerf2real.scenes import assembly, bundle, geometry_stages, image_stages, world_stages
-from nerf2real.scenes.alignment import overrides, surroundings
+from nerf2real.scenes import assembly, bundle
+from nerf2real.scenes.alignment import overrides, room_check
 from nerf2real.scenes.capture.kinds import source_kind
-from nerf2real.scenes.results import Measure, SceneResults, Source, Watcher
 from nerf2real.scenes.settings import SceneSettings
-from nerf2real.scenes.stages import Stages
+from nerf2real.scenes.stages import geometry, judging, localising, radiance_field, world_frame
+from nerf2real.scenes.stages.cache import Stages
+from nerf2real.scenes.stages.pictures import PosedPictures
+from nerf2real.scenes.stages.results import Given, Measure, SceneResults, Source, Watcher
 
 STAGES = bundle.STAGES
 
@@ -58,8 +59,7 @@ def make_scene(
       out,
       Stages(out / STAGES, show_progress=show_progress),
       settings=settings,
-      override=fixed,
-      override_key=files.hash_path(override) if override else "",
+      given=Given(fixed, files.hash_path(override) if override else "", settings.marker_side),
       name=name or out.name,
       measure=measure,
       watcher=watcher,
@@ -72,53 +72,34 @@ def _run_stages(
   cache: Stages,
   *,
   settings: SceneSettings,
-  override: overrides.Overrides,
-  override_key: str,
+  given: Given,
   name: str,
   measure: Measure | None,
   watcher: Watcher | None,
 ) -> bundle.Bundle:
-  capture = image_stages.keyframes(cache, film, settings.capture)
-  poses = image_stages.poses(cache, capture, settings.localise)
+  capture = localising.keyframes(cache, film, settings.capture)
+  poses = localising.poses(cache, capture, settings.localise)
   if watcher is not None:
     watcher.poses(poses.value)
-  if override.floor_points is None:
-    surroundings.require_room(poses.value.world_from_camera, poses.value.points)
-  outlook = world_stages.outlook(
-    cache,
-    capture,
-    poses,
-    settings.align,
-    voxel=settings.mesh.voxel,
-    marker_side=settings.marker_side,
-    override=override,
-    override_key=override_key,
+  if given.override.floor_points is None:
+    room_check.require_room(poses.value.world_from_camera, poses.value.points)
+  outlook = world_frame.outlook(
+    cache, capture, poses, settings.align, given, voxel=settings.mesh.voxel
   )
-  pictures = image_stages.PosedPictures(
-    capture, poses, settings.train_width, settings.held_out_every
-  )
+  pictures = PosedPictures(capture, poses, settings.train_width, settings.held_out_every)
   show = None if watcher is None else watcher.field
-  field = image_stages.field(cache, pictures, settings.train, show=show)
-  depth = image_stages.depth(cache, field, capture, poses, width=settings.depth_width)
-  figures = image_stages.figures(cache, field, pictures)
-  world = world_stages.world(
-    cache,
-    capture,
-    poses,
-    outlook,
-    depth,
-    settings.align,
-    marker_side=settings.marker_side,
-    override=override,
-    override_key=override_key,
-  )
+  field = radiance_field.field(cache, pictures, settings.train, show=show)
+  depth = radiance_field.depth(cache, field, capture, poses, width=settings.depth_width)
+  figures = judging.figures(cache, field, pictures)
+  world = world_frame.world(cache, capture, poses, outlook, depth, settings.align, given)
   rendered = depth.value.transformed(world.value.world_from_unit)
-  metric_depth = geometry_stages.floor(cache, world, rendered, pictures, settings.collision)
-  surface = geometry_stages.surface(cache, world, metric_depth, settings.mesh)
-  contact = geometry_stages.contact(
-    cache, world, metric_depth, settings.collision, settings.free_space
+  metric_depth = geometry.floor(cache, world, rendered, pictures, settings.collision)
+  surface = geometry.surface(cache, world, metric_depth, settings.mesh)
+  contact = geometry.contact(cache, world, metric_depth, settings.collision, settings.free_space)
+  errors = judging.contact_errors(
+    cache, world, metric_depth, contact, pictures, top=settings.collision.top
   )
-  baseline = image_stages.baseline(cache, pictures) if settings.baseline == "colmap" else None
+  baseline = judging.baseline(cache, pictures) if settings.baseline == "colmap" else None
 
   results = SceneResults(
     source=film,
@@ -132,6 +113,7 @@ def _run_stages(
     moved_to_floor=float((metric_depth.value.depth != rendered.depth).mean()),
     surface=surface,
     contact=contact,
+    errors=errors,
     baseline=baseline,
   )
   return assembly.assemble(

@@ -1,4 +1,4 @@
-"""A pose on the floor: where a robot starts, is, or is believed to be."""
+"""A planar pose: position and heading on the floor."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

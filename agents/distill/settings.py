@@ -12,6 +12,7 @@ from nerf2real.agents.dmpo.config import AugmentationConfig, DmpoConfig, Network
 ENCODER, POLICY, END_TO_END = "encoder", "policy", "end_to_end"
 STAGES = (ENCODER, POLICY, END_TO_END)
 SETTINGS = "settings.json"  # in a run's folder
+KIND = "distillation"  # of run, in the learner's description
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -177,6 +178,20 @@ def adapt() -> DistillSettings:
   )
 
 
+def room() -> DistillSettings:
+  """Navigation: a student of one room is trained on in another, which looks different."""
+  return dataclasses.replace(
+    adapt(),
+    mixture=MixtureSettings(first_share=0.7),
+    # It walks already and must learn where it is; the shares of `ball_push`, for the same reasons.
+    stages=ball_push().stages,
+    settling=600,
+    first_frames=8_000,
+    learning_rate=1e-3,
+    evaluation_period=1_500.0,
+  )
+
+
 def ball_push() -> DistillSettings:
   """Ball pushing: the walker whose head follows the ball."""
   return DistillSettings(
@@ -253,6 +268,7 @@ PRESETS: Mapping[str, Callable[[], DistillSettings]] = {
   "nerf_nav_60x80": nerf_nav_60x80,
   "ball_push": ball_push,
   "adapt": adapt,
+  "room": room,
   "tiny": tiny,
 }
 

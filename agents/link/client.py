@@ -157,7 +157,7 @@ class ActorLink:
     return None if message is None else message.values
 
   def report(self, values: Mapping[str, Any]) -> None:
-    """Sends metrics; they are lost if nobody is there."""
+    """Sends metrics; they are lost without a learner."""
     self._metrics.put(schema.encode("metrics", {"who": self.actor, **values}))
 
   def close(self) -> None:

@@ -9,7 +9,7 @@ from dm_control.rl import control
 from nerf2real.agents.dmpo.policy import acting
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.link.schema import MessageError
-from nerf2real.agents.processes.joining import AWAY_POLL, JoinedProcess
+from nerf2real.agents.processes.joining import AWAY_POLL, PolicyProcess
 from nerf2real.agents.processes.timings import StageTimes
 
 _log = logging.getLogger(__name__)
@@ -17,7 +17,7 @@ _POLL = 0.01  # s between questions while no credit is granted
 _DRAIN = 3.0  # s to deliver what was made, at the end
 
 
-class ActorProcess(JoinedProcess):
+class ActorProcess(PolicyProcess):
   """Runs episodes with drawn actions and sends every transition once."""
 
   def __init__(self, link: ActorLink, *, seed: int, index: int = 0):

@@ -1,5 +1,6 @@
 """The evaluator's process: measures the policy's mean action while a run goes on."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,13 @@ from nerf2real.agents.dmpo.policy import acting
 from nerf2real.agents.environments.loading import trials_of
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.link.schema import MessageError
-from nerf2real.agents.processes.joining import AWAY_POLL, JoinedProcess
+from nerf2real.agents.processes.joining import AWAY_POLL, PolicyProcess
 from nerf2real.core.intervals import clopper_pearson
 
 _EPISODES = 5  # of an evaluation, where there is no protocol
 
 
-class EvaluatorProcess(JoinedProcess):
+class EvaluatorProcess(PolicyProcess):
   """Measures the policy's mean action at regular numbers of environment steps.
 
   Where the task has success, a policy that looks as good as the best so far is measured again on
@@ -99,9 +100,15 @@ class EvaluatorProcess(JoinedProcess):
       if self._stop.is_set():
         return None
       results.append(acting.run_episode(self.agent, self.environment))
-    figures = {name: float(np.mean([r[name] for r in results if name in r])) for name in results[0]}
-    figures["length"] = figures.pop("steps")
-    if "success" in figures:
-      interval = clopper_pearson(round(figures["success"] * count), count)
-      figures |= {"success_low": interval.low, "success_high": interval.high}
-    return figures | {"episodes": count}
+    return summary(results)
+
+
+def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+  """Means of the figures of episodes; success with its exact interval."""
+  count = len(results)
+  figures = {name: float(np.mean([r[name] for r in results if name in r])) for name in results[0]}
+  figures["length"] = figures.pop("steps")
+  if "success" in figures:
+    interval = clopper_pearson(round(figures["success"] * count), count)
+    figures |= {"success_low": interval.low, "success_high": interval.high}
+  return figures | {"episodes": count}

@@ -96,7 +96,34 @@ def make_known_environment(
 
 
 class JoinedProcess:
-  """What actor and evaluator share: description, parameters, environment, failed episodes."""
+  """What the processes of a run share: description, layout, failed episodes, a way to end."""
+
+  def __init__(self, link: ActorLink):
+    """Joins.
+
+    Args:
+      link: the process's link.
+    """
+    self.link = link
+    self._stop = threading.Event()
+    answer = wait_for(link.status, self._stop)
+    self.description = answer["description"]
+    self.layout = from_plain(self.description["layout"], Layout)
+    # What seeds depend on besides: where the learner began, how many were in this one's place.
+    self._beginning = (self.description["begin_steps"], answer["predecessors"])
+    self._failures = Failures(link)
+
+  def run(self) -> None:
+    """Works until the run is over or `stop` is called."""
+    raise NotImplementedError
+
+  def stop(self) -> None:
+    """Ends `run`; safe in a signal handler."""
+    self._stop.set()
+
+
+class PolicyProcess(JoinedProcess):
+  """What actor and evaluator of the agent share: its environment, and the newest policy."""
 
   def __init__(
     self,
@@ -115,33 +142,20 @@ class JoinedProcess:
         learner began and how many were in this one's place before are added.
       deterministic: takes the policy's mean instead of drawing.
     """
-    self.link = link
-    self._stop = threading.Event()
-    answer = wait_for(link.status, self._stop)
-    self.description = description = answer["description"]
-    self.config: configs.DmpoConfig = from_plain(description["config"], configs.DmpoConfig)
-    self.layout = from_plain(description["layout"], Layout)
+    super().__init__(link)
+    self.config: configs.DmpoConfig = from_plain(self.description["config"], configs.DmpoConfig)
     if not deterministic:
-      entropy = (*entropy, description["begin_steps"], answer["predecessors"])
+      entropy = (*entropy, *self._beginning)
     self.seed, action_seed = (int(s) for s in np.random.SeedSequence(entropy).generate_state(2))
     self.environment = make_known_environment(
-      description[environment], self.layout, seed=self.seed, history=self.config.history
+      self.description[environment], self.layout, seed=self.seed, history=self.config.history
     )
     self.agent = acting.Agent(
-      Policy(
-        wait_for(link.parameters, self._stop)[1],
-        init_stddev=self.config.network.init_stddev,
-        min_stddev=self.config.network.min_stddev,
-      ),
+      Policy.of_network(wait_for(link.parameters, self._stop)[1], self.config.network),
       self.layout,
       seed=action_seed,
       deterministic=deterministic,
     )
-    self._failures = Failures(link)
-
-  def stop(self) -> None:
-    """Ends `run`; safe in a signal handler."""
-    self._stop.set()
 
   def _update_parameters(self, grant: Grant, *, hold: bool = False) -> None:
     # Another version, not a later one: a learner that resumed may have gone back.

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from nerf2real.agents.link.children import last_lines, start_child
+from nerf2real.agents.link.child_processes import last_lines, start_child
 from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
 
 _MAX_RESTARTS = 5  # of one process within the restart window

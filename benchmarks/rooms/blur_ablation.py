@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks import harness
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.builtin import filming, yardstick
+from nerf2real.scenes.builtin import filming, ground_truth
 from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.engine.device import num_threads
 from nerf2real.scenes.field.render.renderer import Renderer
@@ -55,12 +55,12 @@ def unit_from_room() -> Similarity:
 
 def film_views(settings: Settings) -> Views:
   """Reads keyframes of the shipped film with their true poses in the unit frame."""
-  truth = filming.read_truth(yardstick.TRUTH)
+  truth = filming.read_truth(ground_truth.TRUTH)
   poses, camera = truth["world_from_camera"], truth["camera"]
   groups = np.array_split(np.arange(len(poses)), settings.keyframes)
   best: dict[int, tuple[float, int, np.ndarray]] = {}
   group_of = {int(i): g for g, group in enumerate(groups) for i in group}
-  with av.open(str(yardstick.VIDEO)) as container:
+  with av.open(str(ground_truth.VIDEO)) as container:
     for index, frame in enumerate(container.decode(video=0)):
       if index not in group_of:
         break
@@ -84,11 +84,13 @@ def film_views(settings: Settings) -> Views:
 
 def robot_views() -> dict[str, Views]:
   """The true pictures of the robot's camera, by size."""
-  arrays = np.load(yardstick.ROBOT_VIEWS)
+  arrays = np.load(ground_truth.ROBOT_VIEWS)
   poses = unit_from_room().apply_pose(arrays["world_from_camera"])
   names = tuple(str(i) for i in range(len(poses)))
   return {
-    f"robot {h}x{w}": Views(yardstick.robot_camera(h, w), arrays[f"images_{h}x{w}"], poses, names)
+    f"robot {h}x{w}": Views(
+      ground_truth.robot_camera(h, w), arrays[f"images_{h}x{w}"], poses, names
+    )
     for h, w in SIZES
   }
 

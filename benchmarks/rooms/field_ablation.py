@@ -20,11 +20,11 @@ from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.engine.device import num_threads
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.views import Views
-from nerf2real.scenes.pictures import PosedPictures
-from nerf2real.scenes.poses import localise
+from nerf2real.scenes.poses import localisation
 from nerf2real.scenes.quality import held_out
 from nerf2real.scenes.settings import SceneSettings
-from nerf2real.scenes.stages import Made, StageResult
+from nerf2real.scenes.stages.cache import Made, StageResult
+from nerf2real.scenes.stages.pictures import PosedPictures
 
 Part = Literal["falloff", "near_gradient", "points", "distortion", "blur"]
 CHANGES: dict[str, dict[str, Any]] = {  # all turn a part off but near_gradient, which is off
@@ -63,7 +63,7 @@ def read_views(scene: Path) -> Views:
   settings = SceneSettings()
   return PosedPictures(
     Made(capture, taken),
-    Made(localise.load(poses.folder / "sfm"), poses),
+    Made(localisation.load(poses.folder / "sfm"), poses),
     settings.train_width,
     settings.held_out_every,
   ).views()

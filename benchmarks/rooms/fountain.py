@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks import harness
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import read_capture
-from nerf2real.scenes.poses.localise import Localisation, localise
+from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.poses.structure_from_motion import localise
 
 MAX_POSITION_RMSE = 0.01  # [m]
 MAX_ROTATION_RMSE = 0.1  # [degree]

@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks import harness
 from nerf2real.core.serialization import from_plain
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.builtin import yardstick
+from nerf2real.scenes.builtin import ground_truth
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export.mjcf import mujoco_quaternion
 from nerf2real.scenes.export.splats.splats import Splats
@@ -41,7 +41,7 @@ def draw_with_mujoco_warp(splats: Splats, poses: np.ndarray, *, samples: int) ->
 
   spec = mujoco.MjSpec()
   for number, pose in enumerate(poses):
-    fov = float(np.degrees(yardstick.robot_camera(_HEIGHT, _WIDTH).vertical_fov))
+    fov = float(np.degrees(ground_truth.robot_camera(_HEIGHT, _WIDTH).vertical_fov))
     spec.worldbody.add_camera(
       name=f"view_{number}", pos=pose[:3, 3], quat=mujoco_quaternion(pose), fovy=fov
     )
@@ -68,12 +68,12 @@ def draw_with_mujoco_warp(splats: Splats, poses: np.ndarray, *, samples: int) ->
 def main(settings: Settings) -> None:
   """Draws and prints the table."""
   bundle = Bundle.load()
-  arrays = np.load(yardstick.ROBOT_VIEWS)
+  arrays = np.load(ground_truth.ROBOT_VIEWS)
   world_from_room = from_plain(bundle.figures["room_from_world"], Similarity).inverse()
   poses = world_from_room.apply_pose(arrays["world_from_camera"])
   truth = arrays[f"images_{_HEIGHT}x{_WIDTH}"]
   field = render_views(
-    bundle, renderer_of(bundle), yardstick.robot_camera(_HEIGHT, _WIDTH), poses
+    bundle, renderer_of(bundle), ground_truth.robot_camera(_HEIGHT, _WIDTH), poses
   ).color
   assert field is not None
   splats = Splats.load_ply(settings.splats)

@@ -2,7 +2,7 @@
 
 The same robot stands on the same floor and follows the same random targets (through the action
 filter) for half a second, as it would between two corrections of a policy. Its end state is
-compared with the end state at 0.125 ms. As a yardstick the last rows show what a change of mass
+compared with the end state at 0.125 ms. As a truth the last rows show what a change of mass
 within the paper's randomisation (0 to 0.5 kg) does to the same motion at the fine step: an error
 far below it cannot matter to a policy. The results are in suite/README.md.
 

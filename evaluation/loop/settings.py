@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
-from nerf2real.evaluation import policy_names
+from nerf2real.evaluation.policies import names as policy_names
 
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"

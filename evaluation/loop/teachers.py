@@ -20,8 +20,9 @@ from nerf2real.evaluation import runner
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.plant import Plant, Trial
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
-from nerf2real.evaluation.policies import GaitPolicy
+from nerf2real.evaluation.policies.policy import GaitPolicy
 from nerf2real.evaluation.session import choose
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite.gaits.evolution import Evolution
 from nerf2real.suite.protocols import NAVIGATION
 
@@ -138,8 +139,7 @@ def _episode(plant: Plant, scene: Any, settings: WalkerSettings, trial: Trial, i
 @contextlib.contextmanager
 def _plant(scene: Any, effects: Path, time_limit: float | None) -> Iterator[Plant]:
   """Yields the simulation with the effects, without pictures."""
-  plant = SimulatedPlant(
-    scene, NAVIGATION, image_size=None, effects=effects, draw_effects=True, time_limit=time_limit
-  )
+  settings = EvaluationSettings(effects=effects, time_limit=time_limit)
+  plant = SimulatedPlant(scene, settings, image_size=None, draw_effects=True)
   with contextlib.closing(plant):
     yield plant

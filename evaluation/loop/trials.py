@@ -15,14 +15,14 @@ from nerf2real.core.intervals import Interval, clopper_pearson
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
-from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.loop import starts
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.evaluation.loop.starts import Walked
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.making import free_name, make_plant
 from nerf2real.evaluation.plants.plant import Plant
-from nerf2real.evaluation.policies import EvaluatedPolicy, GaitPolicy, resolution
+from nerf2real.evaluation.policies.learned import LearnedPolicy
+from nerf2real.evaluation.policies.policy import EvaluatedPolicy, GaitPolicy, resolution
 from nerf2real.evaluation.session import choose
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual.undeclared import Undeclared

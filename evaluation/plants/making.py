@@ -41,46 +41,20 @@ def make_plant(
 
     return SimulatedPlant(
       scene,
-      settings.protocol,
-      settings.perturb,
+      settings,
       image_size=image_size,
       camera=camera_settings(trained_on),
-      effects=settings.effects,
       draw_effects=draw_effects,
-      seed=settings.seed,
-      time_limit=settings.time_limit,
-      swap=settings.swap,
     )
   if settings.plant == "virtual":
     from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 
     return RehearsedPlant(
-      scene,
-      settings.protocol,
-      settings.perturb,
-      image_size=image_size,
-      robot_seed=settings.robot_seed[0],
-      altered=altered,
-      session=session,
-      time_limit=settings.time_limit,
-      swap=settings.swap,
-      record=record,
+      scene, settings, image_size=image_size, altered=altered, session=session, record=record
     )
   from nerf2real.evaluation.plants.operated import OperatedPlant
 
-  return OperatedPlant(
-    scene,
-    settings.protocol,
-    settings.perturb,
-    robot=settings.robot,
-    camera=settings.camera,
-    image_size=image_size,
-    time_limit=settings.time_limit,
-    record=record,
-    offsets=settings.offsets,
-    lens=settings.lens,
-    dry_run=settings.dry_run,
-  )
+  return OperatedPlant(scene, settings, image_size=image_size, record=record)
 
 
 def free_name(path: Path) -> Path:

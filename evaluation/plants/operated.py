@@ -14,6 +14,7 @@ from nerf2real.evaluation import episodes
 from nerf2real.evaluation.plants import perturbations
 from nerf2real.evaluation.plants.plant import TASKS, Sight, Trial
 from nerf2real.evaluation.plants.robot_plant import RobotPlant
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.camera.device import Controls
 from nerf2real.real.clock import RealClock, prefer_this_thread
 from nerf2real.real.loading import Connection
@@ -39,17 +40,10 @@ class OperatedPlant(RobotPlant):
   def __init__(
     self,
     scene: Any,
-    protocol: str,
-    perturbation: str = perturbations.NONE,
+    settings: EvaluationSettings,
     *,
-    robot: Any,
-    camera: Any,
     image_size: tuple[int, int] | None,
-    time_limit: float | None = None,
     record: Path | None = None,
-    offsets: Path | None = None,
-    lens: Path | None = None,
-    dry_run: bool = False,
     observer: Callable[[], Sight] | None = None,
     ask: Callable[[str], str] | None = None,
     say: Callable[[str], None] = print,
@@ -58,23 +52,18 @@ class OperatedPlant(RobotPlant):
 
     Args:
       scene: An opened bundle of the room.
-      protocol: One of `protocols.PROTOCOLS`.
-      perturbation: One of `perturbations.PERTURBATIONS`.
-      robot: Serial port, or a `real.loading.Connection`.
-      camera: Device number, file or URL.
+      settings: The evaluation's: protocol, perturbation, time limit, where the robot is reached and
+        what is its own. In a dry run nothing moves, and no verdict is asked for.
       image_size: Height and width of the policy's picture; None for no camera.
-      time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
-      offsets: The robot's `offset.yaml`.
-      lens: The camera's camera_info YAML, for the recording.
-      dry_run: Everything is read, asked and computed, and nothing moves; no verdict is asked for.
       observer: Motion capture, if there is any.
       ask: Puts a question to the operator and returns the answer; None: at this terminal.
       say: Shows the operator a line.
     """
-    super().__init__(scene, protocol, perturbation, record=record)
+    super().__init__(scene, settings, record=record)
+    robot: Any = settings.robot
     connection = Connection(port=robot) if isinstance(robot, str) else robot
-    own = {"camera": camera, "offsets": offsets, "lens": lens}
+    own = {name: getattr(settings, name) for name in ("camera", "offsets", "lens")}
     given = {name: value for name, value in own.items() if value is not None}
     connection = dataclasses.replace(connection, **given)
     if ask is None:  # through the terminal that the stop key is read from, never beside it
@@ -83,17 +72,17 @@ class OperatedPlant(RobotPlant):
       ask = terminal.ask
     self._observer, self._ask, self._say = observer, ask, say
     self._environment = real.load(
-      TASKS[protocol],
+      TASKS[self.protocol],
       robot=connection,
       scene=scene,
       image_size=image_size,
-      time_limit=time_limit,
-      settings=RobotSettings(dry_run=dry_run),
+      time_limit=settings.time_limit,
+      settings=RobotSettings(dry_run=settings.dry_run),
       recorder=self._recorder,
     )
     if isinstance(self._environment.bus.clock, RealClock):
       prefer_this_thread(acting=True)
-    self._dry_run = dry_run
+    self._dry_run = settings.dry_run
     self._steps = 0
 
   def start(self, trial: Trial) -> dm_env.TimeStep:

@@ -8,6 +8,7 @@ import numpy as np
 
 from nerf2real.core import errors
 from nerf2real.evaluation.plants import perturbations
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite import protocols
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.protocols import BALL, PROTOCOLS, BallTrial, NavigationTrial
@@ -35,15 +36,14 @@ class Plant(abc.ABC):
   plant_id: str = ""  # which one
   _recorder: Any = None  # a `real.recorder.recorder.Recorder`
 
-  def __init__(self, scene: Any, protocol: str, perturbation: str):
+  def __init__(self, scene: Any, settings: EvaluationSettings):
     """Notes what is evaluated.
 
     Args:
       scene: An opened bundle.
-      protocol: One of `protocols.PROTOCOLS`.
-      perturbation: One of `perturbations.PERTURBATIONS`.
+      settings: The evaluation's protocol and perturbation, and what the kind of plant reads.
     """
-    self.scene, self.protocol, self.perturbation = scene, protocol, perturbation
+    self.scene, self.protocol, self.perturbation = scene, settings.protocol, settings.perturb
 
   @property
   @abc.abstractmethod

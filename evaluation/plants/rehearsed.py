@@ -12,6 +12,7 @@ from nerf2real import real
 from nerf2real.evaluation.plants import perturbations, swaps
 from nerf2real.evaluation.plants.plant import TASKS, Sight, Trial, make_intruder
 from nerf2real.evaluation.plants.robot_plant import RobotPlant
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.camera import LENS
 from nerf2real.real.virtual.robot import VirtualRobot
@@ -21,7 +22,7 @@ from nerf2real.suite.protocols import BALL, NavigationTrial
 
 
 class CoveredCamera:
-  """A camera that somebody may cover with a hand."""
+  """A camera that can be covered: the paper's blocked camera."""
 
   def __init__(self, camera: Any):
     self._camera = camera
@@ -45,36 +46,30 @@ class RehearsedPlant(RobotPlant):
   def __init__(
     self,
     scene: Any,
-    protocol: str,
-    perturbation: str = perturbations.NONE,
+    settings: EvaluationSettings,
     *,
     image_size: tuple[int, int] | None,
-    robot_seed: int | None = 1,
     altered: Sequence[Undeclared] = (),
     session: float = 0.0,
     world: str = "room",
-    time_limit: float | None = None,
     record: Path | None = None,
-    swap: str = swaps.NONE,
   ):
     """Builds the robot and connects to it.
 
     Args:
       scene: An opened bundle of the room that the robot stands in.
-      protocol: One of `protocols.PROTOCOLS`.
-      perturbation: One of `perturbations.PERTURBATIONS`.
+      settings: The evaluation's; read are protocol, perturbation, time limit, the first robot's
+        seed, and whether nothing is hidden in it (`swaps.PHYSICS`).
       image_size: Height and width of the policy's picture; None for no camera.
-      robot_seed: Which robot: the seed of what is hidden in it; None: as in the data sheets.
       altered: Undeclared effects that the robot has besides.
       session: Time that its battery was in use before [s].
       world: "room" or "floor", see `VirtualRobot`.
-      time_limit: Length of an episode [s]; the task's own if None.
       record: Where the run is recorded; not recorded if None.
-      swap: `swaps.PHYSICS`: nothing is hidden in the robot.
     """
-    super().__init__(scene, protocol, perturbation, record=record)
-    self.plant_id = "data sheet" if robot_seed is None else f"robot {robot_seed}"
-    known = swap == swaps.PHYSICS
+    super().__init__(scene, settings, record=record)
+    robot_seed = settings.robot_seed[0]
+    self.plant_id = f"robot {robot_seed}"
+    known = settings.swap == swaps.PHYSICS
     self.plant_id += ", data sheet's physics" if known else ""
     self._intruder = make_intruder(self, self._starts)
     if altered:
@@ -86,14 +81,14 @@ class RehearsedPlant(RobotPlant):
       hidden=build.hidden,
       stepped=True,
       camera=None if image_size is None else build.camera,
-      ball=protocol == BALL,
+      ball=self.protocol == BALL,
       furnish=None if self._intruder is None else self._intruder.add_to_spec,
     )
     if self._intruder is not None:
       self._intruder.bind(self.robot.body.model)
     self._camera: CoveredCamera | None = None
     try:
-      self._environment = self._connect(image_size, time_limit)
+      self._environment = self._connect(image_size, settings.time_limit)
     except BaseException:
       self.robot.close()
       raise

@@ -7,6 +7,7 @@ import dm_env
 import numpy as np
 
 from nerf2real.evaluation.plants.plant import Plant, Trial
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.real.safety.monitor import Reason
 from nerf2real.suite import protocols
@@ -20,18 +21,17 @@ class RobotPlant(Plant):
 
   _environment: Any
 
-  def __init__(self, scene: Any, protocol: str, perturbation: str, *, record: Path | None):
+  def __init__(self, scene: Any, settings: EvaluationSettings, *, record: Path | None):
     """Finds the starts in the scene and opens the recording.
 
     Args:
       scene: An opened bundle of the room.
-      protocol: One of `protocols.PROTOCOLS`.
-      perturbation: One of `perturbations.PERTURBATIONS`.
+      settings: The evaluation's.
       record: Where the run is recorded; not recorded if None.
     """
-    super().__init__(scene, protocol, perturbation)
+    super().__init__(scene, settings)
     self._starts = protocols.scene_starts(scene)
-    self._workspace = find_workspace(scene) if protocol == BALL else None
+    self._workspace = find_workspace(scene) if self.protocol == BALL else None
     self._recorder = None if record is None else Recorder(record)
 
   @property

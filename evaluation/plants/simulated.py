@@ -9,6 +9,7 @@ import numpy as np
 from nerf2real import suite
 from nerf2real.evaluation.plants import perturbations, swaps
 from nerf2real.evaluation.plants.plant import TASKS, Plant, Sight, Trial, make_intruder
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite import protocols
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.sensors.camera import CameraSettings
@@ -23,39 +24,30 @@ class SimulatedPlant(Plant):
   def __init__(
     self,
     scene: Any,
-    protocol: str,
-    perturbation: str = perturbations.NONE,
+    settings: EvaluationSettings,
     *,
     image_size: tuple[int, int] | None,
     camera: CameraSettings | None = None,
-    effects: Any = None,
     draw_effects: bool = False,
-    seed: int = 0,
-    time_limit: float | None = None,
-    swap: str = swaps.NONE,
   ):
     """Builds the environment.
 
     Args:
       scene: An opened bundle.
-      protocol: One of `protocols.PROTOCOLS`.
-      perturbation: One of `perturbations.PERTURBATIONS`.
+      settings: The evaluation's; read are protocol, perturbation, effects, seed, time limit, swap.
       image_size: Height and width of the picture; None for no camera.
       camera: Settings of the camera; the suite's own if None.
-      effects: An effects.json, or effects.
       draw_effects: Whether every episode draws the effects' values from their intervals.
-      seed: Of what differs between episodes, with the trial's own.
-      time_limit: Length of an episode [s]; the task's own if None.
-      swap: What is taken from the virtual robot: `swaps.PICTURE` or `swaps.DELAY`.
     """
-    super().__init__(scene, protocol, perturbation)
+    super().__init__(scene, settings)
+    effects, seed, swap = settings.effects, settings.seed, settings.swap
     self.plant_id = f"seed {seed}" + ("" if effects is None else ", effects")
     self.plant_id += "" if swap == swaps.NONE else f", the robot's {swap}"
     self._room = swaps.TrueRoom(scene) if swap == swaps.PICTURE and image_size else None
     self._seed = seed
     self._intruder = make_intruder(self, protocols.scene_starts(scene))
     self._environment = suite.load(
-      TASKS[protocol],
+      TASKS[self.protocol],
       scene=scene,
       effects=effects,
       draw_effects=draw_effects,
@@ -64,7 +56,7 @@ class SimulatedPlant(Plant):
       renderer=self._room,
       random=seed,
       randomisation=dataclasses.replace(RandomisationSettings(), pushes=False),
-      time_limit=time_limit,
+      time_limit=settings.time_limit,
       furnish=None if self._intruder is None else self._intruder.add_to_arena,
     )
     if self._intruder is not None:

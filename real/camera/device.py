@@ -90,19 +90,16 @@ class Camera:
     self,
     source: Source,
     *,
-    size: tuple[int, int],
     settings: CaptureSettings,
     capture: Callable[[Source], Any],
   ):
     """See `open`."""
     self.source = source
-    self._height, self._width = size
     self._settings, self._asked = settings, settings.controls
     self._make_capture = capture
     self._lock = threading.Condition()
     self._picture: np.ndarray | None = None  # full size, BGR
     self._taken = 0.0  # monotonic s
-    self._shape_error: str | None = None
     self._stop = threading.Event()
     self.frames = 0  # that came
     self.reopened = 0  # times that the source was lost and found again
@@ -114,7 +111,6 @@ class Camera:
     cls,
     source: Source,
     *,
-    size: tuple[int, int],
     settings: CaptureSettings | None = None,
     capture: Callable[[Source], Any] | None = None,
   ) -> "Camera":
@@ -122,18 +118,13 @@ class Camera:
 
     Args:
       source: Number of a device, a video file (played at its own rate), or the URL of a stream.
-      size: Height and width of the policy's picture. The source's pictures must have the same
-        shape, as a calibrated lens is for one shape.
       settings: Settings of the camera.
       capture: Opens a source as cv2.VideoCapture does; for tests.
 
     Raises:
       CameraLostError: No picture came.
-      ValueError: The size is not a size, the file does not exist, or the pictures have another
-        shape.
+      ValueError: The file does not exist.
     """
-    if len(size) != 2 or min(size) < 1:
-      raise ValueError(f"A camera's size is (height, width) in pixels, found {size!r}.")
     if isinstance(source, Path) or (isinstance(source, str) and not source.startswith(_NETWORK)):
       if isinstance(source, str) and source.isdigit():
         source = int(source)
@@ -141,15 +132,12 @@ class Camera:
         raise ValueError(f"Found no {source}: expected a device's number, a video file or a URL.")
     settings = settings or CaptureSettings()
     timeout = settings.timeout
-    camera = cls(source, size=size, settings=settings, capture=capture or open_capture)
+    camera = cls(source, settings=settings, capture=capture or open_capture)
     camera._thread.start()
     with camera._lock:
-      camera._lock.wait_for(lambda: camera._picture is not None or camera._shape_error, timeout)
-      arrived, error = camera._picture is not None, camera._shape_error
-    if error is not None or not arrived:
+      arrived = camera._lock.wait_for(lambda: camera._picture is not None, timeout)
+    if not arrived:
       camera.close()
-      if error is not None:
-        raise ValueError(error)
       raise CameraLostError(
         f"No picture came from the camera {source} in {timeout:g} s: check that it is plugged in "
         "(v4l2-ctl --list-devices), free, and that its number or address is right."
@@ -243,8 +231,6 @@ class Camera:
       arrived = time.monotonic()
       if not found or picture is None:
         return
-      if not self._check_shape(picture):
-        return
       with self._lock:
         self._picture, self._taken = picture, self._stamp(capture, arrived)
         self.frames += 1
@@ -260,20 +246,6 @@ class Camera:
       if 0 <= arrived - taken <= _MAX_DRIVER_AGE:
         return taken
     return arrived
-
-  def _check_shape(self, picture: np.ndarray) -> bool:
-    height, width = picture.shape[:2]
-    # Half a pixel of the small picture is what rounding explains.
-    if abs(width * self._height / height - self._width) <= 0.5:
-      return True
-    with self._lock:
-      self._shape_error = (
-        f"The camera {self.source} gives {width} x {height} pixels, which do not shrink to "
-        f"{self._width} x {self._height}: ask for another capture_size, or calibrate this one."
-      )
-      self._lock.notify_all()
-    self._stop.set()
-    return False
 
 
 def open_capture(source: Source) -> Any:

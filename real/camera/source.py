@@ -16,6 +16,22 @@ class CameraSource(Protocol):
     """Frees the camera."""
 
 
+def check_shape(picture: np.ndarray, size: tuple[int, int]) -> None:
+  """Raises ValueError where pictures [H, W, 3] have another shape than (height, width) of a policy.
+
+  A lens is calibrated for one shape.
+  """
+  if len(size) != 2 or min(size) < 1:
+    raise ValueError(f"A camera's size is (height, width) in pixels, found {size!r}.")
+  height, width = picture.shape[:2]
+  # Half a pixel of the small picture is what rounding explains.
+  if abs(width * size[0] / height - size[1]) > 0.5:
+    raise ValueError(
+      f"The camera gives {width} x {height} pixels, which do not shrink to {size[1]} x {size[0]}: "
+      "ask for another capture_size, or calibrate this one."
+    )
+
+
 def resize(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
   """Returns a picture [H, W, 3] in another size (height, width): each pixel is the area's mean."""
   height, width = size

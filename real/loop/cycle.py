@@ -33,11 +33,11 @@ class Cycle:
     self,
     bus: Bus,
     servos: Servos,
-    monitor: Monitor,
     *,
     operator: Operator,
     timing: Timing,
     settings: RobotSettings,
+    camera: bool,
     recorder: Any = None,
   ):
     """Starts reading.
@@ -45,15 +45,17 @@ class Cycle:
     Args:
       bus: The bus.
       servos: The servos on it, set up.
-      monitor: Judges the readings.
       operator: Whose key stops the robot.
       timing: Takes how long things took.
       settings: Settings of the robot.
+      camera: Whether pictures are expected.
       recorder: Takes everything that was read (`real.recorder.recorder.Recorder`), or None.
     """
     self.stop: Stop | None = None
     self.sensing = Sensing(low_pass=not settings.chip_low_pass)
-    self._bus, self._servos, self._monitor, self._operator = bus, servos, monitor, operator
+    self._bus, self._servos, self._operator = bus, servos, operator
+    self._monitor = Monitor(settings.safety, camera=camera)
+    self._monitor.arm(bus.clock.now())
     self._timing, self._recorder, self._dry_run = timing, recorder, settings.dry_run
     self._commands = threading.Lock()  # a goal must not follow a stop
     self._torque_off = True
@@ -69,6 +71,27 @@ class Cycle:
   def torque_off(self) -> bool:
     """Whether all servos have confirmed that their torque is off."""
     return self._torque_off
+
+  def watch(self) -> None:
+    """Begins to watch anew: everything counts as seen just now."""
+    self._monitor.arm(self._bus.clock.now())
+
+  def hold(self, held: bool) -> None:
+    """Sets whether a person holds the robot, so that its tilt does not matter."""
+    self._monitor.held = held
+
+  def accepts(self, action: np.ndarray) -> bool:
+    """Returns whether an action is fit to be sent; one that is not switches the torque off."""
+    stop = self._monitor.action(self._bus.clock.now(), action)
+    if stop is not None:
+      self.halt(stop)
+    return stop is None
+
+  def take_picture(self, age: float | None) -> None:
+    """Judges the age of the newest picture [s]; None if it was lost."""
+    stop = self._monitor.camera(self._bus.clock.now(), age)
+    if stop is not None:
+      self.halt(stop)
 
   def energize(self) -> None:
     """Switches the torque on where the joints are.

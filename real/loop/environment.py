@@ -20,7 +20,7 @@ from nerf2real.real.loop.motion import SUPPORTED_POSE, Motion
 from nerf2real.real.loop.pictures import Pictures
 from nerf2real.real.loop.settings import RobotSettings, TaskSpec
 from nerf2real.real.loop.timing import Timing
-from nerf2real.real.safety.monitor import Limiter, Monitor, Stop
+from nerf2real.real.safety.monitor import Limiter, Stop
 from nerf2real.real.safety.operator import Operator
 from nerf2real.real.wire.bus import Bus
 from nerf2real.real.wire.servos import Servos
@@ -73,17 +73,14 @@ class RobotEnvironment(dm_env.Environment):
     self._lower, self._upper = constants.joint_limits(head_pan=task.head_pan_limit)
     self._middle = (self._lower + self._upper) / 2
     self._half_range = (self._upper - self._lower) / 2
-    safety = self.settings.safety
-    self._limiter = Limiter(self._lower, self._upper, max_speed=safety.max_speed)
+    self._limiter = Limiter(self._lower, self._upper, max_speed=self.settings.safety.max_speed)
     self._action_filter = filters.ExponentialFilter(constants.ACTION_FILTER)
-    self._monitor = Monitor(safety, camera=camera is not None)
     self._pictures: Pictures | None = None
     if camera is not None and image_size is not None:
       self._pictures = Pictures(
         camera,
         image_size,
         clock=self._clock,
-        monitor=self._monitor,
         timing=self.timing,
         recorder=recorder,
       )
@@ -101,20 +98,18 @@ class RobotEnvironment(dm_env.Environment):
     self.servos.power_on()
     if not self.dry_run:
       self.servos.set_up()
-    self._monitor.arm(self._clock.now())
     self._cycle = Cycle(
       bus,
       self.servos,
-      self._monitor,
       operator=operator,
       timing=self.timing,
       settings=self.settings,
+      camera=camera is not None,
       recorder=recorder,
     )
     self._motion = Motion(
       self._cycle,
       self.servos,
-      self._monitor,
       self._limiter,
       operator=operator,
       clock=self._clock,
@@ -145,7 +140,7 @@ class RobotEnvironment(dm_env.Environment):
     self.timing.reset()
     self._missed_before = self._cycle.missed
     now = self._clock.now()
-    self._monitor.arm(now)
+    self._cycle.watch()
     self._cycle.sensing.start(self._control)
     self._start, self._steps, self._due = now, 0, now
     self._running = True
@@ -165,10 +160,7 @@ class RobotEnvironment(dm_env.Environment):
       raise ValueError(errors.bad_action(action, self._action_spec))
     asked = self._clock.now()
     self.timing.add("policy", asked - self._due)
-    stop = self._monitor.action(asked, action)
-    if stop is not None:
-      self._cycle.halt(stop)
-    else:
+    if self._cycle.accepts(action):
       self._act(action, asked)
     self._wait_for_tick()
     self._cycle.sensing.push(self._control)
@@ -276,9 +268,9 @@ class RobotEnvironment(dm_env.Environment):
     )
     found["goal"] = self._goal.astype(np.float32)
     if self._pictures is not None:
-      found["camera"], stop = self._pictures.read(watched=self._running)
-      if stop is not None:
-        self._cycle.halt(stop)
+      found["camera"], age = self._pictures.read()
+      if self._running:
+        self._cycle.take_picture(age)
     return found
 
   def _end(self, timestep: dm_env.TimeStep) -> dm_env.TimeStep:

@@ -7,7 +7,7 @@ import numpy as np
 from nerf2real.real.clock import Clock
 from nerf2real.real.loop.cycle import Cycle
 from nerf2real.real.loop.settings import RobotSettings
-from nerf2real.real.safety.monitor import Limiter, Monitor, Reason, SafetyError, Stop
+from nerf2real.real.safety.monitor import Limiter, Reason, SafetyError, Stop
 from nerf2real.real.safety.operator import Operator
 from nerf2real.real.wire.bus import BusError
 from nerf2real.real.wire.servos import Servos
@@ -26,7 +26,6 @@ class Motion:
     self,
     cycle: Cycle,
     servos: Servos,
-    monitor: Monitor,
     limiter: Limiter,
     *,
     operator: Operator,
@@ -34,7 +33,7 @@ class Motion:
     settings: RobotSettings,
   ):
     """Takes what moves and watches the robot; nothing moves."""
-    self._cycle, self._servos, self._monitor, self._limiter = cycle, servos, monitor, limiter
+    self._cycle, self._servos, self._limiter = cycle, servos, limiter
     self._operator, self._clock = operator, clock
     self._settings = settings
     self.standing = False  # under torque, in the supported pose or beyond
@@ -53,7 +52,7 @@ class Motion:
     self._move_slowly(SUPPORTED_POSE)
     self._level()
     if not self._settings.dry_run:  # without torque it could not stand
-      self._monitor.held = False
+      self._cycle.hold(False)
       self._operator.support(False)
       self._stand_still()
       self._level()
@@ -84,7 +83,7 @@ class Motion:
   def _take_hold(self) -> None:
     if not self._settings.dry_run:  # without torque it lies, hangs or sits where it is
       self._operator.support(True)
-    self._monitor.held = True
+    self._cycle.hold(True)
     self._pause(self._settings.grip_time)
 
   def _energize(self) -> None:

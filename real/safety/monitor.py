@@ -96,7 +96,7 @@ class Limiter:
 
 
 class Monitor:
-  """Decides when the torque must be off. Times are the loop's clock [s]."""
+  """Safety limits on readings, pictures and actions; times are the loop's clock [s]."""
 
   def __init__(self, settings: SafetySettings, *, camera: bool):
     """Starts unarmed.

@@ -14,7 +14,7 @@ from nerf2real.core.cameras import Camera
 from nerf2real.core.rotations import pose_of_mujoco_camera
 from nerf2real.real.clock import Clock
 from nerf2real.real.virtual.body import Body
-from nerf2real.scenes.builtin.eye import Eye
+from nerf2real.scenes.builtin.mujoco_renderer import Eye
 
 # The lens of the virtual robot's camera; chosen: as wide as a Logitech C920's, not quite without
 # distortion, its axis not quite in the middle.

@@ -26,7 +26,7 @@ class Build(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Undeclared:
-  """An effect that a virtual robot has and nobody declared."""
+  """An effect of a virtual robot that its declared model lacks."""
 
   kind: str
   target: str | None

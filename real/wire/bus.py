@@ -135,7 +135,7 @@ class Bus:
   # ---- the cycle ----
 
   def write_goals(self, angles: np.ndarray) -> None:
-    """Sends position goals [J] [rad] to all servos in one packet, which nobody answers."""
+    """Sends position goals [J] [rad] to all servos in one sync write, without an answer."""
     self.write_all(GOAL_POSITION, 4, self.wiring.to_counts(angles).tolist())
 
   def read_joints(self, *, deadline: float | None = None) -> JointReading | None:
@@ -280,7 +280,7 @@ class Bus:
       self._handler.reboot(self._port, device)
 
   def write_all(self, address: int, size: int, values: list[int]) -> None:
-    """Writes a register of every servo in one packet, which nobody answers."""
+    """Writes a register of every servo in one sync write, without an answer."""
     data: list[int] = []
     for device, value in zip(self._ids, values, strict=True):
       data.append(device)

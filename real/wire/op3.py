@@ -97,7 +97,7 @@ class Wiring:
     return self.directions * turned - self.offsets
 
   def name_of(self, device: int) -> str:
-    """Returns what an id stands for."""
+    """Returns the name of the device with an id."""
     names = {joint.device: joint.name for joint in self.joints}
     return names.get(device, "OpenCR" if device == BOARD_ID else "unknown")
 

@@ -1,4 +1,4 @@
-"""Detects the floor plane by RANSAC: the lowest large plane across the cameras' mean up direction.
+"""Detects the floor plane: the lowest large plane across the cameras' mean up direction.
 
 The plane with the most points can be a table top, and the lowest plane a reflection or a few stray
 points. So planes are measured by the ground they cover, not by their points, and of those that
@@ -12,6 +12,7 @@ import numpy as np
 
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.overrides import Overrides
+from nerf2real.scenes.alignment.planes import across, best_plane, fit_plane
 
 _MIN_POINTS = 30
 _PLANES = 12  # candidate planes that are peeled off one after another
@@ -31,8 +32,6 @@ class FloorSettings:
   """Ground is covered in cells of this size."""
   min_cover: float = 0.25
   """Of the largest plane's cover; smaller planes are furniture."""
-  hypotheses: int = 600
-  """Random triples of points a plane; 5 % of points in it: 1 - 5e-2 miss."""
   max_points: int = 40_000
   """Subsample for speed."""
 
@@ -68,58 +67,10 @@ def mean_up(frame_from_camera: np.ndarray) -> np.ndarray:
   return up / length
 
 
-def _basis(normal: np.ndarray) -> np.ndarray:
-  """Two unit vectors [2, 3] that span the plane across a normal."""
-  a = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-  a /= np.linalg.norm(a)
-  return np.stack([a, np.cross(normal, a)])
-
-
 def _cover(points: np.ndarray, normal: np.ndarray, cell: float) -> float:
   """Ground [unit^2] that points cover, in cells that hold one or more."""
-  flat = np.floor(points @ _basis(normal).T / cell).astype(np.int64)
+  flat = np.floor(points @ across(normal).T / cell).astype(np.int64)
   return len(np.unique(flat, axis=0)) * cell * cell
-
-
-def fit_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
-  """Least-squares plane through points [P, 3]: unit normal [3] on the side of up, and offset."""
-  centre = points.mean(0)
-  _, _, vt = np.linalg.svd(points - centre, full_matrices=False)
-  normal = vt[2] * (np.sign(vt[2] @ up) or 1.0)
-  return normal, float(normal @ centre)
-
-
-def _best_plane(points, up, tolerance, settings, rng):
-  """The plane near up with the most points among random triples: normal, offset, inliers."""
-  best, found = -1, None
-  triples = rng.integers(0, len(points), (settings.hypotheses, 3))
-  a, b, c = (points[triples[:, i]] for i in range(3))
-  normals = np.cross(b - a, c - a)
-  lengths = np.linalg.norm(normals, axis=-1)
-  normals /= np.maximum(lengths, 1e-15)[:, None]
-  normals *= np.sign(normals @ up)[:, None]
-  good = (lengths > 0) & (normals @ up > np.cos(np.radians(settings.max_tilt_deg)))
-  # Horizontal planes at the height of single points: they find a small floor under much clutter.
-  level = rng.integers(0, len(points), settings.hypotheses // 4)
-  normals = np.concatenate([normals[good], np.broadcast_to(up, (len(level), 3))])
-  offsets = np.concatenate([(normals[: good.sum()] * a[good]).sum(-1), points[level] @ up])
-  sample = points[rng.permutation(len(points))[:4000]]
-  for start in range(0, len(normals), 64):
-    part = slice(start, start + 64)
-    counts = (np.abs(sample @ normals[part].T - offsets[part]) < tolerance).sum(0)
-    if counts.max() > best:
-      best = counts.max()
-      found = normals[part][counts.argmax()], offsets[part][counts.argmax()]
-  normal, offset = found
-  for factor in (2.0, 1.0, 1.0, 1.0):
-    inliers = np.abs(points @ normal - offset) < factor * tolerance
-    if inliers.sum() < 3:
-      break
-    refined, moved = fit_plane(points[inliers], up)
-    if refined @ up < np.cos(np.radians(settings.max_tilt_deg)):
-      break
-    normal, offset = refined, moved
-  return normal, offset, np.abs(points @ normal - offset) < tolerance
 
 
 def find_floor(
@@ -128,7 +79,6 @@ def find_floor(
   up: np.ndarray,
   camera_positions: np.ndarray,
   settings: FloorSettings | None = None,
-  seed: int = 0,
 ) -> Floor:
   """Finds the floor among sparse points, mesh vertices or lifted depth.
 
@@ -137,7 +87,6 @@ def find_floor(
     up: Rough up direction [3].
     camera_positions: Camera centres [N, 3]; the floor lies below nearly all of them.
     settings: Settings.
-    seed: Of the random triples.
 
   Raises:
     FloorError: too few points, or no plane that qualifies.
@@ -150,9 +99,9 @@ def find_floor(
       f"Found {len(points)} points to look for the floor in, need at least {_MIN_POINTS}: film "
       'more of the floor, or give "floor_points" in the override file.'
     )
-  rng = np.random.default_rng(seed)
   if len(points) > settings.max_points:
-    points = points[rng.permutation(len(points))[: settings.max_points]]
+    chosen = np.random.default_rng(0).permutation(len(points))[: settings.max_points]
+    points = points[chosen]
   up = np.asarray(up, np.float64) / np.linalg.norm(up)
   size = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=-1)))
   tolerance, cell = settings.tolerance * size, settings.cell * size
@@ -160,7 +109,10 @@ def find_floor(
   for _ in range(_PLANES):
     if len(rest) < max(_MIN_POINTS // 2, 0.01 * len(points)):
       break
-    normal, offset, inside = _best_plane(rest, up, tolerance, settings, rng)
+    normal, offset = best_plane(
+      rest, up, tolerance=tolerance, max_tilt=np.radians(settings.max_tilt_deg)
+    )
+    inside = np.abs(rest @ normal - offset) < tolerance
     below = (camera_positions @ normal - offset > 0).mean()
     if inside.sum() < 10:
       break

@@ -182,8 +182,6 @@ def marker_scale(
   camera: cameras.Camera,
   frame_from_camera: np.ndarray,
   side: float,
-  dictionary: str | None = None,
-  marker: int | None = None,
 ) -> MarkerScale | None:
   """Scale from detections of markers that all have the same side.
 
@@ -192,8 +190,6 @@ def marker_scale(
     camera: The camera of the pictures.
     frame_from_camera: Poses [N, 4, 4] in the unit frame.
     side: Side of a marker's black square [m].
-    dictionary: Only this dictionary, if given.
-    marker: Only this identifier, if given.
 
   Returns:
     The scale, or None where no marker was read consistently in at least three pictures.
@@ -202,8 +198,7 @@ def marker_scale(
     raise ValueError(f"A marker's side must be positive, found {side} m.")
   groups: dict[tuple[str, int], list[Detection]] = {}
   for d in detections:
-    if dictionary in (None, d.dictionary) and marker in (None, d.marker):
-      groups.setdefault((d.dictionary, d.marker), []).append(d)
+    groups.setdefault((d.dictionary, d.marker), []).append(d)
   fits: dict[str, list] = {}
   for (name, identifier), group in sorted(groups.items()):
     fit = _fit_marker(group, camera, frame_from_camera)

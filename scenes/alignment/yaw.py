@@ -12,7 +12,7 @@ _REFERENCE = np.pi / 8
 _LONGER = 1.05  # times the other side; nearly square rooms have no longer side
 
 
-def wall_yaw(normals: np.ndarray, *, weights: np.ndarray | None = None) -> float | None:
+def wall_yaw(normals: np.ndarray) -> float | None:
   """Direction of the walls from normals [P, 3], z up: an angle in [0, pi/2), or None.
 
   The mode of the angles modulo a quarter turn, refined by their circular mean near it.
@@ -22,9 +22,8 @@ def wall_yaw(normals: np.ndarray, *, weights: np.ndarray | None = None) -> float
   if upright.sum() < 100:
     return None
   angle = np.mod(np.arctan2(normals[upright, 1], normals[upright, 0]), np.pi / 2)
-  share = np.ones(len(angle)) if weights is None else weights[upright]
   bins = 90
-  counts, _ = np.histogram(angle, bins, (0, np.pi / 2), weights=share)
+  counts, _ = np.histogram(angle, bins, (0, np.pi / 2))
   smooth = sum((np.roll(counts, shift) for shift in range(-3, 4)), np.zeros(bins))
   mode = (np.argmax(smooth) + 0.5) * np.pi / 2 / bins
   if smooth.max() < 1.5 * 7 / bins * counts.sum():  # no direction stands out
@@ -32,7 +31,7 @@ def wall_yaw(normals: np.ndarray, *, weights: np.ndarray | None = None) -> float
   width = np.radians(8)
   for _ in range(5):
     offset = np.mod(angle - mode + np.pi / 4, np.pi / 2) - np.pi / 4
-    kernel = share * np.exp(-0.5 * (offset / (width / 2)) ** 2)
+    kernel = np.exp(-0.5 * (offset / (width / 2)) ** 2)
     mode += float((kernel * offset).sum() / kernel.sum())
     width = max(width * 0.7, np.radians(3))
   return float(np.mod(mode, np.pi / 2))

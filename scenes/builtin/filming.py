@@ -14,7 +14,7 @@ from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.serialization import from_plain, to_plain, write_json
-from nerf2real.scenes.builtin import furniture, room, walk
+from nerf2real.scenes.builtin import camera_path, furniture, room
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
 TRUTH_VERSION = 1
@@ -79,7 +79,7 @@ def shoot(seed: int, settings: FilmSettings) -> Iterator[tuple[np.ndarray, np.nd
     The noisy picture uint8 [H, W, 3], the same without noise float32 [H, W, 3], and the pose at the
     middle of the exposure, world_from_camera [4, 4].
   """
-  path = walk.Walk(
+  path = camera_path.Walk(
     seed,
     seconds=settings.seconds,
     shake_position=settings.shake_position,

@@ -13,7 +13,7 @@ import numpy as np
 from nerf2real.core import rotations
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.builtin import furniture, solids, surfaces
-from nerf2real.scenes.builtin.eye import Eye
+from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
 _TRUE_VIEW_ROWS = 960  # a true view is sampled with about this many rows

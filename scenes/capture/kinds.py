@@ -1,4 +1,4 @@
-"""Tells what kind of capture a path is: video, pictures, or a data set with known poses."""
+"""Classifies a capture by its path: video, pictures, or a data set with known poses."""
 
 from pathlib import Path
 

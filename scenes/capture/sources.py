@@ -141,11 +141,11 @@ def to_opencv(camera: pycolmap.Camera) -> Camera:
   return Camera(width=camera.width, height=camera.height, **values)
 
 
-def to_colmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
+def to_colmap(camera: Camera) -> pycolmap.Camera:
   """Converts to COLMAP's OPENCV camera."""
   params = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
   return pycolmap.Camera(
-    camera_id=camera_id, model="OPENCV", width=camera.width, height=camera.height, params=params
+    camera_id=1, model="OPENCV", width=camera.width, height=camera.height, params=params
   )
 
 

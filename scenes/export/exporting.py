@@ -44,8 +44,7 @@ def _mjcf(order: Order) -> str:
   bundle = order.bundle
   parts = collision.read_parts(bundle.folder / "collision")
   spec = mjcf.scene_spec(parts, extent=bundle.extent, name=bundle.name)
-  camera = views.capture_cameras(bundle)[0]
-  mjcf.add_camera(spec, camera, views.overlooking_pose(bundle), name="capture")
+  mjcf.add_camera(spec, *views.overlooking_view(bundle), name="capture")
   if order.robot is not None:
     mjcf.add_robot(spec, order.robot, bundle.free_space.roomiest())
   mjcf.write(order.out, spec, parts, _textured(order, order.progress))
@@ -59,12 +58,13 @@ def _glb(order: Order) -> str:
 
 def _usd(order: Order) -> str:
   bundle = order.bundle
+  camera, world_from_camera = views.overlooking_view(bundle)
   usd.write(
     order.out,
     visual=meshes.load_glb(bundle.visual_path),
     parts=collision.read_parts(bundle.folder / "collision"),
-    camera=views.capture_cameras(bundle)[0],
-    world_from_camera=views.overlooking_pose(bundle),
+    camera=camera,
+    world_from_camera=world_from_camera,
   )
   return "metres, z up; colliders are guides, which viewers hide at first"
 

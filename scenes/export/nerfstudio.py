@@ -13,7 +13,7 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views
-from nerf2real.scenes.poses import localise
+from nerf2real.scenes.poses import localisation
 
 _POINTS = "sparse_points.ply"
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)  # as the keyframes'
@@ -66,7 +66,7 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
     Where the pictures come from, for the user: "keyframes" or "rendered from the field".
   """
   camera, poses, names = views.capture_cameras(bundle)
-  localisation = localise.load(bundle.folder / "sfm")
+  localised = localisation.load(bundle.folder / "sfm")
   keyframes = bundle.keyframes_folder
   found = all((keyframes / name).is_file() for name in names)
   renderer = None if found else views.renderer_of(bundle)
@@ -78,13 +78,13 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
       if renderer is not None:
         picture = renderer.render(camera, unit_from_world.apply_pose(pose))[0][..., ::-1]
         cv2.imwrite(str(target), picture, _JPEG)
-      elif localisation.shutter is None:
+      elif localised.shutter is None:
         target.write_bytes((keyframes / name).read_bytes())
       else:
-        cv2.imwrite(str(target), localisation.read_picture(keyframes, index), _JPEG)
+        cv2.imwrite(str(target), localised.read_picture(keyframes, index), _JPEG)
       progress((index + 1) / len(names), f"picture {index + 1} of {len(names)}")
     cloud = trimesh.PointCloud(
-      bundle.world_from_unit.apply(localisation.points), localisation.point_colors
+      bundle.world_from_unit.apply(localised.points), localised.point_colors
     )
     cloud.export(str(partial / _POINTS))
     content = transforms(camera, poses, [f"images/{name}" for name in names])

@@ -10,7 +10,7 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.geometry import fusion
-from nerf2real.scenes.poses import localise
+from nerf2real.scenes.poses import localisation
 
 
 def renderer_of(bundle: Bundle) -> Renderer:
@@ -24,20 +24,20 @@ def capture_cameras(bundle: Bundle) -> tuple[Camera, np.ndarray, tuple[str, ...]
   Raises:
     LocalisationError: The bundle's folder sfm/ is missing or damaged.
   """
-  found = localise.load(bundle.folder / "sfm")
+  found = localisation.load(bundle.folder / "sfm")
   poses = bundle.world_from_unit.apply_pose(found.world_from_camera)
   return found.camera, poses, found.names
 
 
-def overlooking_pose(bundle: Bundle) -> np.ndarray:
-  """Pose [4, 4] of the capture's camera that had most of the room before it, world frame.
+def overlooking_view(bundle: Bundle) -> tuple[Camera, np.ndarray]:
+  """The capture's camera and its pose [4, 4], world frame, with the most points before the lens.
 
-  From where nothing was filmed the field is fog.
+  Raises:
+    LocalisationError: The bundle's folder sfm/ is missing or damaged.
   """
-  _, poses, _ = capture_cameras(bundle)
-  depth = np.einsum("ni,ni->n", 0.5 * sum(bundle.extent) - poses[:, :3, 3], poses[:, :3, 2])
-  pose: np.ndarray = poses[int(np.argmax(depth))]
-  return pose
+  found = localisation.load(bundle.folder / "sfm")
+  pose = found.world_from_camera[found.overlooking()]
+  return found.camera, bundle.world_from_unit.apply_pose(pose)
 
 
 def render_views(

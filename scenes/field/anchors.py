@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from nerf2real.core.cameras import Camera
-from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses.localisation import Localisation
 
 if TYPE_CHECKING:
   from nerf2real.scenes.field.views import Views
@@ -26,44 +26,25 @@ _CLEARANCE = 0.4  # no matter this near a camera, as a share of the nearest poin
 _MARGIN = 0.04  # a sight line ends this far before its point [unit]: 10 cm in a room of 5 m
 
 
-def known_points(
-  model: pycolmap.Reconstruction,
-  names: tuple[str, ...],
-  world_from_camera: np.ndarray,
-  *,
-  camera: Camera,
-) -> np.ndarray:
+def known_points(found: Localisation, camera: Camera) -> np.ndarray:
   """Lists the points that the pictures see, each with its distance from the camera.
 
   Args:
-    model: A localised model in the unit frame.
-    names: The pictures' names [N].
-    world_from_camera: Their poses [N, 4, 4].
-    camera: The pictures' camera; its pictures may be smaller than the model's.
+    found: The localised pictures and points.
+    camera: The pictures' camera; its pictures may be smaller than the localised ones.
 
   Returns:
     float32 [A, 4]: index of the picture, pixel x and y, distance along the pixel's ray [unit].
   """
-  index = {name: k for k, name in enumerate(names)}
-  good = {
-    identity: point.xyz
-    for identity, point in model.points3D.items()
-    if point.error < _MOST_ERROR and point.track.length() >= _FEWEST_VIEWS
-  }
-  found = []
-  for image in model.images.values():
-    seen = [(p.xy, good[p.point3D_id]) for p in image.points2D if p.point3D_id in good]
-    if image.name not in index or not seen:
-      continue
-    k = index[image.name]
-    source = model.cameras[image.camera_id]
-    place = np.stack([xy for xy, _ in seen])
-    place *= np.array([camera.width / source.width, camera.height / source.height])
-    distance = np.linalg.norm(np.stack([x for _, x in seen]) - world_from_camera[k, :3, 3], axis=-1)
-    inside = ((place >= 0) & (place < [camera.width, camera.height])).all(-1)
-    rows = np.concatenate([np.full((len(seen), 1), k), np.floor(place), distance[:, None]], -1)
-    found.append(rows[inside])
-  return np.concatenate(found).astype(np.float32) if found else np.zeros((0, 4), np.float32)
+  often = found.tracks.lengths(len(found.points)) >= _FEWEST_VIEWS
+  seen = found.tracks.of_points(often & (found.point_errors < _MOST_ERROR))
+  place = seen.pixel * camera.size_ratio(found.camera)
+  distance = np.linalg.norm(
+    found.points[seen.point] - found.world_from_camera[seen.view, :3, 3], axis=-1
+  )
+  inside = ((place >= 0) & (place < [camera.width, camera.height])).all(-1)
+  rows = np.column_stack([seen.view, np.floor(place), distance])
+  return rows[inside].astype(np.float32)
 
 
 def empty_cells(views: Views) -> np.ndarray:

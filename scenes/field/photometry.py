@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse
 
 from nerf2real.core.cameras import PIXEL_CENTRE, Camera
-from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses.localisation import Localisation
 
 _SMOOTHING = (
   2.0  # deviation of a colour's Gaussian [pixel]; chosen: hides a pixel's reprojection error
@@ -104,41 +104,32 @@ def _powers(radius: np.ndarray) -> np.ndarray:
   return np.square(radius)[..., None] ** np.arange(1, 4)
 
 
-def sightings(
-  model: pycolmap.Reconstruction, names: tuple[str, ...], images: np.ndarray, camera: Camera
-) -> Sightings:
-  """Looks the model's points up in the pictures that see them.
+def sightings(found: Localisation, images: np.ndarray, camera: Camera) -> Sightings:
+  """Looks the localised points up in the pictures that see them.
 
   Args:
-    model: Points with the pictures that see them.
-    names: The pictures' names [N].
-    images: uint8 [N, H, W, 3], of the model's size or smaller.
+    found: The localised pictures and points.
+    images: uint8 [N, H, W, 3], of the localised size or smaller.
     camera: The pictures' camera.
   """
-  source = next(iter(model.cameras.values()))
-  scale = np.array([camera.width / source.width, camera.height / source.height])
-  index = {name: k for k, name in enumerate(names)}
-  found = []
-  for image in model.images.values():
-    k = index.get(image.name)
-    seen = [(p.point3D_id, p.xy) for p in image.points2D if p.has_point3D()]
-    if k is None or not seen:
+  view, point, pixel = found.tracks
+  pixels = pixel * camera.size_ratio(found.camera)
+  place = (pixels - PIXEL_CENTRE).astype(np.float32)
+  colors = np.zeros((len(view), 3), np.float32)
+  starts = np.searchsorted(view, np.arange(len(images) + 1))
+  for k, image in enumerate(images):
+    mine = slice(starts[k], starts[k + 1])
+    if mine.start == mine.stop:
       continue
-    pixels = np.stack([xy for _, xy in seen]) * scale
-    place = (pixels - PIXEL_CENTRE).astype(np.float32)
-    smooth = cv2.GaussianBlur(images[k], (0, 0), _SMOOTHING)
     looked = cv2.remap(
-      smooth.astype(np.float32),
-      place[:, :1],
-      place[:, 1:],
+      cv2.GaussianBlur(image, (0, 0), _SMOOTHING).astype(np.float32),
+      place[mine, :1],
+      place[mine, 1:],
       cv2.INTER_LINEAR,
       borderMode=cv2.BORDER_REPLICATE,
     )
-    points = np.array([identity for identity, _ in seen])
-    found.append(Sightings(np.full(len(seen), k), points, looked[:, 0], radii(camera, pixels)))
-  if not found:
-    return Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3), np.float32), np.zeros(0))
-  return Sightings(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+    colors[mine] = looked[:, 0]
+  return Sightings(view, point, colors, radii(camera, pixels))
 
 
 def fit_exposure(seen: Sightings, *, count: int) -> Exposure:

@@ -98,6 +98,7 @@ class Intrusion(NamedTuple):
 
 
 def intrusion_of(part: Part, space: Space, tolerance: float) -> Intrusion:
+  """Counts the seen free cells inside a part, and those that lie too deep in it."""
   shape = np.array(space.clearance.shape)
   first = np.floor((part.vertices.min(0) - space.lower) / space.voxel).astype(int)
   last = np.ceil((part.vertices.max(0) - space.lower) / space.voxel).astype(int) + 1

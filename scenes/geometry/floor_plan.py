@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import convex, fusion
 from nerf2real.scenes.geometry.free_space import FREE, OCCUPIED, UNKNOWN, FreeSpaceMap
 
@@ -60,7 +59,6 @@ def floor_plan(
   upper: np.ndarray,
   seen: fusion.Grid | None = None,
   settings: FreeSpaceSettings | None = None,
-  progress: Progress = no_progress,
 ) -> FreeSpaceMap:
   """Maps the ground inside an extent.
 
@@ -71,19 +69,17 @@ def floor_plan(
     seen: Fused depth, world frame: columns that no ray ever crossed at the robot's height are
       unknown and no place to stand. Without it everything inside the extent counts as seen.
     settings: Settings.
-    progress: Called with the fraction done and a text.
   """
   settings = settings or FreeSpaceSettings()
   origin, size = np.asarray(lower[:2], np.float64), settings.resolution
   width, height = np.maximum(np.ceil((np.asarray(upper[:2]) - origin) / size).astype(int), 1)
   blocked = np.zeros((height, width), np.uint8)
-  for number, part in enumerate(parts):
+  for part in parts:
     corners = _shadow(part, settings.low, settings.high)
     if corners is not None:
       # Cell (0, 0) has its centre at half a cell; fillConvexPoly takes 1/16 of a cell.
       pixels = np.round(((corners - origin) / size - 0.5) * 16).astype(np.int32)
       cv2.fillConvexPoly(blocked, cv2.convexHull(pixels), 1, shift=4)
-    progress((number + 1) / len(parts), "free space")
   cells = np.where(blocked > 0, OCCUPIED, FREE).astype(np.uint8)
   if seen is not None:
     heights = seen.centres(2)

@@ -19,6 +19,7 @@ from nerf2real.scenes.capture.sources import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.shutter import Shutter
+from nerf2real.scenes.poses.tracks import Tracks
 
 _FIGURES = "localisation.json"
 
@@ -51,12 +52,27 @@ class Localisation:
   """Which pairs were matched and which mapper was used."""
   unit_from_source: Similarity
   """From the source's frame (COLMAP's, or that of the known poses)."""
+  tracks: Tracks
+  """Which keyframes see which points."""
   shutter: Shutter | None = None
   """Motion while a picture was read, unit frame; None where all lines count as read at once."""
   warnings: tuple[str, ...] = ()
   """What may ruin the reconstruction."""
   seconds: dict[str, float] = dataclasses.field(default_factory=dict)
   """Wall time of each step."""
+
+  def overlooking(self) -> int:
+    """Row of the keyframe with the most points before its lens: where a viewer should begin.
+
+    From where nothing was filmed a field is fog.
+    """
+    from_world = np.linalg.inv(self.world_from_camera)
+    edge = np.array([self.camera.width / self.camera.fx, self.camera.height / self.camera.fy]) / 2
+    counts = []
+    for rotation, offset in zip(from_world[:, :3, :3], from_world[:, :3, 3], strict=True):
+      x, y, z = rotation @ self.points.T + offset[:, None]
+      counts.append(((z > 0) & (abs(x) < edge[0] * z) & (abs(y) < edge[1] * z)).sum())
+    return int(np.argmax(counts))
 
   def read_picture(self, keyframes: Path, index: int) -> np.ndarray:
     """Reads a keyframe as if all lines were read at once: BGR uint8 [H, W, 3].
@@ -93,6 +109,7 @@ def poses_of(images: list[pycolmap.Image]) -> np.ndarray:
 
 
 def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Localisation:
+  """Returns the camera, poses, points and tracks of a COLMAP model, with the figures given."""
   images = mapping.registered(model)
   points = list(model.points3D.values())
   return Localisation(
@@ -102,6 +119,7 @@ def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Locali
     points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
     point_colors=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
     point_errors=np.array([p.error for p in points], np.float64),
+    tracks=Tracks.of_model(model, images),
     **values,
   )
 

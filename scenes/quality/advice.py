@@ -13,11 +13,11 @@ import numpy as np
 
 from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
-from nerf2real.scenes.alignment import surroundings, world_frame
+from nerf2real.scenes.alignment import room_check, world_frame
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
-from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.quality.coverage import Coverage, coverage
 
 _FLOOR_SHARE = 0.7  # of the floor that must be covered; chosen: a robot walks on the rest of it
@@ -104,22 +104,16 @@ def judge_pictures(capture: Capture, settings: CaptureSettings) -> list[Finding]
   return found
 
 
-def _shared_points(model: pycolmap.Reconstruction, names: Sequence[str]) -> int | None:
-  """Points that both the first and the last tenth of pictures see; None without observations."""
-  tenth = max(1, len(names) // 10)
-  rank = {name: k for k, name in enumerate(names)}
-  place = {number: rank[image.name] for number, image in model.images.items() if image.name in rank}
-  shared, observed = 0, False
-  for point in model.points3D.values():
-    rows = [place[e.image_id] for e in point.track.elements if e.image_id in place]
-    observed |= bool(rows)
-    shared += any(row < tenth for row in rows) and any(row >= len(names) - tenth for row in rows)
-  return shared if observed else None
+def _shared_points(tracks: Tracks, count: int) -> int | None:
+  """Points that the first and the last tenth of N pictures see; None without observations."""
+  if not len(tracks.view):
+    return None
+  tenth = max(1, count // 10)
+  first, last = (tracks.point[rows] for rows in (tracks.view < tenth, tracks.view >= count - tenth))
+  return len(np.intersect1d(first, last))
 
 
-def judge_poses(
-  capture: Capture, poses: Localisation, model: pycolmap.Reconstruction
-) -> list[Finding]:
+def judge_poses(capture: Capture, poses: Localisation) -> list[Finding]:
   """Judges how many keyframes have a pose and whether a film comes back to where it began."""
   placed = np.isin([path.name for path in capture.images], poses.names)
   good = float(placed.mean()) >= _REGISTERED
@@ -129,7 +123,7 @@ def judge_poses(
       f"; none {_where(capture, ~placed)}: film that stretch again, slower, without plain walls"
     )
   found = [Finding("poses", good, text + ".")]
-  shared = _shared_points(model, poses.names)
+  shared = _shared_points(poses.tracks, len(poses.names))
   if capture.kind == "video" and shared is not None:
     closed = shared >= _LOOP_POINTS
     text = f"Beginning and end share {shared} points, so the loop is closed."
@@ -204,7 +198,6 @@ def judge(
   settings: CaptureSettings,
   *,
   poses: Localisation | None = None,
-  model: pycolmap.Reconstruction | None = None,
   align: world_frame.AlignSettings | None = None,
   reason: str = "",
 ) -> Verdict:
@@ -214,16 +207,15 @@ def judge(
     capture: The keyframes.
     settings: What counts as blurred and as changing exposure.
     poses: The localised keyframes; None where that failed.
-    model: The localised model, with the points' observations.
     align: Of the world frame, for a known camera height.
     reason: Why there are no poses.
   """
   findings = judge_pictures(capture, settings)
-  if poses is None or model is None:
+  if poses is None:
     return Verdict([Finding("poses", False, reason), *findings])
-  findings += judge_poses(capture, poses, model)
+  findings += judge_poses(capture, poses)
   try:
-    surroundings.require_room(poses.world_from_camera, poses.points)
+    room_check.require_room(poses.world_from_camera, poses.points)
     frame = world_frame.align(Evidence(poses.points, poses.world_from_camera), settings=align)
   except ValueError as error:
     return Verdict([*findings, Finding("floor", False, str(error))])

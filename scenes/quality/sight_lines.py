@@ -7,7 +7,7 @@ built-in room, where its points can be held against the truth. Points that judge
 half the tolerance: their deviation follows from their reprojection error and from where they were
 seen from. The held-out pictures trained nothing, but the points may have guided training through
 other pictures that see them, too.
-Shapes: S sight lines, P points.
+Shapes: S sight lines, N pictures, P points.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,9 +18,8 @@ import numpy as np
 from scipy import spatial
 
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture.sources import to_opencv
-from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.geometry import collision, convex
+from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.quality.collision_error import sample_parts
 
 TOLERANCE = 0.05  # m that matter may be away, as the other figures of contact geometry count
@@ -74,35 +73,29 @@ class Judgement(NamedTuple):
     )
 
 
-def deviations(model: pycolmap.Reconstruction) -> dict[int, float]:
-  """Standard deviation [model's unit] of each point along its least certain direction.
+def deviations(found: Localisation) -> np.ndarray:
+  """Standard deviation [P] [unit] of each point along its least certain direction.
 
   A picture at distance r fixes the two directions across its ray to the reprojection error times
-  r over the focal length.
+  r over the focal length. Infinite for points that few pictures see.
   """
-  camera = to_opencv(next(iter(model.cameras.values())))
-  eyes = {
-    number: image.cam_from_world().inverse().translation
-    for number, image in model.images.items()
-    if image.has_pose
-  }
-  found = {}
-  for number, point in model.points3D.items():
-    seen = {e.image_id for e in point.track.elements if e.image_id in eyes}
-    if len(seen) < _FEWEST_VIEWS:
-      continue
-    ways = point.xyz - np.array([eyes[k] for k in seen])
-    squares = np.square(ways).sum(-1)
-    across = np.eye(3) - ways[:, :, None] * ways[:, None] / squares[:, None, None]
-    angle = max(point.error, _LEAST_ERROR) * camera.pixel_angle
-    certainty = (across / (squares * angle**2)[:, None, None]).sum(0)
-    found[number] = float(1 / np.sqrt(np.linalg.eigvalsh(certainty)[0]))
-  return found
+  count = len(found.points)
+  view, point = np.unique(np.stack(found.tracks[:2]), axis=1)  # once a picture
+  ways = found.points[point] - found.world_from_camera[view, :3, 3]
+  squares = np.square(ways).sum(-1)
+  across = np.eye(3) - ways[:, :, None] * ways[:, None] / squares[:, None, None]
+  angle = np.maximum(found.point_errors, _LEAST_ERROR) * found.camera.pixel_angle
+  certainty = np.zeros((count, 3, 3))
+  np.add.at(certainty, point, across / (squares * angle[point] ** 2)[:, None, None])
+  deviation = np.full(count, np.inf)
+  judging = np.bincount(point, minlength=count) >= _FEWEST_VIEWS
+  deviation[judging] = 1 / np.sqrt(np.linalg.eigvalsh(certainty[judging])[:, 0])
+  return deviation
 
 
 def sight_lines(
-  model: pycolmap.Reconstruction,
-  names: Sequence[str],
+  found: Localisation,
+  held_out: np.ndarray,
   world_from_unit: Similarity,
   *,
   lower: np.ndarray,
@@ -111,27 +104,18 @@ def sight_lines(
   """Lists the sight lines of pictures to well localised points inside a box.
 
   Args:
-    model: The localised model with its observations, unit frame.
-    names: Pictures that were held out.
-    world_from_unit: Maps the model to the world.
+    found: The localised pictures and points, unit frame.
+    held_out: Which pictures were held out, bool [N].
+    world_from_unit: Maps them to the world.
     lower: Lower corner of the contact geometry [3] [m].
     upper: Upper corner [3] [m].
   """
-  good = {
-    number: model.points3D[number].xyz
-    for number, deviation in deviations(model).items()
-    if deviation * world_from_unit.scale < TOLERANCE / 2
-  }
-  eyes, points = [np.zeros((0, 3))], [np.zeros((0, 3))]
-  for image in model.images.values():
-    seen = [good[p.point3D_id] for p in image.points2D if p.point3D_id in good]
-    if image.name in set(names) and seen:
-      points.append(world_from_unit.apply(np.stack(seen)))
-      eye = world_from_unit.apply(image.cam_from_world().inverse().translation)
-      eyes.append(np.broadcast_to(eye, points[-1].shape))
-  eye, point = np.concatenate(eyes), np.concatenate(points)
-  inside = ((point > lower) & (point < upper)).all(-1)
-  return SightLines(eye[inside], point[inside])
+  seen = found.tracks.of_points(deviations(found) * world_from_unit.scale < TOLERANCE / 2)
+  judging = held_out[seen.view]
+  eyes = world_from_unit.apply(found.world_from_camera[seen.view[judging], :3, 3])
+  points = world_from_unit.apply(found.points[seen.point[judging]])
+  inside = ((points > lower) & (points < upper)).all(-1)
+  return SightLines(eyes[inside], points[inside])
 
 
 def judge(lines: SightLines, reach: np.ndarray, distance: np.ndarray) -> Judgement:

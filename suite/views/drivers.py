@@ -1,6 +1,6 @@
 """Drivers of an environment that is shown: a standing robot, random motions, a scripted walker.
 
-Learned policies come from `evaluation.driving`, with the same protocol.
+Learned policies come from `evaluation.policies.driving`, with the same protocol.
 """
 
 from collections.abc import Callable, Mapping

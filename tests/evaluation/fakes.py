@@ -6,6 +6,7 @@ import numpy as np
 from nerf2real.evaluation.episodes import Episode, Setting
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.plant import Plant, Sight
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite import specs
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.pose import Pose
@@ -19,7 +20,7 @@ class ScriptedPlant(Plant):
   name, plant_id = "sim", "script"
 
   def __init__(self, script, *, goal=(1.0, 0.0), reason="", image=None, protocol="navigation"):
-    super().__init__(EmptyFloor(), protocol, "none")
+    super().__init__(EmptyFloor(), EvaluationSettings(protocol=protocol))
     self.script, self._goal, self._reason, self._image = script, np.array(goal), reason, image
     self.started = 0
 

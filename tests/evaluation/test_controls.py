@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from nerf2real.core.serialization import to_plain
-from nerf2real.evaluation import controls, episodes, runner, session
+from nerf2real.evaluation import episodes, runner, session
 from nerf2real.evaluation.plants import plant as plants
+from nerf2real.evaluation.policies import controls
 from nerf2real.evaluation.report import tables
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite.gaits.floor import EmptyFloor

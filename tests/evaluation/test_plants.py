@@ -12,7 +12,7 @@ from nerf2real.evaluation.plants import making, operated, perturbations
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
-from nerf2real.evaluation.policies import GaitPolicy
+from nerf2real.evaluation.policies.policy import GaitPolicy
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
@@ -30,7 +30,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def simulated(scene):
-  plant = SimulatedPlant(scene, "navigation", image_size=None)
+  plant = SimulatedPlant(scene, EvaluationSettings(), image_size=None)
   yield plant
   plant.close()
 
@@ -82,7 +82,7 @@ def test_the_simulated_camera_has_the_rate_of_the_policys_training(scene, traine
 
 def test_the_gait_reaches_a_goal_on_the_virtual_robot(scene):
   group, trial = plants.trials("navigation")[NEAREST]
-  plant = RehearsedPlant(scene, "navigation", image_size=None, robot_seed=2, world="floor")
+  plant = RehearsedPlant(scene, EvaluationSettings(robot_seed=(2,)), image_size=None, world="floor")
   try:
     policy = GaitPolicy(scene, "navigation")
     found = runner.run_trial(plant, policy, trial, group=group, index=NEAREST)
@@ -96,7 +96,7 @@ def test_the_gait_reaches_a_goal_on_the_virtual_robot(scene):
 def test_a_virtual_robot_is_altered_and_does_not_say_how(scene):
   altered = undeclared.parse_all(["command_delay:0.045", "supply_course:2,12.5,100"])
   plant = RehearsedPlant(
-    scene, "navigation", image_size=None, altered=altered, session=50.0, world="floor"
+    scene, EvaluationSettings(), image_size=None, altered=altered, session=50.0, world="floor"
   )
   try:
     motors = plant.robot.body.motors
@@ -143,7 +143,7 @@ def test_person_walks_back_and_forth():
 
 
 def test_walking_into_a_moved_object_is_a_collision(scene):
-  plant = SimulatedPlant(scene, "navigation", "moved_object", image_size=None)
+  plant = SimulatedPlant(scene, EvaluationSettings(perturb="moved_object"), image_size=None)
   try:
     plant.start(plants.trials("navigation")[NEAREST][1])
     pose = plant.sight().pose
@@ -191,12 +191,8 @@ def test_robot_prompts_for_placement_and_verdict(scene):
   with VirtualRobot(world="floor", seed=1, stepped=True) as robot:
     plant = operated.OperatedPlant(
       scene,
-      "navigation",
-      "person",
-      robot=robot.connection(),
-      camera=None,
+      EvaluationSettings(perturb="person", robot=robot.connection(), camera=None, time_limit=0.5),
       image_size=None,
-      time_limit=0.5,
       ask=ask,
       say=said.append,
     )
@@ -215,12 +211,8 @@ def test_a_dry_run_moves_nothing_and_asks_for_no_verdict(scene):
     before = [servo.table["goal_position"] for servo in servos]
     plant = operated.OperatedPlant(
       scene,
-      "navigation",
-      robot=robot.connection(),
-      camera=None,
+      EvaluationSettings(robot=robot.connection(), camera=None, time_limit=0.5, dry_run=True),
       image_size=None,
-      time_limit=0.5,
-      dry_run=True,
       ask=lambda question: asked.append(question) or "",
       say=lambda text: None,
     )

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerf2real.evaluation import policy_names
-from nerf2real.evaluation.driving import choose_driver
+from nerf2real.evaluation.policies import names as policy_names
+from nerf2real.evaluation.policies.driving import choose_driver
 from nerf2real.suite.views import drivers
 
 

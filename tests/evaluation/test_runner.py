@@ -9,11 +9,11 @@ from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import to_plain
 from nerf2real.evaluation import episodes, runner, session
-from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants import operated
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.plant import Sight
-from nerf2real.evaluation.policies import Belief
+from nerf2real.evaluation.policies.learned import LearnedPolicy
+from nerf2real.evaluation.policies.policy import Belief
 from nerf2real.evaluation.report import page as report
 from nerf2real.suite.gaits.floor import EmptyFloor
 from nerf2real.suite.pose import Pose

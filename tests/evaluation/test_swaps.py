@@ -6,6 +6,7 @@ import pytest
 from nerf2real.core.cameras import Camera
 from nerf2real.evaluation.plants import swaps
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual.camera import VirtualCamera
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.suite import loading
@@ -37,7 +38,9 @@ def test_the_simulated_camera_takes_the_robots_timing():
 def test_a_robot_without_secrets_is_that_of_the_data_sheets():
   scene = open_scene(None)
   plain, known = (
-    RehearsedPlant(scene, "navigation", image_size=None, robot_seed=2, world="floor", swap=swap)
+    RehearsedPlant(
+      scene, EvaluationSettings(robot_seed=(2,), swap=swap), image_size=None, world="floor"
+    )
     for swap in ("none", "physics")
   )
   sheet = Hidden.none()

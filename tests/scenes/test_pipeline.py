@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from nerf2real.scenes import bundle, pipeline
-from nerf2real.scenes.builtin import filming, yardstick
+from nerf2real.scenes.builtin import filming, ground_truth
 from nerf2real.scenes.bundle import Bundle, BundleError
 from nerf2real.scenes.field.settings import preset as train_preset
 from nerf2real.scenes.geometry import collision as contact
@@ -31,10 +31,10 @@ def source(tmp_path_factory):
   """Frames of the film with their true poses, as nerfstudio writes them."""
   folder = tmp_path_factory.mktemp("capture")
   (folder / "images").mkdir()
-  truth = filming.read_truth(yardstick.TRUTH)
+  truth = filming.read_truth(ground_truth.TRUTH)
   wanted = np.linspace(0, len(truth["world_from_camera"]) - 1, _FRAMES).astype(int)
   frames = []
-  with av.open(str(yardstick.VIDEO)) as container:
+  with av.open(str(ground_truth.VIDEO)) as container:
     for index, frame in enumerate(container.decode(video=0)):
       if index in wanted:
         picture = cv2.resize(frame.to_ndarray(format="bgr24"), _SIZE, interpolation=cv2.INTER_AREA)

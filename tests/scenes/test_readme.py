@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerf2real import scenes
-from nerf2real.scenes.builtin import eye
+from nerf2real.scenes.builtin import mujoco_renderer
 
 
 def _run(*parts):
@@ -29,5 +29,5 @@ def test_the_readme_example_sees_the_room():
 def test_the_built_in_rooms_example_runs():
   try:
     _run("builtin", "README.md")
-  except eye.EglMissingError as error:
+  except mujoco_renderer.EglMissingError as error:
     pytest.skip(str(error))

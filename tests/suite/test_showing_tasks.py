@@ -7,10 +7,10 @@ import viser
 from PIL import Image
 
 from nerf2real import suite
-from nerf2real.suite.viewer.elements import bars
-from nerf2real.suite.viewer.task_viewer import TaskViewer
 from nerf2real.suite.views.drivers import Random, Walking
 from nerf2real.suite.views.rollout import run_episodes
+from nerf2real.suite.views.task_viewer import TaskViewer
+from nerf2real.suite.views.viewer_elements import bars
 from tests.suite.synthetic import FlatRenderer, make_room
 
 

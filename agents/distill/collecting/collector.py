@@ -5,7 +5,6 @@ episode is sent whole when it ends, and kept until the learner has acknowledged 
 """
 
 import logging
-import threading
 import time
 
 import numpy as np
@@ -16,9 +15,8 @@ from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import make_teacher
 from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.policy.inference import Policy
-from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.processes.joining import AWAY_POLL, Failures, make_known_environment, wait_for
+from nerf2real.agents.processes.joining import AWAY_POLL, JoinedProcess, make_known_environment
 from nerf2real.core.serialization import from_plain
 
 _log = logging.getLogger(__name__)
@@ -26,7 +24,7 @@ _DRAIN = 5.0  # s to deliver what was made, at the end
 _MAX_UNDELIVERED = 8  # episodes in the outbox, from which the collector waits for the learner
 
 
-class Collector:
+class Collector(JoinedProcess):
   """Runs labelled episodes for a learner until the run is over."""
 
   def __init__(self, link: ActorLink, *, seed: int, index: int):
@@ -38,22 +36,13 @@ class Collector:
         before, it makes the seeds of environment and mixture.
       index: this collector's number in the run.
     """
-    self._link = link
-    self._stop = threading.Event()
-    answer = wait_for(link.status, self._stop)
-    description = answer["description"]
-    self._settings = from_plain(description["settings"], DistillSettings)
-    self._layout = from_plain(description["layout"], Layout)
-    entropy = (seed, index, description["begin_frames"], answer["predecessors"])
-    self._seeds = np.random.SeedSequence(entropy)
+    super().__init__(link)
+    self._settings = from_plain(self.description["settings"], DistillSettings)
+    self._seeds = np.random.SeedSequence((seed, index, *self._beginning))
     self._policy: Policy | None = None
-    self._begun: int | None = description["begun"]
+    self._begun: int | None = self.description["begun"]
     self._level: tuple[float, float] | None = None
     self._runner: EpisodeRunner | None = None
-
-  def stop(self) -> None:
-    """Ends `run`; safe in a signal handler."""
-    self._stop.set()
 
   def run(self) -> None:
     """Collects until the run is over or `stop` is called.
@@ -61,7 +50,6 @@ class Collector:
     Raises:
       EpisodesFailed: several episodes in a row ended in an exception.
     """
-    failures = Failures(self._link)
     try:
       while not self._stop.is_set():
         frames = self._ask()
@@ -69,30 +57,30 @@ class Collector:
           break
         try:
           self._episode(frames)
-          failures.reset()
+          self._failures.reset()
         except Exception as error:
-          failures.add(error)
+          self._failures.add(error)
     finally:
-      self._link.drain(timeout=_DRAIN)
+      self.link.drain(timeout=_DRAIN)
 
   def _ask(self) -> int | None:
     """Fetches the newest student; returns the run's frames, or None at its end."""
     while not self._stop.is_set():
-      grant = self._link.request(0)
-      if grant is None or self._link.outbox.size > _MAX_UNDELIVERED:
-        self._link.flush()
+      grant = self.link.request(0)
+      if grant is None or self.link.outbox.size > _MAX_UNDELIVERED:
+        self.link.flush()
         self._stop.wait(AWAY_POLL)
         continue
       if grant["stop"]:
         return None
-      if grant["version"] != self._link.version:
-        answer = self._link.parameters()
+      if grant["version"] != self.link.version:
+        answer = self.link.parameters()
         if answer is not None:
-          self._policy = student_policy(answer[1], self._settings)
+          self._policy = Policy.of_network(answer[1], self._settings.agent.network)
           self._begun = grant["steps"] if self._begun is None else self._begun
       if may_collect(self._settings, int(grant["steps"]), begun=self._begun):
         return int(grant["steps"])
-      self._link.flush()
+      self.link.flush()
       self._stop.wait(AWAY_POLL)
     return None
 
@@ -104,26 +92,20 @@ class Collector:
     mixture = mixture_at(self._settings.mixture, frames, begun=self._begun)
     arrays, figures = self._runner.run(self._policy, mixture)
     steps = len(arrays["state"])
-    self._link.send(arrays, steps=steps)
+    self.link.send(arrays, steps=steps)
     rates = {"steps_per_second": steps / (time.perf_counter() - begin), "push_force": level[1]}
     about = {"teacher_share": mixture.teacher, "belief_share": mixture.belief}
-    self._link.report(figures | rates | about | self._runner.times.take(steps))
+    self.link.report(figures | rates | about | self._runner.times.take(steps))
 
   def _make_runner(self, level: tuple[float, float]) -> EpisodeRunner:
     environment_seed, mixture_seed = (int(s) for s in self._seeds.spawn(1)[0].generate_state(2))
     environment = make_known_environment(
-      pushed(self._settings.environment, level), self._layout, seed=environment_seed
+      pushed(self._settings.environment, level), self.layout, seed=environment_seed
     )
     return EpisodeRunner(
       environment,
-      self._layout,
+      self.layout,
       teacher=make_teacher(self._settings.teacher, task_of(environment).scene),
       settings=self._settings.mixture,
       rng=np.random.default_rng(mixture_seed),
     )
-
-
-def student_policy(parameters: dict[str, np.ndarray], settings: DistillSettings) -> Policy:
-  """Returns the policy that runs a student's served parameters."""
-  network = settings.agent.network
-  return Policy(parameters, init_stddev=network.init_stddev, min_stddev=network.min_stddev)

@@ -1,27 +1,25 @@
-"""The evaluator of a distillation: success of the student alone, on trials that nobody reports.
+"""The evaluator of a distillation: success rate of the student alone, on trials kept for it.
 
 Its trials are those of the protocol with the robot turned half way between the protocol's headings
 and with other draws; what is published is measured on the protocol itself (`launch/evaluate.py`).
 """
 
-import threading
 import time
 from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.distill.collecting.collector import student_policy
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.dmpo.policy.acting import Agent, run_episode, task_of
-from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.environments.loading import (
   evaluation_name,
   make_environment,
   trials_of,
 )
 from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.processes.joining import wait_for
-from nerf2real.core.intervals import clopper_pearson
+from nerf2real.agents.processes.evaluator import summary
+from nerf2real.agents.processes.joining import JoinedProcess
 from nerf2real.core.serialization import from_plain
 
 _POLL = 1.0  # s
@@ -38,7 +36,7 @@ def other_trials(trials: list[Any]) -> list[Any]:
   ]
 
 
-class Evaluator:
+class Evaluator(JoinedProcess):
   """Measures the newest student at regular times."""
 
   def __init__(self, link: ActorLink, *, seed: int):
@@ -48,11 +46,9 @@ class Evaluator:
       link: a link of the role "evaluator".
       seed: of what the episodes draw.
     """
-    self._link, self._seed = link, seed
-    self._stop = threading.Event()
-    description = wait_for(link.status, self._stop)["description"]
-    self._settings = from_plain(description["settings"], DistillSettings)
-    self._layout = from_plain(description["layout"], Layout)
+    super().__init__(link)
+    self._seed = seed
+    self._settings = from_plain(self.description["settings"], DistillSettings)
     self._environment = make_environment(evaluation_name(self._settings.environment), seed=seed)
     found = trials_of(self._environment)
     if found is None:
@@ -60,53 +56,42 @@ class Evaluator:
     self._trials = found
     self._chosen = other_trials(found.spread(self._settings.evaluation_trials))
 
-  def stop(self) -> None:
-    """Ends `run`; safe in a signal handler."""
-    self._stop.set()
-
   def run(self) -> None:
     """Evaluates until the run is over or `stop` is called."""
     due = -np.inf
     while not self._stop.is_set():
-      grant = self._link.request(0)
+      grant = self.link.request(0)
       if grant is not None and grant["stop"]:
         return
       # Version 0: no student yet; that of the last evaluation: none since, as while the encoder
       # learns again.
-      fresh = grant is not None and grant["version"] not in (0, self._link.version)
+      fresh = grant is not None and grant["version"] not in (0, self.link.version)
       if fresh and time.monotonic() >= due:
         due = time.monotonic() + self._settings.evaluation_period
-        answer = self._link.parameters()
+        answer = self.link.parameters()
         if answer is not None:
           self._evaluate(*answer)
       self._stop.wait(_POLL)
 
   def _evaluate(self, version: int, parameters: dict[str, np.ndarray]) -> None:
-    agent = Agent(
-      student_policy(parameters, self._settings), self._layout, seed=self._seed, deterministic=True
-    )
+    policy = Policy.of_network(parameters, self._settings.agent.network)
+    agent = Agent(policy, self.layout, seed=self._seed, deterministic=True)
     self._trials.choose(self._chosen, seed=self._seed)
-    figures, times, endings = [], [], []
+    results, times, endings = [], [], []
     for _ in self._chosen:
       if self._stop.is_set():
         return
-      figures.append(run_episode(agent, self._environment))
+      results.append(run_episode(agent, self._environment))
       task = task_of(self._environment)
       endings.append(task.ending)
       if task.success:
         times.append(task.success_time)
-    count, successes = len(figures), sum(bool(f["success"]) for f in figures)
-    interval = clopper_pearson(successes, count)
-    self._link.report(
-      {
+    self.link.report(
+      summary(results)
+      | {
         "version": version,
-        "episodes": count,
-        "success": successes / count,
-        "success_low": interval.low,
-        "success_high": interval.high,
         "median_time": float(np.median(times)) if times else None,
         "falls": endings.count("fall"),
         "collisions": endings.count("collision"),
-        "localisation_error": float(np.mean([f["localisation_error"] for f in figures])),
       }
     )

@@ -123,7 +123,8 @@ class Learner:
       description={
         "settings": to_plain(settings),
         "layout": to_plain(self._layout),
-        "begin_frames": self._data.frames,
+        "kind": stages.KIND,
+        "begin_steps": self._data.frames,
         "begun": self._counters.begun,
       },
     )

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nerf2real.agents.dmpo.config import NetworkConfig
+
 Params = Mapping[str, Any]
 
 _LAYER_NORM_EPSILON = 1e-5  # as in networks.py
@@ -62,6 +64,11 @@ class Policy:
     self._stddev_scale = np.float32(init_stddev / np.log(2.0))
     self._min_stddev = np.float32(min_stddev)
     self.update(parameters)
+
+  @classmethod
+  def of_network(cls, parameters: Mapping[str, np.ndarray], network: NetworkConfig) -> "Policy":
+    """Creates the policy that runs a network's served parameters."""
+    return cls(parameters, init_stddev=network.init_stddev, min_stddev=network.min_stddev)
 
   def update(self, parameters: Mapping[str, np.ndarray]) -> None:
     """Takes newer parameters of the same policy."""

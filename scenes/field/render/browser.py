@@ -15,6 +15,17 @@ _MOVING_WIDTH = 160  # pixels of a picture while the view moves
 _STILL_WIDTHS = (320, 640, 960)  # pixels of the pictures that follow once it rests
 
 
+def begin_as(server: viser.ViserServer, camera: Camera, world_from_camera: np.ndarray) -> None:
+  """Lets clients begin as a camera of the capture saw the scene: pose [4, 4], height of its view.
+
+  Beyond what the cameras saw the field is fog, and viser's own view is 75 degrees high.
+  """
+  start = server.initial_camera
+  start.fov = camera.vertical_fov
+  start.position = tuple(world_from_camera[:3, 3])
+  start.look_at = tuple(world_from_camera[:3, 3] + world_from_camera[:3, 2])
+
+
 class FieldView:
   """Renders the field for a client's camera."""
 

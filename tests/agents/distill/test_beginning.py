@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.distill import settings
-from nerf2real.agents.distill.collecting.collector import student_policy
 from nerf2real.agents.distill.learning import beginning, student
 from nerf2real.agents.distill.learning.updates import make_updates, standardised
 from nerf2real.agents.dmpo.policy import export
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.core.serialization import to_plain
 from nerf2real.launch import distill_learner
 from tests.agents.distill.test_student import LAYOUT, TINY, make_state
@@ -54,11 +54,13 @@ def test_it_acts_as_the_policy_did_also_once_inputs_are_standardised(exported):
   wanted = _act(export.load_policy(exported).policy)
   for begun in (state, scaled):
     served = student.served_parameters(begun.student, begun.scales)
-    np.testing.assert_allclose(_act(student_policy(served, TINY)), wanted, atol=1e-4)
+    np.testing.assert_allclose(
+      _act(Policy.of_network(served, TINY.agent.network)), wanted, atol=1e-4
+    )
   assert np.abs(np.asarray(scaled.scales["state"]["mean"]) - 2.0).max() < 1.5  # of the new data
   fresh = standardised(state, state_rows=rows, labels=labels, layout=LAYOUT, min_spread=0.05)
   served = student.served_parameters(fresh.student, fresh.scales)
-  assert np.abs(_act(student_policy(served, TINY)) - wanted).max() > 0.05
+  assert np.abs(_act(Policy.of_network(served, TINY.agent.network)) - wanted).max() > 0.05
 
 
 def test_other_networks_are_refused_with_the_array(exported):

@@ -1,6 +1,8 @@
 """The collector: the mixture over a run, pushes in steps, and labelled episodes."""
 
 import dataclasses
+import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,6 +48,32 @@ def test_pushes_come_in_steps():
   assert schedule.pushed("suite:nerf_nav", (1.0, 3.0)) == (
     "suite:nerf_nav?pushes=true&push_force=1.0,3.0"
   )
+
+
+def test_the_evaluator_reports_success_with_its_interval_and_how_episodes_end(monkeypatch):
+  reports, trials = [], []
+  task = SimpleNamespace(ending="fall", success=False, success_time=None)
+  outcomes = iter([(True, "goal", 5.0), (False, "fall", None), (True, "goal", 7.0)])
+
+  def run(agent, environment):
+    task.success, task.ending, task.success_time = next(outcomes)
+    return {"return": 1.0, "steps": 4, "success": float(task.success), "localisation_error": 0.1}
+
+  monkeypatch.setattr(evaluator, "run_episode", run)
+  monkeypatch.setattr(evaluator, "Agent", lambda *_, **__: None)
+  monkeypatch.setattr(evaluator.Policy, "of_network", lambda *_: None)
+  found = evaluator.Evaluator.__new__(evaluator.Evaluator)
+  found.link, found.layout = SimpleNamespace(report=reports.append), None
+  found._settings, found._seed, found._stop = settings.preset("tiny"), 3, threading.Event()
+  found._environment, found._chosen = SimpleNamespace(task=task), [0, 1, 2]
+  found._trials = SimpleNamespace(choose=lambda chosen, seed: trials.append((chosen, seed)))
+  found._evaluate(8, {})
+  (report,) = reports
+  assert trials == [([0, 1, 2], 3)]
+  assert report["episodes"] == 3 and report["success"] == pytest.approx(2 / 3)
+  assert report["success_low"] < 0.2 and report["success_high"] > 0.95
+  assert (report["falls"], report["collisions"], report["median_time"]) == (1, 0, 6.0)
+  assert report["version"] == 8 and report["length"] == 4
 
 
 def test_trials_during_a_run_are_not_those_that_are_reported():

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.distill import settings
-from nerf2real.agents.distill.collecting.collector import student_policy
 from nerf2real.agents.distill.learning import student
 from nerf2real.agents.distill.learning.updates import make_updates, standardised
 from nerf2real.agents.dmpo import scaling
 from nerf2real.agents.dmpo.policy import export
+from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.dmpo.specs import POSITION, ROTATION, Layout
 from nerf2real.core.serialization import to_plain
 
@@ -83,7 +83,7 @@ def test_the_export_acts_as_the_training_network(tmp_path):
       assert step.mean == pytest.approx(np.asarray(found.action[row, time]), abs=1e-4)
       assert step.embedding == pytest.approx(np.asarray(found.embedding[row, time]), abs=1e-4)
       assert step.stddev == pytest.approx(network.init_stddev, abs=1e-5)
-  assert student_policy(arrays, TINY).lstm_size == network.lstm_size
+  assert Policy.of_network(arrays, TINY.agent.network).lstm_size == network.lstm_size
 
 
 def test_an_unroll_in_two_parts_is_the_unroll_in_one():

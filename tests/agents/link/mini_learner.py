@@ -47,7 +47,9 @@ def main() -> None:
     return size - 1
 
   session = (
-    sessions.connect(endpoint, settings, timeout=5) if join else sessions.listen(endpoint, settings)
+    sessions.connect(endpoint, settings, timeout=30)
+    if join
+    else sessions.listen(endpoint, settings)
   )
   link = LearnerLink(
     session, settings, limiter=limiter, insert=insert, description={}, known=replay.origins()

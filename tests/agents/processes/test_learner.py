@@ -53,7 +53,7 @@ class Run:
     )
 
   def go(self):
-    session = sessions.connect(self._endpoint, LINK, timeout=5)
+    session = sessions.connect(self._endpoint, LINK, timeout=30)
     process = actor.ActorProcess(ActorLink(session, LINK, actor="actor-0-t"), seed=0)
     thread = threading.Thread(target=process.run)
     thread.start()
@@ -198,7 +198,7 @@ def test_minutes_end_a_run_over_all_its_parts(tmp_path):
   run = Run(tmp_path, minutes=1.5 / 60)
   begin = time.monotonic()
   run.go()
-  assert time.monotonic() - begin < 15
+  assert time.monotonic() - begin < 60
   seconds = read_info(tmp_path)["seconds"]
   assert seconds >= 1.5
   again = Run(tmp_path, minutes=1.5 / 60, resume=True)
@@ -219,7 +219,7 @@ def test_a_full_disk_ends_the_learner_with_a_reason(tmp_path, monkeypatch):
   begin = time.monotonic()
   with pytest.raises(LearnerError, match="No trajectory can be taken in.*No space left"):
     run.go()
-  assert time.monotonic() - begin < 30
+  assert time.monotonic() - begin < 120
 
 
 def _report(learner, **values):

@@ -122,7 +122,7 @@ def test_a_run_ends_by_itself_and_is_resumed(tmp_path):
   agent.act(exported.layout.flatten(environment.reset().observation))
 
   refused = start(run, *CARTPOLE, *SMALL)
-  assert "add --resume" in finish(refused, timeout=20, run=run) and refused.returncode == 2
+  assert "add --resume" in finish(refused, timeout=60, run=run) and refused.returncode == 2
 
   second = start(run, *SMALL, "--actors", "1", "--resume", "--no-evaluator")
   wait_until(lambda: rows(run, "learner")[-1]["updates"] >= 150)

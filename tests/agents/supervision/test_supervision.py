@@ -145,7 +145,7 @@ def test_a_process_that_ignores_sigterm_is_killed_and_its_words_are_kept(tmp_pat
     "print('deaf', flush=True)\ntime.sleep(60)\n"
   )
   process = LocalProcess(script, (), log=tmp_path / "log")
-  wait_until(lambda: process.last_words() == "deaf", timeout=20)
+  wait_until(lambda: process.last_words() == "deaf", timeout=60)
   assert process.exit_status() is None
   process.terminate(0.2)
   assert process.wait() == -signal.SIGKILL == process.exit_status()

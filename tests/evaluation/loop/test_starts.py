@@ -10,6 +10,7 @@ from nerf2real.evaluation.loop import naming, starts
 from nerf2real.evaluation.loop.starts import Walked
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
+from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual import undeclared
 from nerf2real.suite.protocols import NAVIGATION
 from nerf2real.suite.scene import open_scene
@@ -91,7 +92,11 @@ def test_a_robot_that_begins_trials_on_a_slope_names_it(tmp_path, slope):
   altered = undeclared.parse_all([f"floor_slope:0,{slope}"])
   chosen, episodes = (0, 2, 4, 20), []
   plant = RehearsedPlant(
-    open_scene(None), NAVIGATION, image_size=None, altered=altered, record=tmp_path / "a.mcap"
+    open_scene(None),
+    EvaluationSettings(plant="virtual"),
+    image_size=None,
+    altered=altered,
+    record=tmp_path / "a.mcap",
   )
   for index in chosen:
     plant.start(plants.trials(NAVIGATION)[index][1])

@@ -9,7 +9,7 @@ import pytest
 
 from nerf2real.real.camera import device as cameras
 from nerf2real.real.camera.device import CaptureSettings
-from nerf2real.real.camera.source import resize
+from nerf2real.real.camera.source import check_shape, resize
 from nerf2real.real.virtual.camera import Sensor, VirtualCamera
 from nerf2real.real.virtual.stream import CameraStream
 
@@ -33,7 +33,7 @@ def test_newest_frame_and_its_age_from_the_stream():
   scene = Counter()
   with (
     CameraStream(scene, VirtualCamera(rate=40, latency=0.05, noise=0)) as stream,
-    cameras.Camera.open(stream.url, size=SIZE) as camera,
+    cameras.Camera.open(stream.url) as camera,
   ):
     time.sleep(0.6)  # a queue would hold two dozen frames now
     picture, age = camera.read()
@@ -52,7 +52,7 @@ def test_newest_frame_and_its_age_from_the_stream():
 def test_stated_latency_is_part_of_the_age():
   with (
     CameraStream(Counter(), VirtualCamera(rate=40, latency=0)) as stream,
-    cameras.Camera.open(stream.url, size=SIZE, settings=CaptureSettings(latency=5.0)) as camera,
+    cameras.Camera.open(stream.url, settings=CaptureSettings(latency=5.0)) as camera,
   ):
     assert 5.0 <= camera.read()[1] < 6.0
 
@@ -62,7 +62,7 @@ def test_colours_are_rgb_and_pixels_are_means():
   checks[..., 0] = np.where(np.indices((60, 80)).sum(0) % 2, 200, 100)  # red
   with (
     CameraStream(lambda: checks, VirtualCamera(rate=30, latency=0.03, noise=0)) as stream,
-    cameras.Camera.open(stream.url, size=SIZE) as camera,
+    cameras.Camera.open(stream.url) as camera,
   ):
     red, green, blue = np.moveaxis(resize(camera.read()[0], SIZE).astype(float), -1, 0)
   assert red == pytest.approx(150, abs=20) and red.mean() == pytest.approx(150, abs=12)
@@ -74,7 +74,7 @@ def test_controls_are_set_and_read_back(caplog):
   held = cameras.Controls(gain=50, exposure=1)
   with (
     CameraStream(lambda: grey, VirtualCamera(rate=40, latency=0.03, noise=0)) as stream,
-    cameras.Camera.open(stream.url, size=SIZE, settings=CaptureSettings(controls=held)) as camera,
+    cameras.Camera.open(stream.url, settings=CaptureSettings(controls=held)) as camera,
   ):
     assert {k: v.holds for k, v in camera.readback.items()} == {"gain": True, "exposure": True}
     neutral = camera.read()[0].mean()
@@ -92,14 +92,14 @@ def test_controls_are_set_and_read_back(caplog):
 def test_stream_that_is_lost_and_comes_back():
   stream = CameraStream(Counter())
   stream.start()
-  camera = cameras.Camera.open(stream.url, size=SIZE)
+  camera = cameras.Camera.open(stream.url)
   try:
     port = int(stream.url.split(":")[2].split("/")[0])
     stream.close()
     time.sleep(0.8)
     assert camera.read()[1] > 0.6
     with CameraStream(Counter(), port=port):
-      deadline = time.monotonic() + 6
+      deadline = time.monotonic() + 60
       while time.monotonic() < deadline and camera.reopened == 0:
         time.sleep(0.05)
       time.sleep(0.3)
@@ -114,7 +114,7 @@ def test_film_plays_at_its_own_rate(tmp_path):
   for level in range(40):
     film.write(np.full((60, 80, 3), 6 * level, np.uint8))
   film.release()
-  with cameras.Camera.open(path, size=SIZE) as camera:
+  with cameras.Camera.open(path) as camera:
     first = camera.read()[0].mean() / 6
     time.sleep(1.0)
     later = camera.read()[0].mean() / 6
@@ -157,7 +157,7 @@ class Driver:
 def test_device_controls_and_the_drivers_stamps():
   controls = cameras.Controls(gain=50, exposure=156, white_balance=4000)
   settings = CaptureSettings(capture_size=(480, 640), controls=controls)
-  with cameras.Camera.open(0, size=SIZE, settings=settings, capture=Driver) as camera:
+  with cameras.Camera.open(0, settings=settings, capture=Driver) as camera:
     assert camera.readback["gain"] == cameras.Readback(50, 48.0)
     assert not camera.readback["gain"].holds and camera.readback["exposure"].holds
     assert camera.readback["white_balance"].found is None
@@ -168,15 +168,15 @@ def test_device_controls_and_the_drivers_stamps():
 
 def test_errors_say_what_to_do(tmp_path):
   with pytest.raises(ValueError, match="Found no .*nowhere.mp4"):
-    cameras.Camera.open(tmp_path / "nowhere.mp4", size=SIZE)
+    cameras.Camera.open(tmp_path / "nowhere.mp4")
+  picture = Driver(0).read()[1]
+  check_shape(picture, SIZE)
   with pytest.raises(ValueError, match="height, width"):
-    cameras.Camera.open(0, size=(0, 40), capture=Driver)
+    check_shape(picture, (0, 40))
   with pytest.raises(ValueError, match="640 x 480 pixels, which do not shrink to 40 x 20"):
-    cameras.Camera.open(0, size=(20, 40), capture=Driver)
+    check_shape(picture, (20, 40))
   with pytest.raises(cameras.CameraLostError, match="No picture came"):
-    cameras.Camera.open(
-      "http://127.0.0.1:9/x.mjpg", size=SIZE, settings=CaptureSettings(timeout=0.4)
-    )
+    cameras.Camera.open("http://127.0.0.1:9/x.mjpg", settings=CaptureSettings(timeout=0.4))
 
 
 def test_sensor_response_and_noise():

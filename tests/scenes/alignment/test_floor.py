@@ -36,13 +36,24 @@ def test_finds_tilted_floor_below_table(seed):
   scale, shift = 0.37, np.array([0.2, -0.1, 0.4])
   points = scale * room(rng) @ turn.T + shift
   found = floor.find_floor(
-    points, up=np.array([0, 0, 1.0]), camera_positions=scale * CAMERAS @ turn.T + shift, seed=seed
+    points, up=np.array([0, 0, 1.0]), camera_positions=scale * CAMERAS @ turn.T + shift
   )
   truth = turn @ [0, 0, 1]
   assert np.degrees(np.arccos(found.normal @ truth)) < 0.5
   assert abs(found.offset - truth @ shift) < 0.01 * scale
   assert found.tilt_from_cameras_deg == pytest.approx(8, abs=0.5)
   assert found.heights(shift + scale * turn @ [0.3, 0.2, 1.0]) == pytest.approx(scale, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_finds_a_tilted_floor_that_holds_three_percent_of_the_points(seed):
+  rng = np.random.default_rng(seed)
+  turn = Rotation.from_rotvec(np.radians([-5, 4, 0])).as_matrix()
+  clutter = rng.uniform([-2.5, -2, 0.03], [2.5, 2, 2.5], (25_000, 3))
+  points = np.concatenate([room(rng, table_points=0), clutter]) @ turn.T
+  found = floor.find_floor(points, up=np.array([0, 0, 1.0]), camera_positions=CAMERAS @ turn.T)
+  assert np.degrees(np.arccos(found.normal @ turn @ [0, 0, 1])) < 0.5
+  assert abs(found.offset) < 0.015
 
 
 def test_refinement_uses_dense_points():

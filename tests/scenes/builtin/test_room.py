@@ -13,7 +13,7 @@ import pytest
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.rotations import yaw_matrix
-from nerf2real.scenes.builtin import eye, filming, furniture, room, solids, walk
+from nerf2real.scenes.builtin import camera_path, filming, furniture, mujoco_renderer, room, solids
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
 
@@ -27,7 +27,7 @@ def renderer():
   try:
     with room.room_eye(0) as opened:
       yield opened
-  except eye.EglMissingError as error:
+  except mujoco_renderer.EglMissingError as error:
     pytest.skip(str(error))
 
 
@@ -109,7 +109,7 @@ def test_open_floor_is_free(model):
 
 
 def test_path_keeps_clear_of_everything():
-  path = walk.Walk(0, seconds=30.0).pose(np.linspace(0, 30, 300))
+  path = camera_path.Walk(0, seconds=30.0).pose(np.linspace(0, 30, 300))
   np.testing.assert_allclose(
     path[:, :3, :3] @ path[:, :3, :3].transpose(0, 2, 1), [np.eye(3)] * 300, atol=1e-9
   )
@@ -243,9 +243,9 @@ def test_missing_egl_names_the_packages(monkeypatch, model):
   def missing():
     raise ImportError("no EGL here")
 
-  monkeypatch.setattr(eye, "_context_class", missing)
-  with pytest.raises(eye.EglMissingError, match="libegl1 libegl-mesa0 libgl1-mesa-dri"):
-    eye.Eye(model)
+  monkeypatch.setattr(mujoco_renderer, "_context_class", missing)
+  with pytest.raises(mujoco_renderer.EglMissingError, match="libegl1 libegl-mesa0 libgl1-mesa-dri"):
+    mujoco_renderer.Eye(model)
 
 
 def test_shipped_film_and_truth_belong_together():
@@ -282,4 +282,4 @@ print(*(name for name in sys.modules if name.startswith("nerf2real.")))
   )
   packages = {name.split(".")[1] for name in result.stdout.split()}
   assert packages == {"core", "scenes", "launch"}
-  assert "nerf2real.scenes.builtin.yardstick" in result.stdout.split()
+  assert "nerf2real.scenes.builtin.ground_truth" in result.stdout.split()

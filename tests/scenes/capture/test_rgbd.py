@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
-from nerf2real.scenes import image_stages
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import Floor
@@ -22,8 +21,9 @@ from nerf2real.scenes.capture.capture import (
   read_capture,
 )
 from nerf2real.scenes.capture.kinds import source_kind
-from nerf2real.scenes.poses import localise
-from nerf2real.scenes.stages import Made, StageResult, Stages
+from nerf2real.scenes.poses.structure_from_motion import localise
+from nerf2real.scenes.stages import radiance_field
+from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from tests.scenes import synthetic_capture as synthetic
 
 SETTINGS = CaptureSettings(num_keyframes=8)
@@ -161,7 +161,7 @@ def test_measured_depth_stands_for_the_fields(tum, tmp_path):
   cv2.imwrite(str(tmp_path / "gap.png"), gap)
   known = dataclasses.replace(capture.known, depth_files=(tmp_path / "gap.png", *others))
   capture = dataclasses.replace(capture, known=known)
-  found = localise.localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
+  found = localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
 
   def made(value):
     return Made(value, StageResult(tmp_path, "key", "made", 0.0, cached=False))
@@ -172,7 +172,7 @@ def test_measured_depth_stands_for_the_fields(tum, tmp_path):
 
   field = SimpleNamespace(renderer=SimpleNamespace(render=render))
   cache = Stages(tmp_path / "stages", show_progress=False)
-  views = image_stages.depth(cache, made(field), made(capture), made(found), width=80).value
+  views = radiance_field.depth(cache, made(field), made(capture), made(found), width=80).value
   measured = views.depth != 9.0
   assert not measured[0, :30].any() and measured[1:].mean() > 0.9
   rays = views.camera.rays()
@@ -184,7 +184,7 @@ def test_measured_depth_stands_for_the_fields(tum, tmp_path):
 
 def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path):
   capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
-  found = localise.localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
+  found = localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
   assert found.registered_fraction == 1.0 and "rgbd" in found.strategy
   metres = found.unit_from_source.inverse()
   assert _off_the_planes(metres.apply(found.points)).max() < 0.006

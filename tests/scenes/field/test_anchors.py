@@ -3,7 +3,9 @@
 import numpy as np
 import pycolmap
 
+from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.field import anchors
+from nerf2real.scenes.poses import localisation
 from tests.scenes import box_views
 
 
@@ -38,11 +40,21 @@ def _model(views, points, *, scale=2):
   return model
 
 
+def _known_points(model, views):
+  figures = {
+    "reprojection_error_px": 0.5,
+    "registered_fraction": 1.0,
+    "strategy": "made",
+    "unit_from_source": Similarity(),
+  }
+  return anchors.known_points(localisation.from_model(model, figures), views.camera)
+
+
 def test_known_points_lie_on_their_pixels_rays():
   views = box_views.make_views(30, width=64, height=48)
   points = np.random.default_rng(1).uniform(-0.7, 0.7, (80, 3))
   model = _model(views, points)
-  known = anchors.known_points(model, views.names, views.world_from_camera, camera=views.camera)
+  known = _known_points(model, views)
   assert len(known) > 40
   nearest = []
   for picture, x, y, distance in known:
@@ -58,10 +70,10 @@ def test_points_of_two_views_or_with_large_errors_are_left_out():
   model = _model(views, np.random.default_rng(1).uniform(-0.7, 0.7, (80, 3)))
   few = {i for i, point in model.points3D.items() if point.track.length() == 2}
   bad = next(i for i in model.points3D if i not in few)
-  before = anchors.known_points(model, views.names, views.world_from_camera, camera=views.camera)
+  before = _known_points(model, views)
   seen = model.points3D[bad].track.length()
   model.points3D[bad].error = 5.0
-  after = anchors.known_points(model, views.names, views.world_from_camera, camera=views.camera)
+  after = _known_points(model, views)
   assert few
   total = sum(p.track.length() for p in model.points3D.values() if p.track.length() > 2)
   assert len(before) == total

@@ -1,13 +1,11 @@
 """Verdicts on captures: blur, exposure, gaps, the loop, and which side of a room was not filmed."""
 
-from types import SimpleNamespace
-
 import numpy as np
-import pycolmap
 import pytest
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
+from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.quality import advice
 from nerf2real.scenes.quality.coverage import coverage
 from tests.scenes import furnished_room
@@ -73,20 +71,10 @@ def test_the_side_that_was_not_filmed_is_named_and_drawn():
   assert marked[:, : picture.shape[1] // 2].sum() > 2 * marked[:, picture.shape[1] // 2 :].sum()
 
 
-def _model(tracks):
-  """A stand-in for a localised model with 20 pictures and the given tracks."""
-  images = {k: SimpleNamespace(name=f"frame_{k:06d}.jpg") for k in range(20)}
-  points = [
-    SimpleNamespace(track=SimpleNamespace(elements=[SimpleNamespace(image_id=k) for k in track]))
-    for track in tracks
-  ]
-  return SimpleNamespace(images=images, points3D=dict(enumerate(points)))
-
-
-@pytest.mark.parametrize(("tracks", "closed"), [([(0, 19)] * 40, True), ([(0, 5)] * 40, False)])
-def test_a_loop_is_closed_where_the_end_sees_what_the_beginning_saw(tracks, closed):
-  names = [f"frame_{k:06d}.jpg" for k in range(20)]
-  shared = advice._shared_points(_model(tracks), names)
+@pytest.mark.parametrize(("last", "closed"), [(19, True), (5, False)])
+def test_a_loop_is_closed_where_the_end_sees_what_the_beginning_saw(last, closed):
+  views = np.repeat([0, last], 40)
+  shared = advice._shared_points(Tracks(views, np.tile(np.arange(40), 2), np.zeros((80, 2))), 20)
   assert (shared >= advice._LOOP_POINTS) == closed
 
 
@@ -94,4 +82,4 @@ def test_without_poses_the_verdict_is_the_reason(tmp_path):
   verdict = advice.judge(_capture(tmp_path), CaptureSettings(), reason="3 of 20 were localised.")
   assert not verdict.good and verdict.picture is None
   assert verdict.paragraph.startswith("Film again") and "3 of 20" in verdict.paragraph
-  assert advice._shared_points(pycolmap.Reconstruction(), []) is None
+  assert advice._shared_points(Tracks.none(), 0) is None

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment import overrides, picking
-from nerf2real.scenes.override_panel import OverridePanel, surface_point
+from nerf2real.scenes.viewing.override_panel import OverridePanel, surface_point
 
 _TRANSFORM = Similarity(
   2.5, Rotation.from_euler("zyx", [0.4, -0.3, 0.2]).as_matrix(), np.array([0.3, -0.2, 1.1])

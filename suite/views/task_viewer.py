@@ -19,9 +19,9 @@ from nerf2real.suite import loading
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.scene import open_scene
-from nerf2real.suite.viewer.elements import bars, geom_mesh
 from nerf2real.suite.views.drivers import SCRIPTED, Driver, MakeDriver, move_on
 from nerf2real.suite.views.third_person import best_azimuth, clear_distance, direction
+from nerf2real.suite.views.viewer_elements import bars, geom_mesh
 
 _SPRING = 40.0  # N/m between the handle that is dragged and the torso
 _MAX_FORCE = 20.0  # N

@@ -9,7 +9,7 @@ import numpy as np
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.policy.acting import Agent
 from nerf2real.evaluation.plants.plant import Sight
-from nerf2real.evaluation.policies import Belief
+from nerf2real.evaluation.policies.policy import Belief
 
 
 class LearnedPolicy:

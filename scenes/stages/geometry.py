@@ -22,12 +22,12 @@ from nerf2real.scenes.geometry import (
   mesh,
   seen_floor,
 )
-from nerf2real.scenes.pictures import PosedPictures
-from nerf2real.scenes.quality import collision_error
-from nerf2real.scenes.results import Contact
-from nerf2real.scenes.stages import Made, StageResult, Stages
+from nerf2real.scenes.stages.cache import Made, StageResult, Stages
+from nerf2real.scenes.stages.pictures import PosedPictures
+from nerf2real.scenes.stages.results import Contact, FreeFloor
 
-_CONTACT_VERSION = 2  # 2: unseen space is matter behind seen matter alone; no tolerance grows
+# 2: unseen space is matter behind seen matter alone; no tolerance grows; 3: its errors apart
+_CONTACT_VERSION = 3
 
 
 def floor(
@@ -121,25 +121,10 @@ def contact(
     )
     map_server.write(space, folder / "free_space.pgm")
     goals = space.default_goals(count=floor_settings.goals, clearance=floor_settings.goal_clearance)
-    progress(0.85, "distance to the seen surface")
-    error = collision_error.collision_error(
-      parts,
-      depth.value.surface_points(stride=2)[0],
-      eyes=depth.value.positions,
-      lower=place.extent_lower,
-      upper=np.minimum(place.extent_upper, [np.inf, np.inf, shape.top]),
-      floor_threshold=place.floor_threshold,
-    )
-    figures = Contact(
-      goals=goals,
-      free_area_m2=space.area,
-      collision_parts=len(parts),
-      collision_error_m=error.p95,
-      collision_error=error,
-    )
-    write_json(folder / "contact.json", figures)
+    write_json(folder / "contact.json", FreeFloor(goals, space.area))
 
   everything = [collision_settings, floor_settings]
   inputs = {"world": world.stamp, "depth": depth.stamp}
   stage = cache.run("contact", write, settings=everything, inputs=inputs, version=_CONTACT_VERSION)
-  return Made(read_json(stage.folder / "contact.json", Contact), stage)
+  parts = collision.read_parts(stage.folder / "collision")
+  return Made(Contact(parts, read_json(stage.folder / "contact.json", FreeFloor)), stage)

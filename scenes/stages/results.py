@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field.field import Field
@@ -16,11 +17,12 @@ from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.training import Snapshot
 from nerf2real.scenes.geometry.convex import Part
 from nerf2real.scenes.geometry.fusion import DepthViews
-from nerf2real.scenes.pictures import PosedPictures
-from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.quality.collision_error import CollisionError
 from nerf2real.scenes.quality.held_out import ViewScore
-from nerf2real.scenes.stages import Made, StageResult
+from nerf2real.scenes.quality.sight_lines import Judgement
+from nerf2real.scenes.stages.cache import Made, StageResult
+from nerf2real.scenes.stages.pictures import PosedPictures
 
 
 class Source(NamedTuple):
@@ -28,6 +30,14 @@ class Source(NamedTuple):
 
   path: Path
   sha256: str
+
+
+class Given(NamedTuple):
+  """What a person gave for the world frame."""
+
+  override: Overrides
+  override_key: str  # hash of the file of overrides
+  marker_side: float | None  # of the black square of a marker in the room [m]
 
 
 class Watcher(Protocol):
@@ -52,16 +62,25 @@ class TrainedField:
     return Renderer(Field.load(self.path), threads=os.cpu_count() or 1)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Contact:
-  """Figures of the convex parts and of the free floor; their files lie beside them."""
+class FreeFloor(NamedTuple):
+  """Figures of the free floor."""
 
-  goals: np.ndarray
-  """[G, 2] m."""
-  free_area_m2: float
-  collision_parts: int
-  collision_error_m: float
-  collision_error: CollisionError
+  goals: np.ndarray  # [G, 2] m
+  area_m2: float
+
+
+class Contact(NamedTuple):
+  """Contact geometry; the files of its parts and of the map lie in the stage's folder."""
+
+  parts: list[Part]
+  floor: FreeFloor
+
+
+class ContactErrors(NamedTuple):
+  """Errors of the convex parts."""
+
+  distances: CollisionError  # from the surface that they were made of
+  judgement: Judgement | None  # by sight lines; None where points have no pictures
 
 
 class SceneResults(NamedTuple):
@@ -78,6 +97,7 @@ class SceneResults(NamedTuple):
   moved_to_floor: float  # share of its pixels
   surface: StageResult
   contact: Made[Contact]
+  errors: Made[ContactErrors]
   baseline: Made[dict[str, float]] | None
 
 

@@ -10,16 +10,16 @@ import viser
 
 from nerf2real.core import palette
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.field.render.browser import FieldView, serve_field
+from nerf2real.scenes.field.render.browser import FieldView, begin_as, serve_field
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.training import Snapshot
-from nerf2real.scenes.poses.localise import Localisation
+from nerf2real.scenes.poses.localisation import Localisation
 
 _POINT_SIZE = 0.004  # [unit], 1 cm in a room of 5 m
 
 
 class TrainingViewer:
-  """A page of a scene that is being made; a `scenes.results.Watcher`."""
+  """A page of a scene that is being made; a `scenes.stages.results.Watcher`."""
 
   def __init__(self, *, host: str, port: int):
     """Serves the page; see `address`."""
@@ -56,12 +56,7 @@ class TrainingViewer:
     self._server.scene.add_point_cloud(
       "/cameras", places, palette.rgb(palette.VERMILION), point_size=_POINT_SIZE
     )
-    # The camera that has the most of the room before it.
-    ahead = np.median(found.points, axis=0) - places
-    depth = np.einsum("ni,ni->n", ahead, found.world_from_camera[:, :3, 2])
-    start = found.world_from_camera[int(np.argmax(depth))]
-    self._server.initial_camera.position = tuple(start[:3, 3])
-    self._server.initial_camera.look_at = tuple(start[:3, 3] + start[:3, 2])
+    begin_as(self._server, found.camera, found.world_from_camera[found.overlooking()])
     count, keyframes = len(found.points), len(found.names)
     self._text.content = f"{keyframes} keyframes and {count:,} points. The field comes next."
 

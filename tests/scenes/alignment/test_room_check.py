@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf2real.scenes.alignment import surroundings
+from nerf2real.scenes.alignment import room_check
 from tests.scenes import furnished_room, synthetic_capture
 
 
@@ -17,20 +17,20 @@ def _ring(first=0.0, last=2 * np.pi, count=50):
 
 def test_a_thing_from_all_sides_is_no_room():
   thing = np.random.default_rng(0).uniform(-0.3, 0.3, (500, 3))
-  np.testing.assert_allclose(surroundings.common_focus(_ring()), [0, 0, 0.1], atol=1e-9)
-  with pytest.raises(surroundings.NoRoomError, match="50 pictures circle one thing"):
-    surroundings.require_room(_ring(), thing)
+  np.testing.assert_allclose(room_check.common_focus(_ring()), [0, 0, 0.1], atol=1e-9)
+  with pytest.raises(room_check.NoRoomError, match="50 pictures circle one thing"):
+    room_check.require_room(_ring(), thing)
 
 
 def test_a_room_around_the_ring_is_a_room():
   rng = np.random.default_rng(0)
   walls = rng.uniform(-2.5, 2.5, (500, 3))
   walls[:, 0] = 2.5 * np.sign(walls[:, 0])
-  surroundings.require_room(_ring(), walls)
+  room_check.require_room(_ring(), walls)
 
 
 def test_a_walk_and_a_facade_are_no_ring():
   rng = np.random.default_rng(0)
   points = rng.uniform([2, 2, 0], [3, 3, 1], (500, 3))
-  surroundings.require_room(synthetic_capture.walk(30), points)
-  surroundings.require_room(_ring(0.0, 2.0), rng.uniform(-0.3, 0.3, (500, 3)))
+  room_check.require_room(synthetic_capture.walk(30), points)
+  room_check.require_room(_ring(0.0, 2.0), rng.uniform(-0.3, 0.3, (500, 3)))

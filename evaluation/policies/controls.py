@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.evaluation.plants.plant import Sight
-from nerf2real.evaluation.policies import Belief, EvaluatedPolicy
+from nerf2real.evaluation.policies.policy import Belief, EvaluatedPolicy
 from nerf2real.suite.protocols import BALL
 
 NONE, BLACK, OTHER_GOAL = "none", "black", "other_goal"

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from nerf2real.scenes.field import training
-from nerf2real.scenes.poses.localise import Localisation
-from nerf2real.scenes.training_viewer import TrainingViewer
+from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.poses.tracks import Tracks
+from nerf2real.scenes.viewing.training_viewer import TrainingViewer
 from tests.scenes import box_views
 from tests.scenes.field.test_training import FAST
 
@@ -59,6 +60,7 @@ def test_the_page_shows_points_then_the_newest_field(viewer, snapshots, views):
       registered_fraction=1.0,
       strategy="none",
       unit_from_source=None,
+      tracks=Tracks.none(),
     )
   )
   _wait_for(viewer, f"{len(views)} keyframes and 30 points")

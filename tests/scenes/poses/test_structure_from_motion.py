@@ -12,10 +12,11 @@ from benchmarks.rooms import fountain
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
-from nerf2real.scenes.poses import localise as localise_module
-from nerf2real.scenes.poses import mapping, matching
-from nerf2real.scenes.poses.localise import LocalisationError, LocaliseSettings, load, localise
+from nerf2real.scenes.poses import mapping, matching, structure_from_motion
+from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
 from nerf2real.scenes.poses.matching import FeatureSettings
+from nerf2real.scenes.poses.structure_from_motion import LocaliseSettings, localise
+from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.poses.unit_frame import mean_up
 from tests.scenes import synthetic_capture as synthetic
 from tests.scenes.capture.test_capture import write_transforms
@@ -129,7 +130,7 @@ def test_other_pictures_start_a_new_database(corner, tmp_path):
   work = tmp_path / "work"
 
   def prepare(images, settings=FEW):
-    return localise_module._prepare_work(images, work, names, settings, None)
+    return structure_from_motion._prepare_work(images, work, names, settings, None)
 
   database = prepare(folder / "images")
   database.touch()
@@ -247,3 +248,24 @@ def test_fountain():
   )
   assert errors.position_rmse < 1e-9
   assert errors.rotation_rmse < 1e-6
+
+
+def test_overlooking_is_the_keyframe_with_the_most_points_before_its_lens():
+  points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], (300, 3))
+  away, aside = np.eye(4), np.eye(4)
+  away[:3, :3] = np.diag([-1, 1, -1])
+  aside[0, 3] = 1.5  # sees about half of them
+  found = Localisation(
+    camera=Camera.from_vertical_fov(np.radians(40), 64, 48),
+    names=("away", "aside", "ahead"),
+    world_from_camera=np.stack([away, aside, np.eye(4)]),
+    points=points,
+    point_colors=np.zeros((300, 3), np.uint8),
+    point_errors=np.zeros(300),
+    reprojection_error_px=0.0,
+    registered_fraction=1.0,
+    strategy="given",
+    unit_from_source=Similarity(),
+    tracks=Tracks.none(),
+  )
+  assert found.overlooking() == 2

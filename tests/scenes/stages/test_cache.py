@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from nerf2real.scenes.stages import StageError, Stages
+from nerf2real.scenes.stages.cache import StageError, Stages
 
 
 def make(folder):

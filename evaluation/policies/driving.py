@@ -1,4 +1,4 @@
-"""Any policy as the driver of an environment that is shown: viewers, films."""
+"""Chooses the driver of an environment that is shown (viewer, film) by a policy's name."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,10 +8,10 @@ import numpy as np
 
 from nerf2real.agents.dmpo.policy import belief_plot
 from nerf2real.core.floor_map import Extent
-from nerf2real.evaluation.learned import LearnedPolicy
 from nerf2real.evaluation.plants.plant import Sight
-from nerf2real.evaluation.policies import Belief
-from nerf2real.evaluation.policy_names import WALKERS, policy_folder
+from nerf2real.evaluation.policies.learned import LearnedPolicy
+from nerf2real.evaluation.policies.names import WALKERS, policy_folder
+from nerf2real.evaluation.policies.policy import Belief
 from nerf2real.suite.views.drivers import SCRIPTED, WALKER, MakeDriver
 
 
@@ -52,7 +52,7 @@ def choose_driver(name: str, *, task: str, seed: int = 0) -> Chosen:
   """Returns a driver by its name.
 
   Args:
-    name: "walker", "stand", "random", "shipped", or a folder; see `policy_names`.
+    name: "walker", "stand", "random", "shipped", or a folder; see `names`.
     task: The task.
     seed: Of drawn actions.
 

@@ -6,20 +6,21 @@ Each runs, or finds done, one stage of the cache: a function of earlier results 
 import dataclasses
 import warnings
 from pathlib import Path
+from typing import Any
 
 from nerf2real.core.progress import Progress, part
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.scenes.alignment import markers, world_frame
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import FloorError
-from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.geometry import fusion
-from nerf2real.scenes.poses.localise import Localisation
-from nerf2real.scenes.stages import Made, Stages
+from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.stages.cache import Made, Stages
+from nerf2real.scenes.stages.results import Given
 
 _OUTLOOK_VERSION = 3  # 2: no floor is warned of; 3: markers' corners without rolling shutter
-_WORLD_VERSION = 3  # 2: the axes are unique; 3: markers are looked for before
+_WORLD_VERSION = 4  # 2: unique axes; 3: markers are looked for before; 4: all tilts are searched
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 
@@ -37,11 +38,9 @@ def outlook(
   capture: Made[Capture],
   poses: Made[Localisation],
   settings: world_frame.AlignSettings,
+  given: Given,
   *,
   voxel: float,
-  marker_side: float | None,
-  override: Overrides,
-  override_key: str,
 ) -> Made[Outlook]:
   """Finds markers, and refuses before the training what it could not help.
 
@@ -54,10 +53,8 @@ def outlook(
     capture: The keyframes, in which markers are looked for.
     poses: Cameras and sparse points, unit frame.
     settings: Of the alignment.
+    given: Overrides, and the side of a marker.
     voxel: Edge of the surface mesh's voxels [m].
-    marker_side: Side of the black square of a marker in the room [m], or None.
-    override: What a person fixed.
-    override_key: Hash of the file that says so.
 
   Raises:
     ValueError: No direction is up, or the room is too large for its voxels.
@@ -66,7 +63,7 @@ def outlook(
 
   def write(folder: Path, progress: Progress) -> None:
     marker = None
-    if marker_side is not None:
+    if given.marker_side is not None:
       images = [capture.value.folder / name for name in found.names]
       seen = markers.detect(images, progress=part(progress, 0.0, 0.8))
       if found.shutter is not None:
@@ -78,7 +75,7 @@ def outlook(
         seen,
         camera=found.camera,
         frame_from_camera=found.world_from_camera,
-        side=marker_side,
+        side=given.marker_side,
       )
     evidence = Evidence(
       found.points,
@@ -88,7 +85,7 @@ def outlook(
     )
     try:
       frame = world_frame.align(
-        evidence, settings=settings, override=override, progress=part(progress, 0.8, 1.0)
+        evidence, settings=settings, override=given.override, progress=part(progress, 0.8, 1.0)
       )
     except FloorError as error:
       write_json(folder / "outlook.json", Outlook(marker, (f"{_NO_FLOOR} {error}",)))
@@ -105,7 +102,7 @@ def outlook(
       ) from error
     write_json(folder / "outlook.json", Outlook(marker))
 
-  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
+  everything = _key(settings, given)
   everything["voxel"] = voxel
   inputs = {"poses": poses.stamp}
   stage = cache.run("outlook", write, settings=everything, inputs=inputs, version=_OUTLOOK_VERSION)
@@ -113,6 +110,11 @@ def outlook(
   for text in found_out.warnings:
     warnings.warn(text, stacklevel=2)
   return Made(found_out, stage)
+
+
+def _key(settings: world_frame.AlignSettings, given: Given) -> dict[str, Any]:
+  """What the world frame depends on besides earlier results."""
+  return {"align": settings, "marker_side": given.marker_side, "override": given.override_key}
 
 
 def _sensed_scale(capture: Capture, poses: Localisation) -> float | None:
@@ -128,10 +130,7 @@ def world(
   outlook: Made[Outlook],
   depth: Made[fusion.DepthViews],
   settings: world_frame.AlignSettings,
-  *,
-  marker_side: float | None,
-  override: Overrides,
-  override_key: str,
+  given: Given,
 ) -> Made[world_frame.Alignment]:
   """Finds floor, scale, yaw and extent.
 
@@ -142,9 +141,7 @@ def world(
     outlook: The scale that markers give, and warnings.
     depth: Rendered depth, unit frame.
     settings: Of the alignment.
-    marker_side: Side of the black square of a marker in the room [m], or None.
-    override: What a person fixed.
-    override_key: Hash of the file of overrides.
+    given: Overrides, and the side of a marker.
   """
   found = poses.value
 
@@ -154,19 +151,19 @@ def world(
     result = world_frame.align(
       Evidence(found.points, found.world_from_camera, points, normals, outlook.value.scale, sensed),
       settings=settings,
-      override=override,
+      override=given.override,
       progress=progress,
     )
-    if marker_side is not None and outlook.value.scale is None:
+    if given.marker_side is not None and outlook.value.scale is None:
       missing = (
-        f"No marker of side {marker_side} m was read consistently in three pictures or more: "
+        f"No marker of side {given.marker_side} m was read consistently in three pictures or more: "
         "print it larger, lay it flat, film it from nearer."
       )
       result = dataclasses.replace(result, warnings=(*result.warnings, missing))
     result = dataclasses.replace(result, warnings=(*outlook.value.warnings, *result.warnings))
     write_json(folder / "alignment.json", result)
 
-  everything = {"align": settings, "marker_side": marker_side, "override": override_key}
+  everything = _key(settings, given)
   inputs = {"depth": depth.stamp, "outlook": outlook.stamp}
   stage = cache.run("world", write, settings=everything, inputs=inputs, version=_WORLD_VERSION)
   return Made(read_json(stage.folder / "alignment.json", world_frame.Alignment), stage)

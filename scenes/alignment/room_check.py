@@ -1,4 +1,4 @@
-"""Tells a room, filmed from inside, from a thing that the cameras circle.
+"""Rejects captures that circle an object: a room is filmed from inside.
 
 Shapes: N cameras, P points.
 """

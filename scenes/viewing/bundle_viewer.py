@@ -11,11 +11,11 @@ from viser import transforms
 from nerf2real.core import palette
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export.splats.splats import Splats
-from nerf2real.scenes.export.views import capture_cameras, overlooking_pose, renderer_of
+from nerf2real.scenes.export.views import capture_cameras, overlooking_view, renderer_of
 from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 from nerf2real.scenes.geometry.mesh import load_glb
-from nerf2real.scenes.override_panel import OverridePanel
+from nerf2real.scenes.viewing.override_panel import OverridePanel
 
 _CAMERA_STEP = 3  # every third camera is drawn
 _FLOOR_LIFT = 0.02  # of the free floor above the floor, or it would flicker with it [m]
@@ -147,9 +147,7 @@ def view_bundle(
   """
   server = viser.ViserServer(host=host, port=port, label=f"scene {bundle.name}", verbose=False)
   server.scene.set_up_direction("+z")
-  pose = overlooking_pose(bundle)
-  server.initial_camera.position = tuple(pose[:3, 3])
-  server.initial_camera.look_at = tuple(pose[:3, 3] + pose[:3, 2])
+  field_view.begin_as(server, *overlooking_view(bundle))
   renderer = renderer_of(bundle)
   view = field_view.FieldView(renderer, bundle.world_from_unit)
   field_view.serve_field(server, view, setback=_SETBACK, shown=splats is None)

@@ -18,7 +18,7 @@ from nerf2real.scenes.builtin import filming, furniture, room
 from nerf2real.scenes.geometry import convex
 from nerf2real.scenes.quality import collision_error, image_quality
 from nerf2real.scenes.quality import held_out as evaluate
-from nerf2real.scenes.results import Reconstruction, TruthFigures
+from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
 VIDEO = filming.SHIPPED_VIDEO
 TRUTH = VIDEO.with_name("room_truth.json")

@@ -25,7 +25,6 @@ from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
   from_model,
-  load,
   poses_of,
   reprojection_error,
   save,
@@ -35,9 +34,6 @@ from nerf2real.scenes.poses.pairs import PairSettings, repair_pairs
 from nerf2real.scenes.poses.parallax import parallax_share
 from nerf2real.scenes.poses.shutter import Shutter
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
-
-__all__ = ["Localisation", "LocalisationError", "LocaliseSettings", "load", "localise"]
-
 
 _MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
 _STAGE_SHARES = {
@@ -55,10 +51,9 @@ class LocaliseSettings:
 
   features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
   pairs: PairSettings = dataclasses.field(default_factory=PairSettings)
-  mapper: str = (
-    "auto"  # "global", "incremental", or "auto": incremental for stills (few keyframes),
-  )
-  # else global; the other one where the first leaves too many keyframes out
+  mapper: str = "auto"
+  """"global", "incremental", or "auto": incremental for stills (few keyframes), else global; the
+  other one where the first leaves too many keyframes out."""
   few_keyframes: int = 40
   """Up to this many are mapped incrementally."""
   repair_below: float = 0.95

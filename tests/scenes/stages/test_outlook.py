@@ -5,10 +5,11 @@ import types
 import numpy as np
 import pytest
 
-from nerf2real.scenes import world_stages
 from nerf2real.scenes.alignment import overrides, world_frame
 from nerf2real.scenes.settings import SceneSettings
-from nerf2real.scenes.stages import Made, Stages
+from nerf2real.scenes.stages import world_frame as world_frame_stages
+from nerf2real.scenes.stages.cache import Made, Stages
+from nerf2real.scenes.stages.results import Given
 from tests.scenes import furnished_room
 
 
@@ -27,22 +28,20 @@ def _floor(rng, height=0.0):
 
 
 def _outlook(tmp_path, points, **changes) -> Made:
-  return world_stages.outlook(
+  return world_frame_stages.outlook(
     Stages(tmp_path / ".stages", show_progress=False),
     types.SimpleNamespace(value=types.SimpleNamespace(known=None)),
     _poses(points),
     world_frame.AlignSettings(**changes),
+    Given(overrides.Overrides(), "", None),
     voxel=0.02,
-    marker_side=None,
-    override=overrides.Overrides(),
-    override_key="",
   )
 
 
 def test_a_room_with_a_floor_passes_and_is_done_once(tmp_path):
   points = _floor(np.random.default_rng(0))
   made = _outlook(tmp_path, points, camera_height=1.4)
-  assert made.value == world_stages.Outlook(None) and not made.stage.cached
+  assert made.value == world_frame_stages.Outlook(None) and not made.stage.cached
   assert _outlook(tmp_path, points, camera_height=1.4).stage.cached
 
 

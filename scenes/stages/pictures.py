@@ -1,4 +1,4 @@
-"""Reads the keyframes with their poses, for training and scoring."""
+"""Reads the localised keyframes at training size, with exposures, known points and split."""
 
 import dataclasses
 
@@ -7,11 +7,10 @@ import numpy as np
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.capture import Capture
-from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.field import anchors, photometry
 from nerf2real.scenes.field.views import Views
-from nerf2real.scenes.poses.localise import Localisation
-from nerf2real.scenes.stages import Made
+from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.stages.cache import Made
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,20 +31,17 @@ class PosedPictures:
       ValueError: A keyframe is damaged.
     """
     found = self.poses.value
-    camera = found.camera
-    if camera.width > self.width:
-      camera = camera.resized(self.width, round(camera.height * self.width / camera.width))
+    camera = found.camera.at_most(self.width)
     images = []
     for index in range(len(found.names)):
       image = found.read_picture(self.capture.value.folder, index)
       if image.shape[:2] != (camera.height, camera.width):
         image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
       images.append(image[..., ::-1])
-    model = pycolmap.Reconstruction(str(self.poses.stage.folder / "sfm"))
     pictures = np.stack(images)
-    seen = photometry.sightings(model, found.names, pictures, camera)
+    seen = photometry.sightings(found, pictures, camera)
     exposure = photometry.fit_exposure(seen, count=len(images)).for_range(pictures, camera)
-    known = anchors.known_points(model, found.names, found.world_from_camera, camera=camera)
+    known = anchors.known_points(found, camera)
     known = np.concatenate([known, self._measured(camera)])
     return Views(camera, pictures, found.world_from_camera, found.names, exposure, anchors=known)
 
@@ -60,10 +56,7 @@ class PosedPictures:
       row[k] = row_of.get(path.name, -1)
     seen = source.sightings.copy()
     seen[:, 0] = row[seen[:, 0].astype(int)]
-    pixels = seen[:, 1:3] * [
-      camera.width / source.camera.width,
-      camera.height / source.camera.height,
-    ]
+    pixels = seen[:, 1:3] * camera.size_ratio(source.camera)
     seen[:, 1:3] = np.minimum(np.floor(pixels), [camera.width - 1, camera.height - 1])
     seen[:, 3] *= found.unit_from_source.scale
     return seen[seen[:, 0] >= 0].astype(np.float32)

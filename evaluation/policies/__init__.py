@@ -1,0 +1,1 @@
+"""Policies in an evaluation: the scripted walker, exported networks, falsified observations."""

@@ -1,0 +1,114 @@
+"""Stages of the radiance field: its training, its depth from the cameras.
+
+Each runs, or finds done, one stage of the cache: a function of earlier results and settings.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress
+from nerf2real.core.serialization import write_json
+from nerf2real.scenes.capture import rgbd
+from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.field import training
+from nerf2real.scenes.field.settings import TrainSettings
+from nerf2real.scenes.geometry import fusion
+from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.stages.cache import Made, Stages
+from nerf2real.scenes.stages.pictures import PosedPictures
+from nerf2real.scenes.stages.results import TrainedField
+
+_FIELD_VERSION = 2  # 2: the lens's falloff is taken out of the pictures
+
+
+def field(
+  cache: Stages,
+  pictures: PosedPictures,
+  settings: TrainSettings,
+  *,
+  show: Callable[[training.Snapshot], None] | None = None,
+) -> Made[TrainedField]:
+  """Trains the radiance field on all pictures that are not held out; `show` sees it grow."""
+
+  def write(folder: Path, progress: Progress) -> None:
+    trained, outcome = training.train(
+      pictures.training().evened(),
+      settings,
+      progress=progress,
+      checkpoint_dir=folder / "checkpoints",
+      show=show,
+    )
+    trained.save(folder / "field.safetensors")
+    write_json(folder / "training.json", outcome)
+    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+
+  everything = {
+    "train": settings,
+    "held_out_every": pictures.held_out_every,
+    "train_width": pictures.width,
+  }
+  inputs = {"poses": pictures.poses.stamp}
+  stage = cache.run("field", write, settings=everything, inputs=inputs, version=_FIELD_VERSION)
+  return Made(TrainedField(stage.folder / "field.safetensors"), stage)
+
+
+def depth(
+  cache: Stages,
+  field: Made[TrainedField],
+  capture: Made[Capture],
+  poses: Made[Localisation],
+  *,
+  width: int,
+) -> Made[fusion.DepthViews]:
+  """Renders depth and colour of the field where the capture's cameras stood, in the unit frame.
+
+  Where a depth sensor measured, its depth takes the place of the field's.
+
+  Args:
+    cache: The stages of the job.
+    field: The field.
+    capture: The keyframes, which may have come with measured depth.
+    poses: The cameras.
+    width: Of the pictures; at most that of the keyframes [pixel].
+  """
+  found = poses.value
+
+  def write(folder: Path, progress: Progress) -> None:
+    camera = found.camera.at_most(width)
+    pictures = []
+    for index, pose in enumerate(found.world_from_camera):
+      pictures.append(field.value.renderer.render(camera, pose))
+      total = len(found.world_from_camera)
+      progress((index + 1) / total, f"picture {index + 1} of {total}")
+    color, distance = (np.stack(part) for part in zip(*pictures, strict=True))
+    measured = _measured_depth(capture.value, found, camera)
+    if measured is not None:
+      distance = np.where(measured > 0, measured, distance)
+    np.savez(folder / "depth.npz", color=color, depth=distance)
+
+  inputs = {"field": field.stamp, "poses": poses.stamp}
+  if capture.value.known is not None and capture.value.known.depth_files:
+    inputs["keyframes"] = capture.stamp
+  stage = cache.run("depth", write, settings=width, inputs=inputs)
+  arrays = np.load(stage.folder / "depth.npz")
+  views = fusion.DepthViews(
+    camera=found.camera.at_most(width),
+    frame_from_camera=found.world_from_camera,
+    depth=arrays["depth"],
+    color=arrays["color"],
+  )
+  return Made(views, stage)
+
+
+def _measured_depth(capture: Capture, poses: Localisation, camera: Camera) -> np.ndarray | None:
+  """Sensor's depth of the localised keyframes [N, H, W] [unit], 0 where none; None without one."""
+  known = capture.known
+  if known is None or not known.depth_files:
+    return None
+  files = {image.name: file for image, file in zip(capture.images, known.depth_files, strict=True)}
+  unit = known.depth_unit * poses.unit_from_source.scale
+  return np.stack([rgbd.measured_depth(files[name], unit, camera) for name in poses.names])
