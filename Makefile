@@ -17,10 +17,10 @@ demo: install
 	$(BIN)/python launch/make_scene.py --capture builtin --preset $(PRESET) --out out/$(PRESET)
 	@echo "open out/$(PRESET)/report.html"
 
-# the closed loop, first case, at reduced size: 6 trials, 5 minutes of training
+# the closed loop on late commands at reduced size: 7 trials, motions of 6 s, 5 minutes of training
 loop: install
-	$(BIN)/python launch/close_loop.py --robot virtual --hidden command_delay:0.045 --policy shipped \
-	  --trials 6 --seconds 6 --minutes 5 --out out/loop
+	$(BIN)/python launch/close_loop.py --robot virtual --hidden command_delay:0.18 --policy shipped \
+	  --trials 7 --seconds 6 --minutes 5 --out out/loop
 	@echo "open out/loop/loop.html"
 
 test: install lint

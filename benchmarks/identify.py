@@ -199,7 +199,8 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any]) -> str:
   for figure in scoring.table(scores):
     value = "-" if figure.value is None else f"{figure.value:.3g}"
     if figure.value is not None and "%" in figure.target:
-      value = f"{100 * figure.value:.0f} %"
+      rate = harness.Rate(round(figure.value * figure.of), figure.of)
+      value = f"{rate:.0f} % ({rate.span})"
     met = {True: "yes", False: "no", None: "-"}[figure.met]
     found.append((figure.question, value, figure.of, figure.target, met))
   for plant in plants:
@@ -208,7 +209,8 @@ def render(rows: list[dict[str, Any]], answers: dict[str, Any]) -> str:
       if used:
         name = f"{plant}: {words} a set, median (most {used[-1]:.0f})"
         found.append((name, f"{used[len(used) // 2]:.0f}", len(used), "-", "-"))
-  lines += [markdown.table(("figure", "measured", "of", "target", "met"), found)]
+  heads = ("figure", "measured (exact 95 %)", "of", "target", "met")
+  lines += [markdown.table(heads, found)]
   said = []
   for row in rows:
     s = row["score"]

@@ -24,6 +24,12 @@ GENERATORS: dict[str, Callable[..., Any]] = {
   "independent_sets": independent_sets.make_set,
 }
 
+HALF_HEALTHY = (
+  *("healthy", "single", "healthy", "pair", "healthy"),
+  *("single", "healthy", "outside", "healthy", "single"),
+)
+"""Of ten sets in a row, in the mix `half`: a run that is cut short is a fair sample."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -39,8 +45,9 @@ class Settings:
   """Index of the first set; a set depends on seed and index alone."""
   generator: Literal["blind_sets", "independent_sets"] = "blind_sets"
   """Which package makes them."""
-  mix: Literal["single", "pair", "outside", "healthy", "all"] = "all"
-  """What the machines have: one effect, two, one that no library has, none, or all of these."""
+  mix: Literal["single", "pair", "outside", "healthy", "all", "half"] = "all"
+  """What the machines have: one effect, two, one that no library has, none, or all of these, drawn
+  (all) or in turn with every second machine healthy (half)."""
   plants: tuple[str, ...] = ()
   """Kinds of apparatus, of pendulum, arm, op3, or of slider, arm, wheel; empty: all."""
   kinds: tuple[str, ...] = ()
@@ -79,6 +86,11 @@ def _name(settings: Settings, index: int) -> str:
   return f"{settings.seed}_{index:03d}"
 
 
+def mix_of(mix: str, index: int) -> str:
+  """Returns what the set of an index is drawn from, for the generators."""
+  return HALF_HEALTHY[index % len(HALF_HEALTHY)] if mix == "half" else mix
+
+
 def _make(job: tuple[Settings, int]) -> tuple[str, dict, float]:
   settings, index = job
   start = time.perf_counter()
@@ -86,7 +98,7 @@ def _make(job: tuple[Settings, int]) -> tuple[str, dict, float]:
     settings.out / _name(settings, index),
     seed=settings.seed,
     index=index,
-    mix=settings.mix,
+    mix=mix_of(settings.mix, index),
     plants=settings.plants or None,
     kinds=settings.kinds or None,
     reference=settings.reference or settings.generator == "independent_sets",

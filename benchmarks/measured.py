@@ -14,6 +14,8 @@ from benchmarks import harness
 from benchmarks.ledger.records import ROOT
 from nerf2real import sysid
 
+_SIDES = ("before", "after", "single", "median", "least", "most")
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -43,7 +45,7 @@ def main(settings: Settings) -> None:
     kept = ("verdict", "effects", "alternatives", "residual_at", "error", "seconds")
     details = json.loads((settings.out / folder.name / "details.json").read_text())
     rows[folder.name] = {name: content[name] for name in kept}
-    rows[folder.name] |= {name: details[name] for name in ("calibration", "clocks")}
+    rows[folder.name] |= {name: details[name] for name in ("calibration", "clocks", "servo")}
     error = content["error"]
     figures[folder.name] = {
       "verdict": content["verdict"],
@@ -51,14 +53,23 @@ def main(settings: Settings) -> None:
         f"{name}_{side}": 1e3 * error[name][side]
         for name in ("train", "held")
         if name in error
-        for side in ("before", "after")
+        for side in _SIDES
+        if side in error[name]
       },
+      "models": error["held"].get("models", 1),
+      **_gain(content["effects"]),
       "seconds": content["seconds"],
     }
     print(folder.name, figures[folder.name], flush=True)
   (settings.results / "measured.json").write_text(json.dumps(rows, indent=1) + "\n")
   words = "Errors in mrad (positioning: mm)."
   harness.finish("measured", figures, harness.Options(write=settings.write), words=words)
+
+
+def _gain(effects: list[dict[str, Any]]) -> dict[str, harness.Value]:
+  """Returns a servo's gain and its interval, where one is claimed."""
+  found = [row["parameters"]["gain"] for row in effects if row["kind"] == "motor_gain"]
+  return {f"gain_{end}": found[0][end] for end in ("value", "low", "high")} if found else {}
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ def _topic(records: list[Record]) -> list[str]:
 
 def _page_row(record: Record) -> dict[str, str]:
   rates = [value for value in record.values.values() if isinstance(value, ledger.Rate)]
-  spans = [f"{100 * low:.0f} to {100 * high:.0f} %" for low, high in (r.interval for r in rates)]
+  spans = [rate.span for rate in rates]
   commit = record.commit if record.commit != ledger.UNKNOWN else f"({record.stated_in})"
   old = "" if record.measured_again else "; *old*"
   files = [f"[{Path(path).name}](../{path})" for path in record.evidence]

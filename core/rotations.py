@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 # x, its own inverse. world_from_opencv = world_from_opengl @ OPENGL_FROM_OPENCV.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
+_RIGID = 1e-2  # of R R^T to the identity: written with few digits a rotation is one still
 _OPPOSITE = 1e-12  # 1 + cosine under which two directions count as opposite
+
+
+def is_rigid(pose: np.ndarray) -> bool:
+  """Whether the 3x3 part of a pose [>= 3, >= 3] is a rotation, as far as its digits say."""
+  rotation = pose[:3, :3]
+  deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+  return bool(deviation < _RIGID and np.linalg.det(rotation) > 0)
 
 
 def shortest_rotation(

@@ -9,7 +9,7 @@ from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.geometry.collision import CollisionSettings
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.geometry.mesh import MeshSettings
-from nerf2real.scenes.poses.structure_from_motion import LocaliseSettings
+from nerf2real.scenes.poses.settings import LocaliseSettings
 
 MARKER_SIDES = (0.01, 2.0)  # m: from a coin's size to a poster's
 CAMERA_HEIGHTS = (0.05, 10.0)  # m: from a crawling robot's to a tripod's on a gallery

@@ -28,11 +28,11 @@ from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.simulation import Member
-from nerf2real.sysid.report import capability
+from nerf2real.sysid.report import capability, samples, servo
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.explain import Scored, clear
+from nerf2real.sysid.selection.evidence import Scored, clear
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.sensors import sensing
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -116,13 +116,14 @@ def _identify(
   shown = identifiability.of_machine(compiled, logs, repeated=bool(reference), settings=settings)
   progress(_SHOWN, "comparing with the reference" if reference else "explaining every joint")
   found = analyse(compiled, logs, reference, settings=settings)
+  by_duty, before = servo.rows(found)
+  found.in_reference += before
+  _add(found, by_duty)
   progress(_ANALYSIS, "sensors and floor")
   sensed = sensing.find(compiled, logs, reference, tilt=_tilt(found))
   found.objects += sensed.effects
   found.in_reference += sensed.in_reference
-  if sensed.rows:
-    found.effects += sensed.rows
-    found.verdict = "effects" if found.verdict == "none" else found.verdict
+  _add(found, sensed.rows, moves=False)
   progress(_SENSORS, "errors on the logs")
   whole = [*found.calibration, *found.objects]
   near = found.near
@@ -140,7 +141,7 @@ def _identify(
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
     "next_excitation": _next(found, shown),
-    "notes": [capability.sentence(shown), *sensed.notes],
+    "notes": [capability.sentence(shown), *servo.notes(found), *sensed.notes],
   }
   # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
   content["alternatives"] = [*found.nearest, *content["alternatives"]]
@@ -169,7 +170,8 @@ def _identify(
   if len(near) > 1:
     content["notes"] = [*content["notes"], _spread(content["error"])]
   content["alternatives"] += sensed.alternatives
-  write_effects(out / "effects.json", _claimed(found))
+  drawn = samples.with_samples(found, _claimed(found), np.random.default_rng(0))
+  write_effects(out / "effects.json", servo.apart(drawn, by_duty))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
   details = _details(found, model, near, sensed)
   details["identifiability"] = [to_plain(item) for item in shown]
@@ -184,6 +186,20 @@ def _identify(
   content["seconds"] = round(time.perf_counter() - began, 1)
   write_atomically(out / "report.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
   return content
+
+
+def _add(found: Identified, rows: list[dict[str, Any]], *, moves: bool = True) -> None:
+  """Adds entries that are certain by channels of their own.
+
+  Args:
+    found: what joints' motion shows; changed.
+    rows: entries.
+    moves: whether they explain a part of the motion.
+  """
+  if rows:
+    found.effects += rows
+    grade = {"none": "effects"} | ({"unexplained": "partly"} if moves else {})
+    found.verdict = grade.get(found.verdict, found.verdict)
 
 
 def _tilt(found: Identified) -> dict[str, float] | None:
@@ -226,6 +242,7 @@ def _details(
       },
     },
     "audit": found.audits,
+    "servo": {j.joint: to_plain(j.likelihood.law) for j in found.joints if j.likelihood.law},
     "sensors": sensed.errors(),
   }
 

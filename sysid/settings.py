@@ -60,6 +60,9 @@ class Settings:
   """Effects of a joint at most that are looked for in reference logs."""
   structured: float = 0.5
   """Of the readings' noise: a residual that goes together is that large beyond rounding."""
+  suspected: float = 1.0
+  """Standard errors by which logs of other motions must leave more than references do for effects
+  to be tried: a screen that saves time, chosen; blocks of other motions tell little."""
   alike: float = 0.5
   """Of the residual's scale: hypotheses whose predictions differ by less are not told apart."""
   more: float = 2.0

@@ -85,8 +85,8 @@ class DistillSettings:
   in the data."""
 
   settling: int = 600
-  """Updates of a policy stage before its student is given out: it has to get used to the encoder
-  first [updates]."""
+  """Updates of a policy stage, or all of a shorter one, before its student is given out: it has to
+  get used to the encoder first [updates]."""
   first_frames: int = 8_000
   """Frames before training begins [steps]: some 15 episodes; inputs are standardised on them."""
   max_frames: int = 400_000

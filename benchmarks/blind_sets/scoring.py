@@ -201,14 +201,15 @@ class Row:
 
 
 def table(scores: list[Score]) -> list[Row]:
-  """Returns the figures that the benchmark is judged by, with targets."""
+  """Returns the figures that the benchmark is judged by, with the targets of the generators' pages
+  (`independent_sets/README.md`)."""
   seen = [s for s in scores if not s.below_floor]
   rows = [
-    _share("single: right name first", [s.right_first for s in seen], 0.9),
+    _share("single: right name first", [s.right_first for s in seen], 0.95),
     _share("right joint", [s.right_joint for s in seen], 0.98),
-    _share("healthy: accused", [s.accused for s in seen], 0.05, most=True),
-    _share("pair: both right", [s.all_right for s in seen], 0.7),
-    _share("pair: none wrong", [s.none_wrong for s in seen if s.mix == "pair"], 0.9),
+    _share("healthy: accused", [s.accused for s in seen], 1 / 60, most=True),
+    _share("pair: both right", [s.all_right for s in seen], 0.8),
+    _share("pair: none wrong", [s.none_wrong for s in seen if s.mix == "pair"], 0.95),
     _share("outside: unexplained", [s.unexplained for s in seen], 0.9),
     _share(
       "outside: wrong confident name",

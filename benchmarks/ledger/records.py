@@ -45,6 +45,12 @@ class Rate:
 
     return clopper_pearson(self.count, self.of)
 
+  @property
+  def span(self) -> str:
+    """That interval in words."""
+    low, high = self.interval
+    return f"{100 * low:.0f} to {100 * high:.0f} %"
+
   def to_dict(self) -> dict[str, Any]:
     """Returns the rate as it is kept."""
     interval = [round(bound, 4) for bound in self.interval]

@@ -12,8 +12,10 @@ from nerf2real import sysid
 from nerf2real.core.files import write_atomically
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.serialization import write_json
+from nerf2real.evaluation.loop import starts
 from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model, standing_model
 from nerf2real.evaluation.loop.recording import FLOOR
+from nerf2real.evaluation.loop.starts import Walked
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 from nerf2real.sysid.sensors import floor
 from nerf2real.sysid.sensors.sensed import Part
@@ -52,13 +54,22 @@ class Named(NamedTuple):
     return [effect for effect in own if effect not in self.named]
 
 
-def name(out: Path, logs: Path, reference: Path | None = None) -> Named:
+def name(
+  out: Path,
+  logs: Path,
+  reference: Path | None = None,
+  *,
+  walked: Walked | None = None,
+  walked_before: Walked | None = None,
+) -> Named:
   """Identifies what a robot's logs show beyond the declared model, or reads what was found.
 
   Args:
     out: Folder of the analyser's files.
     logs: Folder with the logs of `recording.record_stand`, and with `floor.mcap` if there is one.
     reference: Folder with logs of the same robot from before; they calibrate the constants.
+    walked: The robot's trials, which show the floor's slope better than `floor.mcap`.
+    walked_before: Those of the same robot from before.
 
   Raises:
     ValueError: The logs cannot be identified from.
@@ -74,10 +85,7 @@ def name(out: Path, logs: Path, reference: Path | None = None) -> Named:
       reference=[] if reference is None else [reference / f"{name}.mcap" for name in TRAIN],
       out=out,
     )
-    stood = _floor(logs / f"{FLOOR}.mcap")
-    before = None if reference is None else _floor(reference / f"{FLOOR}.mcap")
-    if before is not None:
-      stood = stood.beside(before)
+    stood = _slope(logs, reference, walked, walked_before)
     effects = read_effects(out / "effects.json")
     if any(effect.kind == "floor_slope" for effect in stood.effects):  # gravity is turned once
       effects = [effect for effect in effects if effect.kind != "gravity_tilt"]
@@ -119,6 +127,19 @@ def _listed(effect: Effect, rows: Sequence[Mapping[str, Any]]) -> bool:
   """Returns whether an effect has an entry in a report."""
   places = [(row["kind"], row.get("body") or row.get("geom") or row.get("joint")) for row in rows]
   return (effect.kind, effect.target) in places
+
+
+def _slope(
+  logs: Path, reference: Path | None, walked: Walked | None, walked_before: Walked | None
+) -> Part:
+  """Returns the floor's slope: from the trials where those of now and before tell it, both alike in
+  the room's axes, else from turning."""
+  given = [walked] if reference is None else [walked, walked_before]
+  parts = [None if one is None else starts.find(one) for one in given]
+  if not all(part is not None and part.estimates for part in parts):
+    parts = [_floor(folder / f"{FLOOR}.mcap") for folder in (logs, reference) if folder is not None]
+  found = parts[0] or Part()
+  return found if len(parts) == 1 else found.beside(parts[1] or Part())
 
 
 def _floor(log: Path) -> Part:

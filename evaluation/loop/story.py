@@ -77,8 +77,15 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
   run(Condition(name=BEFORE, policy=policy, altered=hidden))
   with stages.timed("recording"):
     reference = _record(settings, hidden, say)
+  walked = {name: trials.walked(settings, name, found[name], store) for name in found}
   with stages.timed("identification"):
-    named = naming.name(settings.out / "identified", settings.out / "stand", reference)
+    named = naming.name(
+      settings.out / "identified",
+      settings.out / "stand",
+      reference,
+      walked=walked[BEFORE],
+      walked_before=walked.get(HEALTHY),
+    )
   say(f"verdict: {named.verdict}: {', '.join(e.kind for e in named.named) or 'nothing'}")
   run(Condition(name=NOMINAL, policy=policy, simulated=True))
   trained: Trained | None = None

@@ -15,7 +15,9 @@ from nerf2real.core.intervals import Interval, clopper_pearson
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
+from nerf2real.evaluation.loop import starts
 from nerf2real.evaluation.loop.settings import LoopSettings
+from nerf2real.evaluation.loop.starts import Walked
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.making import free_name, make_plant
 from nerf2real.evaluation.plants.plant import Plant
@@ -117,6 +119,12 @@ def run(
 
     runner.run_all(plant, policy, chosen, store=store, report=report)
   return found()
+
+
+def walked(settings: LoopSettings, name: str, found: Sequence[Episode], store: Store) -> Walked:
+  """Returns a condition's logs, and all its episodes in the order in which they ran."""
+  same = [e for e in store.episodes if found and e.setting == found[0].setting]
+  return Walked(starts.logs(settings.out / "trials", _slug(name)), tuple(same))
 
 
 def plant_label(settings: LoopSettings, condition: Condition) -> str:

@@ -169,6 +169,8 @@ class FoundFloor(NamedTuple):
 
 def rough_up(evidence: Evidence, override: Overrides) -> np.ndarray:
   """The cameras' mean up direction [3]; the unit frame's where only the override has one."""
+  if evidence.up is not None:
+    return evidence.up
   try:
     return mean_up(evidence.frame_from_camera)
   except ValueError:

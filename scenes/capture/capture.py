@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture import stills
+from nerf2real.scenes.capture import agreement, stills
 from nerf2real.scenes.capture.kinds import list_images_below, source_kind
 from nerf2real.scenes.capture.sources import (
   KnownPoses,
@@ -83,6 +83,23 @@ class Capture:
   """What may ruin the reconstruction, one line each."""
   known: KnownPoses | None = None
   """Cameras that came with the pictures."""
+  turned: np.ndarray | None = None
+  """Keyframes that were turned counter-clockwise to lie as the others, bool [N]; None: none."""
+
+  origins: list[str] | None = None
+  """Names of the files that the keyframes were made of; None for a video."""
+
+  def called(self, chosen: np.ndarray, *, most: int) -> str:
+    """Names up to `most` of chosen keyframes (bool [N]) as whoever took them knows them."""
+    names = self.origins or [path.name for path in self.images]
+    found = [name for name, wanted in zip(names, chosen, strict=True) if wanted]
+    rest = f" and {len(found) - most} more" if len(found) > most else ""
+    return ", ".join(found[:most]) + rest
+
+  @property
+  def unit_up(self) -> np.ndarray | None:
+    """Up in the unit frame [3] where the cameras' axes do not show it, as some were turned."""
+    return None if self.turned is None else np.array([0.0, 0.0, 1.0])
 
 
 def read_capture(
@@ -158,20 +175,53 @@ def _read_pictures(
       f"{source} holds {len(files)} pictures, expected at least {settings.min_images} that "
       "overlap: take more, from different places in the room."
     )
-  warnings: list[str] = []
   if known is None:
-    files, warnings = stills.of_one_camera(files)
-    if len(files) < settings.min_images:
-      raise CaptureError(
-        f"{source}: {warnings[0]} At least {settings.min_images} such pictures are needed."
-      )
-  frames = _sharpest_pictures(files, settings, progress)
-  capture = _write(kind, frames, folder, settings, warnings)
-  if known is None:
-    return dataclasses.replace(capture, times=None)
-  indices = [int(path.stem.split("_")[-1]) for path in capture.images]
-  known = known.selected(indices, _written_camera(known.camera, capture)).lifted()
-  return dataclasses.replace(capture, times=None, known=known)
+    return _read_stills(source, files, folder, settings, progress)
+  camera = known.camera
+
+  def read(index: int) -> np.ndarray:
+    return limit_size(_read_posed(files[index], camera), settings.max_size)
+
+  frames = _sharpest_pictures(len(files), read, settings, progress)
+  capture = _write(kind, frames, folder, settings, list(known.warnings))
+  known = known.selected(_numbers(capture), _written_camera(camera, capture))
+  known, warnings = agreement.settled(known, capture.images)
+  capture.warnings.extend(warnings)
+  origins = [path.name for path in known.files]
+  return dataclasses.replace(capture, times=None, known=known.lifted(), origins=origins)
+
+
+def _read_stills(
+  source: Path, files: list[Path], folder: Path, settings: CaptureSettings, progress: Progress
+) -> Capture:
+  """Writes the keyframes of a folder of photographs."""
+  found = stills.of_one_camera(files)
+  if len(found.files) < settings.min_images:
+    raise CaptureError(
+      f"{source}: {' '.join(found.warnings)} At least {settings.min_images} different pictures of "
+      "one camera are needed."
+    )
+  size = min(settings.max_size, found.long_side)
+
+  def read(index: int) -> np.ndarray:
+    image = limit_size(stills.read_still(found.files[index]), size)
+    return stills.quarter_turned(image) if found.turned[index] else image
+
+  frames = _sharpest_pictures(len(found.files), read, settings, progress)
+  capture = _write("images", frames, folder, settings, found.warnings)
+  numbers = _numbers(capture)
+  turned = found.turned[numbers]
+  return dataclasses.replace(
+    capture,
+    times=None,
+    turned=turned if turned.any() else None,
+    origins=[found.files[k].name for k in numbers],
+  )
+
+
+def _numbers(capture: Capture) -> list[int]:
+  """Each keyframe's number in its source."""
+  return [int(path.stem.split("_")[-1]) for path in capture.images]
 
 
 def _written_camera(camera: Camera, capture: Capture) -> Camera:
@@ -185,28 +235,32 @@ def _written_camera(camera: Camera, capture: Capture) -> Camera:
   return camera.resized(capture.width, capture.height)
 
 
-def _read_picture(path: Path) -> np.ndarray:
-  """Reads a picture upright (EXIF) as BGR; transparent parts become black."""
-  image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-  if image is None:
-    raise CaptureError(f"{path} cannot be read as a picture: remove it or copy it again.")
+def _read_posed(path: Path, camera: Camera) -> np.ndarray:
+  """Reads a picture as BGR as its camera has it: EXIF turns it only where the shapes then agree."""
+  image = stills.read_still(path)
+  if (image.shape[1] > image.shape[0]) != (camera.width > camera.height):
+    raw = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return image if raw is None else raw
   return image
 
 
 def _sharpest_pictures(
-  files: list[Path], settings: CaptureSettings, progress: Progress
+  count: int,
+  read: Callable[[int], np.ndarray],
+  settings: CaptureSettings,
+  progress: Progress,
 ) -> Iterator[Frame]:
-  """Yields the sharpest picture of each of equal parts of a list of files."""
-  parts = min(settings.num_keyframes, len(files))
-  edges = np.linspace(0, len(files), parts + 1).astype(int)
+  """Yields the sharpest of each of equal parts of `count` pictures that `read` reads."""
+  parts = min(settings.num_keyframes, count)
+  edges = np.linspace(0, count, parts + 1).astype(int)
   for first, last in itertools.pairwise(edges):
     best: Frame | None = None
     for index in range(first, last):
-      image = _read_picture(files[index])
+      image = read(index)
       value = sharpness(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
       if best is None or value > best.sharpness:
-        best = Frame(index, 0.0, value, limit_size(image, settings.max_size))
-    progress(last / len(files), f"picture {last} of {len(files)}")
+        best = Frame(index, 0.0, value, image)
+    progress(last / count, f"picture {last} of {count}")
     if best is not None:
       yield best
 

@@ -2,10 +2,15 @@
 
 from pathlib import Path
 
-from nerf2real.scenes.capture import stills
 from nerf2real.scenes.capture.rgbd import find_rgbd
 from nerf2real.scenes.capture.sources import find_colmap_model, find_transforms, list_images
 from nerf2real.scenes.capture.video import CaptureError
+
+EXPORT_STREAM = (
+  "export its pictures, depth and poses with ScanNet's SensReader (reader.py "
+  "--export_color_images --export_depth_images --export_poses --export_intrinsics), and give that "
+  "folder."
+)
 
 
 def source_kind(source: Path) -> str:
@@ -20,6 +25,8 @@ def source_kind(source: Path) -> str:
     return "transforms"
   if find_rgbd(source) is not None:
     return "rgbd"
+  if source.suffix.lower() == ".sens":
+    raise CaptureError(f"{source} is ScanNet's stream: {EXPORT_STREAM}")
   if not source.is_dir():
     return "video"
   if find_colmap_model(source) is not None:
@@ -31,15 +38,12 @@ def source_kind(source: Path) -> str:
 
 def _what_instead(source: Path) -> str:
   """Says what a folder that is no capture holds, and what to give."""
+  streams = sorted(source.glob("*.sens"))
+  if streams:
+    return f"{streams[0].name}, ScanNet's stream: {EXPORT_STREAM}"
   below = [child.name for child in sorted(source.iterdir()) if child.is_dir() and _holds(child)]
   if below:
     return f"no capture, but folders that do: give one of them, such as {source / below[0]}."
-  apple = stills.apple_pictures(source)
-  if apple:
-    return (
-      f"{len(apple)} pictures such as {apple[0].name}, which OpenCV does not read: convert them to "
-      "JPEG, or set the phone to its most compatible format."
-    )
   return (
     "no pictures, no COLMAP model and no transforms.json: give a video, or a folder with one of "
     "these."

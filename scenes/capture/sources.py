@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerf2real.core.cameras import Camera, focal_length
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
-from nerf2real.scenes.capture import rgbd
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV, is_rigid
+from nerf2real.scenes.capture import depth_pictures, rgbd
+from nerf2real.scenes.capture.stills import APPLE_SUFFIXES
 from nerf2real.scenes.capture.video import CaptureError
 from nerf2real.scenes.colmap import pycolmap
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *APPLE_SUFFIXES)
 CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera
-ROTATION_TOLERANCE = 1e-2  # of a pose's 3x3 part to a rotation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +44,10 @@ class KnownPoses:
   """Mean reprojection error [P] [pixel]."""
   depth_files: tuple[Path, ...] = ()
   """Depth picture of each pose; empty where there was no sensor."""
-  depth_unit: float = rgbd.MILLIMETRE
+  depth_unit: float = depth_pictures.MILLIMETRE
   """Of the depth pictures, in the unit of the poses."""
+  warnings: tuple[str, ...] = ()
+  """What was left out or assumed."""
   sightings: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4)))
   """Measured depth [A, 4]: picture, pixel x and y, distance along the pixel's ray."""
 
@@ -74,19 +76,26 @@ class KnownPoses:
     """Returns the poses with points from the depth pictures; as they are where there are none."""
     if not self.depth_files:
       return self
-    seen = rgbd.sightings(self.depth_files, self.depth_unit, self.camera)
-    picture = seen[:, 0].astype(int)
-    rays = self.camera.rays(seen[:, 1:3])
-    local = seen[:, 3:] * rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    poses = self.world_from_camera[picture]
+    seen = depth_pictures.sightings(self.depth_files, self.depth_unit, self.camera)
+    colors = [self._colors(k, seen[seen[:, 0] == k, 1:3]) for k in range(len(self.files))]
+    lifted = dataclasses.replace(
+      self, sightings=seen, point_colors=np.concatenate(colors), point_errors=np.zeros(len(seen))
+    )
+    return lifted.with_views(self.camera, self.world_from_camera)
+
+  def with_views(self, camera: Camera, world_from_camera: np.ndarray) -> "KnownPoses":
+    """Returns the same depth seen by another camera from other poses: its points move along."""
+    seen = self.sightings.copy()
+    depth = seen[:, 3] / np.linalg.norm(self.camera.rays(seen[:, 1:3]), axis=-1)
+    local = depth[:, None] * camera.rays(seen[:, 1:3])
+    seen[:, 3] = np.linalg.norm(local, axis=-1)
+    poses = world_from_camera[seen[:, 0].astype(int)]
     return dataclasses.replace(
       self,
+      camera=camera,
+      world_from_camera=world_from_camera,
       sightings=seen,
       points=np.einsum("aij,aj->ai", poses[:, :3, :3], local) + poses[:, :3, 3],
-      point_colors=np.concatenate(
-        [self._colors(k, seen[picture == k, 1:3]) for k in range(len(self.files))]
-      ),
-      point_errors=np.zeros(len(seen)),
     )
 
   def _colors(self, index: int, pixels: np.ndarray) -> np.ndarray:
@@ -266,11 +275,7 @@ def read_transforms(source: Path) -> KnownPoses:
   for frame, matrix in zip(frames, matrices, strict=True):
     if matrix.shape == (3, 4):
       matrix = np.vstack([matrix, [0, 0, 0, 1]])
-    deviation = np.inf
-    if matrix.shape == (4, 4):
-      rotation = matrix[:3, :3]
-      deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not deviation < ROTATION_TOLERANCE or np.linalg.det(matrix[:3, :3]) < 0:
+    if matrix.shape != (4, 4) or not is_rigid(matrix):
       raise CaptureError(f"{path}: transform_matrix of {frame['file_path']} is no rigid pose.")
     matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
     poses.append(matrix)
@@ -292,19 +297,18 @@ def read_rgbd(source: Path) -> KnownPoses:
   layout = rgbd.find_rgbd(source)
   if layout is None:
     raise CaptureError(f"{source} holds no RGB-D sequence: expected rgb.txt and groundtruth.txt.")
-  camera, files, poses, depth, unit = rgbd.READERS[layout](source)
-  missing = [file for file in (*files, *depth) if not file.is_file()]
-  if missing:
-    raise CaptureError(f"{len(missing)} pictures of {source} are missing, as {missing[0].name}.")
+  found = rgbd.READERS[layout](source)
+  assert found.camera is not None  # every reader finds one or raises
   empty = np.zeros((0, 3))
   return KnownPoses(
     kind="rgbd",
-    camera=camera,
-    files=tuple(files),
-    world_from_camera=poses,
+    camera=found.camera,
+    files=tuple(found.files),
+    world_from_camera=found.poses,
     points=empty,
     point_colors=empty.astype(np.uint8),
     point_errors=np.zeros(0),
-    depth_files=tuple(depth),
-    depth_unit=unit,
+    depth_files=tuple(found.depth),
+    depth_unit=found.unit,
+    warnings=found.warnings,
   )

@@ -1,14 +1,19 @@
-"""Stills of one camera among the pictures of a folder: one size, one orientation, one zoom.
+"""Stills of one camera among the pictures of a folder: one lens, one zoom, one shape.
 
-A phone's photographs may be upright and wide, of its main and of its wide lens; structure from
-motion here has one camera. What most of them have in common is kept.
+A phone's photographs may be upright and wide, of several sizes, of its main and of its wide lens;
+structure from motion here has one camera. A still that lies across the others is turned by a
+quarter, so that its sensor lies as theirs; of several lenses the most common one is kept.
 """
 
 import collections
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
+import numpy as np
+import pi_heif
 import PIL.ExifTags
 import PIL.Image
 
@@ -16,10 +21,14 @@ from nerf2real.scenes.capture.video import CaptureError
 
 APPLE_SUFFIXES = (".heic", ".heif")  # what iPhones write; OpenCV does not read them
 _TURNED = (5, 6, 7, 8)  # EXIF orientations with width and height exchanged
+# Camera axes of the upright picture in those of the one that was turned counter-clockwise.
+_TURNED_FROM_UPRIGHT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+pi_heif.register_heif_opener()
 
 
 class Look(NamedTuple):
-  """What stills of one camera have in common."""
+  """What tells a still's camera."""
 
   width: int  # as shown, upright
   height: int
@@ -28,6 +37,30 @@ class Look(NamedTuple):
   def __str__(self) -> str:
     lens = "" if self.focal is None else f" with a lens of {self.focal:g} mm"
     return f"{self.width}x{self.height}{lens}"
+
+  @property
+  def long_side(self) -> int:
+    """Of the picture [pixel]."""
+    return max(self.width, self.height)
+
+  @property
+  def shape(self) -> float:
+    """Long side over short side, to a hundredth: binning and scaling round a picture's size."""
+    return round(self.long_side / min(self.width, self.height), 2)
+
+  def shares_camera(self, other: "Look") -> bool:
+    """Whether both may be of one camera, turned or reduced; a missing lens may be any."""
+    lenses = {self.focal, other.focal} - {None}
+    return self.shape == other.shape and len(lenses) < 2
+
+
+class Stills(NamedTuple):
+  """The stills of one camera."""
+
+  files: list[Path]
+  turned: np.ndarray  # bool [N]: is to be turned by a quarter to lie as the others
+  long_side: int  # of the most common size; larger ones are reduced to it [pixel]
+  warnings: list[str]
 
 
 def look_of(path: Path) -> Look:
@@ -41,9 +74,9 @@ def look_of(path: Path) -> Look:
       width, height = image.size
       exif = image.getexif()
       detail = exif.get_ifd(PIL.ExifTags.IFD.Exif)
-  except (OSError, ValueError, SyntaxError) as error:
+  except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
     raise CaptureError(
-      f"{path} cannot be read as a picture: remove it or copy it again."
+      f"{path} cannot be read as a picture: remove it or copy it again ({error})."
     ) from error
   if exif.get(PIL.ExifTags.Base.Orientation) in _TURNED:
     width, height = height, width
@@ -51,27 +84,71 @@ def look_of(path: Path) -> Look:
   return Look(width, height, float(focal) if focal else None)
 
 
-def of_one_camera(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
-  """Keeps the pictures that share the most common size, orientation and zoom.
+def _without_copies(files: Sequence[Path]) -> list[Path]:
+  """The files whose content did not come before, and none that was converted from another."""
+  others = {path.stem for path in files if path.suffix.lower() not in APPLE_SUFFIXES}
+  first: dict[str, Path] = {}
+  for path in files:
+    if path.suffix.lower() not in APPLE_SUFFIXES or path.stem not in others:
+      first.setdefault(hashlib.sha256(path.read_bytes()).hexdigest(), path)
+  return list(first.values())
 
-  Returns:
-    The pictures, in their order, and a warning where some are left out.
+
+def of_one_camera(files: Sequence[Path]) -> Stills:
+  """Keeps the pictures of the most common camera, each once.
 
   Raises:
     CaptureError: One is no picture.
   """
-  looks = [look_of(path) for path in files]
-  (common, number), *others = collections.Counter(looks).most_common()
-  kept = [path for path, look in zip(files, looks, strict=True) if look == common]
-  if not others:
-    return kept, []
-  rest = ", ".join(f"{count} of {look}" for look, count in others[:3])
-  return kept, [
-    f"Only {number} of {len(files)} pictures are {common}; left out are {rest}: expected one "
-    "camera, one zoom and one orientation."
+  once = _without_copies(files)
+  looks = [look_of(path) for path in once]
+  common = collections.Counter(looks).most_common(1)[0][0]
+  alike = [look.shares_camera(common) and look.long_side >= common.long_side for look in looks]
+  wide = common.width >= common.height
+  kept = [path for path, same in zip(once, alike, strict=True) if same]
+  across = [
+    (look.width >= look.height) != wide for look, same in zip(looks, alike, strict=True) if same
   ]
+  warnings = []
+  if len(once) < len(files):
+    warnings.append(f"{len(files) - len(once)} of {len(files)} pictures are copies of others.")
+  others = collections.Counter(look for look, same in zip(looks, alike, strict=True) if not same)
+  if others:
+    rest = ", ".join(f"{count} of {look}" for look, count in others.most_common(3))
+    warnings.append(
+      f"Only {len(kept)} of {len(once)} pictures are {common} or larger; left out are {rest}: "
+      "expected one camera and one zoom."
+    )
+  return Stills(kept, np.array(across), common.long_side, warnings)
 
 
-def apple_pictures(folder: Path) -> list[Path]:
-  """Pictures of a folder in a format that only Apple's programs write."""
-  return sorted(path for path in folder.iterdir() if path.suffix.lower() in APPLE_SUFFIXES)
+def read_still(path: Path) -> np.ndarray:
+  """Reads a picture upright (EXIF) as BGR uint8 [H, W, 3]; transparent parts become black.
+
+  Raises:
+    CaptureError: It is damaged or no picture.
+  """
+  image = None
+  if path.suffix.lower() in APPLE_SUFFIXES:
+    try:
+      with PIL.Image.open(path) as picture:  # libheif has turned it
+        image = np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
+    except (OSError, ValueError, SyntaxError):
+      image = None
+  else:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+  if image is None:
+    raise CaptureError(f"{path} cannot be read as a picture: remove it or copy it again.")
+  return image
+
+
+def quarter_turned(image: np.ndarray) -> np.ndarray:
+  """Turns a picture [H, W, 3] counter-clockwise by a quarter: what was up is left."""
+  return np.ascontiguousarray(np.rot90(image))
+
+
+def upright_poses(world_from_camera: np.ndarray, turned: np.ndarray) -> np.ndarray:
+  """Poses [N, 4, 4] of the pictures as they were before some were turned (bool [N])."""
+  poses = np.array(world_from_camera, np.float64)
+  poses[turned, :3, :3] = poses[turned, :3, :3] @ _TURNED_FROM_UPRIGHT
+  return poses

@@ -27,6 +27,9 @@ _FIGURES = "localisation.json"
 class LocalisationError(ValueError):
   """The keyframes do not connect; the message holds how many did, why, and what to film."""
 
+  missing: frozenset[str] = frozenset()
+  """Keyframes that have no place."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Localisation:
@@ -94,6 +97,7 @@ class Localisation:
 def reprojection_error(model: pycolmap.Reconstruction) -> float:
   """Mean over the observations [pixel]; over the points where there are no observations."""
   points = list(model.points3D.values())
+  points = [point for point in points if point.track.length()] or points
   if not points:
     return float("nan")
   weights = np.array([max(p.track.length(), 1) for p in points])

@@ -221,15 +221,31 @@ def model_from_poses(known: KnownPoses, names: list[str], ids: dict[str, int] | 
 
 
 def triangulate(
-  database: Path, images_folder: Path, known: KnownPoses, names: list[str]
+  database: Path,
+  images_folder: Path,
+  known: KnownPoses,
+  names: list[str],
+  *,
+  max_error: float = MAX_ERROR,
 ) -> pycolmap.Reconstruction:
-  """Triangulates verified matches with poses and camera held fixed."""
+  """Triangulates verified matches with poses and camera held fixed.
+
+  Args:
+    database: Features and matches.
+    images_folder: Where the pictures lie.
+    known: Their poses and camera.
+    names: The pictures, in the order of the poses.
+    max_error: Observations further off are dropped [pixel].
+  """
   model = model_from_poses(known, names, image_ids(database))
   options = pycolmap.IncrementalPipelineOptions()
   options.num_threads = os.cpu_count() or 1
   options.extract_colors = False
   options.ba_refine_focal_length = False
   options.ba_refine_extra_params = False
+  options.mapper.filter_max_reproj_error = max_error
+  options.triangulation.complete_max_reproj_error = max_error
+  options.triangulation.merge_max_reproj_error = max_error
   with tempfile.TemporaryDirectory(dir=database.parent) as folder, quiet():
     return pycolmap.triangulate_points(
       model, str(database), str(images_folder), folder, options=options

@@ -7,20 +7,16 @@ keyframes, P points.
 
 import dataclasses
 import functools
-import hashlib
-import json
-import shutil
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.progress import Progress, no_progress, part
-from nerf2real.core.serialization import to_plain
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap, to_opencv
+from nerf2real.scenes.capture.stills import upright_poses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, matching, shutter
+from nerf2real.scenes.poses import mapping, matching, refinement, shutter
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -29,43 +25,15 @@ from nerf2real.scenes.poses.localisation import (
   reprojection_error,
   save,
 )
-from nerf2real.scenes.poses.matching import FeatureSettings, quiet
-from nerf2real.scenes.poses.pairs import PairSettings, repair_pairs
+from nerf2real.scenes.poses.matching import quiet
+from nerf2real.scenes.poses.pairs import repair_pairs
 from nerf2real.scenes.poses.parallax import parallax_share
-from nerf2real.scenes.poses.shutter import Shutter
+from nerf2real.scenes.poses.registered import check_registered
+from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
+from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
 
-_MODEL_FOLDER, _WORK_FOLDER, _DATABASE = "sfm", "work", "database.db"
-_STAGE_SHARES = {
-  "features": 0.25,
-  "matching": 0.4,
-  "mapping": 0.25,
-  "refining": 0.05,
-  "shutter": 0.05,
-}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LocaliseSettings:
-  """Settings of structure from motion."""
-
-  features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
-  pairs: PairSettings = dataclasses.field(default_factory=PairSettings)
-  mapper: str = "auto"
-  """"global", "incremental", or "auto": incremental for stills (few keyframes), else global; the
-  other one where the first leaves too many keyframes out."""
-  few_keyframes: int = 40
-  """Up to this many are mapped incrementally."""
-  repair_below: float = 0.95
-  """Fraction of registered keyframes under which more pairs are matched."""
-  min_fraction: float = 0.5
-  """Fewer registered keyframes are an error."""
-  min_registered: int = 10
-  """Fewer are an error, unless there are fewer keyframes."""
-  min_parallax: float = 0.08
-  """Share of matches off a homography below which a warning is given."""
-  seed: int = 0
-  """Of RANSAC and of the mappers."""
+_MODEL_FOLDER, _WORK_FOLDER = "sfm", "work"
 
 
 def localise(
@@ -75,6 +43,7 @@ def localise(
   settings: LocaliseSettings | None = None,
   known: KnownPoses | None = None,
   times: Mapping[str, float] | None = None,
+  turned: frozenset[str] = frozenset(),
   progress: Progress = no_progress,
 ) -> Localisation:
   """Localises the pictures of a folder.
@@ -85,6 +54,7 @@ def localise(
     settings: How.
     known: Poses that came with the pictures, in the order of their sorted names; they are kept.
     times: When each picture of a film was taken [s]: its rolling shutter is taken out.
+    turned: Pictures that were turned counter-clockwise by a quarter.
     progress: Called with the fraction done and a text.
 
   Raises:
@@ -99,82 +69,27 @@ def localise(
     raise LocalisationError(
       f"{len(known.world_from_camera)} known poses for {len(names)} pictures: expected one each."
     )
-  steps = _Steps(progress)
-  if known is not None and len(known.points):
+  steps = Steps(progress)
+  refined = None
+  if known is not None and known.is_metric and settings.refine_known:
+    refined = refinement.localise_known(
+      images_folder, out_folder / _WORK_FOLDER, names, settings, known, steps
+    )
+  if refined is not None:
+    result = refined
+  elif known is not None and len(known.points):
     model = mapping.model_from_poses(known, names)
     for point, error in zip(model.points3D.values(), known.point_errors, strict=True):
       point.error = error
-    result = _Mapped(model, f"poses and points of the {known.kind} source", ())
+    result = Mapped(model, f"poses and points of the {known.kind} source", ())
   else:
-    database = _prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
-    result = _map(database, images_folder, names, settings, known, steps)
+    database = prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
+    result = _map(database, images_folder, names, settings, known, steps, film=times is not None)
     if times is not None and known is None:
       result = _without_shutter(result, times, steps)
-  localisation = _describe(result, len(names), known, images_folder, steps)
+  localisation = _describe(result, len(names), known, images_folder, turned, steps)
   save(result.model, localisation, out_folder / _MODEL_FOLDER)
   return localisation
-
-
-@dataclasses.dataclass(frozen=True)
-class _Mapped:
-  model: pycolmap.Reconstruction
-  """In the source's frame."""
-  strategy: str
-  warnings: tuple[str, ...]
-  lens: mapping.FreeLens | None = None
-  """What was estimated of the lens; None where it was known."""
-  shutter: Shutter | None = None
-
-
-class _Steps:
-  """Times the steps and turns their progress into one fraction."""
-
-  def __init__(self, progress: Progress):
-    self._progress = progress
-    self._name, self._start = "", time.perf_counter()
-    self.seconds: dict[str, float] = {}
-
-  def begin(self, name: str) -> None:
-    self.end()
-    self._name, self._start = name, time.perf_counter()
-
-  def end(self) -> None:
-    if self._name:
-      spent = time.perf_counter() - self._start
-      self.seconds[self._name] = self.seconds.get(self._name, 0.0) + spent
-    self._name = ""
-
-  def report(self, fraction: float, text: str) -> None:
-    done = 0.0
-    for name, share in _STAGE_SHARES.items():
-      if name == self._name:
-        part(self._progress, done, done + share)(fraction, text)
-        return
-      done += share
-
-
-def _prepare_work(
-  images_folder: Path,
-  work: Path,
-  names: list[str],
-  settings: LocaliseSettings,
-  known: KnownPoses | None,
-) -> Path:
-  """Returns the database, after removing one that was made of other pictures or settings."""
-  digest = hashlib.sha256()
-  described = to_plain(settings.features)
-  described["camera"] = None if known is None else to_plain(known.camera)
-  described["seed"] = settings.seed
-  digest.update(json.dumps(described, sort_keys=True).encode())
-  for name in names:
-    digest.update(name.encode())
-    digest.update(hashlib.sha256((images_folder / name).read_bytes()).digest())
-  stamp = work / "inputs.sha256"
-  if not stamp.is_file() or stamp.read_text() != digest.hexdigest():
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    stamp.write_text(digest.hexdigest())
-  return work / _DATABASE
 
 
 def _map(
@@ -183,8 +98,10 @@ def _map(
   names: list[str],
   settings: LocaliseSettings,
   known: KnownPoses | None,
-  steps: _Steps,
-) -> _Mapped:
+  steps: Steps,
+  *,
+  film: bool,
+) -> Mapped:
   """Features, pairs, matches, a model, repairs, refinement."""
   steps.begin("features")
   matching.extract_features(
@@ -215,7 +132,7 @@ def _map(
   steps.begin("mapping")
   if known is not None:
     fixed = mapping.triangulate(database, images_folder, known, names)
-    return _Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
+    return Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
   model, mapper = _best_model(database, images_folder, len(names), settings, steps)
   if model is None or model.num_reg_images() < settings.repair_below * len(names):
     placed = {i.name for i in mapping.registered(model)} if model else set()
@@ -235,18 +152,18 @@ def _map(
       if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
         model, mapper = again, mapper_again
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
-  _check_registered(model, names, settings, share)
-  assert model is not None  # for the type checker: _check_registered has raised
+  check_registered(model, names, settings, share, film=film)
+  assert model is not None  # for the type checker: check_registered has raised
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
   if mapping.drop_weak_images(model):
-    _check_registered(model, names, settings, share)
+    check_registered(model, names, settings, share, film=film)
   if not lens.principal:
     warnings.append(f"Lens: estimated {lens.words}.")
-  return _Mapped(model, f"{words}, {mapper} mapper; lens: {lens.words}", tuple(warnings), lens)
+  return Mapped(model, f"{words}, {mapper} mapper; lens: {lens.words}", tuple(warnings), lens)
 
 
-def _without_shutter(mapped: _Mapped, times: Mapping[str, float], steps: _Steps) -> _Mapped:
+def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -> Mapped:
   """Takes the rolling shutter out of a model; the model itself where that spoils the lens."""
   lens = mapped.lens
   assert lens is not None  # for the type checker: only known poses have none
@@ -268,7 +185,7 @@ def _picture_width(database: Path) -> int:
 
 
 def _best_model(
-  database: Path, images_folder: Path, count: int, settings: LocaliseSettings, steps: _Steps
+  database: Path, images_folder: Path, count: int, settings: LocaliseSettings, steps: Steps
 ) -> tuple[pycolmap.Reconstruction | None, str]:
   """Runs the mapper of the settings, and the other one if that leaves too many keyframes out."""
   mappers = {"global": mapping.map_globally, "incremental": mapping.map_incrementally}
@@ -296,39 +213,13 @@ def _best_model(
   return best, chosen
 
 
-def _check_registered(
-  model: pycolmap.Reconstruction | None,
-  names: list[str],
-  settings: LocaliseSettings,
-  share: float | None,
-) -> None:
-  """Raises LocalisationError if too few keyframes have a place."""
-  number = 0 if model is None else model.num_reg_images()
-  needed = max(
-    int(np.ceil(settings.min_fraction * len(names))), min(settings.min_registered, len(names))
-  )
-  if number >= needed:
-    return
-  if share is None:
-    why = "hardly any two pictures show the same textured surface (blur, plain walls, fast turns)"
-    advice = "film slower, with more light, and keep textured things in view while turning"
-  elif share < settings.min_parallax:
-    why = "the camera hardly moved sideways, so depth cannot be seen"
-    advice = "walk through the room instead of turning on the spot"
-  else:
-    why = "they fall into groups that share too little (blur, plain walls, gaps)"
-    advice = (
-      "film slower and in one go, or take more pictures from places in between, and come back to "
-      "what was seen before"
-    )
-  raise LocalisationError(
-    f"{number} of {len(names)} keyframes were localised, expected at least {needed}: probably "
-    f"{why}; {advice}."
-  )
-
-
 def _describe(
-  result: _Mapped, total: int, known: KnownPoses | None, images_folder: Path, steps: _Steps
+  result: Mapped,
+  total: int,
+  known: KnownPoses | None,
+  images_folder: Path,
+  turned: frozenset[str],
+  steps: Steps,
 ) -> Localisation:
   """Moves the model into the unit frame (in place) and gathers the figures."""
   steps.end()
@@ -336,7 +227,8 @@ def _describe(
   if known is None or not len(known.points):
     model.update_point_3d_errors()
     model.extract_colors_for_all_images(str(images_folder))
-  poses = poses_of(mapping.registered(model))
+  images = mapping.registered(model)
+  poses = upright_poses(poses_of(images), np.array([i.name in turned for i in images], bool))
   solid = [p.xyz for p in model.points3D.values() if p.track.length() >= 3]
   if not solid:
     solid = [p.xyz for p in model.points3D.values()]

@@ -82,8 +82,7 @@ def _where(capture: Capture, chosen: np.ndarray) -> str:
   """Which keyframes, by their time in the film or their names."""
   if capture.times is not None:
     return f"at {_spans(capture.times, chosen)}"
-  names = [path.name for path, wanted in zip(capture.images, chosen, strict=True) if wanted]
-  return f"as {', '.join(names[:3])}"
+  return f"as {capture.called(chosen, most=3)}"
 
 
 def judge_pictures(capture: Capture, settings: CaptureSettings) -> list[Finding]:
@@ -216,7 +215,8 @@ def judge(
   findings += judge_poses(capture, poses)
   try:
     room_check.require_room(poses.world_from_camera, poses.points)
-    frame = world_frame.align(Evidence(poses.points, poses.world_from_camera), settings=align)
+    evidence = Evidence(poses.points, poses.world_from_camera, up=capture.unit_up)
+    frame = world_frame.align(evidence, settings=align)
   except ValueError as error:
     return Verdict([*findings, Finding("floor", False, str(error))])
   world = frame.world_from_unit.apply_pose(poses.world_from_camera)

@@ -6,14 +6,19 @@ Each runs, or finds done, one stage of the cache: a function of earlier results 
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from nerf2real.core.progress import Progress
 from nerf2real.scenes.capture import keyframes as keyframe_files
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, read_capture
+from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.poses import localisation, structure_from_motion
-from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.poses.localisation import Localisation, LocalisationError
+from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Source
 
+_PICTURES_VERSION = 2  # 2: stills turned and without copies; depth checked with the pictures
 _POSES_VERSION = 3  # 2: the unit frame's yaw; 3: the rolling shutter is taken out
 
 
@@ -24,13 +29,13 @@ def keyframes(cache: Stages, source: Source, settings: CaptureSettings) -> Made[
     taken = read_capture(source.path, folder / "images", settings=settings, progress=progress)
     keyframe_files.save(taken, folder)
 
-  stage = cache.run("keyframes", write, settings=settings, inputs={"source": source.sha256})
+  version = 1 if source_kind(source.path) == "video" else _PICTURES_VERSION
+  inputs = {"source": source.sha256}
+  stage = cache.run("keyframes", write, settings=settings, inputs=inputs, version=version)
   return Made(keyframe_files.load(stage.folder, stage.folder / "images"), stage)
 
 
-def poses(
-  cache: Stages, capture: Made[Capture], settings: structure_from_motion.LocaliseSettings
-) -> Made[Localisation]:
+def poses(cache: Stages, capture: Made[Capture], settings: LocaliseSettings) -> Made[Localisation]:
   """Estimates the camera, its poses and sparse points by structure from motion."""
 
   def write(folder: Path, progress: Progress) -> None:
@@ -38,9 +43,23 @@ def poses(
     times = None
     if taken.times is not None:
       times = dict(zip([path.name for path in taken.images], taken.times.tolist(), strict=True))
-    structure_from_motion.localise(
-      taken.folder, folder, settings=settings, known=taken.known, times=times, progress=progress
-    )
+    names = [path.name for path in taken.images]
+    turned = np.zeros(len(names), bool) if taken.turned is None else taken.turned
+    try:
+      structure_from_motion.localise(
+        taken.folder,
+        folder,
+        settings=settings,
+        known=taken.known,
+        times=times,
+        turned=frozenset(name for name, is_so in zip(names, turned, strict=True) if is_so),
+        progress=progress,
+      )
+    except LocalisationError as error:
+      if taken.origins is None or not error.missing:
+        raise
+      lost = taken.called(np.isin(names, sorted(error.missing)), most=4)
+      raise LocalisationError(f"{error} Without a place: {lost}.") from error
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large
 
   inputs = {"keyframes": capture.stamp}

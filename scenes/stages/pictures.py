@@ -54,7 +54,9 @@ class PosedPictures:
     row_of = {name: k for k, name in enumerate(found.names)}
     for k, path in enumerate(self.capture.value.images):
       row[k] = row_of.get(path.name, -1)
-    seen = source.sightings.copy()
+    seen = source.with_views(
+      found.camera.resized(source.camera.width, source.camera.height), source.world_from_camera
+    ).sightings
     seen[:, 0] = row[seen[:, 0].astype(int)]
     pixels = seen[:, 1:3] * camera.size_ratio(source.camera)
     seen[:, 1:3] = np.minimum(np.floor(pixels), [camera.width - 1, camera.height - 1])

@@ -12,7 +12,7 @@ import numpy as np
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress
 from nerf2real.core.serialization import write_json
-from nerf2real.scenes.capture import rgbd
+from nerf2real.scenes.capture import depth_pictures
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field import training
 from nerf2real.scenes.field.settings import TrainSettings
@@ -111,4 +111,5 @@ def _measured_depth(capture: Capture, poses: Localisation, camera: Camera) -> np
     return None
   files = {image.name: file for image, file in zip(capture.images, known.depth_files, strict=True)}
   unit = known.depth_unit * poses.unit_from_source.scale
-  return np.stack([rgbd.measured_depth(files[name], unit, camera) for name in poses.names])
+  named = (files[name] for name in poses.names)
+  return np.stack([depth_pictures.measured_depth(file, unit, camera) for file in named])

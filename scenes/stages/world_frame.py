@@ -82,6 +82,7 @@ def outlook(
       found.world_from_camera,
       marker=marker,
       sensor_scale=_sensed_scale(capture.value, found),
+      up=capture.value.unit_up,
     )
     try:
       frame = world_frame.align(
@@ -149,7 +150,15 @@ def world(
     points, normals = depth.value.surface_points(stride=2)
     sensed = _sensed_scale(capture.value, found)
     result = world_frame.align(
-      Evidence(found.points, found.world_from_camera, points, normals, outlook.value.scale, sensed),
+      Evidence(
+        found.points,
+        found.world_from_camera,
+        points,
+        normals,
+        outlook.value.scale,
+        sensed,
+        capture.value.unit_up,
+      ),
       settings=settings,
       override=given.override,
       progress=progress,

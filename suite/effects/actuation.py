@@ -8,11 +8,12 @@ import math
 
 import numpy as np
 
+from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 from nerf2real.suite.sensors.delays import StepRing
 
-_LEAST_STRENGTH = 0.1  # ours: a servo that hot or starved has shut down; keeps the model regular
+_WARMED, _STRENGTH_OF_HEAT = map(laws.over, (laws.warmed, laws.strength_of_heat))
 
 
 class CommandDelay(Operator):
@@ -116,11 +117,9 @@ class ThermalDerating(Operator):
     self.temperature_rise[:] = 0.0
 
   def step(self, binding: Binding) -> None:
-    heat = np.square(binding.last_force)
-    heat *= self._heating
-    self.temperature_rise *= self._cooling
-    self.temperature_rise += heat
-    strength = np.maximum(1 - self._derating * self.temperature_rise, _LEAST_STRENGTH)
+    rise = self.temperature_rise
+    _WARMED(rise, binding.last_force, self._heating, self._cooling, rise)
+    strength = _STRENGTH_OF_HEAT(rise, self._derating)
     binding.strength *= strength
     if self._scales_limit.any():
       binding.limit *= np.where(self._scales_limit, strength, 1.0)
@@ -143,8 +142,7 @@ class SupplySag(Operator):
 
   def step(self, binding: Binding) -> None:
     load = float(np.abs(binding.last_force) @ self._gear)
-    strength = 1 - self._droop * load - self._fade * binding.data.time
-    strength = max(strength, _LEAST_STRENGTH)
+    strength = laws.strength_of_supply(load, binding.data.time, self._droop, self._fade)
     binding.strength *= strength
     if self._scales_limit:
       binding.limit *= strength

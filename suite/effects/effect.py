@@ -9,7 +9,7 @@ Shapes: J joints of the binding, U actuators of the model.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -77,6 +77,8 @@ class Kind:
   "command", "force", "actuator" or "measurement"."""
   parameters: tuple[Parameter, ...]
   operator: "type[Operator]"
+  law: Callable | None = None
+  """A force of (position, velocity, *parameters), of a kind that is nothing else; `force_law`."""
 
   def nominal(self) -> dict[str, Value]:
     """Returns parameters with which the kind does nothing."""
@@ -104,6 +106,8 @@ class Effect:
   """Values in the units of the kind; those left out are nominal."""
   intervals: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
   """Lower and upper bound of a parameter's value, where known."""
+  samples: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
+  """Values of joint draws: the k-th of all values of all effects belong together."""
 
   def replace(self, **parameters: Value) -> "Effect":
     """Returns a copy with some parameter values changed."""

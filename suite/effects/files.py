@@ -1,4 +1,4 @@
-"""effects.json: a list of {kind, target, parameters: {name: {value, low, high, unit}}}."""
+"""effects.json: a list of {kind, target, parameters: {name: {value, low, high, unit, samples}}}."""
 
 import json
 import math
@@ -18,6 +18,29 @@ def check(effect: Effect) -> None:
     _check_value(kind.name, kind.parameter(name), value)
   for name in effect.intervals:
     kind.parameter(name)
+  for name, values in effect.samples.items():
+    for value in values:
+      _check_value(kind.name, kind.parameter(name), value)
+
+
+def count_samples(effects: Iterable[Effect]) -> int:
+  """Returns how many joint draws effects hold, 0 for none.
+
+  Raises:
+    ValueError: two values have different numbers of draws.
+  """
+  lengths = {
+    (effect.kind, effect.target, name): len(values)
+    for effect in effects
+    for name, values in effect.samples.items()
+  }
+  if len(set(lengths.values())) > 1:
+    few, many = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
+    raise ValueError(
+      f"Found {lengths[few]} samples of {few[2]!r} of the effect {few[0]!r} and {lengths[many]} of"
+      f" {many[2]!r} of {many[0]!r}, expected as many of every value: the k-th of all are one draw."
+    )
+  return next(iter(lengths.values()), 0)
 
 
 def _check_value(kind: str, parameter: Parameter, value: Any) -> None:
@@ -38,6 +61,8 @@ def _check_value(kind: str, parameter: Parameter, value: Any) -> None:
 
 def to_list(effects: Iterable[Effect]) -> list[dict[str, Any]]:
   """Returns the JSON form of effects. Infinite values, which mean no effect, are left out."""
+  effects = list(effects)
+  count_samples(effects)
   result = []
   for effect in effects:
     check(effect)
@@ -54,6 +79,8 @@ def to_list(effects: Iterable[Effect]) -> list[dict[str, Any]]:
         "high": high,
         "unit": kind.parameter(name).unit,
       }
+      if name in effect.samples:
+        parameters[name]["samples"] = list(effect.samples[name])
     result.append({"kind": effect.kind, "target": effect.target, "parameters": parameters})
   return result
 
@@ -72,6 +99,7 @@ def from_list(items: Any) -> list[Effect]:
       effects.append(_parse(item))
     except ValueError as error:
       raise ValueError(f"Effect {index}: {error}") from error
+  count_samples(effects)
   return effects
 
 
@@ -88,6 +116,7 @@ def _parse(item: Any) -> Effect:
     raise ValueError(f"Found {type(raw).__name__} as parameters, expected an object.")
   parameters: dict[str, Value] = {}
   intervals: dict[str, tuple[float, float]] = {}
+  samples: dict[str, list[float]] = {}
   for name, entry in raw.items():
     parameter = kind.parameter(name)
     if not isinstance(entry, Mapping) or "value" not in entry:
@@ -104,7 +133,14 @@ def _parse(item: Any) -> Effect:
     low, high = entry.get("low"), entry.get("high")
     if low is not None and high is not None:
       intervals[name] = (low, high)
-  effect = Effect(kind.name, target, parameters, intervals)
+    if "samples" in entry:
+      if not isinstance(entry["samples"], list) or parameter.is_list:
+        raise ValueError(
+          f"Found {type(entry['samples']).__name__} as samples of {name!r} of {kind.name!r},"
+          " expected a list of numbers, of a value that is a number."
+        )
+      samples[name] = entry["samples"]
+  effect = Effect(kind.name, target, parameters, intervals, samples)
   check(effect)
   return effect
 

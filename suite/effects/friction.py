@@ -9,11 +9,14 @@ which divides the creep by 100; `solimpfriction="0.999 0.999"` says the same in 
 
 import numpy as np
 
+from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 
 _IMPEDANCE = 0.999  # ours, see above
-_VELOCITY_FLOOR = 1e-6  # rad/s, against division by zero
+_STRIBECK, _LOAD_FRICTION, _GEAR_LOAD = map(
+  laws.over, (laws.stribeck, laws.load_friction, laws.gear_load)
+)
 
 
 def _stick(binding: Binding, friction: Array) -> None:
@@ -39,33 +42,22 @@ class ViscousFriction(Operator):
 
 
 class StribeckFriction(Operator):
-  """Dry friction that falls from rest to motion: breakaway * exp(-(v / velocity)^2) on top.
-
-  Source: Armstrong-Helouvry, Dupont, Canudas de Wit 1994, equation of the general kinetic friction
-  model with Stribeck exponent 2. Coulomb friction itself is the model's or `coulomb_friction`.
-  """
+  """Dry friction that falls from rest to motion (`laws.stribeck`); Coulomb friction itself is the
+  model's or `coulomb_friction`."""
 
   def bind(self, binding: Binding) -> None:
     parameters = self.per_joint(binding)
-    self._breakaway = parameters["breakaway"]
+    self._breakaway, self._velocity = parameters["breakaway"], parameters["velocity"]
     _stick(binding, self._breakaway)
-    self._rate = 1 / np.maximum(parameters["velocity"], _VELOCITY_FLOOR)
 
   def step(self, binding: Binding) -> None:
-    scaled = binding.velocity * self._rate
-    scaled *= scaled
-    np.negative(scaled, out=scaled)
-    np.exp(scaled, out=scaled)
-    scaled *= self._breakaway
-    binding.friction += scaled
+    binding.friction += _STRIBECK(binding.velocity, self._breakaway, self._velocity)
 
 
 class LoadFriction(Operator):
-  """Dry friction that grows with the torque that the gear transmits.
+  """Dry friction that grows with the torque that the gear transmits (`laws.load_friction`).
 
-    (coefficient |torque| + quadratic torque^2) (1 + rest exp(-(v / velocity)^2))
-
-  The last factor is a Stribeck fall of it: gears under load hold at rest what they pass in motion
+  A Stribeck fall is a factor of it: gears under load hold at rest what they pass in motion
   (Duclusaud, Passault, Padois and Ly 2024 measure both on small servos).
   The torque is that of the last step; which one loads the gear is `carried`: 0 the actuators', 1
   that less the joint's damping (back-EMF: what is left is the current's), 2 what the link takes,
@@ -75,25 +67,17 @@ class LoadFriction(Operator):
 
   def bind(self, binding: Binding) -> None:
     parameters = self.per_joint(binding)
-    self._coefficient = parameters["coefficient"]
-    self._quadratic = parameters["quadratic"]
-    self._at_rest = parameters["rest"]
-    self._rate = 1 / np.maximum(parameters["velocity"], _VELOCITY_FLOOR)
-    self._falls = bool(self._at_rest.any())
+    names = ("coefficient", "quadratic", "rest", "velocity")
+    self._law = tuple(parameters[name] for name in names)
     self._carried = parameters["carried"]
     self._damping = binding.model.dof_damping[binding.dofs].copy()
     self._sides = bool((self._carried >= 1).any())
-    _stick(binding, self._coefficient + self._quadratic)
+    _stick(binding, parameters["coefficient"] + parameters["quadratic"])
 
   def step(self, binding: Binding) -> None:
     load = binding.actuator_torque()
-    if self._sides:
-      load = self._of_gear(binding, load)
-    np.abs(load, out=load)
-    load *= self._coefficient + self._quadratic * load
-    if self._falls:
-      load *= 1 + self._at_rest * np.exp(-np.square(binding.velocity * self._rate))
-    binding.friction += load
+    load = self._of_gear(binding, load) if self._sides else np.abs(load)
+    binding.friction += _LOAD_FRICTION(load, binding.velocity, *self._law)
 
   def _of_gear(self, binding: Binding, actuator: Array) -> Array:
     """Returns the torque that loads each gear [J], from the actuators'."""
@@ -101,9 +85,7 @@ class LoadFriction(Operator):
     motor = actuator - self._damping * binding.velocity
     link = data.qfrc_actuator[dofs] + data.qfrc_passive[dofs] + data.qfrc_constraint[dofs]
     link += data.qfrc_applied[dofs] - model.dof_armature[dofs] * data.qacc[dofs]
-    sides = np.abs([motor, link])
-    forms = (actuator, motor, link, sides.max(axis=0), sides.mean(axis=0))
-    return np.choose(self._carried.astype(int), forms)
+    return _GEAR_LOAD(self._carried, actuator, motor, link)
 
 
 class AsymmetricFriction(Operator):

@@ -5,9 +5,12 @@ import math
 import numpy as np
 
 from nerf2real.core.rotations import matrix_from_rotvec
+from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Kind, Operator, Parameter
 from nerf2real.suite.randomisation import inertia
+
+_COGGING = laws.over(laws.cogging)
 
 
 class ParameterError(Operator):
@@ -23,6 +26,8 @@ class ParameterError(Operator):
     gain = np.where(driven, factors["gain"][np.maximum(binding.actuator_joint, 0)], 1.0)
     model.actuator_gainprm[:, 0] *= gain
     model.actuator_biasprm[:, :3] *= gain[:, None]
+    limit = np.where(driven, factors["limit"][np.maximum(binding.actuator_joint, 0)], 1.0)
+    model.actuator_forcerange *= limit[:, None]
     for joint, factor in zip(binding.joint_ids, factors["mass"], strict=True):
       if factor != 1:
         body = model.jnt_bodyid[joint]
@@ -71,19 +76,14 @@ class Spring(Operator):
 
 
 class Cogging(Operator):
-  """A torque that repeats with position: amplitude * sin(periods * q + phase)."""
+  """A torque that repeats with position (`laws.cogging`)."""
 
   def bind(self, binding: Binding) -> None:
     parameters = self.per_joint(binding)
-    self._amplitude, self._periods = parameters["amplitude"], parameters["periods"]
-    self._phase = parameters["phase"]
+    self._law = tuple(parameters[name] for name in ("amplitude", "periods", "phase"))
 
   def step(self, binding: Binding) -> None:
-    angle = self._periods * binding.position
-    angle += self._phase
-    np.sin(angle, out=angle)
-    angle *= self._amplitude
-    binding.force += angle
+    binding.force += _COGGING(binding.position, *self._law)
 
 
 class GravityTilt(Operator):
@@ -110,6 +110,7 @@ KINDS = (
       _factor("armature", "true over declared armature"),
       _factor("friction", "true over declared dry friction"),
       _factor("gain", "true over declared actuator gain and bias"),
+      _factor("limit", "true over declared limits of the actuator's force"),
       _factor("mass", "true over declared mass and inertia of the joint's body"),
     ),
     ParameterError,

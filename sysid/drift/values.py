@@ -117,6 +117,12 @@ def _refit(
 ) -> _Refit | None:
   """Returns an entry of the report fitted anew; None if it is of no joint's hypothesis."""
   members = row.get("evidence", {}).get("joints")
+  if "servo_law" in row.get("evidence", {}):  # by the duty alone
+    law = now[row["joint"]].law
+    if law is None:
+      return _Refit(row, row["joint"], None)
+    gain = {"gain": law.gain}, {"gain": law.interval}
+    return _Refit(row, row["joint"], Effect(row["kind"], row["joint"], *gain))
   if row["kind"] == "parameter_error" and members:  # medians over joints
     return None
   if members:
@@ -169,7 +175,7 @@ def _shared(
   own_terms = [_held(m, settings, without=held) for m in members]
   term = next(
     (
-      dataclasses.replace(t if not j.plant.hinge else plausible(t), target=held.target)
+      dataclasses.replace(t if not j.plant.hinge else plausible(t, j.plant), target=held.target)
       for j in joints
       for t in library(j.plant)
       if t.kind == held.kind
@@ -190,8 +196,7 @@ def _shared(
   layout = Layout([terms for terms, _ in own_terms], [term])
   x = np.concatenate([values, *[own for _, own in own_terms]])
   fit = _fitted(joints, layout, x, layout.spans[0], term)
-  spread = intervals.covariance(fit, joints, systematic=intervals.SYSTEMATIC)
-  reaches = intervals.reaches(fit, spread, layout.spans[0])
+  reaches = intervals.reaches(fit, intervals.spread(fit, joints), layout.spans[0])
   bounds = intervals.around(term, fit.x[: len(values)], *reaches)
   return _Refit(row, where, term.effect(fit.x[: len(values)], bounds))
 

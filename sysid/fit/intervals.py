@@ -15,7 +15,7 @@ import numpy as np
 from nerf2real.sysid.fit.layout import Fit
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.model.kernel import INDEX
 
 Array = np.ndarray
@@ -36,6 +36,7 @@ _RESOLVED = 1e-4
 """Of a curvature scaled to 1 for each value: twins whose derivatives agree to a hundredth have
 less."""
 _DRAWS, _FEW = 4000, 200  # of the normal distribution, and least that must be within bounds
+_AGAIN = 20  # times at most that draws beyond a bound are taken anew
 _EDGE = 1e-6  # scales by which a value may be beyond its bound
 _WIDTH = 0.004  # of finite differences, of a value's scale
 
@@ -48,27 +49,64 @@ def intervals(
   return around(
     term,
     fit.x[slice(*span)],
-    *reaches(fit, _spread(joint, fit), span),
+    *reaches(fit, spread(fit, [joint]), span),
     own_latency=own_latency,
     friction=float(joint.plant.declared[INDEX["friction"]]),
     relative=BESIDE_PLAY if any(t.kind == "backlash" for t in fit.layout.terms) else RELATIVE,
   )
 
 
-def reaches(fit: Fit, spread: Array, span: tuple[int, int]) -> tuple[Array, Array]:
+def unmodelled(
+  term: Term, name: str, value: float, *, friction: float = 0.0, relative: float = RELATIVE
+) -> float:
+  """Returns the standard deviation of a value by what no model of the joint holds; see `around`."""
+  own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
+  known = LATE if name == "delay" else 0.0
+  known = RUBS * friction if name in _DRY and term.kind != "calibration" else known
+  return float(np.hypot((PEAK if name == "breakaway" else relative) * own, known))
+
+
+def draws(joint: JointLikelihood, fit: Fit, count: int, random: np.random.Generator) -> Array:
+  """Returns joint draws [count, n] of a fit's values, within their bounds.
+
+  Of the normal distribution whose ends intervals are: what goes together in the fit does in the
+  draws; what no model holds is independent. Draws beyond a bound are taken anew, and at the last
+  put on it.
+  """
+  layout, own = fit.layout, np.zeros(len(fit.x))
+  friction = float(joint.plant.declared[INDEX["friction"]])
+  for term, (a, b) in zip(layout.terms, layout.spans, strict=True):
+    if term.kind == FREE:
+      continue
+    for at, name in zip(range(a, b), term.names, strict=True):
+      share = 0.0 if name in ("zero", "skew", "latency") else RELATIVE
+      own[at] = unmodelled(term, name, fit.x[at], friction=friction, relative=share)
+  wide = spread(fit, [joint]) + np.diag(own**2)
+  result = random.multivariate_normal(fit.x, wide, count, check_valid="ignore", method="eigh")
+  for _ in range(_AGAIN):
+    out = ((result < layout.low) | (result > layout.high)).any(axis=1)
+    if not out.any():
+      break
+    result[out] = random.multivariate_normal(
+      fit.x, wide, int(out.sum()), check_valid="ignore", method="eigh"
+    )
+  return np.clip(result, layout.low, layout.high)
+
+
+def reaches(fit: Fit, covariance: Array, span: tuple[int, int]) -> tuple[Array, Array]:
   """Returns how far values [k] may be below and above a fit's, all others within their bounds.
 
   Ends of 95 % of a normal distribution that is cut off where other values have their bounds.
 
   Args:
     fit: the values.
-    spread: their covariance [n, n].
+    covariance: of all [n, n].
     span: which ones.
   """
   own = slice(*span)
-  half = _Z * np.sqrt(np.maximum(np.diag(spread)[own], 0.0))
+  half = _Z * np.sqrt(np.maximum(np.diag(covariance)[own], 0.0))
   random = np.random.default_rng(0)
-  draws = random.multivariate_normal(fit.x, spread, _DRAWS, check_valid="ignore", method="eigh")
+  draws = random.multivariate_normal(fit.x, covariance, _DRAWS, check_valid="ignore", method="eigh")
   others = np.ones(len(fit.x), bool)
   others[own] = False
   inside = (draws >= fit.layout.low - _EDGE * fit.layout.scale) & (
@@ -83,11 +121,14 @@ def reaches(fit: Fit, spread: Array, span: tuple[int, int]) -> tuple[Array, Arra
   )
 
 
-def _spread(joint: JointLikelihood, fit: Fit) -> Array:
-  """Returns a covariance [n, n], which a fit keeps as long as the joint's scale stays."""
-  scale = joint.scale.tobytes() + joint.independent.tobytes()
+def spread(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
+  """Returns the covariance [n, n] of a fit's values, widened by the systematic share.
+
+  A fit keeps it as long as the joints' scales stay.
+  """
+  scale = b"".join(j.scale.tobytes() + j.independent.tobytes() for j in joints)
   if fit.spread is None or fit.spread[0] != scale:
-    fit.spread = scale, covariance(central(joint, fit), [joint], systematic=SYSTEMATIC)
+    fit.spread = scale, covariance(central(fit, joints), joints, systematic=SYSTEMATIC)
   return fit.spread[1]
 
 
@@ -113,19 +154,25 @@ def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float
   return inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse
 
 
-def central(joint: JointLikelihood, fit: Fit) -> Fit:
+def central(fit: Fit, joints: Sequence[JointLikelihood]) -> Fit:
   """Returns a fit linearised by central differences.
 
   Where two values do the same (damping and added friction), their derivatives must agree to a part
   in a thousand, or the difference looks like information.
   """
-  fitter = Fitter([joint], fit.layout)
+  fitter = Fitter(joints, fit.layout)
   sides = [fitter.linearise(fit.x, width, residuals=fit.residuals) for width in (_WIDTH, -_WIDTH)]
-  (mean,) = np.mean([side.jacobian for side in sides], axis=0)
-  weights = 2.0 * joint.weights(joint.squares(sides[0].residuals[0]))
-  mean = np.tensordot(_resolved(np.einsum("icn,jcn->ij", weights * mean, mean)), mean, 1)
-  curvature = np.einsum("icn,jcn->ij", weights * mean, mean)
-  return dataclasses.replace(sides[0], jacobian=[mean], curvature=curvature[None])
+  jacobians, curvature = [], np.zeros((fit.layout.count, fit.layout.count))
+  for joint, index, residual, *both in zip(
+    joints, fit.layout.index, fit.residuals, *[side.jacobian for side in sides], strict=True
+  ):
+    mean = np.mean(both, axis=0)
+    weights = 2.0 * joint.weights(joint.squares(residual))
+    resolved = _resolved(np.einsum("icn,jcn->ij", weights * mean, mean))
+    jacobians.append(np.tensordot(resolved, mean, 1))
+    part = np.einsum("icn,jcn->ij", weights * jacobians[-1], jacobians[-1])
+    curvature[np.ix_(index, index)] += part
+  return dataclasses.replace(sides[0], jacobian=jacobians, curvature=curvature[None])
 
 
 def _resolved(curvature: Array) -> Array:
@@ -161,11 +208,7 @@ def around(
   """
   result = {}
   for name, value, less, more, lowest in zip(term.names, x, down, up, term.low, strict=True):
-    own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
-    known = LATE if name == "delay" else 0.0
-    known = RUBS * friction if name in _DRY and term.kind != "calibration" else known
-    share = PEAK if name == "breakaway" else relative
-    model = _Z * float(np.hypot(share * own, known))
+    model = _Z * unmodelled(term, name, value, friction=friction, relative=relative)
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     low = max(value - float(np.hypot(less, model)) - below, lowest)
     high = value + float(np.hypot(more, model))

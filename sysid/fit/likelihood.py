@@ -22,6 +22,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured
+from nerf2real.sysid.model.servo_law import command_jump, duty_of
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -47,9 +48,9 @@ class JointLikelihood:
     self.position_noise, self.stamp_noise = timing(plant)
     logs = plant.logs
     self.effort: list[Array] | None = None
-    self.is_duty = False
-    if all(log.duty is not None for log in logs):
-      self.effort, self.is_duty = [log.duty for log in logs], True  # type: ignore[misc]
+    self.law = None if plant.law is None else plant.law[0]
+    if self.law is not None:
+      self.effort = [log.duty for log in logs]  # type: ignore[misc]
     elif all(log.effort is not None for log in logs) and plant.holds:
       self.effort = [log.effort for log in logs]  # type: ignore[misc]
     self.channels = ["course"] + (["effort"] if self.effort is not None else [])
@@ -58,13 +59,29 @@ class JointLikelihood:
     )
     self.mask = np.concatenate([log.valid for log in logs]).astype(float)
     self.speed = np.concatenate([log.velocity for log in logs])
-    self.speed_matters = not self.is_duty
     shaky = self.stamp_noise * self.speed / self.position_noise
     self.gain = np.array([self.mask / np.sqrt(1.0 + shaky**2), self.mask][: len(self.channels)])
     self._cut()
     self.expectation: Expectation | None = None
     self.scale = np.maximum(self.floor, 1e-12)
     self.independent = np.ones(len(self.channels))
+    self._known = None if plant.law is None else self._measure(plant.law[1])
+
+  def _measure(self, left: Array) -> tuple[float, float]:
+    """Returns scale and correlation time of what a servo's law leaves of the duty [N]."""
+    assert self.law is not None and self.effort is not None
+    self._nominal = 1.0 if self.law.is_off(self.settings.duty_scale) else self.law.gain
+    jump = np.concatenate(
+      [command_jump(self.plant, i, 2.0 * self.plant.step) for i in range(len(self.plant.logs))]
+    )
+    self.gain[1] *= 1.0 / np.sqrt(1.0 + (self.law.gain * jump / (4.0 * self.floor[1])) ** 2)
+    self.counts = np.maximum(np.add.reduceat(self.gain**2, self.starts, axis=1), 1.0)
+    rows = np.zeros((2, self.size))
+    rows[1] = left * self.gain[1]
+    squares = self.squares(rows)[1]
+    row = rows[1] / np.sqrt(squares[self.block_of] + 1e-30)
+    scale = float(np.sqrt(np.median(squares) + self.floor[1] ** 2))
+    return scale, _correlation_time(row, self.starts)
 
   def _cut(self) -> None:
     starts, folds, offset = [], [], 0
@@ -101,9 +118,10 @@ class JointLikelihood:
   def simulate(
     self, terms: Sequence[Term], xs: Array, logs: Sequence[int] | None = None
   ) -> list[list[tuple[Simulated, Simulated | None]]]:
-    """Returns every log's open-loop run, and its run along the readings where efforts are known."""
+    """Returns every log's open-loop run, and its run along the readings where torque is known."""
     chosen = list(range(len(self.plant.logs)) if logs is None else logs)
-    ways = [self.follows] + [True] * (self.effort is not None and not self.follows)
+    along = self.effort is not None and self.law is None and not self.follows
+    ways = [self.follows] + [True] * along
     runs = []
     for x in np.atleast_2d(xs):
       c = compose(self.plant, terms, x)
@@ -114,7 +132,7 @@ class JointLikelihood:
       ]
     done = at_once(runs)
     pairs = [
-      (done[k], done[k + len(ways) - 1] if self.effort is not None else None)
+      (done[k], done[k + len(ways) - 1] if along or self.follows else None)
       for k in range(0, len(done), len(ways))
     ]
     return [pairs[k : k + len(chosen)] for k in range(0, len(pairs), len(chosen))]
@@ -122,12 +140,14 @@ class JointLikelihood:
   def residuals(self, terms: Sequence[Term], xs: Array) -> Array:
     """Returns measured minus simulated [X, C, N]; masked samples are 0."""
     rows = []
-    for outputs in self.simulate(terms, xs):
+    for outputs, x in zip(self.simulate(terms, xs), np.atleast_2d(xs), strict=True):
       course = [
         log.position - o.position for log, (o, _) in zip(self.plant.logs, outputs, strict=True)
       ]
       channels = [np.concatenate(course)]
-      if self.effort is not None:
+      if self.law is not None:
+        channels.append(self._duties(compose(self.plant, terms, x).p))
+      elif self.effort is not None:
         channels.append(self._efforts([along for _, along in outputs]))
       rows.append(channels)
     result = np.nan_to_num(np.array(rows), nan=1e3, posinf=1e3, neginf=-1e3)
@@ -168,33 +188,36 @@ class JointLikelihood:
     self.expectation = Expectation(self.plant.logs, likes, baseline)
     return True
 
+  def _duties(self, p: Array) -> Array:
+    """Returns measured duty minus that of the law of kernel parameters [P].
+
+    A gain within what a data sheet leaves open is taken for the declared one.
+    """
+    assert self.effort is not None and self.law is not None
+    if self._nominal != 1.0:
+      p = p.copy()
+      p[INDEX["gain"]] *= self._nominal
+    ahead = self.law.ahead
+    law = [duty_of(self.plant, p, i, ahead=ahead) for i in range(len(self.plant.logs))]
+    return np.concatenate(self.effort) - np.concatenate(law)
+
   def _efforts(self, along: Sequence[Simulated | None]) -> Array:
     assert self.effort is not None
     measured = np.concatenate(self.effort)
     torque = np.concatenate([a.torque for a in along])  # type: ignore[union-attr]
     jump = np.concatenate([a.jump for a in along])  # type: ignore[union-attr]
     soft = 1.0 / np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2) * self.mask
-    scale = self._factor(soft * measured, soft * torque)
-    left = soft * (measured - scale * torque)
-    if not self.is_duty:  # a current's torque lacks what the back-EMF takes
-      speed = soft * self.speed
-      left = left - float(left @ speed) / (float(speed @ speed) + 1e-12) * speed
-    return left
+    left = soft * (measured - self._factor(soft * measured, soft * torque) * torque)
+    # A current's torque lacks what the back-EMF takes.
+    speed = soft * self.speed
+    return left - float(left @ speed) / (float(speed @ speed) + 1e-12) * speed
 
   def _factor(self, measured: Array, torque: Array) -> float:
-    """Returns measured over simulated effort, within what a data sheet leaves open."""
-    scale = float(measured @ torque) / (float(torque @ torque) + 1e-12)
-    full = float(self.plant.declared[INDEX["highest"]])
-    if not self.is_duty:
-      spread, nominal = self.settings.effort_scale, 1.0
-      if self.speed_matters:
-        both = np.array([torque, self.speed * self.mask])
-        scale = float(np.linalg.lstsq(both @ both.T, both @ measured, rcond=None)[0][0])
-    elif np.isfinite(full):
-      spread, nominal = self.settings.duty_scale, 1.0 / full
-    else:
-      return scale
-    return float(np.clip(scale, nominal / (1.0 + spread), nominal * (1.0 + spread)))
+    """Returns measured over simulated effort, within what torque constants leave open."""
+    both = np.array([torque, self.speed * self.mask])
+    scale = float(np.linalg.lstsq(both @ both.T, both @ measured, rcond=None)[0][0])
+    spread = self.settings.effort_scale
+    return float(np.clip(scale, 1.0 / (1.0 + spread), 1.0 + spread))
 
   def squares(self, residuals: Array) -> Array:
     """Returns mean squares of blocks [..., C, B]."""
@@ -215,7 +238,7 @@ class JointLikelihood:
     """Sets the scale and the number of independent samples by the residuals [C, N] of a fit.
 
     Channels show one misfit: where courses go together for long, efforts count no more often. A
-    duty is of the servo's law alone, which the measured positions feed: its misfit is another.
+    duty is of the servo's law alone, which the readings feed: it counts by what that law leaves.
     """
     squares = self.squares(residuals)
     self.scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
@@ -223,7 +246,9 @@ class JointLikelihood:
       _correlation_time(row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts)
       for c, row in enumerate(residuals)
     ]
-    self.independent[:] = 1.0 / np.array(times if self.is_duty else np.maximum(times, times[0]))
+    self.independent[:] = 1.0 / np.maximum(times, times[0])
+    if self._known is not None:
+      self.scale[1], self.independent[1] = self._known[0], 1.0 / self._known[1]
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

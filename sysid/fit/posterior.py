@@ -11,12 +11,13 @@ are predicted by one further step from the mode without their share of gradient 
 infinitesimal jackknife). Shapes: n values, C channels, N samples, B blocks, X sets of values.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.fit.steps import bounded
 
 Array = np.ndarray
 
@@ -33,13 +34,7 @@ _FIRST = 2  # steps that are tried first; the others where these gain less than 
 _AS_EXPECTED = 0.5  # share of the gain that the linearisation promises, chosen
 _CARRIED = 3  # steps at most between Jacobians of finite differences, chosen
 _LEAST_CARRIED = 0.03  # scales that a step must be long to correct a Jacobian: costs are rough
-_WIDTH, _FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
-_SHIFTS = tuple(0.0005 * k for k in (-8, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 8))
-"""s by which latencies are shifted to look about."""
-_WORTH = 0.5  # nats that other latencies must be better by, chosen
-_GENERATIONS, _DRAWN, _ELITE = 12, 120, 20  # of values that are drawn where costs are rough, chosen
-_SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least, chosen
-_FAR = 3.0  # the same of the values of effects alone, at first
+_WIDTH, FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
 _CONVERGED = 0.05  # nats that a step gains at which a fit ends
 
 
@@ -163,11 +158,11 @@ class Fitter:
       begun, best = best, self._descended(best, quick)
       if quick:
         continue
-      if best is begun and best.width is not None and best.width <= _FINE:
+      if best is begun and best.width is not None and best.width <= FINE:
         break
       # Friction and held commands are rough: from coarse to fine.
       known = best.jacobian if known is not None else None
-      best = self.linearise(best.x, _FINE, known, fresh, best.residuals)
+      best = self.linearise(best.x, FINE, known, fresh, best.residuals)
     return best
 
   def _descended(self, fit: Fit, quick: bool) -> Fit:
@@ -181,13 +176,14 @@ class Fitter:
 
   def _stepped(self, fit: Fit, quick: bool) -> Fit | None:
     """Returns a fit after the step that gains most; None where none gains."""
-    steps = np.array([self._step(fit, *d) for d in _DAMPINGS])
-    by = steps[0] - fit.x
-    possible = -float(fit.slope @ by + 0.5 * by @ fit.precision @ by)
+    possible = self.promised(fit)
     if possible < _CONVERGED:
       return None
+    steps = np.array([self._step(fit, *d) for d in _DAMPINGS])
     gained, found = _CONVERGED, None
-    for tried in (steps[:_FIRST],) if quick else (steps[:_FIRST], steps[_FIRST:]):
+    for tried in (steps[:_FIRST], steps[_FIRST:]):
+      if quick and found is not None:
+        break
       costs, rows = self.simulated(tried)
       k = int(np.argmin(costs))
       if fit.cost - costs[k] > gained:
@@ -197,6 +193,11 @@ class Fitter:
     if found is None:
       return None
     return self.weighed(*found, self._carried(fit, *found), None)
+
+  def promised(self, fit: Fit) -> float:
+    """Returns the nats that a full step from a fit gains by its own linearisation."""
+    by = self._step(fit, *_DAMPINGS[0]) - fit.x
+    return -float(fit.slope @ by + 0.5 * by @ fit.precision @ by)
 
   def _carried(self, fit: Fit, x: Array, residuals: list[Array]) -> list[Array]:
     """Returns the Jacobian that also tells what a step from a fit has changed (Broyden 1965)."""
@@ -212,48 +213,9 @@ class Fitter:
       result.append(jacobian)
     return result
 
-  def look_about(self, fit: Fit, names: Collection[str], *, iterations: int = 2) -> Fit:
-    """Returns a fit from near other latencies where that is better: held commands make stairs of
-    them, in which steps end.
-
-    Args:
-      fit: where steps have ended.
-      names: of the latencies to shift.
-      iterations: Jacobians at most of the fit from the best shifted values.
-    """
-    layout = self.layout
-    kinds = [n for t in layout.terms for n in t.names]
-    moved = [at for at, name in enumerate(kinds) if name in names]
-    if not moved:
-      return fit
-    tried = fit.x + np.array([s * np.eye(len(kinds))[at] for at in moved for s in _SHIFTS])
-    tried = np.clip(tried, layout.low, layout.high)
-    costs, rows = self.simulated(tried)
-    k = int(np.argmin(costs))
-    begin = self.weighed(tried[k], [row[k] for row in rows], fit.jacobian, None)
-    other = self.fit(begin, iterations=iterations)
-    return other if other.cost < fit.cost - _WORTH else fit
-
-  def draw(self, fit: Fit) -> Fit:
-    """Returns a better fit where costs are too rough for derivatives: values are drawn about the
-    best so far (cross-entropy method, Rubinstein 1999), those of effects from far about first."""
-    random, layout = np.random.default_rng(0), self.layout
-    best, least = fit.x, fit.cost
-    for moving, shaken in ((layout.is_effect, _FAR), (np.ones(len(fit.x), bool), _SHAKEN)):
-      mean, spread = best.copy(), shaken * layout.scale * moving
-      for _ in range(_GENERATIONS):
-        tried = random.normal(mean, spread, (_DRAWN, len(mean)))
-        tried = np.clip(np.vstack([best, tried]), layout.low, layout.high)
-        costs = self.costs(tried)
-        elite = tried[np.argsort(costs)[:_ELITE]]
-        best, least = elite[0], float(costs.min())
-        narrow = _LEAST_SHAKEN * layout.scale * moving
-        mean, spread = elite.mean(axis=0), np.maximum(elite.std(axis=0), narrow)
-    return self.linearise(best, _FINE) if least < fit.cost else fit
-
   def _step(self, fit: Fit, damping: float, share: float, clocks: bool) -> Array:
     moving = None if clocks else np.flatnonzero(~self.layout.is_clock)
-    return _bounded(fit.x, fit.precision, fit.slope, self.layout, damping, share, moving)
+    return bounded(fit.x, fit.precision, fit.slope, self.layout, damping, share, moving)
 
   def leave_out(self, fit: Fit) -> Fit:
     """Fills in what a fit predicts of each fold when its effects are fitted to the others alone.
@@ -269,7 +231,7 @@ class Fitter:
     tried = []
     for f in range(len(self.folds)):
       g, h = fit.slope - fit.gradient[f], fit.precision - fit.curvature[f]
-      tried += [_bounded(x, h, g, layout, 1e-3, share, moving) for share in (1.0, 0.5)]
+      tried += [bounded(x, h, g, layout, 1e-3, share, moving) for share in (1.0, 0.5)]
     _, rows = self.simulated(np.array(tried))
     squares = [j.squares(r) for j, r in zip(self.joints, rows, strict=True)]
     within = [h.copy() for h in fit.held]
@@ -284,36 +246,3 @@ class Fitter:
       for joint, found, out in zip(self.joints, own, fit.held, strict=True):
         out[:, joint.fold == fold] = found[best][:, joint.fold == fold]
     return fit
-
-
-def _bounded(
-  x: Array,
-  h: Array,
-  g: Array,
-  layout: Layout,
-  damping: float,
-  share: float,
-  moving: Array | None = None,
-) -> Array:
-  """Returns a damped Newton step from x, within bounds; values that press on one stay.
-
-  Args:
-    x: values [n].
-    h: curvature [n, n].
-    g: gradient [n].
-    layout: bounds and scales.
-    damping: of Marquardt's kind.
-    share: of the step.
-    moving: indices of the values that may move; all for None.
-  """
-  s = layout.scale
-  free = ~(((x <= layout.low + 1e-9 * s) & (g > 0)) | ((x >= layout.high - 1e-9 * s) & (g < 0)))
-  if moving is not None:
-    free &= np.isin(np.arange(len(x)), moving)
-  result = x.copy()
-  if free.any():
-    block = (h * s[:, None] * s)[np.ix_(free, free)]
-    block = block + (1e-9 * np.trace(block) + 1e-9) * np.eye(len(block))
-    block += damping * np.diag(np.diag(block))
-    result[free] -= share * np.linalg.solve(block, (g * s)[free]) * s[free]
-  return np.clip(result, layout.low, layout.high)

@@ -8,6 +8,8 @@ import dataclasses
 
 import numpy as np
 
+from nerf2real.suite.effects.registry import KINDS
+from nerf2real.sysid.hypotheses import force_law
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.plant import JointPlant
@@ -141,8 +143,8 @@ def library(plant: JointPlant) -> list[Term]:
     )
   else:
     terms.append(_payload(plant))
-  strongest = _strongest(plant)
-  limit = strongest if not np.isfinite(top) else min(top, strongest)
+  most = strongest(plant)
+  limit = most if not np.isfinite(top) else min(top, most)
   terms.append(
     Term(
       "torque_limit",
@@ -154,13 +156,13 @@ def library(plant: JointPlant) -> list[Term]:
       ((0.9 * limit,), (0.7 * limit,), (0.45 * limit,)),
     )
   )
-  return terms
+  return terms + [force_law.term_of(plant, kind) for kind in KINDS.values() if kind.law is not None]
 
 
 def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   """Returns a weakened actuator in its forms: whether its limit falls too, whether efforts tell."""
   limited = np.isfinite(plant.declared[INDEX["highest"]])
-  told = all(log.effort is not None or log.duty is not None for log in plant.logs)
+  told = all(log.effort is not None for log in plant.logs) and not plant.logs_duty
   told = told and term.kind != "motor_gain"
   return [
     dataclasses.replace(
@@ -272,5 +274,6 @@ def typical_torque(plant: JointPlant) -> float:
   return max(float(np.quantile(plant.declared_torque(), 0.95)), 1e-6)
 
 
-def _strongest(plant: JointPlant) -> float:
+def strongest(plant: JointPlant) -> float:
+  """Returns the largest torque that the declared model needs in the logs [N m, or N of a slide]."""
   return max(float(plant.declared_torque().max()), 1e-6)

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.sysid.hypotheses import free_force
+from nerf2real.suite.effects.registry import KINDS
+from nerf2real.sysid.hypotheses import force_law, free_force
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.model.joint import JointModel, Load, Table
 
@@ -25,13 +26,15 @@ class Composed(NamedTuple):
 
 def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
   """Returns terms with values x [n] composed."""
-  p, loads, at, table = plant.declared.copy(), [], 0, None
+  p, loads, at, table, forces = plant.declared.copy(), [], 0, None, []
   for term in terms:
     part = x[at : at + len(term.names)]
     at += len(term.names)
     term.apply(plant, p, part)
     values = dict(zip(term.names, map(float, part), strict=True)) | dict(term.fixed)
-    if term.kind == "payload":
+    if term.kind in KINDS and KINDS[term.kind].law is not None:
+      forces.append((term, values))
+    elif term.kind == "payload":
       m, a, b, c = (values[n] for n in ("mass", "x", "y", "z"))
       moments = m * np.array([1, a, b, c, a * a, b * b, c * c, a * b, a * c, b * c])
       loads.append(Load(str(term.target), moments))
@@ -41,4 +44,6 @@ def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
       loads.append(Load("mass", np.array([values["mass"]])))
     elif term.kind == FREE:
       table = free_force.table(term, part)
+  for term, values in forces:  # over the places of a free force, where there is one
+    table = force_law.add(plant, term, values, table)
   return Composed(p, loads, table)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerf2real.sysid.hypotheses.terms import STICKING, Term
+from nerf2real.sysid.hypotheses.terms import SERVO_GAIN, STICKING, Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -37,7 +37,13 @@ def constants(plant: JointModel, settings: Settings = SETTINGS) -> Term:
   low = tuple(0.0 if n == "latency" else -b for n, b in zip(names, limit, strict=True))
   zeros = (0.0,) * len(names)
   scale = tuple(0.005 if n in ("skew", "latency") else t for n, t in zip(names, sigma, strict=True))
-  return Term(NAME, plant.joint, names, low, limit, scale, (zeros,), sigma, zeros)
+  fixed: tuple[tuple[str, float], ...] = ()
+  if plant.law is not None:
+    # The duty shows the servo's own law: what is left open is the torque at a duty.
+    fixed = (("scales_limit", 1.0),)
+    if plant.law[0].is_off(settings.duty_scale):
+      fixed = (*fixed, (SERVO_GAIN, plant.law[0].gain))
+  return Term(NAME, plant.joint, names, low, limit, scale, (zeros,), sigma, zeros, fixed)
 
 
 def sticking(plant: JointModel) -> Term:

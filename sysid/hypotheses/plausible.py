@@ -5,22 +5,37 @@ import dataclasses
 import numpy as np
 
 from nerf2real.suite.effects import kind_of
+from nerf2real.sysid.hypotheses.candidates import strongest
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.model.plant import JointPlant
 
 _SLACK = 1.25
 """Times the ends of the registry's ranges, which are where a search may start."""
 _CYCLIC = ("phase",)
+_SERVO = 2.5
+"""N m; stall torque of the OP3's MX-28 (Robotis), of whose kind the registry's ranges are."""
 
 
-def plausible(term: Term) -> Term:
-  """Returns a term of a hinge whose bounds lie within the registry's ranges."""
+def plausible(term: Term, plant: JointPlant) -> Term:
+  """Returns a term of a hinge whose bounds lie within the registry's ranges.
+
+  A machine with more torque than such a servo rubs, springs and carries more: ranges of torques, of
+  masses and of what is torque per something grow with it.
+  """
+  limit = plant.declared[INDEX["highest"]]
+  torque = max(strongest(plant), limit if np.isfinite(limit) else 0.0)
+  larger = max(1.0, torque / _SERVO)
   low, high = list(term.low), list(term.high)
   for at, name in enumerate(term.names):
     if name in _CYCLIC or name not in {p.name for p in kind_of(term.kind).parameters}:
       continue
     parameter = kind_of(term.kind).parameter(name)
     lowest = parameter.low / _SLACK if parameter.low > 0 else parameter.low * _SLACK
-    low[at], high[at] = max(low[at], lowest), min(high[at], parameter.high * _SLACK)
+    highest = (
+      parameter.high * _SLACK * (larger if parameter.unit.startswith(("N m", "kg")) else 1.0)
+    )
+    low[at], high[at] = max(low[at], lowest), min(high[at], highest)
     high[at] = max(high[at], low[at])
   starts = dict.fromkeys(tuple(map(float, np.clip(s, low, high))) for s in term.starts)
   return dataclasses.replace(term, low=tuple(low), high=tuple(high), starts=tuple(starts))

@@ -26,6 +26,10 @@ STICKING = "sticking"
 MuJoCo's own lets it creep."""
 
 
+SERVO_GAIN = "servo_gain"
+"""Fixed parameter of constants: gain of the servo's law over the declared one, by the duty log."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Term:
   """What is fitted of one kind."""
@@ -97,8 +101,11 @@ class Term:
     """Returns the fitted effect."""
     values = {n: float(v) for n, v in zip(self.names, x, strict=True)} | dict(self.fixed)
     if self.kind == "calibration":
-      factors = {n: 1.0 + values[n] for n in values if n not in ("skew", "latency", "zero")}
+      factors = {n: 1.0 + values[n] for n in self.names if n not in ("skew", "latency", "zero")}
       bounds = {n: (1.0 + a, 1.0 + b) for n, (a, b) in (intervals or {}).items() if n in factors}
+      if "gain" in factors and values.get("scales_limit", 0.0) > 0:
+        factors["limit"] = factors["gain"]
+        factors["gain"] *= values.get(SERVO_GAIN, 1.0)
       return Effect("parameter_error", self.target, factors, bounds)
     known = {p.name for p in kind_of(self.kind).parameters}
     values = {n: v for n, v in values.items() if n in known}
@@ -131,8 +138,12 @@ def _calibration(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["damping"]] *= 1.0 + v.get("damping", 0.0)
   p[I["armature"]] *= 1.0 + v.get("armature", 0.0)
   p[I["friction"]] *= 1.0 + v.get("friction", 0.0)
-  for name in ("input", "constant", "position", "velocity"):  # limits stay
+  names: tuple[str, ...] = ("input", "constant", "position", "velocity")
+  if v.get("scales_limit", 0.0) > 0:  # the torque at a duty; else limits stay
+    names = (*names, "lowest", "highest", "strength")
+  for name in names:
     p[I[name]] *= 1.0 + v.get("gain", 0.0)
+  p[I["gain"]] *= v.get(SERVO_GAIN, 1.0)
   p[I["measurement_delay"]] += v.get("skew", 0.0)
   p[I["effort_delay"]] += v.get("skew", 0.0)
   p[I["command_delay"]] += v.get("latency", 0.0)
@@ -171,7 +182,7 @@ def _spring(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
 
 def _gain(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   scales_limit = v.get("scales_limit", 0.0) > 0
-  for name in ("gain", "lowest", "highest") if scales_limit else ("gain",):
+  for name in ("gain", "lowest", "highest", "strength") if scales_limit else ("gain",):
     p[I[name]] *= v["gain"]
 
 

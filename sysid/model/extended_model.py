@@ -140,6 +140,7 @@ def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float
       joint.frictionloss *= value.get("friction", 1.0)
       for actuator in actuators:
         _scale(actuator, value.get("gain", 1.0))
+        actuator.forcerange = np.array(actuator.forcerange) * value.get("limit", 1.0)
       if value.get("mass", 1.0) != 1.0:
         joint.parent.mass *= value["mass"]
         joint.parent.inertia = np.array(joint.parent.inertia) * value["mass"]

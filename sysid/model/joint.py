@@ -5,6 +5,7 @@ What masses and gravity add is linear and kept on the step grid, so that a hypot
 arrays, not a pass over the model. Shapes: N samples of a log, T grid points, P kernel parameters.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.plant import JointPlant, turning
 from nerf2real.sysid.model.reduction import Reduction, Surroundings
+from nerf2real.sysid.model.servo_law import ServoLaw, servo_law
 
 Array = np.ndarray
 I = kernel.INDEX  # noqa: E741
@@ -89,6 +91,11 @@ class JointModel(JointPlant):
       ]
       result.append(np.array(rows))
     return result
+
+  @functools.cached_property
+  def law(self) -> tuple[ServoLaw, Array] | None:
+    """The law of its servo and what that leaves of the duty [N], where logs hold it."""
+    return servo_law(self)
 
   def tilt_load(self, x: float, y: float) -> Load:
     """Returns what turning gravity by the rotation vector (x, y, 0) adds."""

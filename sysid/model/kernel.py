@@ -22,7 +22,7 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from nerf2real.suite.effects import gear_train
+from nerf2real.suite.effects import gear_train, laws
 from nerf2real.suite.effects.backlash import LINK_SHARE, ROTOR_WITHOUT_ARMATURE
 from nerf2real.sysid.model.kernel_cache import discard_stale
 
@@ -53,6 +53,8 @@ NAMES = (
   *("follow", "follow_speed"),
   # the same of the supply as of heat
   *("sag_scales_limit", "sag_tells"),
+  # torque at a duty over the declared: nothing here needs it, what is told of the duty does
+  "strength",
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 
@@ -60,6 +62,7 @@ NEUTRAL = {
   "heat_tells": 1.0,
   "sag_tells": 1.0,
   "gain": 1.0,
+  "strength": 1.0,
   "stribeck_velocity": 0.1,
   "load_velocity": 0.1,
   "time_constant": 300.0,
@@ -70,8 +73,9 @@ NEUTRAL = {
 """Values that do nothing, where that is not zero."""
 
 _LITTLE = 0.03  # rad; beyond it series of three terms are no longer exact to rounding
-_LEAST_STRENGTH = 0.1  # as suite.effects.actuation
-_CACHE = discard_stale(Path(__file__).parent, ("kernel",), (Path(gear_train.__file__),))
+_CACHE = discard_stale(
+  Path(__file__).parent, ("kernel",), (Path(gear_train.__file__), Path(laws.__file__))
+)
 
 
 @numba.njit(cache=_CACHE, nogil=True, fastmath=False, error_model="numpy")
@@ -179,14 +183,14 @@ def simulate(
   armature, damping, friction, drag = p[6], p[7], p[8], p[9]
   stiffness, reference = p[10], p[11]
   gain, delay, late, late_effort, rate = p[12], p[13], p[14], p[15], p[16]
-  breakaway, stribeck, load_share, offset_force = p[17], max(p[18], 1e-6), p[19], p[20]
+  breakaway, stribeck, load_share, offset_force = p[17], p[18], p[19], p[20]
   half, on_motor, encoder = 0.5 * p[21], p[22], p[23]
   droop, fade, heating, cooling, derating = p[24], p[25], p[26], p[27], p[28]
   amplitude, periods, phase = p[29], p[30], p[31]
-  load_kind = int(p[32])
+  load_kind = p[32]
   softness, stopping_rate = p[33], p[34]
   heat_limits, heat_tells = p[35] > 0.5, p[36] > 0.5
-  load_square, load_at_rest, load_velocity = p[37], p[38], max(p[39], 1e-6)
+  load_square, load_at_rest, load_velocity = p[37], p[38], p[39]
   tooth_stiffness, tooth_damping, friction_on_link = p[40], p[41], p[42]
   follow, follow_speed = p[43], p[44]
   sag_limits, sag_tells = p[45] > 0.5, p[46] > 0.5
@@ -258,12 +262,12 @@ def simulate(
       before = torque  # of the last step
       inner, outer, untold = gain, 1.0, 1.0  # strength before the limits and after; not in efforts
       if heating > 0.0:
-        heat = heat * keep_cool + heating * step * before * before
-        weaker = max(1.0 - derating * heat, _LEAST_STRENGTH)
+        heat = laws.warmed(heat, before, heating * step, keep_cool)
+        weaker = laws.strength_of_heat(heat, derating)
         inner, outer = (inner, outer * weaker) if heat_limits else (inner * weaker, outer)
         untold *= 1.0 if heat_tells else weaker
       if droop > 0.0 or fade != 0.0:
-        weaker = max(1.0 - droop * (abs(before) + load[i]) - fade * time, _LEAST_STRENGTH)
+        weaker = laws.strength_of_supply(abs(before) + load[i], time, droop, fade)
         inner, outer = (inner, outer * weaker) if sag_limits else (inner * weaker, outer)
         untold *= 1.0 if sag_tells else weaker
       strength = inner * outer
@@ -291,30 +295,19 @@ def simulate(
         demand = demand * cosine + gravity_sin[i] * sine
       passive = -demand - bias[i] + offset_force - stiffness * (q - reference)
       if amplitude != 0.0:
-        passive += amplitude * math.sin(periods * q + phase)
+        passive += laws.cogging(q, amplitude, periods, phase)
       if learned:
         passive += force_at(q, v, weights, bounds)
       limit = friction
       if breakaway > 0.0:
-        ratio = v / stribeck
-        limit += breakaway * math.exp(-ratio * ratio)
+        limit += laws.stribeck(v, breakaway, stribeck)
       if load_share > 0.0 or load_square > 0.0:
-        carried = before  # of the last step, as suite.effects
-        if load_kind == 1:
-          carried = before - damping * v
-        elif load_kind == 2:
-          carried = demand + bias[i] + inertia[i] * acceleration
-        elif load_kind >= 3:
-          motor_side = abs(before - damping * v)
-          link_side = abs(demand + bias[i] + inertia[i] * acceleration)
-          carried = max(motor_side, link_side)
-          if load_kind == 4:
-            carried = 0.5 * (motor_side + link_side)
-        rubbing = (load_share + load_square * abs(carried)) * abs(carried)
-        if load_at_rest > 0.0:
-          ratio = v / load_velocity
-          rubbing *= 1.0 + load_at_rest * math.exp(-ratio * ratio)
-        limit += rubbing
+        taken = demand + bias[i] + inertia[i] * acceleration
+        # Torque of the last step, as suite.effects.
+        carried = laws.gear_load(load_kind, before, before - damping * v, taken)
+        limit += laws.load_friction(
+          carried, v, load_share, load_square, load_at_rest, load_velocity
+        )
       back_emf = 0.0
       if outer * lowest < torque < outer * highest:
         back_emf = strength * per_v

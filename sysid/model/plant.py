@@ -167,6 +167,12 @@ class JointPlant:
     index = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
     return index if index >= 0 else int(self.model.jnt_bodyid[self.model.joint(name).id])
 
+  @property
+  def logs_duty(self) -> bool:
+    """Whether all logs hold the duty of an actuator that limits it."""
+    limited = bool(np.isfinite(self.declared[kernel.INDEX["highest"]]))
+    return self.holds and limited and all(log.duty is not None for log in self.logs)
+
   def declared_torque(self) -> Array:
     """Returns the size of the declared actuator's torque over all logs [N]."""
     outputs = [

@@ -8,15 +8,19 @@ that is missing. Shapes: N samples.
 
 import numpy as np
 
+from nerf2real.suite.effects import laws
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.signatures import TorqueResidual
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.selection.explain import Scored
+from nerf2real.sysid.selection.evidence import Scored
 
 Array = np.ndarray
 
+_COGGING, _STRIBECK, _LOAD_FRICTION, _GEAR_LOAD = map(
+  laws.over, (laws.cogging, laws.stribeck, laws.load_friction, laws.gear_load)
+)
 _AT_REST = 0.02  # of the usual highest speed, below which a joint may stick; ours
 
 
@@ -32,7 +36,7 @@ def missing_torque(plant: JointModel, item: Scored, index: int) -> tuple[TorqueR
   r = signatures.torque_residual(plant, hypothesis, index)
   value = dict(zip(INDEX, hypothesis.p, strict=True))
   needed = -r.residual + value["drag"] * np.abs(r.velocity) * r.velocity
-  needed -= value["amplitude"] * np.sin(value["periods"] * r.position + value["phase"])
+  needed -= _COGGING(r.position, value["amplitude"], value["periods"], value["phase"])
   limit = _friction(value, r, needed)
   moving = np.abs(r.velocity) > _AT_REST * np.quantile(np.abs(r.velocity), 0.98)
   sliding = needed + limit * np.sign(r.velocity)
@@ -42,18 +46,9 @@ def missing_torque(plant: JointModel, item: Scored, index: int) -> tuple[TorqueR
 
 def _friction(value: dict[str, float], r: TorqueResidual, needed: Array) -> Array:
   """Returns the limit of dry friction [N]."""
-  ratio = r.velocity / max(value["stribeck_velocity"], 1e-6)
-  limit = value["friction"] + value["breakaway"] * np.exp(-(ratio**2))
-  carried = r.torque
-  if value["load_kind"] == 1:
-    carried = r.torque - value["damping"] * r.velocity
-  elif value["load_kind"] == 2:
-    carried = r.torque + needed - value["damping"] * r.velocity
-  size = np.abs(carried)
-  if value["load_kind"] >= 3:
-    motor = r.torque - value["damping"] * r.velocity
-    sides = np.abs([motor, motor + needed])
-    size = sides.max(axis=0) if value["load_kind"] == 3 else sides.mean(axis=0)
-  rubbing = (value["load_coefficient"] + value["load_square"] * size) * size
-  fall = r.velocity / max(value["load_velocity"], 1e-6)
-  return limit + rubbing * (1.0 + value["load_at_rest"] * np.exp(-(fall**2)))
+  motor = r.torque - value["damping"] * r.velocity
+  load = _GEAR_LOAD(value["load_kind"], r.torque, motor, motor + needed)
+  names = ("load_coefficient", "load_square", "load_at_rest", "load_velocity")
+  rubbing = _LOAD_FRICTION(load, r.velocity, *(value[name] for name in names))
+  falling = _STRIBECK(r.velocity, value["breakaway"], value["stribeck_velocity"])
+  return value["friction"] + falling + rubbing

@@ -16,9 +16,9 @@ from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
-from nerf2real.sysid.selection import changes, claims, scopes
+from nerf2real.sysid.selection import changes, claims, scopes, wide
 from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.explain import clear
+from nerf2real.sysid.selection.evidence import clear
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.naming import Name
 from nerf2real.sysid.selection.scopes import Shared
@@ -76,7 +76,7 @@ def analyse(
   if len(off) > _ALL_OFF * len(joints) and len(off) > 1:
     result.effects = [row for row in result.effects if row not in off]
     result.effects.append(claims.constants_of_all(off))
-  result.verdict = _verdict([c.verdict for c in changed] + ["effects"] * bool(shared))
+  result.verdict = machine_verdict([c.verdict for c in changed], claimed=bool(result.effects))
   return result
 
 
@@ -96,6 +96,7 @@ def _explained(
     changed = [changes.explain(subject, settings) for subject in subjects]
     needless = scopes.needless(shared, changed)
     if not needless:
+      changes.elaborate(changed)
       return shared, changed
     refuted |= {s.term.kind for s in needless}
     for subject, state in zip(subjects, before, strict=True):
@@ -112,19 +113,23 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   }
   effect, row = claims.shared(shared.term, shared.x, bounds, evidence)
   if shared.term.kind == "payload":
-    row |= {"joint": shared.origin.joint, "body": shared.term.target}
+    body = result.model.body(str(shared.term.target)).id
+    row |= {"joint": wide.ancestors(result.model, body)[0], "body": shared.term.target}
   result.objects.append(effect)
   result.effects.append(row)
 
 
-def _verdict(verdicts: Sequence[str]) -> str:
-  """Returns the machine's verdict: names stand where any joint has them, and say what is left."""
+def machine_verdict(verdicts: Sequence[str], *, claimed: bool) -> str:
+  """Returns the machine's verdict, which speaks of effects only where the report claims one.
+
+  Args:
+    verdicts: the joints'.
+    claimed: whether the report lists an effect.
+  """
   kinds = set(verdicts)
-  if kinds <= {"none"}:
-    return "none"
-  if kinds <= {"none", "effects"}:
-    return "effects"
-  return "partly" if kinds & {"effects", "partly"} else "unexplained"
+  if not claimed:
+    return "none" if kinds <= {"none"} else "unexplained"
+  return "effects" if kinds <= {"none", "effects"} else "partly"
 
 
 def _write_down(result: Identified, item: Changed) -> None:

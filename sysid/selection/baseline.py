@@ -4,7 +4,7 @@ import dataclasses
 
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.explain import Scored
+from nerf2real.sysid.selection.evidence import Scored
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 

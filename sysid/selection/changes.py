@@ -19,8 +19,11 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.selection import rivals
 from nerf2real.sysid.selection.elaboration import elaborated
-from nerf2real.sysid.selection.explain import UNREPEATED, Explainer, Scored, clear
+from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear
+from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import Explanation, conclude
 from nerf2real.sysid.selection.remainder import grown, scatter, structured
 from nerf2real.sysid.selection.subject import Subject, following
@@ -31,6 +34,9 @@ Array = np.ndarray
 
 _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
+_REST = 0.1
+"""Of the squares that all joints leave: less is left to joints that are not elaborated, chosen (5 %
+of the error)."""
 
 
 @dataclasses.dataclass
@@ -48,6 +54,8 @@ class Changed:
   """What the machine leaves anyway in the median block, rad (m)."""
   left: float
   """The same of the logs, under the best hypothesis."""
+  more_remains: bool
+  """Whether that is more than the machine leaves anyway, by the limit of what counts as more."""
   constants_off: bool
   """Whether declared constants are off by more than machines of one kind differ."""
   elaborated: list[Scored] = dataclasses.field(default_factory=list)
@@ -132,8 +140,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
-  if leaves(subject, explainer.null, settings):
-    ranked = explainer.explain(leaves=lambda item: leaves(subject, item, settings))
+  if _may_leave(subject, explainer.null, settings):
+    ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
@@ -146,22 +154,18 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   if now.follows:
     anyway = max(anyway, scatter(now, found.best))
   left = float(np.median(found.left))
-  over = float(np.sqrt(left / max(anyway, 1e-300)))
-  if named and over > settings.more:
+  more = left > settings.more**2 * anyway
+  if named and more:
     named = _supported(explainer, found.best, named, subject.beyond)
     ranked = explainer.ranked()
   verdict = _verdict(
     found,
     named,
     any(t.wider for t in known),
-    leaves(subject, found.best, settings),
-    over,
-    settings,
+    more or leaves(subject, found.best, settings),
+    more,
   )
   off = _constants_off(subject, found.best, settings)
-  near = []
-  if verdict in ("partly", "unexplained") and not now.follows:
-    near = elaborated(explainer, found.best, named)
   return Changed(
     subject,
     ranked,
@@ -170,9 +174,25 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     "effects" if off and verdict == "none" else verdict,
     float(np.sqrt(anyway)),
     float(np.sqrt(left)),
+    more,
     off,
-    near,
   )
+
+
+def elaborate(found: Sequence[Changed]) -> None:
+  """Adds fits with richer friction where more remains than names explain.
+
+  They make predictions better by what is left. Joints come in the order of that, until all others
+  together leave no more than a tenth of the squares.
+  """
+  left = sorted(found, key=lambda c: -c.left)
+  most = np.cumsum([c.left**2 for c in left])
+  before = np.append(0.0, most[:-1])
+  for item, sum_before in zip(left, before, strict=True):
+    if sum_before > (1.0 - _REST) * most[-1]:
+      break
+    if item.verdict in ("partly", "unexplained") and not item.likelihood.follows:
+      item.elaborated = elaborated(item.subject.explainer, item.found.best, item.named)
 
 
 def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
@@ -206,12 +226,13 @@ def _supported(
   """
   kept = []
   for kind in named:
-    without = explainer.lacking(best, kind)
+    without = rivals.lacking(explainer, best, kind)
     if kind in VARIABLE:
-      rival = explainer.with_force(without, VARIABLE[kind])
+      rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond
     else:
-      stands = clear(explainer.with_force(best), explainer.with_force(without)) > beyond
+      forced = (rivals.with_force(explainer, s) for s in (best, without))
+      stands = clear(*forced) > beyond
     if stands:
       kept.append(kind)
   return tuple(kept)
@@ -229,6 +250,14 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
     return grown(item, subject.usual, subject.beyond, settings)
   left = float(np.sqrt(np.median(item.fit.held[0][0])))
   return left > settings.more * subject.now.position_noise
+
+
+def _may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
+  """Tells whether a hypothesis may leave more than the machine does anyway: effects are tried then,
+  and names must be clear by themselves."""
+  if subject.usual is not None and not subject.paired:
+    return grown(item, subject.usual, settings.suspected, settings)
+  return leaves(subject, item, settings)
 
 
 def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
@@ -268,8 +297,7 @@ def _verdict(
   named: Sequence[str],
   shared: bool,
   remains: bool,
-  over: float,
-  settings: Settings,
+  more: bool,
 ) -> str:
   """Returns the graded verdict of a joint.
 
@@ -277,12 +305,11 @@ def _verdict(
     found: the best hypothesis.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
-    remains: whether more remains than the machine leaves anyway.
-    over: what the median block leaves, over what the machine leaves anyway.
-    settings: limits.
+    remains: whether more is left than the machine leaves anyway, by a test or by that limit.
+    more: whether it is by the limit.
   """
   if not named and not shared:
     return "unexplained" if remains or found.best.names else "none"
   if not named and not remains:
     return "none"
-  return "effects" if over <= settings.more else "partly"
+  return "partly" if more else "effects"

@@ -15,16 +15,18 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.rich_friction import FORMS, REPLACED, rich_friction
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING, Term
-from nerf2real.sysid.selection.explain import Explainer, Scored
+from nerf2real.sysid.selection.evidence import Scored, kinds_of
+from nerf2real.sysid.selection.explain import Explainer
 
 Array = np.ndarray
 
 _NEAR = 0.95
 """Share of a posterior that lies within so much of the least cost: half a quantile of chi square
 with as many degrees as values."""
-_MOST = 10  # fits that are fitted anew without each log, chosen
-_REFITTED = 3  # Jacobians at most of a fit without a fold
-_ROUNDS = 2  # of fitting and setting the scale by the best
+_MOST = 8  # fits that are fitted to the end and anew without each log, chosen
+_FIRST = 3  # steps after which the best are chosen
+_REFITTED = 3  # Jacobians at most of a fit
+_ROUNDS = 3  # of fitting and setting the scale by the best
 
 
 def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> list[Scored]:
@@ -39,22 +41,18 @@ def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> li
     named: kinds that every one must have.
   """
   joint = explainer.joint
-  tried: list[tuple[Fitter, Scored]] = []
-  for terms, x in _bases(explainer, best, named):
-    for carried in FORMS:
-      term = rich_friction(joint.plant, carried)
-      fitter = Fitter([joint], Layout([(*terms, term)]))
-      for start in term.starts:
-        fit = fitter.fit(np.concatenate([x, start]), iterations=3)
-        tried.append((fitter, Scored((*terms, term), fit, np.zeros(0))))
+  tried = sorted(_begun(explainer, best, named), key=lambda t: t[1].fit.cost)[:_MOST]
   for _ in range(_ROUNDS):
-    joint.rescale(min(tried, key=lambda t: t[1].fit.cost)[1].fit.residuals[0])
     for fitter, item in tried:
-      item.fit = fitter.fit(item.fit, iterations=3)
+      item.fit = fitter.fit(item.fit, iterations=_REFITTED)
+    tried.sort(key=lambda t: t[1].fit.cost)
+    joint.rescale(tried[0][1].fit.residuals[0])
+  for fitter, item in tried:
+    item.fit = fitter.again(item.fit)
   tried.sort(key=lambda t: t[1].fit.cost)
   least = tried[0][1].fit
   reach = 0.5 * float(chi2.ppf(_NEAR, least.layout.count))
-  near = [(fitter, s) for fitter, s in tried[:_MOST] if s.fit.cost < least.cost + reach]
+  near = [(fitter, s) for fitter, s in tried if s.fit.cost < least.cost + reach]
   for fitter, item in near:
     item.nats = joint.loglik(fitter.leave_out(item.fit).held[0])
   explainer.rescore()
@@ -63,6 +61,26 @@ def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> li
   if crossed(joint, plain) > left_out[0][0]:
     return []
   return [s for nats, s in left_out if nats > left_out[0][0] - reach]
+
+
+def _begun(
+  explainer: Explainer, best: Scored, named: Collection[str]
+) -> list[tuple[Fitter, Scored]]:
+  """Returns every form from every start after a few steps, the derivatives of what it is added to
+  taken over."""
+  joint, tried = explainer.joint, []
+  for terms, x in bases(explainer, best, named):
+    known = Fitter([joint], Layout([terms])).linearise(x).jacobian[0]
+    for carried in FORMS:
+      term = rich_friction(joint.plant, carried)
+      fitter = Fitter([joint], Layout([(*terms, term)]))
+      blank = [np.concatenate([known, np.zeros((len(term.names), *known.shape[1:]))])]
+      fresh = np.arange(len(x) + len(term.names)) >= len(x)
+      for start in term.starts:
+        begin = fitter.linearise(np.concatenate([x, start]), known=blank, fresh=fresh)
+        fit = fitter.fit(begin, iterations=_FIRST, quick=True)
+        tried.append((fitter, Scored((*terms, term), fit, np.zeros(0))))
+  return tried
 
 
 def crossed(joint: JointLikelihood, item: Scored) -> float:
@@ -77,11 +95,11 @@ def crossed(joint: JointLikelihood, item: Scored) -> float:
   return total
 
 
-def _bases(
+def bases(
   explainer: Explainer, best: Scored, named: Collection[str]
 ) -> list[tuple[tuple[Term, ...], Array]]:
   """Returns what richer friction is added to: the named effects on constants within tolerances, and
-  on freed ones."""
+  on freed ones; a name that is theirs needs the freed ones."""
   gone = {FREE, STICKING, "load_friction", *(k for k in REPLACED if k not in named)}
   kept = [
     t
@@ -94,4 +112,5 @@ def _bases(
   bases = [(tight, x)]
   if explainer.freed is not None:
     bases.append((tuple(explainer.freed if t.kind == CONSTANTS else t for t in kept), x))
-  return bases
+  rich = {"load_friction"}
+  return [(terms, x) for terms, x in bases if kinds_of(terms) | rich >= set(named)]

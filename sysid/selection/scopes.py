@@ -16,9 +16,9 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection import wide
+from nerf2real.sysid.selection import rivals, wide
 from nerf2real.sysid.selection.changes import Changed, leaves
-from nerf2real.sysid.selection.explain import Scored
+from nerf2real.sysid.selection.evidence import Scored
 from nerf2real.sysid.selection.naming import USUAL
 from nerf2real.sysid.selection.subject import Subject
 from nerf2real.sysid.selection.wide import Evidence, Wide
@@ -85,21 +85,39 @@ def shared_effects(
     found.append(best)
     for member in best.members:
       member.take(best.held)
-  return found
+  return _settled(found)
+
+
+def _settled(found: Sequence[Shared]) -> list[Shared]:
+  """Returns the effects with values that hold beside all others: they were found in turn."""
+  settled = list(found)
+  for at, item in enumerate(found if len(found) > 1 else ()):
+    for member in item.members:
+      member.known = tuple(t for t in member.known if t != item.held)
+    again = wide.resumed(item.term, item.members, item.x)
+    settled[at] = dataclasses.replace(item, x=again.x, reach=_reach(again))
+    for member in item.members:
+      member.take(settled[at].held)
+  return settled
+
+
+def _reach(item: Wide) -> tuple[Array, Array]:
+  spread = intervals.spread(item.fit, [m.now for m in item.members])
+  return intervals.reaches(item.fit, spread, (0, len(item.x)))
 
 
 def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   """Returns the best of the screened effects if it is clear of all that lack it."""
   forms: dict[tuple[str, str | None], Wide] = {}
-  for item in sorted(tried, key=lambda w: -w.evidence().total):
+  for item in sorted(tried, key=lambda w: -w.possible().total):
     forms.setdefault(item.key, item)
   if not forms:
     return None
   beyond = max(m.beyond for item in forms.values() for m in item.members)
   top, *others = forms.values()
-  if top.evidence().clear < beyond:
+  if top.possible().clear < beyond:
     return None
-  near = [w for w in others if (top.evidence() - w.evidence()).clear < beyond]
+  near = [w for w in others if (top.evidence() - w.possible()).clear < beyond]
   top = wide.adopted(wide.fitted(top), [m for w in near for m in w.members])
   items = sorted([top, *map(wide.fitted, near)], key=lambda w: -w.evidence().total)
   alike = [w for w in items if wide.same(items[0], w)]
@@ -109,9 +127,7 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   most = max(range(len(single)), key=lambda at: single[at].total)
   rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
   clear = min(mine.clear, *((mine - r).clear for r in rivals))
-  joints = [m.now for m in best.members]
-  spread = intervals.covariance(best.fit, joints, systematic=intervals.SYSTEMATIC)
-  reach = intervals.reaches(best.fit, spread, (0, len(best.x)))
+  reach = _reach(best)
   nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
   if clear < beyond or nothing or not _is_new(best, beyond):
     return None
@@ -146,7 +162,9 @@ def _is_new(item: Wide, beyond: float) -> bool:
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
   """Returns the shared effects without which the joints' explanations do about as well.
 
-  What joints have of their own may look like one effect of all of them.
+  What joints have of their own may look like one effect of all of them. Where more remains at a
+  joint than the machine leaves anyway, both have a force of any form beside them there: what is
+  named may be a part of what remains.
 
   Args:
     found: the shared effects.
@@ -158,6 +176,8 @@ def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared
     for item in (c for c in changed if c.subject in shared.members):
       best = item.found.best
       without = wide.without(item.subject, best, shared.held)
+      if item.more_remains:
+        best, without = (rivals.beside(item.subject.explainer, s) for s in (best, without))
       rows[item.joint], prior = best.nats - without.nats, prior + best.prior - without.prior
     if Evidence(rows, prior).clear < shared.origin.beyond:
       result.append(shared)

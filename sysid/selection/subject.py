@@ -21,7 +21,9 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection.baseline import freed_constants, known_terms, widened
-from nerf2real.sysid.selection.explain import Explainer, Scored
+from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import conclude, threshold
 from nerf2real.sysid.selection.remainder import structured
 from nerf2real.sysid.settings import Settings
@@ -159,7 +161,7 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   library = own_library(before.plant, alone=subject.alone)
   known = [sticking(before.plant)]
   first = Explainer(before, own, library, settings=settings, known=known)
-  usual = conclude(before, first.explain(settings.reference_depth), subject.beyond).best
+  usual = conclude(before, grow(first, settings.reference_depth), subject.beyond).best
   shared = [t for t in subject.known if t.wider]
   subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
   subject.paired = subject.now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
@@ -189,4 +191,4 @@ def own_library(plant: JointModel, *, alone: bool) -> list[Term]:
   waves = signatures.waves(plant)
   terms = [*candidates.library(plant), candidates.cogging(plant, waves)]
   terms = [t for t in terms if alone or t.kind not in WHOLE]
-  return [plausible(term) for term in terms] if plant.hinge else terms
+  return [plausible(term, plant) for term in terms] if plant.hinge else terms

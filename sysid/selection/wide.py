@@ -1,8 +1,9 @@
 """Hypotheses of a body or of the whole machine, fitted to all joints that they concern.
 
 Every hypothesis is screened over all its joints: from where its values and the joints' constants
-cost least, two Gauss-Newton steps of the shared values with the constants following. What the best
-of them is not clearly better than is fitted to the end. Shapes: B blocks, n shared values.
+cost least, two rounds of Gauss-Newton steps of the shared values with the constants following. What
+the best of them is not clearly better than, with what its next step promises, is fitted to the end.
+Shapes: B blocks, n shared values.
 """
 
 import dataclasses
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from nerf2real.sysid.fit import rough
 from nerf2real.sysid.fit.layout import CLOCKS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
@@ -18,7 +20,7 @@ from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.point_mass import carrying
-from nerf2real.sysid.selection.explain import Scored, variance
+from nerf2real.sysid.selection.evidence import Scored, variance
 from nerf2real.sysid.selection.subject import WHOLE, Subject
 
 Array = np.ndarray
@@ -54,6 +56,12 @@ class Wide:
   def evidence(self) -> "Evidence":
     """Returns the gain over the joints without it."""
     return _evidence(self.members, self.fit)
+
+  def possible(self) -> "Evidence":
+    """Returns the gain with what a further step promises: screened effects have not settled."""
+    promised = Fitter([m.now for m in self.members], self.fit.layout).promised(self.fit)
+    found = self.evidence()
+    return dataclasses.replace(found, prior=found.prior - promised)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +100,7 @@ def hypotheses(
   machine: dict[tuple, Term] = {}
   for subject in subjects:
     plant = subject.now.plant
-    terms = [plausible(t) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
+    terms = [plausible(t, plant) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
     late = [dataclasses.replace(t, target=None) for t in subject.library if t.kind in _LATE]
     for term in (*terms, *late):
       known = machine.get((term.kind, term.fixed))
@@ -113,7 +121,8 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
 
 
 def screened(term: Term, members: Sequence[Subject]) -> Wide:
-  """Returns an effect after two steps from its best start, constants' derivatives taken over."""
+  """Returns an effect after two rounds of steps from its best start, the constants' derivatives
+  taken over."""
   layout = Layout([m.explainer.null.terms for m in members], [term])
   joints = [m.now for m in members]
   begin = _begin(term, members)
@@ -123,7 +132,7 @@ def screened(term: Term, members: Sequence[Subject]) -> Wide:
     jacobian = m.explainer.null.fit.jacobian[0]
     known.append(np.concatenate([jacobian, np.zeros((count, *jacobian.shape[1:]))]))
   fresh = np.arange(layout.count) < count
-  fit = Fitter(joints, layout).fit(begin, iterations=2, known=known, fresh=fresh, quick=True)
+  fit = Fitter(joints, layout).fit(begin, iterations=2, known=known, fresh=fresh)
   return Wide(term, tuple(members), fit)
 
 
@@ -132,8 +141,16 @@ def fitted(item: Wide) -> Wide:
   fitter = Fitter([m.now for m in item.members], item.fit.layout)
   fit = fitter.fit(item.fit, iterations=_ENOUGH)
   if _late(item.term):
-    fit = fitter.look_about(fit, ("delay",), iterations=_ENOUGH)
+    fit = rough.look_about(fitter, fit, ("delay",), iterations=_ENOUGH)
   return dataclasses.replace(item, fit=fitter.leave_out(fit))
+
+
+def resumed(term: Term, members: Sequence[Subject], x: Array) -> Wide:
+  """Returns an effect fitted to the end from known values, beside what its joints have by now."""
+  layout = Layout([m.known for m in members], [term])
+  start = np.concatenate([x, *[m.explainer.null.fit.x for m in members]])
+  fit = Fitter([m.now for m in members], layout).linearise(start)
+  return fitted(Wide(term, tuple(members), fit))
 
 
 def _late(term: Term) -> list[int]:

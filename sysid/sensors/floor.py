@@ -7,34 +7,30 @@ differ horizontally by
     m = Rz(-psi) s + b
 
 s: the floor's slope, fixed in the world. b: what turns with the robot, a tilted or biased IMU,
-zeros of the legs' encoders. Headings come from the integrated gyroscope, its zero from the stops.
-A robot that always faces one way cannot tell s from b: then both are listed as alternatives.
+zeros of the legs' encoders. Headings are known, or come from the integrated gyroscope, its zero
+from the stops. A robot that always faces one way cannot tell s from b: then both are listed as
+alternatives.
 
-The slope's axes are the world's of a model that faces at its first stop as in qpos0.
+The slope's axes are those of the known headings, else the world's of a model that faces at its
+first stop as in qpos0.
 
 Shapes: N readings, K stops.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from nerf2real.core import least_squares, rotations
-from nerf2real.core.robot_logs.reading import ImuSeries, Log
-from nerf2real.sysid.model.reduction import smooth_motion
+from nerf2real.core import least_squares
+from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.sensors import standing
 from nerf2real.sysid.sensors.sensed import Estimate, Part, row
+from nerf2real.sysid.sensors.stops import Stood, Stops, find_stops, join_stops, known_stops
 
 Array = np.ndarray
 
-_STILL = (0.1, 0.05)  # rad/s of the torso beyond its zero, of any joint
-_SLOWLY = 0.12  # s over which a speed is taken: counts of an encoder that flicker are no motion
-_STOP = 0.6  # s that a stop lasts at least
-_EDGE = 0.15  # s at both ends of a stop that are left out: the robot still rocks
 _USUAL = 0.02  # rad; ours: floors of rooms, zeros of encoders
 _NOISE = 0.002  # rad; no stop is known better
 _ROUGH = (
@@ -47,20 +43,17 @@ _SIGMAS = 3.0
 _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Stops:
-  """One log's stops."""
+def find(
+  model: mujoco.MjModel, logs: Sequence[Log], known: Sequence[Sequence[Stood]] | None = None
+) -> Part | None:
+  """Returns the floor's slope; None where model or logs cannot show one.
 
-  heading: Array
-  """[K] rad in the model's world, the first as in qpos0."""
-  tilt: Array
-  """[K, 2] rad: the floor's normal beside gravity's, along the heading and to its left."""
-  sensor: Array
-  """[3, 3], torso from IMU."""
-
-
-def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Part | None:
-  """Returns the floor's slope; None where model or logs cannot show one."""
+  Args:
+    model: with a floor, and a free body with an accelerometer.
+    logs: of it; each is judged by its own stops.
+    known: where it stood in each log and how it faced: all are judged together then. None: stops
+      and headings are found.
+  """
   plane, root, site = standing.floor(model), _root(model), _site(model)
   if plane is None or root is None or site is None:
     return None
@@ -69,11 +62,15 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Part | None:
   limbs = [model.joint(i).name for i in range(model.njnt) if _of(model, i) == root]
   if any(not set(limbs) <= set(log.joints) for log in logs):
     return None
-  stops = [_stops(model, log, root, site) for log in logs]
-  stops = [s for s in stops if len(s.heading)]
-  if not stops:
+  if known is None:
+    found = [find_stops(model, log, root, site) for log in logs]
+  else:
+    each = [known_stops(model, *one, root, site) for one in zip(logs, known, strict=True)]
+    found = [join_stops(each)]
+  found = [s for s in found if len(s.heading)]
+  if not found:
     return Part(notes=["The robot never stands still in the logs: no slope of the floor shows."])
-  judged = [_judge(s, plane) for s in stops]
+  judged = [_judge(s, plane) for s in found]
   named = [part for part in judged if part.rows]
   return max(named or judged, key=lambda part: part.before or 0.0)
 
@@ -106,85 +103,7 @@ def _site(model: mujoco.MjModel) -> int | None:
   return int(model.sensor_objid[found[0]]) if len(found) else None
 
 
-def _stops(model: mujoco.MjModel, log: Log, root: int, site: int) -> _Stops:
-  motion = smooth_motion(log, half_width=_SLOWLY)
-  data, imu = mujoco.MjData(model), log.imu
-  assert imu is not None
-  moving = np.abs(motion.velocity).max(axis=1)
-  rate = imu.angular_velocity
-  zero = np.median(rate, axis=0)
-  calm = np.interp(imu.stamp, motion.time, moving) < _STILL[1]
-  calm &= _smooth(np.linalg.norm(rate - zero, axis=1)) < _STILL[0]
-  spans = _spans(calm, imu.stamp)
-  if not spans:
-    return _Stops(np.zeros(0), np.zeros((0, 2)), np.eye(3))
-  zero = np.median(np.concatenate([rate[s] for s in spans]), axis=0)
-  start, address = int(model.jnt_qposadr[model.body_jntadr[root]]), model.jnt_qposadr
-  qpos = address[[model.joint(name).id for name in log.joints]]
-  headings, tilts, first, sensor = [], [], None, np.eye(3)
-  for span in spans:
-    within = (motion.time >= imu.stamp[span][0]) & (motion.time <= imu.stamp[span][-1])
-    data.qpos[:] = model.qpos0
-    data.qpos[start + 3 : start + 7] = (1, 0, 0, 0)
-    data.qpos[qpos] = np.median(motion.position[within], axis=0)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    # The root's frame is the world's here, so is the IMU's pose in it.
-    sensor = data.site_xmat[site].reshape(3, 3)
-    up = sensor @ np.mean(imu.linear_acceleration[span], axis=0)
-    up /= np.linalg.norm(up)
-    floor = standing.normal(model, data, root, up)
-    if floor is None:
-      continue
-    turned = _turned(imu, zero, sensor, span)
-    if first is None:
-      first = (up, turned)
-    ahead, left = _level(up)
-    tilts.append((floor @ ahead, floor @ left))
-    ahead, left = _level(first[0])
-    now = (first[1].inv() * turned).apply(_level(up)[0])
-    headings.append(np.arctan2(now @ left, now @ ahead))
-  faced = rotations.yaw_of(rotations.matrix_from_quaternion(model.qpos0[start + 3 : start + 7]))
-  return _Stops(np.array(headings) + faced, np.array(tilts).reshape(-1, 2), sensor)
-
-
-def _smooth(values: Array) -> Array:
-  """Returns a mean over 9 readings: noise is no motion."""
-  return np.convolve(np.pad(values, 4, mode="edge"), np.full(9, 1 / 9), mode="valid")
-
-
-def _spans(calm: Array, stamp: Array) -> list[slice]:
-  """Returns the stretches of readings in which the robot stands still, without their ends."""
-  edges = np.flatnonzero(np.diff(np.concatenate([[0], calm.astype(int), [0]])))
-  found = []
-  for begin, end in zip(edges[::2], edges[1::2], strict=True):
-    inner = np.flatnonzero(
-      (stamp[begin:end] > stamp[begin] + _EDGE) & (stamp[begin:end] < stamp[end - 1] - _EDGE)
-    )
-    if len(inner) > 5 and stamp[end - 1] - stamp[begin] > _STOP:
-      found.append(slice(begin + int(inner[0]), begin + int(inner[-1]) + 1))
-  return found
-
-
-def _turned(imu: ImuSeries, zero: Array, sensor: Array, span: slice) -> Rotation:
-  """Returns the torso's rotation from the log's start to the middle of a stop, by the gyroscope."""
-  middle = (span.start + span.stop) // 2
-  steps = np.diff(imu.stamp[: middle + 1])[:, None]
-  rates = (imu.angular_velocity[:middle] + imu.angular_velocity[1 : middle + 1]) / 2 - zero
-  total = Rotation.identity()
-  for step in Rotation.from_rotvec((rates * steps) @ sensor.T):
-    total = total * step
-  return total
-
-
-def _level(up: Array) -> tuple[Array, Array]:
-  """Returns the body's x axis made level, and what lies to its left."""
-  ahead = np.array([1.0, 0, 0]) - up[0] * up
-  ahead /= np.linalg.norm(ahead)
-  return ahead, np.cross(up, ahead)
-
-
-def _fit(stops: _Stops, slope: bool, chosen: Array) -> tuple[Array, Array]:
+def _fit(stops: Stops, slope: bool, chosen: Array) -> tuple[Array, Array]:
   """Returns s and b [4] and their covariance per square rad; s is 0 without slope."""
   design = _design(stops)[chosen].reshape(-1, 4)
   free = [0, 1, 2, 3] if slope else [2, 3]
@@ -195,7 +114,7 @@ def _fit(stops: _Stops, slope: bool, chosen: Array) -> tuple[Array, Array]:
   return x, covariance
 
 
-def _design(stops: _Stops) -> Array:
+def _design(stops: Stops) -> Array:
   """Returns derivatives [K, 2, 4] of the tilts by s and b."""
   cos, sin = np.cos(stops.heading), np.sin(stops.heading)
   zero, one = np.zeros_like(cos), np.ones_like(cos)
@@ -203,7 +122,7 @@ def _design(stops: _Stops) -> Array:
   return np.stack(rows, axis=1)
 
 
-def _left_out(stops: _Stops, slope: bool) -> float:
+def _left_out(stops: Stops, slope: bool) -> float:
   """Returns the logarithm of the error [rad] on stops that were left out."""
   every, squares = np.arange(len(stops.heading)), []
   for k in every:
@@ -212,7 +131,7 @@ def _left_out(stops: _Stops, slope: bool) -> float:
   return 0.5 * float(np.log(np.mean(squares) + _NOISE**2))
 
 
-def _judge(stops: _Stops, plane: str) -> Part:
+def _judge(stops: Stops, plane: str) -> Part:
   """Returns what one log's stops say."""
   count = len(stops.heading)
   mean = stops.tilt.mean(axis=0)

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks import make_blind_sets
 from benchmarks.blind_sets import apparatus as apparatuses
 from benchmarks.blind_sets import effects, machine, plant, recording, rigid_body, sets
 from nerf2real.core.robot_logs import reading as logs
@@ -300,6 +301,14 @@ def test_sets_are_what_their_seed_says(tmp_path):
     assert log.duration == pytest.approx(16.0, abs=0.1)
     steps = np.unique(np.round(log.states.position * plant.COUNTS_PER_RADIAN, 6) % 1)
     np.testing.assert_array_equal(steps, [0.0])  # whole encoder counts
+
+
+def test_every_second_set_of_the_mix_of_halves_is_healthy():
+  drawn = [make_blind_sets.mix_of("half", index) for index in range(120)]
+  assert drawn[::2] == ["healthy"] * 60
+  counts = {mix: drawn.count(mix) for mix in sets.MIXES}
+  assert counts == {"healthy": 60, "single": 36, "pair": 12, "outside": 12}
+  assert make_blind_sets.mix_of("all", 3) == "all"
 
 
 def test_the_command_writes_answers_and_resumes(tmp_path):

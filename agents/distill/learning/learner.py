@@ -208,11 +208,19 @@ class Learner:
       self._is_fit = kind == stages.END_TO_END or (
         kind == stages.POLICY and done >= self._settings.settling
       )
-      if self._is_fit and self._counters.begun is None:
-        self._counters = dataclasses.replace(self._counters, begun=self._data.frames)
-        self._publish()
+      if self._is_fit:
+        self._begin_serving()
       self._housekeeping(kind)
+    if kind == stages.POLICY and not self._stop.is_set():  # it has learned what a short one can
+      self._is_fit = True
+      self._begin_serving()
     self._save()
+
+  def _begin_serving(self) -> None:
+    """Serves the first student."""
+    if self._counters.begun is None:
+      self._counters = dataclasses.replace(self._counters, begun=self._data.frames)
+      self._publish()
 
   # ---- periodical work ----
 

@@ -6,8 +6,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -15,6 +17,7 @@ import pytest
 
 from nerf2real.agents.distill import schedule, settings
 from nerf2real.agents.distill.learning import checkpoint
+from nerf2real.agents.distill.learning.learner import Learner
 from nerf2real.agents.distill.learning.updates import make_updates
 from nerf2real.agents.distill.settings import Stage
 from nerf2real.agents.dmpo.policy.export import load_policy
@@ -50,6 +53,27 @@ def test_a_state_is_read_as_it_was_written(tmp_path):
   other = make_updates(settings.nerf_nav(), LAYOUT).init(jax.random.PRNGKey(0))
   with pytest.raises(ValueError, match="of other networks"):
     checkpoint.load_state(tmp_path / "state.npz", like=other)
+
+
+@pytest.mark.parametrize(
+  ("kind", "stopped", "given"),
+  [("policy", False, True), ("policy", True, False), ("encoder", False, False)],
+)
+def test_a_policy_stage_that_ends_before_it_settled_gives_its_student(kind, stopped, given):
+  """A slow machine has fewer updates in its minutes: they must not end without a policy."""
+  learner, saved = object.__new__(Learner), []
+  learner._settings = dataclasses.replace(
+    TINY, stages=(Stage(kind=kind, share=1.0),), settling=1_000_000
+  )
+  learner._minutes, learner._counters = 1e-6, checkpoint.Counters()
+  learner._stop, learner._recent, learner._compiled = threading.Event(), [], set()
+  learner._data, learner._is_fit = SimpleNamespace(frames=12), False
+  learner._trainer = SimpleNamespace(begin_stage=lambda kind: None, update=lambda within: {})
+  learner._housekeeping = lambda kind: learner._stop.set() if stopped else None
+  learner._publish, learner._save = lambda: None, lambda: saved.append(learner._is_fit)
+  learner._run_stage(0)
+  assert saved == [given]
+  assert learner._counters.begun == (12 if given else None)
 
 
 def _start(run, *extra):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from types import SimpleNamespace
 
 import cv2
@@ -10,17 +11,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import Floor
 from nerf2real.scenes.alignment.overrides import Overrides
-from nerf2real.scenes.capture import keyframes, rgbd
+from nerf2real.scenes.capture import depth_pictures, keyframes, trajectory
 from nerf2real.scenes.capture.capture import (
   CaptureError,
   CaptureSettings,
   read_capture,
 )
 from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.stages import radiance_field
 from nerf2real.scenes.stages.cache import Made, StageResult, Stages
@@ -60,7 +63,7 @@ def tum(tmp_path_factory):
   rows = []
   for t, pose in zip(times, POSES, strict=True):
     numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-    rows.append(f"{t - 0.002:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
+    rows.append(f"{t:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
   (folder / "groundtruth.txt").write_text("\n".join(rows))
   return folder
 
@@ -140,7 +143,7 @@ def test_measured_depth_comes_at_the_size_of_the_pictures(tum, tmp_path):
   capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
   known = capture.known
   camera = known.camera.resized(80, 60)
-  depth = rgbd.measured_depth(known.depth_files[3], known.depth_unit, camera)
+  depth = depth_pictures.measured_depth(known.depth_files[3], known.depth_unit, camera)
   points = (camera.rays() * depth[..., None])[depth > 0]
   pose = known.world_from_camera[3]
   assert (depth > 0).mean() > 0.5
@@ -150,7 +153,7 @@ def test_measured_depth_comes_at_the_size_of_the_pictures(tum, tmp_path):
   spoilt = cv2.imread(str(known.depth_files[3]), cv2.IMREAD_UNCHANGED)
   spoilt[:] = 65535
   cv2.imwrite(str(tmp_path / "nothing.png"), spoilt)
-  assert not rgbd.measured_depth(tmp_path / "nothing.png", 1e-3, camera).any()
+  assert not depth_pictures.measured_depth(tmp_path / "nothing.png", 1e-3, camera).any()
 
 
 def test_measured_depth_stands_for_the_fields(tum, tmp_path):
@@ -182,7 +185,7 @@ def test_measured_depth_stands_for_the_fields(tum, tmp_path):
     assert np.percentile(off, 90) < 0.03
 
 
-def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path):
+def test_known_poses_and_depth_keep_the_scale(tum, tmp_path):
   capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
   found = localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
   assert found.registered_fraction == 1.0 and "rgbd" in found.strategy
@@ -201,6 +204,54 @@ def test_known_poses_and_depth_need_no_matching_and_keep_the_scale(tum, tmp_path
   assert chosen.source == "depth_sensor" and chosen.value.metres_per_unit == metres.scale
 
 
+def test_metric_poses_are_adjusted_to_the_pictures(tum, tmp_path):
+  """Poses with the noise of a tracker, a nominal lens: both are better afterwards, and metric.
+
+  A picture of nothing keeps its pose.
+  """
+  folder = _copied(tum, tmp_path / "tum")
+  cv2.imwrite(str(folder / "rgb" / "005.png"), np.full((240, 320, 3), 128, np.uint8))
+  rng = np.random.default_rng(0)
+  rows = []
+  for k, pose in enumerate(POSES):
+    turn = Rotation.from_rotvec(rng.normal(0, np.radians(0.4), 3))
+    numbers = [*(pose[:3, 3] + rng.normal(0, 0.008, 3))]
+    numbers += [*(turn * Rotation.from_matrix(pose[:3, :3])).as_quat()]
+    rows.append(f"{100 + k / 30:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
+  (folder / "groundtruth.txt").write_text("\n".join(rows))
+  (folder / "camera_info.yaml").write_text(INFO.replace("280.0", "286.0"))
+  settings = dataclasses.replace(SETTINGS, num_keyframes=16)
+  capture = read_capture(folder, tmp_path / "images", settings=settings)
+
+  def off(found):
+    metres = found.unit_from_source.inverse()
+    poses = metres.apply_pose(found.world_from_camera)
+    best = Similarity.fit(poses[:, :3, 3], POSES[:, :3, 3], with_scale=False)
+    place = np.linalg.norm(best.apply(poses[:, :3, 3]) - POSES[:, :3, 3], axis=-1)
+    steps, true = (
+      Rotation.from_matrix(np.swapaxes(p[:-1, :3, :3], 1, 2) @ p[1:, :3, :3])
+      for p in (poses, POSES)
+    )
+    angle = (steps.inv() * true).magnitude()
+    return np.median(place), np.degrees(np.median(angle)), abs(found.camera.fx / 280 - 1)
+
+  def located(name, refine_known):
+    return localise(
+      tmp_path / "images",
+      tmp_path / name,
+      known=capture.known,
+      settings=LocaliseSettings(refine_known=refine_known),
+    )
+
+  plain, refined = located("plain", False), located("refined", True)
+  assert "adjusted" in refined.strategy and "adjusted" not in plain.strategy
+  assert refined.registered_fraction == 1.0 and refined.reprojection_error_px < 1.0
+  for after, before in zip(off(refined), off(plain), strict=True):
+    assert after < 0.5 * before
+  kept = refined.unit_from_source.inverse().apply_pose(refined.world_from_camera)[5]
+  np.testing.assert_allclose(kept, capture.known.world_from_camera[5], atol=1e-6)
+
+
 def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
   folder = tmp_path / "tum"
   folder.mkdir()
@@ -209,8 +260,119 @@ def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
   with pytest.raises(CaptureError, match="no picture has a pose"):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
   (folder / "groundtruth.txt").write_text("1.0 0 0 0 0 0 0 1\n")
-  with pytest.raises(CaptureError, match="missing, as 0.png"):
+  with pytest.raises(CaptureError, match="1 of 1 pictures are missing, as 0.png"):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
   (folder / "groundtruth.txt").write_text("1.0 0 0\n")
   with pytest.raises(CaptureError, match="expected 8 columns"):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
+
+
+def _copied(tum, folder):
+  shutil.copytree(tum, folder)
+  return folder
+
+
+def test_poses_are_interpolated_and_gaps_left_out():
+  rows = np.zeros((6, 8))
+  rows[:, 0] = [0.0, 0.1, 0.2, 1.0, 1.1, 1.2]
+  rows[:, 1] = rows[:, 0]
+  turns = Rotation.from_rotvec(np.outer(rows[:, 0], [0, 0, 1.0]))
+  rows[:, 4:] = turns.as_quat()
+  rows[4, 1] = np.nan
+  rows[5, 4:] = 0.0
+  poses, known = trajectory.poses_at(rows, np.array([-0.01, 0.05, 0.2, 0.23, 0.6, 1.01, 1.1, 1.2]))
+  np.testing.assert_array_equal(known, [True, True, True, False, False, True, False, False])
+  np.testing.assert_allclose(poses[1, :3, 3], [0.05, 0, 0], atol=1e-9)
+  expected = Rotation.from_rotvec([0, 0, 0.05]).as_matrix()
+  np.testing.assert_allclose(poses[1, :3, :3], expected, atol=1e-9)
+
+
+def test_an_association_file_may_list_depth_first(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  rows = [
+    f"{100 + k / 30:.4f} depth/{k:03d}.png {100 + k / 30:.4f} rgb/{k:03d}.png"
+    for k in range(len(POSES))
+  ]
+  (folder / "associations.txt").write_text("\n".join(rows))
+  for name in ("rgb.txt", "depth.txt"):
+    (folder / name).unlink()
+  assert source_kind(folder) == "rgbd"
+  _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
+
+
+def test_pictures_without_depth_are_left_out(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  for name in ("rgb/003.png", "depth/007.png"):
+    (folder / name).unlink()
+  capture = read_capture(
+    folder, tmp_path / "images", settings=dataclasses.replace(SETTINGS, num_keyframes=16)
+  )
+  assert len(capture.images) == 14 and any("2 of 16" in text for text in capture.warnings)
+  known = capture.known
+  assert [path.stem for path in known.files] == [path.stem for path in known.depth_files]
+  rows = [k for k in range(16) if k not in (3, 7)]
+  np.testing.assert_allclose(known.world_from_camera, POSES[rows], atol=1e-5)
+  for path in sorted((folder / "depth").iterdir())[4:]:
+    path.unlink()
+  capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  assert not capture.known.depth_files and any("none used" in t for t in capture.warnings)
+
+
+@pytest.mark.parametrize("axes", [np.eye(3), OPENGL_FROM_OPENCV])
+@pytest.mark.parametrize("inverse", [False, True])
+def test_unit_and_convention_are_read_as_the_pictures_ask_for(tum, tmp_path, axes, inverse):
+  folder = _copied(tum, tmp_path / "tum")
+  rows = []
+  for k, pose in enumerate(POSES):
+    other = pose.copy()
+    other[:3, :3] = other[:3, :3] @ axes
+    other = np.linalg.inv(other) if inverse else other
+    numbers = [*other[:3, 3], *Rotation.from_matrix(other[:3, :3]).as_quat()]
+    rows.append(f"{100 + k / 30:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
+  (folder / "groundtruth.txt").write_text("\n".join(rows))
+  for path in (folder / "depth").iterdir():
+    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), (depth / 5.0).astype(np.uint16))
+  capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  _check(capture)
+  assert capture.known.depth_unit == 1e-3 and any("1 mm" in text for text in capture.warnings)
+
+
+def test_poses_of_another_recording_are_refused(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  rng = np.random.default_rng(0)
+  rows = [
+    f"{100 + k / 30:.4f} " + " ".join(f"{v:.5f}" for v in rng.normal(size=7))
+    for k in range(len(POSES))
+  ]
+  (folder / "groundtruth.txt").write_text("\n".join(rows))
+  with pytest.raises(CaptureError, match="do not belong to the pictures"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+
+
+def test_a_camera_is_read_from_other_tools_files_or_assumed(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  (folder / "camera_info.yaml").unlink()
+  with pytest.raises(CaptureError, match="320x240, not TUM's 640x480: add camera_info.yaml"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  (folder / "calibration.txt").write_text("280 280 160 120")
+  _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
+  (folder / "calibration.txt").write_text("280 280")
+  with pytest.raises(CaptureError, match="holds 2 numbers, expected"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  columns = np.array([[280.0, 0, 160], [0, 280, 120], [0, 0, 1]]).T.ravel().tolist()
+  (folder / "camera_intrinsic.json").write_text(json.dumps({"intrinsic_matrix": columns}))
+  _check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
+
+
+def test_eight_bit_depth_and_streams_are_refused(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  for path in (folder / "depth").iterdir():
+    cv2.imwrite(str(path), np.zeros((240, 320), np.uint8))
+  with pytest.raises(CaptureError, match="found uint8 of shape .*, expected 16-bit grey"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  stream = tmp_path / "scene0000_00.sens"
+  stream.write_bytes(b"sens")
+  for source in (stream, tmp_path):
+    with pytest.raises(CaptureError, match="SensReader"):
+      source_kind(source)

@@ -1,19 +1,29 @@
-"""Photographs of a folder: those of one camera, zoom and orientation are kept."""
+"""Photographs of a folder: those of one camera are kept, turned alike, each once."""
+
+import shutil
+from pathlib import Path
 
 import numpy as np
 import PIL.ExifTags
 import PIL.Image
 import pytest
 
-from nerf2real.scenes.capture import stills
+from nerf2real.scenes.capture import keyframes, stills
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.video import CaptureError
+from nerf2real.scenes.poses.matching import FeatureSettings
+from nerf2real.scenes.poses.settings import LocaliseSettings
+from nerf2real.scenes.poses.structure_from_motion import localise
+from nerf2real.scenes.poses.unit_frame import mean_up
+from tests.scenes import synthetic_capture as synthetic
+
+HEIC = Path(__file__).with_name("wide.heic")  # 64x48, a lens of 26 mm, redder to the right
 
 
-def _still(path, size, *, focal=None, orientation=None):
+def _still(path, size, *, focal=None, orientation=None, seed=0):
   """Writes noise of a size (width, height) with EXIF tags."""
-  pixels = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
+  pixels = np.random.default_rng(seed).integers(0, 255, (size[1], size[0], 3), np.uint8)
   exif = PIL.Image.Exif()
   if orientation is not None:
     exif[PIL.ExifTags.Base.Orientation] = orientation
@@ -24,30 +34,80 @@ def _still(path, size, *, focal=None, orientation=None):
 
 def test_most_stills_are_kept_and_the_rest_is_named(tmp_path):
   for number in range(12):
-    focal = 13 if number in (3, 4) else 26
+    focal = 13 if number in (3, 4) else None if number == 5 else 26
+    size = (80, 60) if number == 8 else (320, 240) if number == 9 else (160, 120)
     orientation = 6 if number == 7 else 1
-    _still(tmp_path / f"{number:02d}.jpg", (160, 120), focal=focal, orientation=orientation)
+    path = tmp_path / f"{number:02d}.jpg"
+    _still(path, size, focal=focal, orientation=orientation, seed=number)
   files = sorted(tmp_path.iterdir())
-  kept, warnings = stills.of_one_camera(files)
-  assert [path.stem for path in kept] == [f"{k:02d}" for k in range(12) if k not in (3, 4, 7)]
-  assert len(warnings) == 1
-  for text in ("Only 9 of 12", "2 of 160x120 with a lens of 13 mm", "1 of 120x160"):
-    assert text in warnings[0]
+  found = stills.of_one_camera(files)
+  kept = [k for k in range(12) if k not in (3, 4, 8)]
+  assert [int(path.stem) for path in found.files] == kept
+  np.testing.assert_array_equal(found.turned, [k == 7 for k in kept])
+  assert found.long_side == 160 and len(found.warnings) == 1
+  for text in ("Only 9 of 12", "2 of 160x120 with a lens of 13 mm", "1 of 80x60"):
+    assert text in found.warnings[0]
   capture = read_capture(tmp_path, tmp_path / "out", settings=CaptureSettings(num_keyframes=20))
-  assert len(capture.images) == 9 and warnings[0] in capture.warnings
-  with pytest.raises(CaptureError, match="At least 10 such pictures"):
+  assert len(capture.images) == 9 and found.warnings[0] in capture.warnings
+  assert (capture.width, capture.height) == (160, 120)
+  keyframes.save(capture, tmp_path)
+  again = keyframes.load(tmp_path, tmp_path / "out")
+  np.testing.assert_array_equal(again.turned, found.turned)
+  with pytest.raises(CaptureError, match="At least 10 different pictures"):
     read_capture(tmp_path, tmp_path / "out", settings=CaptureSettings(min_images=10))
 
 
-def test_stills_of_one_look_are_all_kept(tmp_path):
+def test_stills_of_one_look_are_all_kept_but_copies(tmp_path):
   for number in range(3):
-    _still(tmp_path / f"{number}.png", (40, 30))
+    _still(tmp_path / f"{number}.png", (40, 30), seed=number)
   files = sorted(tmp_path.iterdir())
-  assert stills.of_one_camera(files) == (files, [])
+  found = stills.of_one_camera(files)
+  assert found.files == files and not found.turned.any() and not found.warnings
   assert stills.look_of(files[0]) == (40, 30, None)
+  shutil.copy(files[1], tmp_path / "1 (copy).png")
+  found = stills.of_one_camera(sorted(tmp_path.iterdir()))
+  assert len(found.files) == 3 and found.warnings == ["1 of 4 pictures are copies of others."]
 
 
-def test_apples_format_is_named(tmp_path):
-  (tmp_path / "IMG_0001.HEIC").write_bytes(b"ftypheic")
-  with pytest.raises(CaptureError, match=r"1 pictures such as IMG_0001\.HEIC.*convert them"):
-    source_kind(tmp_path)
+def test_upright_stills_are_localised_with_wide_ones(tmp_path):
+  for row, pose in enumerate(synthetic.walk(12)):
+    if row % 3 == 1:  # the same camera held upright: rolled by a quarter
+      roll = np.eye(4)
+      roll[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+      picture = np.rot90(synthetic.render(pose @ roll), -1)
+    else:
+      picture = synthetic.render(pose)
+    (tmp_path / "photos").mkdir(exist_ok=True)
+    rgb = np.ascontiguousarray(picture[..., ::-1])
+    PIL.Image.fromarray(rgb).save(tmp_path / "photos" / f"{row:02d}.png")
+  capture = read_capture(tmp_path / "photos", tmp_path / "images")
+  assert capture.turned.sum() == 4 and len(capture.images) == 12
+  turned = [path.name for path, is_so in zip(capture.images, capture.turned, strict=True) if is_so]
+  plain = LocaliseSettings(
+    features=FeatureSettings(affine_shape=False, guided_matching=False, few_num_features=400)
+  )
+  found = localise(
+    tmp_path / "images", tmp_path / "poses", settings=plain, turned=frozenset(turned)
+  )
+  assert found.registered_fraction == 1.0
+  upright = stills.upright_poses(found.world_from_camera, capture.turned)
+  up = mean_up(upright)
+  np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
+  ups = -upright[:, :3, 1]
+  assert ups[:, 2].min() > 0.8  # each of them, as the walk looks down by 10 to 20 degrees
+
+
+def test_apples_pictures_are_read(tmp_path):
+  assert stills.look_of(HEIC) == (64, 48, 26.0)
+  image = stills.read_still(HEIC)
+  assert image.shape == (48, 64, 3)
+  assert image[10, 60, 2] > 200 > 60 > image[10, 4, 2]  # BGR
+  shutil.copy(HEIC, tmp_path / "IMG_0001.HEIC")
+  assert source_kind(tmp_path) == "images"
+  _still(tmp_path / "IMG_0001.jpg", (64, 48))  # converted from it
+  assert [p.name for p in stills.of_one_camera(sorted(tmp_path.iterdir())).files] == [
+    "IMG_0001.jpg"
+  ]
+  (tmp_path / "IMG_0002.HEIC").write_bytes(b"ftypheic")
+  with pytest.raises(CaptureError, match=r"IMG_0002\.HEIC cannot be read as a picture"):
+    stills.of_one_camera(sorted(tmp_path.iterdir()))

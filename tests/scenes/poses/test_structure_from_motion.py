@@ -15,7 +15,8 @@ from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
 from nerf2real.scenes.poses import mapping, matching, structure_from_motion
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
 from nerf2real.scenes.poses.matching import FeatureSettings
-from nerf2real.scenes.poses.structure_from_motion import LocaliseSettings, localise
+from nerf2real.scenes.poses.settings import LocaliseSettings
+from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.poses.unit_frame import mean_up
 from tests.scenes import synthetic_capture as synthetic
@@ -199,8 +200,12 @@ def test_unrelated_pictures_are_told_so(tmp_path):
     cv2.imwrite(str(folder / f"{number}.png"), synthetic.texture(100 + number, 160))
   with pytest.raises(LocalisationError, match=r"0 of 8 keyframes were localised") as error:
     localise(folder, tmp_path / "out", settings=FEW)
-  assert "film slower" in str(error.value)
+  assert "take pictures from places in between" in str(error.value)
   assert "\n" not in str(error.value)
+  assert error.value.missing == {f"{number}.png" for number in range(8)}
+  times = {f"{number}.png": float(number) for number in range(8)}
+  with pytest.raises(LocalisationError, match="film slower"):
+    localise(folder, tmp_path / "out", settings=FEW, times=times)
   assert not (tmp_path / "out" / "sfm").exists()
 
 

@@ -30,7 +30,7 @@ def _floor(rng, height=0.0):
 def _outlook(tmp_path, points, **changes) -> Made:
   return world_frame_stages.outlook(
     Stages(tmp_path / ".stages", show_progress=False),
-    types.SimpleNamespace(value=types.SimpleNamespace(known=None)),
+    types.SimpleNamespace(value=types.SimpleNamespace(known=None, unit_up=None)),
     _poses(points),
     world_frame.AlignSettings(**changes),
     Given(overrides.Overrides(), "", None),

@@ -8,8 +8,9 @@ from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.selection import analysis, naming, subject
-from nerf2real.sysid.selection.explain import Scored, standardised
+from nerf2real.sysid.selection.evidence import Scored, standardised
 from tests.sysid.synthetic import PENDULUM, log_of
 
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
@@ -122,16 +123,29 @@ def test_the_report_lists_what_was_there_before(found):
   assert {e.kind for e in result.objects} >= {"command_delay", *kinds}
 
 
-def test_values_stay_within_what_is_plausible():
+class _Machine:
+  """A joint whose actuator has a largest torque, and whose motion took 1 N m."""
+
+  def __init__(self, limit):
+    self.declared = np.zeros(len(INDEX))
+    self.declared[INDEX["highest"]] = limit
+
+  @staticmethod
+  def declared_torque():
+    return np.ones(3)
+
+
+@pytest.mark.parametrize(("limit", "amplitude"), [(2.0, 0.625), (25.0, 6.25), (np.inf, 0.625)])
+def test_values_stay_within_what_is_plausible_for_the_machine(limit, amplitude):
   waves = candidates.Term(
     "cogging",
     "joint",
     ("amplitude", "periods", "phase"),
     (0.0, 3.0, -10.0),
-    (5.0, 300.0, 10.0),
+    (50.0, 300.0, 10.0),
     (0.1, 0.05, 0.3),
     ((0.1, 216.0, 0.0), (0.1, 40.0, 0.0)),
   )
-  term = plausible(waves)
-  assert term.high == (0.625, 125.0, 10.0)
+  term = plausible(waves, _Machine(limit))
+  assert term.high == pytest.approx((amplitude, 125.0, 10.0))
   assert term.starts == ((0.1, 125.0, 0.0), (0.1, 40.0, 0.0))

@@ -1,15 +1,19 @@
 """Fits near the best with a richer friction."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.simulation import Member
 from nerf2real.sysid.selection.baseline import widened
-from nerf2real.sysid.selection.elaboration import crossed, elaborated
+from nerf2real.sysid.selection.elaboration import bases, crossed, elaborated
+from nerf2real.sysid.selection.evidence import kinds_of
 from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.findings import effects_of
 from tests.sysid.fit.test_likelihood import joint_of
@@ -23,11 +27,23 @@ RICH = Effect(
 
 
 @pytest.fixture(scope="module")
-def near():
+def explainer():
   _, joint = joint_of(("sweep", "slow", "steps"), [RICH])
   own = constants(joint.plant)
-  explainer = Explainer(joint, own, (), freed=widened(own))
-  return elaborated(explainer, explainer.null, ()), joint
+  return Explainer(joint, own, (), freed=widened(own))
+
+
+@pytest.fixture(scope="module")
+def near(explainer):
+  return elaborated(explainer, explainer.null, ()), explainer.joint
+
+
+def test_every_fit_has_what_is_named(explainer):
+  freed = (explainer.freed, *explainer.null.terms[1:])
+  best = explainer.score(freed, dataclasses.replace(explainer.null.fit, layout=Layout([freed])))
+  both, one = (bases(explainer, best, named) for named in ((), ("parameter_error",)))
+  assert [kinds_of(terms) for terms, _ in both] == [frozenset(), {"parameter_error"}]
+  assert [kinds_of(terms) for terms, _ in one] == [{"parameter_error"}]
 
 
 def test_fits_near_the_best_come_in_order_and_are_of_richer_friction(near):

@@ -1,6 +1,7 @@
 """The whole tool: verdicts, files, bad input."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.wide import ancestors
 from tests.sysid.synthetic import ARM, PENDULUM, log_of, logs_of
@@ -260,3 +262,14 @@ def test_sample_sets_with_known_answers(name: str, tmp_path: Path) -> None:
   if truth:
     assert error["after"] < 0.4 * error["before"]
   assert error["after"] < 1.3 * content["error"]["floor"]
+
+
+def test_a_verdict_speaks_of_effects_only_where_one_is_claimed() -> None:
+  grades = ("none", "effects", "partly", "unexplained")
+  for joints in itertools.combinations_with_replacement(grades, 3):
+    said = {claimed: analysis.machine_verdict(joints, claimed=claimed) for claimed in (False, True)}
+    assert said[False] in ("none", "unexplained")
+    assert said[True] in ("effects", "partly")
+    left = bool({"partly", "unexplained"} & set(joints))
+    assert (said[True] == "partly") == left
+    assert (said[False] == "none") == (set(joints) == {"none"})

@@ -1,11 +1,15 @@
 """Effects of a body and of the machine: evidence summed over joints."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.selection import analysis, subject, wide
+from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.selection import analysis, rivals, scopes, subject, wide
+from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.test_changes import few
 from tests.sysid.synthetic import ARM, log_of
 
@@ -48,6 +52,24 @@ def test_one_joint_s_friction_stays_its_own_beside_a_reference(model):
   assert [(e["kind"], e["joint"]) for e in found.effects] == [("coulomb_friction", "shoulder")]
 
 
+def test_a_load_that_is_screened_has_left_its_start(model):
+  logs = _logs([PAYLOAD])
+  reductions = [Reduction(model, log) for log in logs]
+  joints = [
+    subject.prepare(model, joint, logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS)
+    for joint in ("shoulder", "elbow")
+  ]
+  (term, members), *_ = [
+    (term, members)
+    for term, members in wide.hypotheses(model, joints)
+    if (term.kind, term.target) == ("payload", "lower")
+  ]
+  screened = wide.screened(term, members)
+  assert screened.x[0] == pytest.approx(0.25, rel=0.3)
+  fitted = wide.fitted(screened).evidence().total
+  assert screened.possible().total == pytest.approx(fitted, rel=0.1)
+
+
 def test_two_healthy_joints_have_nothing(model):
   found = analysis.analyse(model, _logs([]))
   assert (found.verdict, found.effects) == ("none", [])
@@ -72,3 +94,16 @@ def test_a_difference_counts_joints_that_one_side_lacks():
   both = wide.Evidence({"a": row, "b": row}, prior=2.0)
   assert both.total == pytest.approx(18.0)
   assert (both - wide.Evidence({"a": row}, prior=0.5)).total == pytest.approx(8.5)
+
+
+@pytest.mark.parametrize("more_remains", [False, True])
+def test_a_shared_name_stands_beside_a_free_force_where_more_remains(monkeypatch, more_remains):
+  joint = SimpleNamespace(joint="elbow", beyond=3.0, explainer=None)
+  nats = np.linspace(0.9, 1.1, 30)
+  best, without = SimpleNamespace(nats=nats, prior=0.0), SimpleNamespace(nats=0 * nats, prior=0.0)
+  monkeypatch.setattr(wide, "without", lambda *_: without)
+  monkeypatch.setattr(rivals, "beside", lambda *_: best)  # the force does as well without the name
+  shared = SimpleNamespace(members=(joint,), held=None, origin=joint)
+  found = SimpleNamespace(best=best)
+  item = SimpleNamespace(subject=joint, joint="elbow", found=found, more_remains=more_remains)
+  assert scopes.needless([shared], [item]) == ([shared] if more_remains else [])

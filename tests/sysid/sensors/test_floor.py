@@ -10,6 +10,7 @@ from nerf2real.suite.effects import Effect, EffectStack
 from nerf2real.suite.effects.files import from_list, to_list
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.sensors import floor, standing
+from nerf2real.sysid.sensors.stops import Stood
 
 LEG = (
   '<body pos="0 {y} -0.1"><joint name="{n}_hip" axis="0 1 0"/><geom type="capsule" size=".02 .06"'
@@ -73,8 +74,8 @@ def _log(
   )
 
 
-def _find(*logs):
-  return floor.find(mujoco.MjModel.from_xml_string(MODEL), list(logs))
+def _find(*logs, known=None):
+  return floor.find(mujoco.MjModel.from_xml_string(MODEL), list(logs), known)
 
 
 TURNS = (0.0, 1.3, 2.6, 4.0)
@@ -141,9 +142,20 @@ def test_a_robot_held_in_the_air_is_not_believed():
     _log((h,), slope=tuple(np.random.default_rng([7, i]).normal(0, 0.05, 2)), seed=i)
     for i, h in enumerate(TURNS)
   ]
-  stops = [floor._stops(mujoco.MjModel.from_xml_string(MODEL), log, 1, 0) for log in logs]
-  joined = floor._Stops(np.array(TURNS), np.concatenate([s.tilt for s in stops]), np.eye(3))
-  assert floor._judge(joined, "ground").rows == []
+  assert _find(*logs, known=[[Stood(0.0, 1.5, h)] for h in TURNS]).rows == []
+
+
+def test_known_headings_give_the_slope_in_the_worlds_axes():
+  """Nothing shows how the robot was carried from stop to stop, and the first faces 1.1 rad."""
+  slope = (0.03, -0.05)
+  headings = [1.1 + turn for turn in TURNS]
+  logs = [_log((h,), slope=slope, lean=0.07, seed=i) for i, h in enumerate(headings)]
+  (found,) = _find(*logs, known=[[Stood(0.0, 1.5, h)] for h in headings]).rows
+  for axis, value in zip("xy", slope, strict=True):
+    parameter = found["parameters"][axis]
+    assert parameter["low"] <= value <= parameter["high"]
+    assert parameter["high"] - parameter["low"] < 0.015
+  assert all(_find(log).rows == [] for log in logs)  # one stop shows none
 
 
 def test_the_sole_is_what_a_robot_stands_on():

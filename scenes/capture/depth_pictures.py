@@ -1,0 +1,88 @@
+"""Depth pictures of a sensor: reading, resampling and lifting to rays.
+
+Shapes: A sightings, H height, W width.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from nerf2real.core.cameras import Camera
+from nerf2real.scenes.capture.video import CaptureError
+
+MILLIMETRE = 1e-3  # m: 7-Scenes', ScanNet's and nerfstudio's depth
+_SIGHTINGS = 400  # points lifted from a picture
+_INVALID = 65535  # 7-Scenes' value where no depth was measured; 0 is everybody's
+
+
+def _read(path: Path) -> np.ndarray:
+  """Reads a depth picture, uint16 [H, W]; what counts as not measured is 0."""
+  depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+  if depth is None or depth.ndim != 2 or depth.dtype != np.uint16:
+    found = "nothing readable" if depth is None else f"{depth.dtype} of shape {depth.shape}"
+    raise CaptureError(f"{path} is no depth picture: found {found}, expected 16-bit grey.")
+  return np.where(depth == _INVALID, 0, depth)
+
+
+def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
+  """Reads a depth picture at a camera's size, the nearest pixel each.
+
+  Args:
+    path: 16-bit picture, z-depth in a unit, of the same view as the camera's.
+    unit: That unit [m].
+    camera: Of the pictures; may be smaller.
+
+  Returns:
+    z-depth float32 [H, W] [m]; 0 where nothing was measured.
+  """
+  depth = _read(path)
+  row, column = (
+    ((np.arange(size) + 0.5) * length / size).astype(int)
+    for size, length in zip((camera.height, camera.width), depth.shape, strict=True)
+  )
+  return (depth[row][:, column] * unit).astype(np.float32)
+
+
+def at_pixels(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
+  """Reads z-depth float64 [A] at pixels [A, 2] of a camera; 0 where none was measured [unit]."""
+  depth = _read(path)
+  height, width = depth.shape
+  column, row = np.floor(pixels * [width / camera.width, height / camera.height]).astype(int).T
+  return depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(np.float64)
+
+
+def sightings(depth_files: Sequence[Path], unit: float, camera: Camera) -> np.ndarray:
+  """Lifts a grid of pixels of depth pictures that are aligned with the colour pictures.
+
+  Args:
+    depth_files: 16-bit pictures, z-depth in a unit.
+    unit: That unit [m].
+    camera: Of the colour pictures, whose pixels the result is in.
+
+  Returns:
+    float64 [A, 4]: index of the picture, pixel x and y, distance along the pixel's ray [m].
+
+  Raises:
+    CaptureError: A picture cannot be read or shows nothing.
+  """
+  found = []
+  for index, path in enumerate(depth_files):
+    depth = _read(path)
+    height, width = depth.shape
+    stride = max(1, int(np.sqrt(width * height / _SIGHTINGS)))
+    row, column = (
+      axis.ravel() for axis in np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride]
+    )
+    value = depth[row, column].astype(np.float64)
+    good = value > 0
+    pixel = np.stack(
+      [(column + 0.5) * camera.width / width, (row + 0.5) * camera.height / height], -1
+    )[good]
+    reach = np.linalg.norm(camera.rays(pixel), axis=-1) * value[good] * unit
+    found.append(np.column_stack([np.full(good.sum(), float(index)), pixel, reach]))
+  rows = np.concatenate(found)
+  if not len(rows):
+    raise CaptureError(f"{depth_files[0].parent}: the depth pictures hold no measured pixel.")
+  return rows

@@ -1,0 +1,99 @@
+"""RGB-D sequences in the layout of TUM's benchmark: lists of stamped pictures and a trajectory.
+
+Source: Sturm et al. 2012, A benchmark for the evaluation of RGB-D SLAM systems, and the page of its
+file formats; ORB-SLAM, ETH3D and ICL-NUIM write pictures and depth into one list of associations.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from nerf2real.scenes.capture import trajectory
+from nerf2real.scenes.capture.recording import Recording, camera_of
+from nerf2real.scenes.capture.video import CaptureError
+
+_PICTURES, _DEPTH = "rgb.txt", "depth.txt"
+_ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
+_POSES = ("groundtruth.txt", "gt.txt", "trajectory.txt", "CameraTrajectory.txt")
+_DEPTH_UNIT = 1 / 5000  # m
+
+
+def _first(source: Path, names: tuple[str, ...]) -> Path | None:
+  return next((source / name for name in names if (source / name).is_file()), None)
+
+
+def is_tum(source: Path) -> bool:
+  """Whether a folder holds lists of pictures and poses in TUM's layout."""
+  return _first(source, (_PICTURES, *_ASSOCIATIONS)) is not None and (
+    _first(source, _POSES) is not None
+  )
+
+
+def _table(path: Path, columns: int) -> list[list[str]]:
+  """Rows of a text file of TUM's: words, without comments."""
+  lines = (line.strip() for line in path.read_text().replace(",", " ").splitlines())
+  rows = [line.split(maxsplit=columns - 1) for line in lines if line[:1] not in ("", "#")]
+  if not rows or any(len(row) < columns for row in rows):
+    raise CaptureError(f"{path} is no list of TUM's layout: expected {columns} columns a line.")
+  return rows
+
+
+def _stamped(path: Path, words: list[str]) -> np.ndarray:
+  """Times [s] of a column."""
+  try:
+    return np.array([float(word) for word in words])
+  except ValueError as error:
+    raise CaptureError(f"{path}: a time or pose is no number ({error}).") from error
+
+
+def _listed(source: Path) -> tuple[np.ndarray, list[Path], list[Path]]:
+  """Times, pictures and depth pictures (none or one each) of a sequence."""
+  path = source / _PICTURES
+  if path.is_file():
+    rows = _table(path, 2)
+    times = _stamped(path, [row[0] for row in rows])
+    files = [source / row[1] for row in rows]
+    if not (source / _DEPTH).is_file():
+      return times, files, []
+    listed = _table(source / _DEPTH, 2)
+    index, near = trajectory.nearest(_stamped(source / _DEPTH, [row[0] for row in listed]), times)
+    chosen = np.flatnonzero(near)
+    depth = [source / listed[index[k]][1] for k in chosen]
+    return times[chosen], [files[k] for k in chosen], depth
+  joint = _first(source, _ASSOCIATIONS)
+  assert joint is not None  # `is_tum` has found one
+  pairs = [row[:3] + row[3].split()[:1] for row in _table(joint, 4)]
+  if all("depth" in row[1].lower() for row in pairs):  # ICL-NUIM lists the depth first
+    pairs = [row[2:] + row[:2] for row in pairs]
+  times = _stamped(joint, [row[0] for row in pairs])
+  return times, [source / row[1] for row in pairs], [source / row[3] for row in pairs]
+
+
+def read_tum(source: Path) -> Recording:
+  """Reads a folder of TUM's layout; pictures without a pose or depth are left out.
+
+  Raises:
+    CaptureError: A list is damaged, or no picture has a pose and, where there is depth, depth.
+  """
+  times, files, depth = _listed(source)
+  path = _first(source, _POSES)
+  assert path is not None  # `is_tum` has found one
+  words = [row[:7] + row[7].split()[:1] for row in _table(path, 8)]
+  values = np.stack([_stamped(path, list(column)) for column in zip(*words, strict=True)], -1)
+  poses, known = trajectory.poses_at(values, times)
+  if not known.any():
+    raise CaptureError(
+      f"{source}: no picture has a pose within {trajectory.SAME_TIME:g} s: expected pictures, "
+      f"depth and {path.name} of one recording."
+    )
+  chosen = np.flatnonzero(known)
+  found = Recording(
+    files=[files[k] for k in chosen],
+    poses=poses[chosen],
+    depth=[depth[k] for k in chosen] if depth else [],
+    unit=_DEPTH_UNIT,
+  ).present(source)
+  lost = len(files) - len(chosen)
+  if lost:
+    found = found.warned(f"{lost} of {len(files)} pictures have no pose: left out.")
+  return camera_of(found, source, focal=525.0, what="TUM's")

@@ -1,0 +1,31 @@
+"""Settings of structure from motion."""
+
+import dataclasses
+
+from nerf2real.scenes.poses.matching import FeatureSettings
+from nerf2real.scenes.poses.pairs import PairSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocaliseSettings:
+  """Settings of structure from motion."""
+
+  features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
+  pairs: PairSettings = dataclasses.field(default_factory=PairSettings)
+  mapper: str = "auto"
+  """"global", "incremental", or "auto": incremental for stills (few keyframes), else global; the
+  other one where the first leaves too many keyframes out."""
+  few_keyframes: int = 40
+  """Up to this many are mapped incrementally."""
+  repair_below: float = 0.95
+  """Fraction of registered keyframes under which more pairs are matched."""
+  min_fraction: float = 0.5
+  """Fewer registered keyframes are an error."""
+  min_registered: int = 10
+  """Fewer are an error, unless there are fewer keyframes."""
+  min_parallax: float = 0.08
+  """Share of matches off a homography below which a warning is given."""
+  refine_known: bool = True
+  """Whether poses that came with measured depth are adjusted to the pictures."""
+  seed: int = 0
+  """Of RANSAC and of the mappers."""

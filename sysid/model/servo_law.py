@@ -1,0 +1,190 @@
+"""The law from position error to duty of a servo that logs its duty, fitted by itself.
+
+With the command u, the reading q and k the declared stiffness over the declared limit,
+
+    duty(t) = clip(gain B(x(t); w) + integral I(t) + c, -saturation, saturation)
+    x(t) = k (u(t - delay) - q(t + ahead)),  I = integral of x dt
+
+where B takes a dead band w off, and ahead is by how much a duty is read later than a position, or
+the law's derivative over its gain: the readings do not tell these apart. The readings feed the law,
+so that no motion is simulated: one regression for every delay and dead band of a grid. Deviations
+are of the blocks' scatter (Liang and Zeger 1986), or of the logs' where that is more. Shapes: N
+samples of a log or of all, K columns, P kernel parameters (`kernel.NAMES`).
+"""
+
+import dataclasses
+
+import numpy as np
+
+from nerf2real.sysid.model.kernel import INDEX, NAMES
+from nerf2real.sysid.model.measured import Measured, quantum
+from nerf2real.sysid.model.plant import JointPlant
+
+Array = np.ndarray
+
+_DELAYS = np.arange(0.0, 0.0605, 0.001)
+"""s; chosen: firmware and bus work in cycles of a millisecond."""
+_BANDS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
+"""Dead bands that are tried, in steps of the position's reading."""
+_AT_LIMIT = 0.98  # of the largest duty: saturated
+_BLOCK_S = 1.0  # s that are independent of others: as `settings.block_s`
+_FEWEST = 50  # samples of a line
+_Z = 1.96
+_CLEAR = 2.8  # standard errors from which a dead band or an integral is said to be there
+
+
+@dataclasses.dataclass(frozen=True)
+class ServoLaw:
+  """The law of a joint's servo, with standard deviations."""
+
+  gain: float
+  """Over the declared one."""
+  gain_deviation: float
+  delay: float
+  """s between a command and the duty."""
+  ahead: float
+  """s by which the positions that the duty is of are later than those that are logged with it."""
+  dead_band: float
+  """rad (m) of position error."""
+  integral: float
+  """1/s, of the declared proportional part."""
+  integral_deviation: float
+  wound: float
+  """rms of what the integral makes of the duty, zero where it is not clear of none."""
+  saturation: float
+  """Largest duty."""
+  left: float
+  """rms of what gain, delay and ahead leave, of full duty."""
+
+  @property
+  def interval(self) -> tuple[float, float]:
+    """95 % interval of the gain."""
+    return self.gain - _Z * self.gain_deviation, self.gain + _Z * self.gain_deviation
+
+  def is_off(self, tolerance: float) -> bool:
+    """Tells whether the gain is off the declared one by more than a share, all of its interval."""
+    return all(abs(end - 1.0) > tolerance for end in self.interval)
+
+
+def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
+  """Returns the law, and what gain, delay and ahead leave of the duty [N]; None where the logs hold
+  too little of it.
+
+  Args:
+    plant: a joint whose logs all hold the duty, or not.
+  """
+  if not plant.logs_duty:
+    return None
+  logs = plant.logs
+  duty = np.concatenate([log.duty for log in logs])  # type: ignore[misc]
+  speed = np.concatenate([log.velocity for log in logs])
+  top = float(np.abs(duty).max())
+  kept = (np.abs(duty) < _AT_LIMIT * top) & np.concatenate([log.valid for log in logs])
+  if kept.sum() < _FEWEST:
+    return None
+  log_of = np.repeat(np.arange(len(logs)), [len(log.time) for log in logs])
+  beside = np.column_stack([speed, log_of[:, None] == np.arange(len(logs))])
+  step = min(quantum(log.position) for log in logs)
+  slope = abs(plant.declared[INDEX["position"]] / plant.declared[INDEX["highest"]])
+
+  def line(delay: float, band: float = 0.0) -> tuple[float, Array]:
+    columns = np.column_stack([_shrunk(_declared(plant, delay), slope * band), beside])
+    beta = np.linalg.lstsq(columns[kept], duty[kept], rcond=None)[0]
+    return float(np.sum((duty - columns @ beta)[kept] ** 2)), columns
+
+  # Held commands give plateaus of equal squares: the middle of the best.
+  squares = np.array([line(delay)[0] for delay in _DELAYS])
+  delay = float(np.median(_DELAYS[squares <= squares.min() * (1.0 + 1e-6)]))
+  best, band = min((line(delay, steps * step)[0], steps * step) for steps in _BANDS)
+  block = np.concatenate([np.floor(log.time / _BLOCK_S) + 1e6 * i for i, log in enumerate(logs)])
+  nothing = line(delay)[0]
+  if (nothing - best) / best * len(np.unique(block[kept])) < _CLEAR**2:  # a likelihood ratio
+    band = 0.0
+  columns = line(delay, band)[1]
+  beta, spread = _regressed(columns[kept], duty[kept], block[kept])
+  total = np.concatenate(
+    [_integral(columns[log_of == i, 0], log.time) for i, log in enumerate(logs)]
+  )
+  wound, wide = _regressed(np.column_stack([total, columns])[kept], duty[kept], block[kept])
+  apart = [
+    np.linalg.lstsq(columns[m], duty[m], rcond=None)[0][0]
+    for m in (kept & (log_of == i) for i in range(len(logs)))
+    if m.sum() > _FEWEST
+  ]
+  between = float(np.std(apart, ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else 0.0
+  left = duty - np.clip(columns[:, :2] @ beta[:2], -top, top)
+  is_clear = abs(wound[0]) > _CLEAR * wide[0]
+  return ServoLaw(
+    gain=float(beta[0]),
+    gain_deviation=max(float(spread[0]), between),
+    delay=delay,
+    ahead=float(-beta[1] / (beta[0] * slope)),
+    dead_band=band,
+    integral=float(wound[0]),
+    integral_deviation=float(wide[0]),
+    wound=float(np.sqrt(np.mean((wound[0] * total) ** 2))) if is_clear else 0.0,
+    saturation=top,
+    left=float(np.sqrt(np.mean(left[kept] ** 2))),
+  ), left
+
+
+def duty_of(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0) -> Array:
+  """Returns the duty [N] that a servo's law makes of a log's commands and readings.
+
+  Supply and heat change the torque at a duty, not the duty.
+
+  Args:
+    plant: the joint.
+    p: kernel parameters [P].
+    index: of the log.
+    ahead: s by which the positions that the duty is of are later than those read with it.
+  """
+  value = dict(zip(NAMES, p, strict=True))
+  log, rate = plant.logs[index], 1.0 + value["clock_rate"]
+  true = log.time / rate - value["effort_delay"]
+  command = _held(log, true - value["command_delay"])
+  stamp = (true + value["measurement_delay"] + ahead) * rate
+  read, speed = (np.interp(stamp, log.time, row) for row in (log.position, log.velocity))
+  torque = value["input"] * command + value["constant"]
+  torque = torque + value["position"] * read + value["velocity"] * speed
+  torque = np.clip(value["gain"] * torque, value["lowest"], value["highest"])
+  return torque / (value["strength"] * plant.declared[INDEX["highest"]])
+
+
+def command_jump(plant: JointPlant, index: int, within: float) -> Array:
+  """Returns by how much of full duty [N] commands jump within so many seconds of a sample."""
+  log = plant.logs[index]
+  slope = plant.declared[INDEX["input"]] / plant.declared[INDEX["highest"]]
+  return np.abs(slope * (_held(log, log.time + within) - _held(log, log.time - within)))
+
+
+def _held(log: Measured, time: Array) -> Array:
+  """Returns the last command [N] at each time [N]."""
+  at = np.searchsorted(log.command_time, time, side="right") - 1
+  return log.command[np.clip(at, 0, None)]
+
+
+def _declared(plant: JointPlant, delay: float) -> Array:
+  """Returns the declared model's duty [N] without limits, at a command delay [s]."""
+  p = plant.declared.copy()
+  p[INDEX["command_delay"]] = delay
+  p[INDEX["lowest"]], p[INDEX["highest"]] = -np.inf, np.inf
+  return np.concatenate([duty_of(plant, p, i) for i in range(len(plant.logs))])
+
+
+def _shrunk(x: Array, band: float) -> Array:
+  return np.sign(x) * np.maximum(np.abs(x) - band, 0.0)
+
+
+def _integral(x: Array, time: Array) -> Array:
+  return np.cumsum(x * np.gradient(time))
+
+
+def _regressed(columns: Array, values: Array, block: Array) -> tuple[Array, Array]:
+  """Returns coefficients [K] of least squares and their deviations [K] by the blocks' scatter."""
+  inverse = np.linalg.pinv(columns.T @ columns)
+  beta = inverse @ (columns.T @ values)
+  scores = columns * (values - columns @ beta)[:, None]
+  _, label = np.unique(block, return_inverse=True)
+  summed = np.array([np.bincount(label, column) for column in scores.T])
+  return beta, np.sqrt(np.maximum(np.diag(inverse @ (summed @ summed.T) @ inverse), 0.0))

@@ -1,0 +1,85 @@
+"""A scored hypothesis of one joint, and how clear its evidence is of another's."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from nerf2real.sysid.fit.layout import Fit
+from nerf2real.sysid.hypotheses.terms import FREE, Term
+
+Array = np.ndarray
+
+UNREPEATED = ("backlash",)
+"""Kinds under which a course does not repeat: which way teeth bounce depends on microradians."""
+
+
+@dataclasses.dataclass
+class Scored:
+  """A fitted hypothesis of one joint, with its evidence."""
+
+  terms: tuple[Term, ...]
+  fit: Fit
+  nats: Array
+  """[B] log-likelihood of the left-out blocks."""
+  neutral: bool = False
+  """Whether an effect stands at the values that do nothing: a rival, never an explanation."""
+
+  @property
+  def names(self) -> frozenset[str]:
+    """Kinds of its effects."""
+    return kinds_of(self.terms)
+
+  @property
+  def beside_force(self) -> bool:
+    """Whether a force of any form is among its terms."""
+    return any(t.kind == FREE for t in self.terms)
+
+  def values(self, kind: str) -> dict[str, float]:
+    """Returns the values of the term of a kind by name; empty if it has none."""
+    term = next((t for t in self.terms if t.kind == kind), None)
+    return {} if term is None else self.fit.values(term)
+
+  @property
+  def evidence(self) -> float:
+    """Sum of the blocks' nats, less what the priors cost."""
+    return float(self.nats.sum()) - self.prior
+
+  @property
+  def prior(self) -> float:
+    """What the priors cost, nats."""
+    sigma, centre = self.fit.layout.sigma, self.fit.layout.centre
+    return 0.5 * float(np.sum(((self.fit.x - centre) / sigma) ** 2))
+
+
+def kinds_of(terms: Sequence[Term]) -> frozenset[str]:
+  """Returns the kinds of effects that are not the machine's anyway."""
+  return frozenset(t.name for t in terms if t.name is not None)
+
+
+def clear(better: Scored, other: Scored) -> float:
+  """Returns how clear a difference of evidence is, in its standard errors (Vuong 1989).
+
+  The blocks' differences are paired; neighbours may be correlated.
+  """
+  d = better.nats - other.nats
+  return standardised(d, better.evidence - other.evidence, 1.0)
+
+
+def standardised(differences: Array, total: float | None = None, least: float = 1e-300) -> float:
+  """Returns a sum of blocks' differences over its standard error."""
+  total = float(differences.sum()) if total is None else total
+  return total / max(np.sqrt(variance(differences)), least)
+
+
+def variance(differences: Array) -> float:
+  """Returns the variance of a sum of blocks' differences, of which neighbours may go together."""
+  e = differences - differences.mean()
+  own = float(e @ e)
+  return max(own + 2.0 * float(e[1:] @ e[:-1]), own) * len(e) / max(len(e) - 1, 1)
+
+
+def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
+  """Returns the explanations by a number of effects alone."""
+  alone = (item for item in items if not (item.neutral or item.beside_force))
+  return [item for item in alone if len(item.names) == size]

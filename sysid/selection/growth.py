@@ -1,0 +1,49 @@
+"""Grows sets of effects forward until one more is not clear, and scores their rivals."""
+
+from collections.abc import Callable
+
+from nerf2real.sysid.selection.evidence import Scored, clear, of_size
+from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.rivals import beside_force, neutralise
+
+
+def grow(
+  explainer: Explainer,
+  depth: int | None = None,
+  leaves: Callable[[Scored], bool] = lambda _: False,
+) -> list[Scored]:
+  """Returns all scored hypotheses, the best first.
+
+  Args:
+    explainer: of the joint, with its constants fitted.
+    depth: effects at most; those of the settings for None.
+    leaves: whether a hypothesis leaves more than a machine does anyway: then one more is tried as
+      long as it predicts what was left out better, too.
+  """
+  s, limit = explainer.settings, depth or explainer.settings.depth
+  parents, best = [explainer.null], explainer.null
+  for size in range(limit):
+    grown = [g for p in parents for g in explainer.extend(p, s.kept)]
+    if not grown:
+      break
+    top = max(grown, key=lambda g: g.evidence)
+    if top.evidence > best.evidence:
+      top = explainer.adopt(top)
+      if size == 0:
+        explainer.null = explainer.refit(explainer.null)
+      for item in sorted(grown, key=lambda g: -g.evidence)[: s.kept]:
+        if item.terms != top.terms:
+          explainer.refit(item, 3)
+    grown = sorted(of_size(explainer.scored.values(), size + 1), key=lambda g: -g.evidence)
+    better = grown[0].evidence > best.evidence and leaves(best)
+    if clear(grown[0], best) < s.worth and not better:
+      break
+    best = grown[0]
+    parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
+  for size in {len(item.names) for item in explainer.scored.values()}:
+    same = of_size(explainer.scored.values(), size)
+    if same:
+      neutralise(explainer, max(same, key=lambda item: item.evidence))
+  if leaves(best):
+    beside_force(explainer, best)
+  return explainer.ranked()

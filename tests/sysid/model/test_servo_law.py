@@ -1,0 +1,121 @@
+"""The law of a servo that logs its duty, on duties made by hand."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.core.robot_logs.reading import JointSeries
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.layout import Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.hypotheses.terms import SERVO_GAIN
+from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.servo_law import duty_of, servo_law
+from tests.sysid.synthetic import PENDULUM, log_of
+
+STEP = 1.0 / 885  # of the PWM's counts
+DECLARED = 21.0 / 4.0  # duty a rad
+
+
+def plant_of(*, gain=1.0, delay=0.0, band=0.0, integral=0.0, top=1.0, noise=0.0, effects=()):
+  """Returns a joint with duties that follow a law from its readings."""
+  logs, random = [], np.random.default_rng(0)
+  for seed, kind in enumerate(("sweep", "slow")):
+    log = log_of(PENDULUM, kind, effects, duration=5.0, seed=seed)
+    time, position = log.states.stamp, log.states.position[:, 0]
+    sent = np.searchsorted(log.commands.stamp, time - delay, side="right") - 1
+    error = log.commands.position[np.clip(sent, 0, None), 0] - position
+    error = np.sign(error) * np.maximum(np.abs(error) - band, 0.0)
+    duty = gain * DECLARED * error + integral * DECLARED * np.cumsum(error * np.gradient(time))
+    duty = np.clip(duty + noise * random.normal(size=len(time)), -top, top)
+    duty = np.round(duty / STEP) * STEP
+    pwm = JointSeries(("joint",), time, time, None, None, duty[:, None])
+    logs.append(dataclasses.replace(log, pwm=pwm))
+  return JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
+
+
+def law_of(**law):
+  found = servo_law(plant_of(**law))
+  assert found is not None
+  return found[0]
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.0, 1.3])
+def test_the_gain_is_in_its_interval_which_is_narrow(gain):
+  law = law_of(gain=gain, noise=0.002)
+  low, high = law.interval
+  assert low < gain < high
+  assert high - low < 0.02 * gain
+  assert law.left < 0.004
+  assert (law.delay, law.dead_band) == (pytest.approx(0.0, abs=0.005), 0.0)
+
+
+def test_delay_dead_band_and_saturation_are_found():
+  law = law_of(gain=0.8, delay=0.03, band=0.012, top=0.4)
+  assert law.delay == pytest.approx(0.03, abs=0.006)
+  assert law.dead_band == pytest.approx(0.012, rel=0.3)
+  assert law.saturation == pytest.approx(0.4, abs=0.01)
+  assert law.gain == pytest.approx(0.8, rel=0.01)
+
+
+def test_an_integral_is_found_where_there_is_one():
+  none, some = law_of(noise=0.001), law_of(integral=0.5, noise=0.001)
+  assert abs(none.integral) < 3.0 * none.integral_deviation + 0.01
+  assert some.integral == pytest.approx(0.5, rel=0.1)
+  assert abs(some.integral) > 3.0 * some.integral_deviation
+
+
+def test_without_duty_there_is_no_law():
+  logs = [log_of(PENDULUM, "slow", duration=3.0)]
+  plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
+  assert servo_law(plant) is None
+
+
+def test_constants_hold_the_law_of_a_gain_that_is_off():
+  """Moves as with 0.6 of the gain, tells duties of 0.5 of it."""
+  weaker = [Effect("motor_gain", "joint", {"gain": 0.6})]
+  plant = plant_of(gain=0.5, noise=0.001, effects=weaker)
+  own = constants(plant)
+  assert dict(own.fixed)[SERVO_GAIN] == pytest.approx(0.5, rel=0.01)
+  effect = own.effect(np.array(own.starts[0]))
+  assert effect.parameters["gain"] == pytest.approx(0.5, rel=0.01)
+  assert effect.parameters["limit"] == 1.0
+  p = plant.declared.copy()
+  own.apply(plant, p, np.array(own.starts[0]))
+  left = plant.logs[0].duty - duty_of(plant, p, 0)
+  assert np.sqrt(np.mean(left**2)) < 0.01
+  assert SERVO_GAIN not in dict(constants(plant_of(gain=1.01)).fixed)
+
+
+def test_the_duty_alone_sets_the_gain_of_a_motion_that_says_another():
+  """Moves as with 0.6 of the gain, tells duties of 0.5 of it."""
+  weaker = [Effect("motor_gain", "joint", {"gain": 0.6})]
+  joint = JointLikelihood(plant_of(gain=0.5, noise=0.001, effects=weaker))
+  own = constants(plant_of())  # of a healthy reference
+  term = next(
+    t
+    for t in candidates.library(joint.plant)
+    if t.kind == "motor_gain" and dict(t.fixed)["scales_limit"] == 0.0
+  )
+  start = np.concatenate([own.starts[0], [0.75]])
+  joint.rescale(joint.residuals((own, term), start[None])[0])
+  fit = Fitter([joint], Layout([(own, term)])).fit(start, iterations=6)
+  assert fit.values(term)["gain"] == pytest.approx(0.5, rel=0.01)
+
+
+def test_a_weaker_motor_changes_no_duty():
+  plant = plant_of()
+  term = next(
+    t
+    for t in candidates.library(plant)
+    if t.kind == "motor_gain" and dict(t.fixed)["scales_limit"] == 1.0
+  )
+  p = plant.declared.copy()
+  before = duty_of(plant, p, 0)
+  term.apply(plant, p, np.array([0.7]))
+  np.testing.assert_allclose(duty_of(plant, p, 0), before)
