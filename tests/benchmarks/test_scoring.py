@@ -169,8 +169,8 @@ def test_the_harness_scores_kept_reports(tmp_path):
     timeout=60,
   )
   text = (tmp_path / "identify.md").read_text()
-  assert "| single: right name first | 100 % | 1 | >= 90 % | yes |" in text
-  assert "| healthy: accused | 100 % | 1 | <= 5 % | no |" in text
+  assert "| single: right name first | 100 % (3 to 100 %) | 1 | >= 95 % | yes |" in text
+  assert "| healthy: accused | 100 % (3 to 100 %) | 1 | <= 2 % | no |" in text
   assert "| 5_001 pendulum | nothing | spring@elbow | **no** |" in text
   scores = json.loads((tmp_path / "identify.json").read_text())["scores"]
   assert [row["set"] for row in scores] == ["5_000", "5_001"]

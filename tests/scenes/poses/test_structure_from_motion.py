@@ -12,13 +12,14 @@ from benchmarks.rooms import fountain
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
-from nerf2real.scenes.poses import mapping, matching, structure_from_motion
+from nerf2real.scenes.poses import mapping, matching
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
 from nerf2real.scenes.poses.matching import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.poses.unit_frame import mean_up
+from nerf2real.scenes.poses.work import prepare_work
 from tests.scenes import synthetic_capture as synthetic
 from tests.scenes.capture.test_capture import write_transforms
 
@@ -131,7 +132,7 @@ def test_other_pictures_start_a_new_database(corner, tmp_path):
   work = tmp_path / "work"
 
   def prepare(images, settings=FEW):
-    return structure_from_motion._prepare_work(images, work, names, settings, None)
+    return prepare_work(images, work, names, settings, None)
 
   database = prepare(folder / "images")
   database.touch()
