@@ -23,9 +23,8 @@ HISTORY = specs.HISTORY  # control signals that the phase is read from: as many 
 # 0.15 leaves the filter as 0.05.
 _DEVIATION = 0.05
 _START = 0.05  # oscillation that is added at phase 0, of a full one's 1: where standing leads
-_STOPPING = (
-  0.8  # share of the amplitude that a step to a stand leaves; chosen: still within a period
-)
+# Share of the amplitude that a step to a stand leaves; chosen: it stands within a period.
+_STOPPING = 0.8
 _COMMANDS = [
   Command(forward, turn) for forward in (0.0, 0.5, 1.0) for turn in (-1, -0.5, 0, 0.5, 1)
 ]
