@@ -152,6 +152,9 @@ class DmpoConfig:
   frozen_encoder: bool = False
   """Whether the image encoder stays what the run began with: the replay then holds its features in
   place of pictures."""
+  frozen_memory: bool = False
+  """Whether the LSTM stays, too: the replay then holds its outputs, and an update is one of MLPs on
+  single transitions."""
   feature_copies: int = 2
   """Features of a frozen encoder for each picture: of the picture as it is, and of augmented ones.
   Source: chosen."""
@@ -167,6 +170,11 @@ class DmpoConfig:
       raise ValueError(f"trajectory_length must be 2 or more, found {self.trajectory_length}.")
     if self.n_step < 1:
       raise ValueError(f"n_step must be 1 or more, found {self.n_step}.")
+    if self.frozen_memory and not (self.frozen_encoder and self.network.recurrent):
+      raise ValueError(
+        "frozen_memory keeps the LSTM behind a frozen encoder: it needs frozen_encoder=true and "
+        "network.recurrent=true."
+      )
     if self.steps_per_update <= 0:
       raise ValueError(f"steps_per_update must be positive, found {self.steps_per_update}.")
     if self.network.vmin >= self.network.vmax:
