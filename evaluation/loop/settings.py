@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
-from nerf2real.evaluation.policies import names as policy_names
 
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"
@@ -62,6 +61,8 @@ def policy_folder(settings: LoopSettings) -> Path | None:
   Raises:
     ValueError: There is none.
   """
+  from nerf2real.evaluation.policies import names as policy_names
+
   if settings.policy in policy_names.WALKERS:
     return None
   return policy_names.policy_folder(settings.policy, task=TASK)
