@@ -40,6 +40,8 @@ class LoopSettings:
   """Length of a recorded motion [s]."""
   trials: int = 18
   """Trials of the navigation protocol, spread over its 54."""
+  processes: int = 2
+  """Conditions whose trials run side by side, each in a process of its own (a core, 1.5 GB)."""
   time_limit: float | None = None
   """Length of a trial [s]; the task's own if not given."""
   minutes: float = 30.0
