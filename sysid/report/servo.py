@@ -38,7 +38,11 @@ def apart(effects: list[Effect], claimed: list[dict[str, Any]]) -> list[Effect]:
         for name, row in effect.samples.items()
       }
       torque = float(effect.parameters["gain"]) / value  # type: ignore[arg-type]
-      effect = dataclasses.replace(effect.replace(gain=torque), samples=samples)
+      bounds = dict(effect.intervals)
+      if "gain" in bounds:
+        bounds["gain"] = bounds["gain"][0] / value, bounds["gain"][1] / value
+      effect = effect.replace(gain=torque)
+      effect = dataclasses.replace(effect, intervals=bounds, samples=samples)
     result.append(effect)
   for joint, gain in gains.items():
     result.append(

@@ -103,6 +103,9 @@ def test_constants_hold_the_law_of_a_gain_that_is_off():
   effect = own.effect(np.array(own.starts[0]))
   assert effect.parameters["gain"] == pytest.approx(0.5, rel=0.01)
   assert effect.parameters["limit"] == 1.0
+  with_interval = own.effect(np.array(own.starts[0]), {"gain": (-0.02, 0.04)})
+  assert with_interval.intervals["limit"] == pytest.approx((0.98, 1.04))
+  assert with_interval.intervals["gain"] == pytest.approx((0.49, 0.52), rel=0.01)
   p = plant.declared.copy()
   own.apply(plant, p, np.array(own.starts[0]))
   left = plant.logs[0].duty - duty_of(plant, p, 0)
