@@ -90,12 +90,12 @@ def summary(found: list[Trial]) -> dict[str, harness.Value]:
 def difference(found: list[Trial], reference: list[Trial]) -> dict[str, harness.Value]:
   """Figures of a policy less those of the reference, trial by trial."""
   pairs = list(zip(found, reference, strict=True))
-  times = np.array([a.time - b.time for a, b in pairs if a.success and b.success])
+  times = np.array([a.time - b.time for a, b in pairs if a.success and b.success] or [np.nan])
   resampled = np.random.default_rng(0).choice(times, (_RESAMPLES, len(times))).mean(1)
   return {
     "won": sum(a.success and not b.success for a, b in pairs),
     "lost": sum(b.success and not a.success for a, b in pairs),
-    "both": len(times),
+    "both": sum(a.success and b.success for a, b in pairs),
     "time_s": float(times.mean()),
     "low_s": float(np.percentile(resampled, 2.5)),
     "high_s": float(np.percentile(resampled, 97.5)),

@@ -78,12 +78,14 @@ class FrozenEncoder:
 
     self._encode = jax.jit(encode)
 
-  def encode(self, images: np.ndarray, initial: LstmState | None = None) -> np.ndarray:
+  def encode(
+    self, images: np.ndarray, initial: tuple[np.ndarray, np.ndarray] | None = None
+  ) -> np.ndarray:
     """Returns features [N, C, F], or outputs of the LSTM [N, C, U], of consecutive pictures.
 
     Args:
       images: uint8 [N, H, W, 3]; every T of them share a draw of the augmentation.
-      initial: the LSTM's state before the first one [U]; None for zeros.
+      initial: the LSTM's output and cell before the first one [U]; None for zeros.
     """
     shape = (self._config.feature_copies, self._config.network.lstm_size)
     hidden, cell = initial or (np.zeros(shape[1:], np.float32),) * 2
@@ -102,5 +104,6 @@ class FrozenEncoder:
     """Returns a trajectory with what was made of its pictures in place of them."""
     replaced = _replaced(self._config)
     others: dict[str, Any] = {n: a for n, a in trajectory.items() if n not in replaced}
-    initial = LstmState(*(trajectory[n] for n in _MEMORY)) if self.has_memory else None
+    hidden, cell = _MEMORY
+    initial = (trajectory[hidden], trajectory[cell]) if self.has_memory else None
     return others | {self.name: self.encode(trajectory["image"], initial)}
