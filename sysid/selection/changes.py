@@ -25,7 +25,7 @@ from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear
 from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import Explanation, conclude
-from nerf2real.sysid.selection.remainder import grown, scatter, structured
+from nerf2real.sysid.selection.remainder import grown, mean_left, scatter, structured
 from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -51,7 +51,7 @@ class Changed:
   verdict: str
   """none, effects, partly or unexplained."""
   reference_left: float
-  """What the machine leaves anyway in the median block, rad (m)."""
+  """What the machine leaves anyway, root of `mean_left`, rad (m)."""
   left: float
   """The same of the logs, under the best hypothesis."""
   more_remains: bool
@@ -128,7 +128,8 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   predicts from each reading on is judged where play is in the best hypothesis of whole logs.
   """
   whole = _explained(subject, settings)
-  if whole.verdict in ("none", "effects") or not whole.found.best.names & set(UNREPEATED):
+  done = subject.now.follows or whole.verdict in ("none", "effects")
+  if done or not whole.found.best.names & set(UNREPEATED):
     return whole
   near = _explained(following(subject), settings)
   stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
@@ -150,10 +151,11 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     named = tuple(k for k in named if _is_new(before, usual, found.best, k, subject.beyond))
   anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
   if usual is not None and not subject.paired:
-    anyway = float(np.median(usual.fit.held[0][0]))
+    assert before is not None
+    anyway = mean_left(before, usual.fit.held[0][0])
   if now.follows:
     anyway = max(anyway, scatter(now, found.best))
-  left = float(np.median(found.left))
+  left = mean_left(now, found.left)
   more = left > settings.more**2 * anyway
   if named and more:
     named = _supported(explainer, found.best, named, subject.beyond)

@@ -187,12 +187,13 @@ def _begin(term: Term, members: Sequence[Subject]) -> Array:
   return np.concatenate([starts[best], *[own[best] for own in owns]])
 
 
-def alone(item: Wide, at: int) -> Evidence:
-  """Returns the evidence of the same effect at one of its joints, fitted there alone."""
+def alone(item: Wide, at: int) -> tuple[Evidence, Array]:
+  """Returns the evidence of the same effect at one of its joints, fitted there alone, and its
+  values [n]."""
   member = item.members[at]
   fitter = Fitter([member.now], Layout([(*member.explainer.null.terms, item.term)]))
   fit = fitter.fit(np.concatenate([item.own(at), item.x]), iterations=_ENOUGH)
-  return _evidence([member], fitter.leave_out(fit))
+  return _evidence([member], fitter.leave_out(fit)), fit.x[-len(item.x) :]
 
 
 def _evidence(members: Sequence[Subject], fit: Fit) -> Evidence:
