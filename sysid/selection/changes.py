@@ -21,7 +21,7 @@ from nerf2real.sysid.hypotheses.free_force import VARIABLE
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import rivals
 from nerf2real.sysid.selection.elaboration import elaborated
-from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear
+from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear, more_likely
 from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import Explanation, conclude
@@ -148,7 +148,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
   named = tuple(k for k in found.named if _is_something(subject, found.best, k))
   if before is not None and usual is not None and not subject.paired:
-    named = tuple(k for k in named if _is_new(before, usual, found.best, k, subject.beyond))
+    named = tuple(k for k in named if _is_new(before, usual, found.best, k))
   anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
   if usual is not None and not subject.paired:
     assert before is not None
@@ -280,8 +280,8 @@ def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
   )
 
 
-def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:
-  """Tells whether the reference is clearly worse with an effect of these values than without."""
+def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str) -> bool:
+  """Tells whether the reference is less likely with an effect of these values than without."""
   term = next(t for t in best.terms if t.name == kind)
   if term.freed:
     return True
@@ -291,7 +291,9 @@ def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, bey
   x = np.array([v for _, values in kept for v in values.values()])
   fitter = Fitter([before], Layout([terms]))
   fit = fitter.leave_out(fitter.fit(x, iterations=3))
-  return clear(usual, Scored(terms, fit, before.loglik(fit.held[0]))) > beyond
+  beside = Scored(terms, fit, before.loglik(fit.held[0]))
+  gains, prior = usual.nats - beside.nats, usual.prior - beside.prior
+  return more_likely(gains, prior, before.settings.level)
 
 
 def _verdict(

@@ -108,11 +108,16 @@ def _name(
   behind = [(clear(best, s), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
   alike = tuple(s for s in near if _same(joint, best, s))
-  told = [z for z, s in behind if not any(s is a for a in alike)]
+  told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
   certain = least >= beyond and carries_over(joint, best, plain)
   return Name(kind, least, certain, alike)
+
+
+def _holds(item: Scored, twin: Scored) -> bool:
+  """Tells whether a hypothesis is one that predicts the same as a name, with more effects."""
+  return bool(twin.names) and twin.names < item.names
 
 
 def carries_over(joint: JointLikelihood, item: Scored, plain: Scored) -> bool:

@@ -18,7 +18,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import rivals, wide
 from nerf2real.sysid.selection.changes import Changed, leaves
-from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.evidence import Scored, more_likely
 from nerf2real.sysid.selection.naming import USUAL
 from nerf2real.sysid.selection.subject import Subject
 from nerf2real.sysid.selection.wide import Evidence, Wide
@@ -169,10 +169,10 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   most = max(range(len(single)), key=lambda at: single[at][0].total)
   behind = (mine - single[most][0]).clear
   others_behind = [(mine - w.evidence()).clear for w in items if w not in alike]
-  clear = min(mine.clear, *others_behind, *([] if _may_be_own(best, most) else [behind]))
+  clear = min([mine.clear, *others_behind, *([] if _may_be_own(best, most) else [behind])])
   reach = _reach(best)
   nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
-  if clear < beyond or behind < 0.0 or nothing or not _is_new(best, beyond):
+  if clear < beyond or behind < 0.0 or nothing or not _is_new(best):
     return None
   origin = best.members[most]
   or_alone = (behind, single[most][1]) if behind < beyond else None
@@ -195,8 +195,8 @@ def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency
   return all(n in sizes and low <= sizes[n] <= high for n, (low, high) in bounds.items())
 
 
-def _is_new(item: Wide, beyond: float) -> bool:
-  """Tells whether references, of other commands, are clearly worse with an effect of these values
+def _is_new(item: Wide) -> bool:
+  """Tells whether references, of other commands, are less likely with an effect of these values
   than without: else it is theirs, too."""
   rows, prior = {}, 0.0
   held = item.term.held_at(item.x)
@@ -209,7 +209,7 @@ def _is_new(item: Wide, beyond: float) -> bool:
     fit = fitter.leave_out(fitter.fit(usual.fit.x, iterations=3))
     beside = Scored(terms, fit, before.loglik(fit.held[0]))
     rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
-  return Evidence(rows, prior).clear > beyond
+  return more_likely(np.concatenate(list(rows.values())), prior, before.settings.level)
 
 
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:

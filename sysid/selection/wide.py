@@ -177,7 +177,9 @@ def _begin(term: Term, members: Sequence[Subject]) -> Array:
   totals, owns = np.zeros(len(starts)), []
   for m in members:
     null = m.explainer.null
-    places = (null.fit.x, np.concatenate([t.centre for t in null.terms]))
+    values = (null.fit.values(t).values() for t in null.terms)
+    before = [t.centre or tuple(v) for t, v in zip(null.terms, values, strict=True)]
+    places = (null.fit.x, np.concatenate(before))
     tried = np.array([np.concatenate([own, s]) for s in starts for own in places])
     costs = Fitter([m.now], Layout([[*null.terms, term]])).costs(tried)
     costs = costs.reshape(len(starts), len(places))
