@@ -158,7 +158,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   left = mean_left(now, found.left)
   more = left > settings.more**2 * anyway
   if named and more:
-    named = _supported(explainer, found.best, named, subject.beyond)
+    named = _supported(explainer, found.best, named, subject.beyond, anyway)
     ranked = explainer.ranked()
   verdict = _verdict(
     found,
@@ -212,24 +212,30 @@ def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
 
 
 def _supported(
-  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float
+  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float, anyway: float
 ) -> tuple[str, ...]:
   """Returns the names that stand where something is left that no name is for.
 
-  What is named may then be a part of that: half of a soft stop is a spring. A kind that is a force
-  over one variable stands unless a force of any form over that variable does clearly better; any
-  other where hypotheses with a force of any form over both are clearly worse without it.
+  What is named may then be a part of that: half of a soft stop is a spring. A kind must explain
+  more squares than remain. One that is a force over one variable stands unless a force of any form
+  over that variable does clearly better; any other where hypotheses with a force of any form over
+  both are clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
     best: the best hypothesis, of which more remains than the machine leaves anyway.
     named: kinds that are clear.
     beyond: standard errors that count as clear.
+    anyway: mean square that the machine leaves anyway.
   """
   kept = []
+  left = mean_left(explainer.joint, best.fit.held[0][0])
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
-    if kind in VARIABLE:
+    explained = mean_left(explainer.joint, without.fit.held[0][0]) - left
+    if explained <= left - anyway:
+      stands = False
+    elif kind in VARIABLE:
       rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond
     else:

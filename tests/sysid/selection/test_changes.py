@@ -13,8 +13,8 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection import analysis, naming, remainder, subject
-from nerf2real.sysid.selection.evidence import Scored, standardised
+from nerf2real.sysid.selection import analysis, changes, naming, remainder, rivals, subject
+from nerf2real.sysid.selection.evidence import Scored, more_likely, standardised
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
@@ -81,6 +81,25 @@ def test_a_name_that_makes_one_motion_clearly_worse_does_not_stand():
   assert name.clear > 3.0 and not name.certain
   inert = _scored(("a",), np.repeat([4.0, 4.0, 0.0], 10) + noise)
   assert naming.conclude(_Joint, [null, inert], 3.0).named == ("a",)
+
+
+def test_a_twin_with_more_beside_it_is_no_rival():
+  null = _scored((), np.linspace(-4, -3, 30))
+  right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
+  more = _scored(("b", "c"), np.linspace(0, 0.11, 30), prediction=5.0)
+  other = _scored(("c", "d"), np.linspace(0, 0.11, 30), prediction=5.0)
+  assert naming.conclude(_Joint, [null, right, twin, more], 3.0).named == ("a",)
+  assert naming.conclude(_Joint, [null, right, twin, more, other], 3.0).named == ()
+
+
+def test_few_blocks_tell_what_a_log_holds_and_one_does_not():
+  gains = np.zeros(40)
+  gains[[3, 4, 30]] = 8.0
+  assert standardised(gains) < 2.0
+  assert more_likely(gains, 0.0, 0.05)
+  assert not more_likely(gains, 14.0, 0.05)
+  gains[[4, 30]] = 0.0
+  assert not more_likely(gains, 0.0, 0.05)
 
 
 def test_one_block_is_no_evidence():
@@ -164,6 +183,19 @@ def test_a_misfit_in_few_blocks_remains():
   assert remainder.mean_left(joint, blocks) == 1.0
   blocks[[5, 8, 25]] = 40.0  # a detent that is passed thrice
   assert remainder.mean_left(joint, blocks) > SETTINGS.more**2 > np.median(blocks)
+
+
+@pytest.mark.parametrize(("without", "stands"), [(1.3, ()), (2.5, ("cogging",))])
+def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, without, stands):
+  def leaving(square):
+    return SimpleNamespace(fit=SimpleNamespace(held=[np.full((1, 20), square)]))
+
+  monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(without))
+  monkeypatch.setattr(rivals, "with_force", lambda *_: None)
+  monkeypatch.setattr(changes, "clear", lambda *_: 0.0)  # no force does better
+  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20)))
+  found = changes._supported(explainer, leaving(1.0), ("cogging",), 3.0, 0.1)
+  assert found == stands
 
 
 @pytest.mark.parametrize(("independent", "follows"), [(0.002, True), (0.05, False)])
