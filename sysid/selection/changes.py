@@ -32,6 +32,7 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 Array = np.ndarray
 
 
+CONSTANTS_OFF = "parameter_error"
 _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
 _REST = 0.1
@@ -149,22 +150,20 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   named = tuple(k for k in found.named if _is_something(subject, found.best, k))
   if before is not None and usual is not None and not subject.paired:
     named = tuple(k for k in named if _is_new(before, usual, found.best, k))
-  anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
-  if usual is not None and not subject.paired:
-    assert before is not None
-    anyway = mean_left(before, usual.fit.held[0][0])
-  if now.follows:
-    anyway = max(anyway, scatter(now, found.best))
-  left = mean_left(now, found.left)
-  more = left > settings.more**2 * anyway
-  if named and more:
-    named = _supported(explainer, found.best, named, subject.beyond, anyway)
+  anyway, left = _remaining(subject, found)
+  typical, few = settings.more**2 * anyway < left
+  if named and (typical or few):
+    # That constants are off is no effect: a misfit in few blocks does not speak against it.
+    doubted = [k for k in named if typical or k != CONSTANTS_OFF]
+    stands = _supported(explainer, found.best, doubted, subject.beyond, float(anyway[1]))
+    named = tuple(k for k in named if k in stands or k not in doubted)
     ranked = explainer.ranked()
+  more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
     found,
     named,
     any(t.wider for t in known),
-    more or leaves(subject, found.best, settings),
+    bool(typical) or leaves(subject, found.best, settings),
     more,
   )
   off = _constants_off(subject, found.best, settings)
@@ -174,11 +173,26 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     found,
     named,
     "effects" if off and verdict == "none" else verdict,
-    float(np.sqrt(anyway)),
-    float(np.sqrt(left)),
+    *(float(v) for v in np.sqrt([anyway[1], left[1]])),
     more,
     off,
   )
+
+
+def _remaining(subject: Subject, found: Explanation) -> tuple[Array, Array]:
+  """Returns what a machine leaves anyway, and what its best hypothesis does: mean squares [2] of
+  the median block, and of all blocks by `mean_left`."""
+  now, before, usual = subject.now, subject.before, subject.usual
+
+  def both(joint: JointLikelihood, squares: Array) -> Array:
+    return np.array([np.median(squares), mean_left(joint, squares)])
+
+  anyway = np.full(2, (2.0 if subject.paired else 1.0) * now.position_noise**2)
+  if before is not None and usual is not None and not subject.paired:
+    anyway = both(before, usual.fit.held[0][0])
+  if now.follows:
+    anyway = np.maximum(anyway, both(now, scatter(now, found.best)))
+  return anyway, both(now, found.left)
 
 
 def elaborate(found: Sequence[Changed]) -> None:
@@ -233,7 +247,7 @@ def _supported(
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
     explained = mean_left(explainer.joint, without.fit.held[0][0]) - left
-    if explained <= left - anyway:
+    if kind != CONSTANTS_OFF and explained <= left - anyway:
       stands = False
     elif kind in VARIABLE:
       rival = rivals.with_force(explainer, without, VARIABLE[kind])

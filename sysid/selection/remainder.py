@@ -36,9 +36,9 @@ def mean_left(joint: JointLikelihood, squares: Array) -> float:
   return float(squares[kept].mean())
 
 
-def scatter(joint: JointLikelihood, item: Scored) -> float:
-  """Returns the mean square that a hypothesis leaves in readings made by itself: where a course
-  does not repeat, a simulation that follows them strays all the same."""
+def scatter(joint: JointLikelihood, item: Scored) -> Array:
+  """Returns the mean squares of blocks [B] that a hypothesis leaves in readings made by itself:
+  where a course does not repeat, a simulation that follows them strays all the same."""
   random = np.random.default_rng(0)
   c = compose(joint.plant, item.terms, item.fit.x)
   residual = []
@@ -50,7 +50,7 @@ def scatter(joint: JointLikelihood, item: Scored) -> float:
     residual.append(np.nan_to_num(read - near.position))
   rows = np.zeros((len(joint.channels), joint.size))
   rows[0] = np.concatenate(residual)
-  return mean_left(joint, joint.squares(rows * joint.gain)[0])
+  return joint.squares(rows * joint.gain)[0]
 
 
 def grown(best: Scored, usual: Scored, beyond: float, settings: Settings) -> bool:
