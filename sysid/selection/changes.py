@@ -173,7 +173,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     found,
     named,
     "effects" if off and verdict == "none" else verdict,
-    *(float(v) for v in np.sqrt([anyway[1], left[1]])),
+    float(np.sqrt(anyway[1])),
+    float(np.sqrt(left[1])),
     more,
     off,
   )

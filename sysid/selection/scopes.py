@@ -198,7 +198,7 @@ def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency
 def _is_new(item: Wide) -> bool:
   """Tells whether references, of other commands, are less likely with an effect of these values
   than without: else it is theirs, too."""
-  rows, prior = {}, 0.0
+  rows, prior, level = {}, 0.0, item.members[0].now.settings.level
   held = item.term.held_at(item.x)
   for member in item.members:
     before, usual = member.before, member.usual
@@ -209,7 +209,7 @@ def _is_new(item: Wide) -> bool:
     fit = fitter.leave_out(fitter.fit(usual.fit.x, iterations=3))
     beside = Scored(terms, fit, before.loglik(fit.held[0]))
     rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
-  return more_likely(np.concatenate(list(rows.values())), prior, before.settings.level)
+  return more_likely(np.concatenate(list(rows.values())), prior, level)
 
 
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
