@@ -132,7 +132,7 @@ def _identify(
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else found.effects,
     "in_reference": found.in_reference,
-    "alternatives": _alternatives(found),
+    "alternatives": [*found.scopes, *_alternatives(found)],
     "residual_at": residual_at(found),
     "error": {
       "train": _errors(found, logs, near, settings),
@@ -142,7 +142,10 @@ def _identify(
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
     "next_excitation": _next(found, shown),
-    "notes": [capability.sentence(shown), *servo.notes(found), *sensed.notes],
+    "notes": [
+      *(capability.sentence(shown), *servo.notes(found), *map(_of_one, found.scopes)),
+      *sensed.notes,
+    ],
   }
   # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
   content["alternatives"] = [*found.nearest, *content["alternatives"]]
@@ -155,8 +158,8 @@ def _identify(
     joints = ", ".join(item.joint for item in found.followed)
     content["notes"] = [
       *content["notes"],
-      f"Found by a simulation that follows the readings, as courses with play do not repeat:"
-      f" {joints}. The errors before and after are of whole courses, which stray.",
+      f"Found by a simulation that follows the readings, as courses do not repeat (play, or where a"
+      f" motion stops): {joints}. The errors before and after are of whole courses, which stray.",
     ]
   if found.in_reference:
     counts = collections.Counter(row["kind"] for row in found.in_reference)
@@ -269,6 +272,14 @@ def _errors(
   window = settings.window_s
   before = evaluation.error(found.model, logs, window_s=window)
   return {"before": before} | evaluation.errors(found.model, logs, near, window_s=window)
+
+
+def _of_one(row: dict[str, Any]) -> str:
+  """Returns a sentence on an effect of several joints that may be of one alone."""
+  return (
+    f"These logs do not tell whether {row['kind']} is of all joints or of {row['joint']} alone,"
+    f" which is behind by {row['evidence']['behind_by_standard_errors']:.1f} standard errors."
+  )
 
 
 def _spread(error: dict[str, Any]) -> str:

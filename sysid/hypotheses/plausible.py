@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from nerf2real.suite.effects import kind_of
+from nerf2real.suite.effects import Parameter, kind_of
 from nerf2real.sysid.hypotheses.candidates import strongest
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
@@ -15,6 +15,12 @@ _SLACK = 1.25
 _CYCLIC = ("phase",)
 _SERVO = 2.5
 """N m; stall torque of the OP3's MX-28 (Robotis), of whose kind the registry's ranges are."""
+
+
+def ends(parameter: Parameter) -> tuple[float, float]:
+  """Returns the least and the largest value that a parameter is looked for at."""
+  low = parameter.low / _SLACK if parameter.low > 0 else parameter.low * _SLACK
+  return low, parameter.high * _SLACK
 
 
 def plausible(term: Term, plant: JointPlant) -> Term:
@@ -31,10 +37,9 @@ def plausible(term: Term, plant: JointPlant) -> Term:
     if name in _CYCLIC or name not in {p.name for p in kind_of(term.kind).parameters}:
       continue
     parameter = kind_of(term.kind).parameter(name)
-    lowest = parameter.low / _SLACK if parameter.low > 0 else parameter.low * _SLACK
-    highest = (
-      parameter.high * _SLACK * (larger if parameter.unit.startswith(("N m", "kg")) else 1.0)
-    )
+    lowest, highest = ends(parameter)
+    if parameter.unit.startswith(("N m", "kg")):
+      highest *= larger
     low[at], high[at] = max(low[at], lowest), min(high[at], highest)
     high[at] = max(high[at], low[at])
   starts = dict.fromkeys(tuple(map(float, np.clip(s, low, high))) for s in term.starts)

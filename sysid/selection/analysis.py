@@ -1,7 +1,7 @@
 """Analyses a machine: effects of its scopes, joint by joint, in the form of a report."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import mujoco
@@ -96,11 +96,37 @@ def _explained(
     changed = [changes.explain(subject, settings) for subject in subjects]
     needless = scopes.needless(shared, changed)
     if not needless:
+      shared, changed = _reopened(model, shared, changed, settings, refuted)
       changes.elaborate(changed)
       return shared, changed
     refuted |= {s.term.kind for s in needless}
     for subject, state in zip(subjects, before, strict=True):
       subject.state = state
+
+
+def _reopened(
+  model: mujoco.MjModel,
+  shared: list[Shared],
+  changed: list[Changed],
+  settings: Settings,
+  refuted: Collection[str],
+) -> tuple[list[Shared], list[Changed]]:
+  """Returns the same with one more shared effect where what joints have of their own hid it."""
+  if len(changed) < 2:
+    return shared, changed
+  known = {s.term.kind for s in shared} | set(refuted)
+  further = scopes.found_beside(model, changed, settings, known=known)
+  if further is None:
+    return shared, changed
+  before = [c.subject.state for c in changed]
+  for member in further.members:
+    member.take(further.held)
+  again = [changes.explain(c.subject, settings) for c in changed]
+  if not scopes.needless([*shared, further], again):
+    return [*shared, further], again
+  for item, state in zip(changed, before, strict=True):
+    item.subject.state = state
+  return shared, changed
 
 
 def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:
@@ -117,6 +143,8 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
     row |= {"joint": wide.ancestors(result.model, body)[0], "body": shared.term.target}
   result.objects.append(effect)
   result.effects.append(row)
+  if shared.or_alone is not None:
+    result.scopes.append(claims.alone(shared.term, shared.origin.joint, *shared.or_alone))
 
 
 def machine_verdict(verdicts: Sequence[str], *, claimed: bool) -> str:

@@ -1,8 +1,11 @@
 """What reference logs show: constants and effects that a machine has without the fault."""
 
 import dataclasses
+from collections.abc import Collection
 
+from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit.layout import CONSTANTS
+from nerf2real.sysid.hypotheses.plausible import ends
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.evidence import Scored
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -29,15 +32,35 @@ def known_terms(found: Scored, settings: Settings = SETTINGS) -> tuple[Term, ...
 
 
 _MAY_CHANGE = ("damping", "armature", "friction")
+_FACTORS = (0.7, 1.4, 1.9)  # of a changed constant where searches start, chosen: within its range
 
 
-def freed_constants(known: Term, settings: Settings = SETTINGS) -> Term:
+def freed_constants(known: Term) -> Term:
   """Returns a reference's constants, of which those that no effect stands for may have changed."""
-  tolerance = dict(settings.tolerances)
-  sigma = tuple(
-    tolerance[n] if n in _MAY_CHANGE else s for n, s in zip(known.names, known.prior, strict=True)
+  return _freed(known, _MAY_CHANGE)
+
+
+def changed_constants(known: Term) -> tuple[Term, ...]:
+  """Returns a reference's constants with one of them changed, for each that may have."""
+  return tuple(_freed(known, (name,)) for name in known.names if name in _MAY_CHANGE)
+
+
+def _freed(known: Term, names: Collection[str]) -> Term:
+  """Returns constants of which some lie anywhere in their plausible range about what they were."""
+  low, high, sigma = list(known.low), list(known.high), list(known.prior)
+  starts = [known.starts[0]]
+  for at, name in enumerate(known.names):
+    if name not in names:
+      continue
+    before, (least, most) = 1.0 + known.centre[at], ends(kind_of("parameter_error").parameter(name))
+    low[at], high[at], sigma[at] = least * before - 1.0, most * before - 1.0, float("inf")
+    starts += [
+      tuple(s * before - 1.0 if k == at else v for k, v in enumerate(known.starts[0]))
+      for s in _FACTORS
+    ]
+  return dataclasses.replace(
+    known, low=tuple(low), high=tuple(high), prior=tuple(sigma), starts=tuple(starts), freed=True
   )
-  return dataclasses.replace(known, prior=sigma, freed=True)
 
 
 def widened(own: Term) -> Term:

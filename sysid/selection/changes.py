@@ -21,17 +21,18 @@ from nerf2real.sysid.hypotheses.free_force import VARIABLE
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import rivals
 from nerf2real.sysid.selection.elaboration import elaborated
-from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear
+from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear, more_likely
 from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import Explanation, conclude
-from nerf2real.sysid.selection.remainder import grown, scatter, structured
+from nerf2real.sysid.selection.remainder import grown, mean_left, scatter, structured
 from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
 
+CONSTANTS_OFF = "parameter_error"
 _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
 _REST = 0.1
@@ -51,7 +52,7 @@ class Changed:
   verdict: str
   """none, effects, partly or unexplained."""
   reference_left: float
-  """What the machine leaves anyway in the median block, rad (m)."""
+  """What the machine leaves anyway, root of `mean_left`, rad (m)."""
   left: float
   """The same of the logs, under the best hypothesis."""
   more_remains: bool
@@ -128,7 +129,8 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   predicts from each reading on is judged where play is in the best hypothesis of whole logs.
   """
   whole = _explained(subject, settings)
-  if whole.verdict in ("none", "effects") or not whole.found.best.names & set(UNREPEATED):
+  done = subject.now.follows or whole.verdict in ("none", "effects")
+  if done or not whole.found.best.names & set(UNREPEATED):
     return whole
   near = _explained(following(subject), settings)
   stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
@@ -147,22 +149,21 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
   named = tuple(k for k in found.named if _is_something(subject, found.best, k))
   if before is not None and usual is not None and not subject.paired:
-    named = tuple(k for k in named if _is_new(before, usual, found.best, k, subject.beyond))
-  anyway = (2.0 if subject.paired else 1.0) * now.position_noise**2
-  if usual is not None and not subject.paired:
-    anyway = float(np.median(usual.fit.held[0][0]))
-  if now.follows:
-    anyway = max(anyway, scatter(now, found.best))
-  left = float(np.median(found.left))
-  more = left > settings.more**2 * anyway
-  if named and more:
-    named = _supported(explainer, found.best, named, subject.beyond)
+    named = tuple(k for k in named if _is_new(before, usual, found.best, k))
+  anyway, left = _remaining(subject, found)
+  typical, few = settings.more**2 * anyway < left
+  if named and (typical or few):
+    # That constants are off is no effect: a misfit in few blocks does not speak against it.
+    doubted = [k for k in named if typical or k != CONSTANTS_OFF]
+    stands = _supported(explainer, found.best, doubted, subject.beyond, float(anyway[1]))
+    named = tuple(k for k in named if k in stands or k not in doubted)
     ranked = explainer.ranked()
+  more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
     found,
     named,
     any(t.wider for t in known),
-    more or leaves(subject, found.best, settings),
+    bool(typical) or leaves(subject, found.best, settings),
     more,
   )
   off = _constants_off(subject, found.best, settings)
@@ -172,11 +173,27 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     found,
     named,
     "effects" if off and verdict == "none" else verdict,
-    float(np.sqrt(anyway)),
-    float(np.sqrt(left)),
+    float(np.sqrt(anyway[1])),
+    float(np.sqrt(left[1])),
     more,
     off,
   )
+
+
+def _remaining(subject: Subject, found: Explanation) -> tuple[Array, Array]:
+  """Returns what a machine leaves anyway, and what its best hypothesis does: mean squares [2] of
+  the median block, and of all blocks by `mean_left`."""
+  now, before, usual = subject.now, subject.before, subject.usual
+
+  def both(joint: JointLikelihood, squares: Array) -> Array:
+    return np.array([np.median(squares), mean_left(joint, squares)])
+
+  anyway = np.full(2, (2.0 if subject.paired else 1.0) * now.position_noise**2)
+  if before is not None and usual is not None and not subject.paired:
+    anyway = both(before, usual.fit.held[0][0])
+  if now.follows:
+    anyway = np.maximum(anyway, both(now, scatter(now, found.best)))
+  return anyway, both(now, found.left)
 
 
 def elaborate(found: Sequence[Changed]) -> None:
@@ -210,24 +227,30 @@ def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
 
 
 def _supported(
-  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float
+  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float, anyway: float
 ) -> tuple[str, ...]:
   """Returns the names that stand where something is left that no name is for.
 
-  What is named may then be a part of that: half of a soft stop is a spring. A kind that is a force
-  over one variable stands unless a force of any form over that variable does clearly better; any
-  other where hypotheses with a force of any form over both are clearly worse without it.
+  What is named may then be a part of that: half of a soft stop is a spring. A kind must explain
+  more squares than remain. One that is a force over one variable stands unless a force of any form
+  over that variable does clearly better; any other where hypotheses with a force of any form over
+  both are clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
     best: the best hypothesis, of which more remains than the machine leaves anyway.
     named: kinds that are clear.
     beyond: standard errors that count as clear.
+    anyway: mean square that the machine leaves anyway.
   """
   kept = []
+  left = mean_left(explainer.joint, best.fit.held[0][0])
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
-    if kind in VARIABLE:
+    explained = mean_left(explainer.joint, without.fit.held[0][0]) - left
+    if kind != CONSTANTS_OFF and explained <= left - anyway:
+      stands = False
+    elif kind in VARIABLE:
       rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond
     else:
@@ -278,8 +301,8 @@ def _is_something(subject: Subject, best: Scored, kind: str) -> bool:
   )
 
 
-def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, beyond: float) -> bool:
-  """Tells whether the reference is clearly worse with an effect of these values than without."""
+def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str) -> bool:
+  """Tells whether the reference is less likely with an effect of these values than without."""
   term = next(t for t in best.terms if t.name == kind)
   if term.freed:
     return True
@@ -289,7 +312,9 @@ def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, bey
   x = np.array([v for _, values in kept for v in values.values()])
   fitter = Fitter([before], Layout([terms]))
   fit = fitter.leave_out(fitter.fit(x, iterations=3))
-  return clear(usual, Scored(terms, fit, before.loglik(fit.held[0]))) > beyond
+  beside = Scored(terms, fit, before.loglik(fit.held[0]))
+  gains, prior = usual.nats - beside.nats, usual.prior - beside.prior
+  return more_likely(gains, prior, before.settings.level)
 
 
 def _verdict(

@@ -71,6 +71,26 @@ def shared(
   }
 
 
+def alone(term: Term, joint: str, behind: float, x: Array) -> dict[str, Any]:
+  """Returns the entry of an alternative: an effect of several joints that may be of one alone.
+
+  Args:
+    term: the effect.
+    joint: which joint.
+    behind: standard errors by which that is less likely.
+    x: its values there [n].
+  """
+  values = {n: round(float(v), 5) for n, v in zip(term.names, x, strict=True)}
+  return {
+    "kinds": [term.kind],
+    "kind": term.kind,
+    "joint": joint,
+    "confounded": False,
+    "parameters": {term.kind: values},
+    "evidence": {"behind_by_standard_errors": round(behind, 2)},
+  }
+
+
 def constants_of_all(claimed: list[dict[str, Any]]) -> dict[str, Any]:
   """Returns one entry for constants that are off alike in (nearly) all joints: their medians.
 

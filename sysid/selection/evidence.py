@@ -79,6 +79,20 @@ def variance(differences: Array) -> float:
   return max(own + 2.0 * float(e[1:] @ e[:-1]), own) * len(e) / max(len(e) - 1, 1)
 
 
+def more_likely(differences: Array, prior: float, level: float) -> bool:
+  """Tells whether logs as they are were left by a hypothesis and not by another: whether that is
+  more likely by 1 / level, without the block that says so most.
+
+  The standard error by blocks is for what other motions would show, and few blocks never tell.
+
+  Args:
+    differences: nats of the blocks of all logs, less the other's.
+    prior: nats that the priors cost more.
+    level: of significance.
+  """
+  return float(differences.sum() - differences.max()) - prior > -np.log(level)
+
+
 def of_size(items: Iterable[Scored], size: int) -> list[Scored]:
   """Returns the explanations by a number of effects alone."""
   alone = (item for item in items if not (item.neutral or item.beside_force))

@@ -42,6 +42,7 @@ class Explainer:
     start: Array | None = None,
     known: Sequence[Term] = (),
     freed: Term | None = None,
+    changed: Sequence[Term] = (),
   ):
     """Fits the constants, setting the residual's scale as they improve.
 
@@ -52,10 +53,12 @@ class Explainer:
       settings: effort.
       start: of the constants.
       known: effects that every hypothesis has.
-      freed: constants that may differ from those of a reference.
+      freed: constants that may differ from what they are taken for.
+      changed: the same, each of which frees some of them; `freed` alone if empty.
     """
     self.joint, self.constants, self.settings = joint, constants, settings
     self.library, self.freed = list(library), freed
+    self.changed = tuple(changed) or ((freed,) if freed is not None else ())
     self.scored: dict[tuple[Term, ...], Scored] = {}
     self.base = base = (constants, *known)
     x = np.concatenate([t.starts[0] for t in base]) if start is None else start
@@ -155,10 +158,13 @@ class Explainer:
           fresh[at : at + count] = True
           yield terms, np.array(starts), [known], fresh
       at += count
-    if self.freed is not None and not parent.terms[0].freed:
-      fresh = np.zeros(len(x), bool)
-      fresh[: len(self.freed.names)] = True
-      yield (self.freed, *parent.terms[1:]), x[None], [known], fresh
+    for freed in () if parent.terms[0].freed else self.changed:
+      fresh = np.arange(len(x)) < len(freed.names)
+      before, *others = np.array(freed.starts)
+      begin = np.tile(x, (1 + len(others), 1))
+      for row, start in zip(begin[1:], others, strict=True):
+        row[fresh] = np.where(start != before, start, row[fresh])
+      yield (freed, *parent.terms[1:]), begin, [known], fresh
     for term in self.library:
       if term.kind in old:
         continue

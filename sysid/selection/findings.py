@@ -61,6 +61,9 @@ class Identified:
   in_reference: list[dict[str, Any]] = dataclasses.field(default_factory=list)
   """Entries of effects that reference logs show, too: the model lacks them, nothing has changed."""
 
+  scopes: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+  """Entries of alternatives: an effect of several joints at one of them alone."""
+
   @property
   def near(self) -> list[Member]:
     """What to simulate with: the extended model, and others whose fits are near its own."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.selection.evidence import Scored, clear, of_size
+from nerf2real.sysid.selection.evidence import Scored, clear, of_size, standardised
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
@@ -108,9 +108,33 @@ def _name(
   behind = [(clear(best, s), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
   alike = tuple(s for s in near if _same(joint, best, s))
-  told = [z for z, s in behind if not any(s is a for a in alike)]
+  told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
-  return Name(kind, least, least >= beyond, alike)
+  plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
+  certain = least >= beyond and carries_over(joint, best, plain)
+  return Name(kind, least, certain, alike)
+
+
+def _holds(item: Scored, twin: Scored) -> bool:
+  """Tells whether a hypothesis is one that predicts the same as a name, with more effects."""
+  return bool(twin.names) and twin.names < item.names
+
+
+def carries_over(joint: JointLikelihood, item: Scored, plain: Scored) -> bool:
+  """Tells whether a hypothesis predicts no log clearly worse than one without an effect.
+
+  Logs are of different motions. Their blocks are predicted with values that were fitted to the
+  other logs, so that an effect that holds has nothing to lose on any.
+
+  Args:
+    joint: the logs.
+    item: the hypothesis.
+    plain: the same without an effect.
+  """
+  logs = np.unique(joint.log_of)
+  least = float(norm.isf(joint.settings.level / len(logs)))
+  gains = item.nats - plain.nats
+  return all(standardised(gains[joint.log_of == log], least=1.0) > -least for log in logs)
 
 
 def _same(joint: JointLikelihood, one: Scored, other: Scored) -> bool:

@@ -25,9 +25,20 @@ def structured(joint: JointLikelihood, item: Scored, settings: Settings) -> bool
   return int(np.sum((certain > rare) & large)) >= 2
 
 
-def scatter(joint: JointLikelihood, item: Scored) -> float:
-  """Returns the mean square that a hypothesis leaves in the median block of readings made by
-  itself: where a course does not repeat, a simulation that follows them strays all the same."""
+def mean_left(joint: JointLikelihood, squares: Array) -> float:
+  """Returns the mean square of blocks [B] but for the largest of every log, which may hold a knock:
+  a misfit may be in few blocks, as where a detent is passed."""
+  kept = np.ones(len(squares), bool)
+  for log in np.unique(joint.log_of):
+    of_log = np.flatnonzero(joint.log_of == log)
+    if len(of_log) > 1:
+      kept[of_log[np.argmax(squares[of_log])]] = False
+  return float(squares[kept].mean())
+
+
+def scatter(joint: JointLikelihood, item: Scored) -> Array:
+  """Returns the mean squares of blocks [B] that a hypothesis leaves in readings made by itself:
+  where a course does not repeat, a simulation that follows them strays all the same."""
   random = np.random.default_rng(0)
   c = compose(joint.plant, item.terms, item.fit.x)
   residual = []
@@ -39,7 +50,7 @@ def scatter(joint: JointLikelihood, item: Scored) -> float:
     residual.append(np.nan_to_num(read - near.position))
   rows = np.zeros((len(joint.channels), joint.size))
   rows[0] = np.concatenate(residual)
-  return float(np.median(joint.squares(rows * joint.gain)[0]))
+  return joint.squares(rows * joint.gain)[0]
 
 
 def grown(best: Scored, usual: Scored, beyond: float, settings: Settings) -> bool:

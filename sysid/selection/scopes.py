@@ -18,7 +18,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection import rivals, wide
 from nerf2real.sysid.selection.changes import Changed, leaves
-from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.evidence import Scored, more_likely
 from nerf2real.sysid.selection.naming import USUAL
 from nerf2real.sysid.selection.subject import Subject
 from nerf2real.sysid.selection.wide import Evidence, Wide
@@ -43,6 +43,9 @@ class Shared:
   """Standard errors by which it is better than any that lacks it."""
   nats: float
   """What its joints gain together, priors included."""
+  or_alone: tuple[float, Array] | None = None
+  """Where the same at `origin` alone, whose own it may be, is not clearly worse: standard errors
+  that it is behind, and its values there [n]."""
 
   @property
   def held(self) -> Term:
@@ -69,15 +72,8 @@ def shared_effects(
   """
   found: list[Shared] = []
   while len(found) < settings.depth:
-    leaving = [s for s in subjects if leaves(s, s.explainer.null, settings)]
-    known = {s.term.kind for s in found} | set(refuted)
-    tried = [
-      wide.screened(term, members)
-      for term, members in (wide.hypotheses(model, subjects) if leaving else ())
-      if term.kind not in known and any(m in leaving for m in members)
-    ]
     before = [s.state for s in subjects]
-    best = _best(tried, own_latency=subjects[0].before is None)
+    best = _next(model, subjects, settings, {s.term.kind for s in found} | set(refuted))
     if best is None:
       for subject, state in zip(subjects, before, strict=True):
         subject.state = state
@@ -86,6 +82,52 @@ def shared_effects(
     for member in best.members:
       member.take(best.held)
   return _settled(found)
+
+
+def found_beside(
+  model: mujoco.MjModel,
+  changed: Sequence[Changed],
+  settings: Settings,
+  *,
+  known: Collection[str],
+) -> Shared | None:
+  """Returns one more effect of wider scope, beside what joints have of their own, if there is one.
+
+  What a joint has of its own may hide an effect of the machine that was looked for before.
+
+  Args:
+    model: the declared one.
+    changed: the joints' explanations; they stay.
+    settings: effort.
+    known: kinds that are not tried.
+  """
+  if not any(c.named for c in changed):
+    return None
+  subjects = [c.subject for c in changed]
+  before = [s.state for s in subjects]
+  for item in changed:
+    explainer, certain = item.subject.explainer, item.found.best
+    for kind in sorted(certain.names - set(item.named)):
+      certain = rivals.lacking(explainer, certain, kind)
+    explainer.null = certain
+  best = _next(model, subjects, settings, known)
+  for subject, state in zip(subjects, before, strict=True):
+    subject.state = state
+  return best
+
+
+def _next(
+  model: mujoco.MjModel, subjects: Sequence[Subject], settings: Settings, known: Collection[str]
+) -> Shared | None:
+  """Returns the best effect of a body or of the machine, if it is clear, where a joint leaves more
+  than the machine does anyway; joints' scales may have changed after."""
+  leaving = [s for s in subjects if leaves(s, s.explainer.null, settings)]
+  tried = [
+    wide.screened(term, members)
+    for term, members in (wide.hypotheses(model, subjects) if leaving else ())
+    if term.kind not in known and any(m in leaving for m in members)
+  ]
+  return _best(tried, own_latency=subjects[0].before is None)
 
 
 def _settled(found: Sequence[Shared]) -> list[Shared]:
@@ -124,15 +166,26 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   best = min(alike, key=lambda w: USUAL.index(w.key[0]) if w.key[0] in USUAL else len(USUAL))
   mine = best.evidence()
   single = [wide.alone(best, at) for at in range(len(best.members))]
-  most = max(range(len(single)), key=lambda at: single[at].total)
-  rivals = [single[most], *(w.evidence() for w in items if w not in alike)]
-  clear = min(mine.clear, *((mine - r).clear for r in rivals))
+  most = max(range(len(single)), key=lambda at: single[at][0].total)
+  behind = (mine - single[most][0]).clear
+  others_behind = [(mine - w.evidence()).clear for w in items if w not in alike]
+  clear = min([mine.clear, *others_behind, *([] if _may_be_own(best, most) else [behind])])
   reach = _reach(best)
   nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
-  if clear < beyond or nothing or not _is_new(best, beyond):
+  if clear < beyond or behind < 0.0 or nothing or not _is_new(best):
     return None
   origin = best.members[most]
-  return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total)
+  or_alone = (behind, single[most][1]) if behind < beyond else None
+  return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total, or_alone)
+
+
+def _may_be_own(item: Wide, at: int) -> bool:
+  """Tells whether one of the joints may have an effect of that kind to itself.
+
+  Then the scopes are alternatives of one name, of which the more likely is told; a kind that is the
+  machine's alone needs what other kinds imitate at one joint to be clearly worse.
+  """
+  return any(t.kind == item.term.kind for t in item.members[at].library)
 
 
 def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency: bool) -> bool:
@@ -142,10 +195,10 @@ def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency
   return all(n in sizes and low <= sizes[n] <= high for n, (low, high) in bounds.items())
 
 
-def _is_new(item: Wide, beyond: float) -> bool:
-  """Tells whether references, of other commands, are clearly worse with an effect of these values
+def _is_new(item: Wide) -> bool:
+  """Tells whether references, of other commands, are less likely with an effect of these values
   than without: else it is theirs, too."""
-  rows, prior = {}, 0.0
+  rows, prior, level = {}, 0.0, item.members[0].now.settings.level
   held = item.term.held_at(item.x)
   for member in item.members:
     before, usual = member.before, member.usual
@@ -156,7 +209,7 @@ def _is_new(item: Wide, beyond: float) -> bool:
     fit = fitter.leave_out(fitter.fit(usual.fit.x, iterations=3))
     beside = Scored(terms, fit, before.loglik(fit.held[0]))
     rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
-  return Evidence(rows, prior).clear > beyond
+  return more_likely(np.concatenate(list(rows.values())), prior, level)
 
 
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:

@@ -20,7 +20,12 @@ from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection.baseline import freed_constants, known_terms, widened
+from nerf2real.sysid.selection.baseline import (
+  changed_constants,
+  freed_constants,
+  known_terms,
+  widened,
+)
 from nerf2real.sysid.selection.evidence import Scored
 from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.growth import grow
@@ -65,20 +70,23 @@ class Subject:
   def take(self, term: Term) -> None:
     """Adds an effect that has been found to hold, fits the constants anew."""
     self.known = (*self.known, term)
-    self.explainer = _explainer(self.now, self.known, self.library, self.freed)
+    self.explainer = _explainer(self.now, self.before, self.known, self.library, self.freed)
 
   @property
   def state(self) -> tuple[Any, ...]:
-    """What is known, the hypothesis without effects, and the residual's scale."""
+    """What is known, the hypotheses that were scored, and the residual's scale."""
     known = self.known, self.freed, self.usual, self.paired, self.now.expectation
-    return known, self.explainer, self.explainer.null, self.now.scale, self.now.independent.copy()
+    scored = self.explainer, self.explainer.null, dict(self.explainer.scored)
+    return known, scored, self.now.scale, self.now.independent.copy()
 
   @state.setter
   def state(self, state: tuple[Any, ...]) -> None:
-    known, self.explainer, null, self.now.scale, independent = state
+    known, scored, self.now.scale, independent = state
     self.known, self.freed, self.usual, self.paired, self.now.expectation = known
     self.now.independent = independent.copy()
-    self.explainer.null, self.explainer.scored = null, {null.terms: null}
+    self.explainer, self.explainer.null, kept = scored
+    self.explainer.scored = dict(kept)
+    self.explainer.rescore()
 
 
 def prepare(
@@ -93,6 +101,10 @@ def prepare(
 ) -> Subject:
   """Returns a joint with its constants fitted.
 
+  Its courses are compared with those simulated from the commands alone, unless what these leave
+  of a reference's goes together for longer than a block: then with what is predicted from each
+  reading on.
+
   Args:
     model: the declared one.
     joint: its name.
@@ -106,7 +118,8 @@ def prepare(
   before = _likelihood(model, joint, reference, reductions[1], settings) if reference else None
   library = own_library(now.plant, alone=tried == 1)
   beyond = threshold(len({t.kind for t in library} | set(WHOLE)) * tried, settings)
-  return _subject(now, before, library, beyond, alone=tried == 1)
+  found = _subject(now, before, library, beyond, alone=tried == 1)
+  return found if found.paired or before is None or _tells(before) else following(found)
 
 
 def following(subject: Subject) -> Subject:
@@ -117,6 +130,12 @@ def following(subject: Subject) -> Subject:
   )
   assert now is not None
   return _subject(now, before, subject.library, subject.beyond, alone=subject.alone)
+
+
+def _tells(joint: JointLikelihood) -> bool:
+  """Tells whether what a course leaves in a block is worth an observation: where a joint that stops
+  stays a little off, the residual goes together for longer."""
+  return bool(joint.independent[0] * np.median(joint.counts[0]) >= 1.0)
 
 
 def _subject(
@@ -131,13 +150,13 @@ def _subject(
   if before is None:
     own = constants(now.plant, settings)
     freed = widened(own)
-    explainer = _explainer(now, (own,), library, freed)
+    explainer = _explainer(now, None, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
   usual = _bare(before, settings)
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
-  freed = freed_constants(known[0], settings)
-  explainer = _explainer(now, known, library, freed)
+  freed = freed_constants(known[0])
+  explainer = _explainer(now, before, known, library, freed)
   return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
 
 
@@ -165,8 +184,8 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   shared = [t for t in subject.known if t.wider]
   subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
   subject.paired = subject.now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
-  subject.freed = freed_constants(subject.known[0], settings)
-  subject.explainer = _explainer(subject.now, subject.known, subject.library, subject.freed)
+  subject.freed = freed_constants(subject.known[0])
+  subject.explainer = _explainer(subject.now, before, subject.known, subject.library, subject.freed)
 
 
 def _likelihood(
@@ -181,9 +200,16 @@ def _likelihood(
 
 
 def _explainer(
-  now: JointLikelihood, known: Sequence[Term], library: Sequence[Term], freed: Term
+  now: JointLikelihood,
+  before: JointLikelihood | None,
+  known: Sequence[Term],
+  library: Sequence[Term],
+  freed: Term,
 ) -> Explainer:
-  return Explainer(now, known[0], library, settings=now.settings, known=known[1:], freed=freed)
+  changed = () if before is None else changed_constants(known[0])
+  return Explainer(
+    now, known[0], library, settings=now.settings, known=known[1:], freed=freed, changed=changed
+  )
 
 
 def own_library(plant: JointModel, *, alone: bool) -> list[Term]:

@@ -177,7 +177,9 @@ def _begin(term: Term, members: Sequence[Subject]) -> Array:
   totals, owns = np.zeros(len(starts)), []
   for m in members:
     null = m.explainer.null
-    places = (null.fit.x, np.concatenate([t.centre for t in null.terms]))
+    values = (null.fit.values(t).values() for t in null.terms)
+    before = [t.centre or tuple(v) for t, v in zip(null.terms, values, strict=True)]
+    places = (null.fit.x, np.concatenate(before))
     tried = np.array([np.concatenate([own, s]) for s in starts for own in places])
     costs = Fitter([m.now], Layout([[*null.terms, term]])).costs(tried)
     costs = costs.reshape(len(starts), len(places))
@@ -187,12 +189,13 @@ def _begin(term: Term, members: Sequence[Subject]) -> Array:
   return np.concatenate([starts[best], *[own[best] for own in owns]])
 
 
-def alone(item: Wide, at: int) -> Evidence:
-  """Returns the evidence of the same effect at one of its joints, fitted there alone."""
+def alone(item: Wide, at: int) -> tuple[Evidence, Array]:
+  """Returns the evidence of the same effect at one of its joints, fitted there alone, and its
+  values [n]."""
   member = item.members[at]
   fitter = Fitter([member.now], Layout([(*member.explainer.null.terms, item.term)]))
   fit = fitter.fit(np.concatenate([item.own(at), item.x]), iterations=_ENOUGH)
-  return _evidence([member], fitter.leave_out(fit))
+  return _evidence([member], fitter.leave_out(fit)), fit.x[-len(item.x) :]
 
 
 def _evidence(members: Sequence[Subject], fit: Fit) -> Evidence:

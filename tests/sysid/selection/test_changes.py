@@ -1,16 +1,21 @@
 """Names of what changed since a reference: one rule, and a machine that had something before."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.layout import Fit, Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.selection import analysis, naming, subject
-from nerf2real.sysid.selection.evidence import Scored, standardised
+from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.selection import analysis, changes, naming, remainder, rivals, subject
+from nerf2real.sysid.selection.evidence import Scored, more_likely, standardised
+from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
@@ -29,8 +34,10 @@ class _Joint:
 
   class settings:
     alike = 0.5
+    level = 0.05
 
   scale = np.array([1.0])
+  log_of = np.repeat([0, 1, 2], 10)
 
   @staticmethod
   def squares(residuals):
@@ -49,21 +56,50 @@ def _scored(kinds, nats, prediction=0.0):
 
 def test_a_name_needs_all_that_lack_it_to_be_clearly_worse():
   random = np.random.default_rng(0)
-  noise = random.normal(0, 0.1, 20)
+  noise = random.normal(0, 0.1, 30)
   null = _scored((), noise - 3.0)
-  right = _scored(("a",), noise + random.normal(0, 0.1, 20))
-  worse = _scored(("b",), noise - 1.0 + random.normal(0, 0.1, 20), prediction=5.0)
-  as_good = _scored(("c",), noise - 0.001 + random.normal(0, 0.1, 20), prediction=5.0)
+  right = _scored(("a",), noise + random.normal(0, 0.1, 30))
+  worse = _scored(("b",), noise - 1.0 + random.normal(0, 0.1, 30), prediction=5.0)
+  as_good = _scored(("c",), noise - 0.001 + random.normal(0, 0.1, 30), prediction=5.0)
   assert naming.conclude(_Joint, [null, right, worse], 3.0).named == ("a",)
   assert naming.conclude(_Joint, [null, right, worse, as_good], 3.0).named == ()
 
 
 def test_a_rival_that_predicts_the_same_is_said_beside_the_name():
-  null = _scored((), np.linspace(-4, -3, 20))
-  right, twin = _scored(("a",), np.linspace(0, 0.1, 20)), _scored(("b",), np.linspace(0, 0.09, 20))
+  null = _scored((), np.linspace(-4, -3, 30))
+  right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
   (name,) = naming.conclude(_Joint, [null, right, twin], 3.0).names
   assert name.certain
   assert [sorted(s.names) for s in name.confounded] == [["b"]]
+
+
+def test_a_name_that_makes_one_motion_clearly_worse_does_not_stand():
+  random = np.random.default_rng(0)
+  noise = random.normal(0, 0.3, 30)
+  null, split = _scored((), np.zeros(30)), _scored(("a",), np.repeat([4.0, 4.0, -0.8], 10) + noise)
+  (name,) = naming.conclude(_Joint, [null, split], 3.0).names
+  assert name.clear > 3.0 and not name.certain
+  inert = _scored(("a",), np.repeat([4.0, 4.0, 0.0], 10) + noise)
+  assert naming.conclude(_Joint, [null, inert], 3.0).named == ("a",)
+
+
+def test_a_twin_with_more_beside_it_is_no_rival():
+  null = _scored((), np.linspace(-4, -3, 30))
+  right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
+  more = _scored(("b", "c"), np.linspace(0, 0.11, 30), prediction=5.0)
+  other = _scored(("c", "d"), np.linspace(0, 0.11, 30), prediction=5.0)
+  assert naming.conclude(_Joint, [null, right, twin, more], 3.0).named == ("a",)
+  assert naming.conclude(_Joint, [null, right, twin, more, other], 3.0).named == ()
+
+
+def test_few_blocks_tell_what_a_log_holds_and_one_does_not():
+  gains = np.zeros(40)
+  gains[[3, 4, 30]] = 8.0
+  assert standardised(gains) < 2.0
+  assert more_likely(gains, 0.0, 0.05)
+  assert not more_likely(gains, 14.0, 0.05)
+  gains[[4, 30]] = 0.0
+  assert not more_likely(gains, 0.0, 0.05)
 
 
 def test_one_block_is_no_evidence():
@@ -121,6 +157,66 @@ def test_the_report_lists_what_was_there_before(found):
   kinds = {row["kind"] for row in result.in_reference}
   assert kinds <= {"coulomb_friction", "viscous_friction", "payload"}
   assert {e.kind for e in result.objects} >= {"command_delay", *kinds}
+
+
+def test_a_rotor_of_twice_the_inertia_since_the_reference_is_named(monkeypatch):
+  monkeypatch.setattr(subject, "own_library", few)
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  heavier = Effect("parameter_error", "joint", {"armature": 1.9})
+  logs, before = (
+    [log_of(PENDULUM, k, e, duration=5.0, seed=s + i) for i, k in enumerate(("sweep", "steps"))]
+    for e, s in (([heavier], 0), ([], 10))
+  )
+  found = analysis.analyse(model, logs, before)
+  assert found.verdict == "effects"
+  (row,) = found.effects
+  assert row["kind"] == "parameter_error"
+  assert row["parameters"]["armature"]["value"] == pytest.approx(1.9, rel=0.03)
+  assert row["parameters"]["damping"]["value"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_misfit_in_few_blocks_remains():
+  blocks = np.ones(30)
+  joint = SimpleNamespace(log_of=np.repeat([0, 1], 15))
+  assert remainder.mean_left(joint, blocks) == 1.0
+  blocks[[3, 20]] = 500.0  # a knock in each log
+  assert remainder.mean_left(joint, blocks) == 1.0
+  blocks[[5, 8, 25]] = 40.0  # a detent that is passed thrice
+  assert remainder.mean_left(joint, blocks) > SETTINGS.more**2 > np.median(blocks)
+
+
+@pytest.mark.parametrize(("without", "stands"), [(1.3, ()), (2.5, ("cogging",))])
+def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, without, stands):
+  def leaving(square):
+    return SimpleNamespace(fit=SimpleNamespace(held=[np.full((1, 20), square)]))
+
+  monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(without))
+  monkeypatch.setattr(rivals, "with_force", lambda *_: None)
+  monkeypatch.setattr(changes, "clear", lambda *_: 0.0)  # no force does better
+  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20)))
+  found = changes._supported(explainer, leaving(1.0), ("cogging",), 3.0, 0.1)
+  assert found == stands
+
+
+@pytest.mark.parametrize(("independent", "follows"), [(0.002, True), (0.05, False)])
+def test_a_machine_whose_courses_stray_for_long_is_judged_from_each_reading_on(
+  monkeypatch, independent, follows
+):
+  monkeypatch.setattr(subject, "own_library", few)
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  logs = [log_of(PENDULUM, "sweep", duration=3.0, seed=s) for s in (0, 1)]
+  strayed = JointLikelihood.rescale
+
+  def rescale(joint, residuals):
+    strayed(joint, residuals)
+    joint.independent[:] = independent  # of blocks of 100 readings
+
+  monkeypatch.setattr(JointLikelihood, "rescale", rescale)
+  reductions = [Reduction(model, logs[0])], [Reduction(model, logs[1])]
+  found = subject.prepare(
+    model, "joint", logs[:1], logs[1:], reductions=reductions, tried=1, settings=SETTINGS
+  )
+  assert found.now.follows == found.before.follows == follows
 
 
 class _Machine:

@@ -70,6 +70,33 @@ def test_a_load_that_is_screened_has_left_its_start(model):
   assert screened.possible().total == pytest.approx(fitted, rel=0.1)
 
 
+def test_a_scope_that_is_open_leaves_the_kind_certain(model, monkeypatch):
+  def alone(item, at):
+    """Returns the evidence of one joint as nearly all there is."""
+    rows = item.evidence().rows
+    rows = {j: row - 0.3 - (-1.0) ** np.arange(len(row)) for j, row in rows.items()}
+    return wide.Evidence(rows, item.evidence().prior), 1.02 * item.x
+
+  monkeypatch.setattr(wide, "alone", alone)
+  found = analysis.analyse(model, _logs([LATE]))
+  assert [(e["kind"], e["joint"]) for e in found.effects] == [("command_delay", None)]
+  (other,) = found.scopes
+  assert other["kinds"] == ["command_delay"] and other["joint"] in ("shoulder", "elbow")
+  assert 0.0 < other["evidence"]["behind_by_standard_errors"] < 3.0
+  assert other["parameters"]["command_delay"]["delay"] == pytest.approx(0.021, abs=0.002)
+
+
+def test_an_effect_of_the_machine_is_looked_for_beside_what_joints_have(model, monkeypatch):
+  monkeypatch.setattr(scopes, "shared_effects", lambda *_, **__: [])  # hidden at first
+  drift = Effect("clock_drift", None, {"rate": 0.002})
+  damped = Effect("viscous_friction", "shoulder", {"coefficient": 0.8})
+  found = analysis.analyse(model, _logs([drift, damped]))
+  assert {(e["kind"], e["joint"]) for e in found.effects} == {
+    ("clock_drift", None),
+    ("viscous_friction", "shoulder"),
+  }
+
+
 def test_two_healthy_joints_have_nothing(model):
   found = analysis.analyse(model, _logs([]))
   assert (found.verdict, found.effects) == ("none", [])
