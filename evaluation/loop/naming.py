@@ -12,10 +12,10 @@ from nerf2real import sysid
 from nerf2real.core.files import write_atomically
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.serialization import write_json
-from nerf2real.evaluation.loop import starts
-from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model, standing_model
-from nerf2real.evaluation.loop.recording import FLOOR
-from nerf2real.evaluation.loop.starts import Walked
+from nerf2real.evaluation.loop.robot import starts
+from nerf2real.evaluation.loop.robot.motions import HELD, TRAIN, declared_model, standing_model
+from nerf2real.evaluation.loop.robot.recording import FLOOR
+from nerf2real.evaluation.loop.robot.starts import Walked
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 from nerf2real.sysid.sensors import floor
 from nerf2real.sysid.sensors.sensed import Part
@@ -124,9 +124,15 @@ def _share(error: dict[str, Any]) -> float | None:
 
 
 def _listed(effect: Effect, rows: Sequence[Mapping[str, Any]]) -> bool:
-  """Returns whether an effect has an entry in a report."""
-  places = [(row["kind"], row.get("body") or row.get("geom") or row.get("joint")) for row in rows]
-  return (effect.kind, effect.target) in places
+  """Returns whether an effect has an entry in a report: kind, place and values."""
+
+  def is_of(row: Mapping[str, Any]) -> bool:
+    place = row.get("body") or row.get("geom") or row.get("joint")
+    values = {name: found["value"] for name, found in row.get("parameters", {}).items()}
+    same = all(effect.parameters.get(name, value) == value for name, value in values.items())
+    return (row["kind"], place) == (effect.kind, effect.target) and same
+
+  return any(is_of(row) for row in rows)
 
 
 def _slope(

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf2real.evaluation.loop import naming, starts
-from nerf2real.evaluation.loop.starts import Walked
+from nerf2real.evaluation.loop import naming
+from nerf2real.evaluation.loop.robot import starts
+from nerf2real.evaluation.loop.robot.starts import Walked
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.evaluation.settings import EvaluationSettings

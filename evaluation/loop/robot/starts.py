@@ -16,7 +16,7 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log, read_log
 from nerf2real.evaluation.episodes import Episode
-from nerf2real.evaluation.loop.motions import standing_model
+from nerf2real.evaluation.loop.robot.motions import standing_model
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.suite.op3.constants import CONTROL_TIMESTEP
