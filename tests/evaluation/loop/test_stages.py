@@ -207,7 +207,7 @@ def test_five_numbers_and_what_came_back(tmp_path):
   assert len(figures) == 5
   assert figures[1].value.startswith("0 % (0 of 4") and figures[-1].value == "67 %"
   text = telling.as_text(told)
-  assert "hidden: command_delay:0.045; named: command_delay: delay 0.044 (0.04 to 0.05)" in text
+  assert "hidden: command_delay:0.045; named: command_delay: delay 0.044 s (0.04 to 0.05)" in text
   summary = story.summary(told)
   assert json.loads(json.dumps(summary)) == summary
   # Of robot (3 falls, 1 collision) and simulation (3 falls, 1 success) one trial in four differs.
