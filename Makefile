@@ -20,8 +20,8 @@ demo: install
 # the closed loop on late commands at reduced size: 7 trials, motions of 6 s, 5 minutes of training
 loop: install
 	$(BIN)/python launch/close_loop.py --robot virtual --hidden command_delay:0.18 --policy shipped \
-	  --trials 7 --seconds 6 --minutes 5 --out out/loop
-	@echo "open out/loop/loop.html"
+	  --trials 7 --seconds 6 --minutes 5 --out out/make_loop
+	@echo "open out/make_loop/loop.html"
 
 test: install lint
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadscope

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.robot_logs.reading import read_log
-from nerf2real.evaluation.loop import motions, recording
+from nerf2real.evaluation.loop.robot import motions, recording
 from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.op3 import constants

@@ -52,7 +52,7 @@ def _close(arguments: Arguments) -> None:
     say(telling.as_text(told))
     say(f"page: {arguments.out / 'loop.html'}")
     return
-  from nerf2real.evaluation.loop.closing import close_loop
+  from nerf2real.evaluation.loop.joint_space.closing import close_loop
 
   closed = close_loop(arguments)
   say(closed.table)

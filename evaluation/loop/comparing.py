@@ -6,7 +6,7 @@ from typing import NamedTuple
 from nerf2real.evaluation.loop.naming import CONSTANTS
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.undeclared import Undeclared
-from nerf2real.suite.effects import Effect
+from nerf2real.suite.effects import Effect, kind_of
 
 # Effects of the library that are a right description of one that it lacks.
 _DESCRIBED_BY = {
@@ -67,14 +67,15 @@ def compare(
 
 
 def describe(effect: Effect) -> str:
-  """Returns an effect with its values and intervals in a line."""
-  parts = []
+  """Returns an effect with its values, units and intervals in a line."""
+  parts, kind = [], kind_of(effect.kind)
   for name, value in effect.parameters.items():
     if not isinstance(value, int | float):
       continue
     low, high = effect.intervals.get(name, (None, None))
     bounds = "" if low is None or high is None else f" ({low:.3g} to {high:.3g})"
-    parts.append(f"{name} {value:.3g}{bounds}")
+    unit = kind.parameter(name).unit
+    parts.append(f"{name} {value:.3g}{'' if unit == '1' else ' ' + unit}{bounds}")
   place = "" if effect.target is None else f" at {effect.target}"
   return f"{effect.kind}{place}: {', '.join(parts)}"
 

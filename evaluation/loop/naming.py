@@ -12,16 +12,20 @@ from nerf2real import sysid
 from nerf2real.core.files import write_atomically
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.serialization import write_json
-from nerf2real.evaluation.loop import starts
-from nerf2real.evaluation.loop.motions import HELD, TRAIN, declared_model, standing_model
-from nerf2real.evaluation.loop.recording import FLOOR
-from nerf2real.evaluation.loop.starts import Walked
+from nerf2real.evaluation.loop.robot import starts
+from nerf2real.evaluation.loop.robot.motions import HELD, TRAIN, declared_model, standing_model
+from nerf2real.evaluation.loop.robot.recording import FLOOR
+from nerf2real.evaluation.loop.robot.starts import Walked
 from nerf2real.suite.effects import Effect, read_effects, write_effects
+from nerf2real.suite.op3.constants import TORSO_LINK
 from nerf2real.sysid.sensors import floor
 from nerf2real.sysid.sensors.sensed import Part
+from nerf2real.sysid.sensors.walks import finding
+from nerf2real.sysid.sensors.walks.replay import Walk
 
 NONE = "none"
 _FINDING = "finding.json"  # the loop's own file: written last, so that it stands for a whole stage
+Walks = Sequence[Sequence[Walk]]  # log by log
 CONSTANTS = ("parameter_error",)  # errors of declared constants: no effect, and no name
 
 
@@ -68,7 +72,8 @@ def name(
     out: Folder of the analyser's files.
     logs: Folder with the logs of `recording.record_stand`, and with `floor.mcap` if there is one.
     reference: Folder with logs of the same robot from before; they calibrate the constants.
-    walked: The robot's trials, which show the floor's slope better than `floor.mcap`.
+    walked: The robot's trials, which show the floor's slope better than `floor.mcap`, and with
+      those from before friction under weight and slip.
     walked_before: Those of the same robot from before.
 
   Raises:
@@ -85,16 +90,16 @@ def name(
       reference=[] if reference is None else [reference / f"{name}.mcap" for name in TRAIN],
       out=out,
     )
-    stood = _slope(logs, reference, walked, walked_before)
+    trials = [None if one is None else starts.read(one) for one in (walked, walked_before)]
+    stood = _slope(logs, reference, *trials)
     effects = read_effects(out / "effects.json")
     if any(effect.kind == "floor_slope" for effect in stood.effects):  # gravity is turned once
       effects = [effect for effect in effects if effect.kind != "gravity_tilt"]
-    write_effects(out / "effects.json", [*effects, *stood.effects])
-    if stood.rows and content["verdict"] == NONE:
-      content["verdict"] = "effects"
-    content["effects"] = [*content["effects"], *stood.rows]
-    content["in_reference"] = [*content["in_reference"], *stood.in_reference]
-    content["notes"] = [*content["notes"], *stood.notes]
+    effects += stood.effects
+    _add(content, stood)
+    trodden = _walking(content, effects, *trials)
+    _add(content, trodden)
+    write_effects(out / "effects.json", [*effects, *trodden.effects])
     write_json(out / _FINDING, content)
   return read(out)
 
@@ -124,17 +129,57 @@ def _share(error: dict[str, Any]) -> float | None:
 
 
 def _listed(effect: Effect, rows: Sequence[Mapping[str, Any]]) -> bool:
-  """Returns whether an effect has an entry in a report."""
-  places = [(row["kind"], row.get("body") or row.get("geom") or row.get("joint")) for row in rows]
-  return (effect.kind, effect.target) in places
+  """Returns whether an effect has an entry in a report: kind, place and values."""
+
+  def is_of(row: Mapping[str, Any]) -> bool:
+    place = row.get("body") or row.get("geom") or row.get("joint")
+    values = {name: found["value"] for name, found in row.get("parameters", {}).items()}
+    same = all(effect.parameters.get(name, value) == value for name, value in values.items())
+    return (row["kind"], place) == (effect.kind, effect.target) and same
+
+  return any(is_of(row) for row in rows)
 
 
-def _slope(
-  logs: Path, reference: Path | None, walked: Walked | None, walked_before: Walked | None
+def _add(content: dict[str, Any], part: Part) -> None:
+  """Adds what a sensor says to a report."""
+  if part.rows:
+    content["verdict"] = {NONE: "effects", "unexplained": "partly"}.get(
+      content["verdict"], content["verdict"]
+    )
+  content["effects"] = [*content["effects"], *part.rows]
+  content["in_reference"] = [*content["in_reference"], *part.in_reference]
+  content["notes"] = [*content["notes"], *part.notes]
+
+
+def _walking(
+  content: Mapping[str, Any], effects: Sequence[Effect], now: Walks | None, before: Walks | None
 ) -> Part:
+  """Returns what the trials' walks show that those of before did not: friction under weight, slip.
+
+  Args:
+    content: Of the report.
+    effects: What is known of the robot by now.
+    now: Its walks, log by log.
+    before: Those of the same robot from before.
+  """
+  if now is None or before is None:
+    return Part()
+  changed = [e for e in effects if e.kind not in CONSTANTS and _listed(e, content["effects"])]
+  model = standing_model()
+  return finding.find(
+    model,
+    model.body(TORSO_LINK).id,
+    finding.Recordings([walk for log in now for walk in log], effects),
+    finding.Recordings(
+      [walk for log in before for walk in log], [e for e in effects if e not in changed]
+    ),
+  )
+
+
+def _slope(logs: Path, reference: Path | None, now: Walks | None, before: Walks | None) -> Part:
   """Returns the floor's slope: from the trials where those of now and before tell it, both alike in
   the room's axes, else from turning."""
-  given = [walked] if reference is None else [walked, walked_before]
+  given = [now] if reference is None else [now, before]
   parts = [None if one is None else starts.find(one) for one in given]
   if not all(part is not None and part.estimates for part in parts):
     parts = [_floor(folder / f"{FLOOR}.mcap") for folder in (logs, reference) if folder is not None]

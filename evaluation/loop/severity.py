@@ -6,7 +6,8 @@ from typing import Any
 from nerf2real.core import markdown
 from nerf2real.core.serialization import to_plain, write_json
 from nerf2real.evaluation.episodes import Store
-from nerf2real.evaluation.loop import machines, trials
+from nerf2real.evaluation.loop import trials
+from nerf2real.evaluation.loop.robot import machines
 from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
 from nerf2real.evaluation.loop.trials import Condition, Say, Tally, tally
 from nerf2real.suite.scene import open_scene

@@ -17,9 +17,10 @@ from nerf2real.core.camera_info import read_camera_info
 from nerf2real.core.serialization import to_plain, write_json
 from nerf2real.evaluation import side_by_side
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Store
-from nerf2real.evaluation.loop import machines, naming, recording, training, trials
+from nerf2real.evaluation.loop import naming, training, trials
 from nerf2real.evaluation.loop.comparing import Comparison, compare
 from nerf2real.evaluation.loop.naming import Named
+from nerf2real.evaluation.loop.robot import machines, recording
 from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
 from nerf2real.evaluation.loop.training import Trained
 from nerf2real.evaluation.loop.trials import Condition, Say, Tally, tally

@@ -63,7 +63,11 @@ def write(path: Path, story: Story) -> None:
   )
   settings = Preformatted(json.dumps(to_plain(story.settings), indent=1))
   sections = [
-    Section("Five numbers", "", [Figures(five_numbers(story))]),
+    Section(
+      "Five numbers",
+      "Success: share of the trials, with their count and the exact 95 % interval.",
+      [Figures(five_numbers(story))],
+    ),
     before,
     _finding(story.named),
     simulated,
@@ -93,15 +97,15 @@ def five_numbers(story: Story) -> list[Figure]:
     Figure(
       f"success, {name}",
       _percent(tallies.get(name)),
-      "% of trials",
-      f"{meaning}; count and exact 95 % interval in brackets",
+      "",
+      meaning,
       good,
     )
     for name, meaning, good in wanted
   ]
   value = _NOTHING if share is None else f"{100 * share:.0f} %"
-  lost = "of what was lost"
-  return [*figures, Figure("lost success that came back", value, lost, "after, less before", "100")]
+  back = "after less before, of what was lost"
+  return [*figures, Figure("lost success that came back", value, "", back, "100 %")]
 
 
 def as_text(story: Story) -> str:
@@ -155,11 +159,12 @@ def _finding(named: Named) -> Section:
       f"Share of the squared error above the noise that is explained: {share}."
     )
   )
-  blocks += [Text(note) for note in named.notes]
   listed = "; ".join(describe(e) for e in named.named) or "nothing"
   own = "; ".join(describe(e) for e in named.in_reference)
   if own:
     blocks.append(Text(f"In the reference, too, so that the robot had it before: {own}."))
+  if named.notes:
+    blocks.append(Details(f"notes: {len(named.notes)}", [Text(note) for note in named.notes]))
   return Section("What the recordings say", f"Verdict: {named.verdict}. {listed}.", blocks)
 
 
@@ -180,7 +185,7 @@ def _training(story: Story) -> Section:
     Figure(
       "success in the simulation with the effects",
       _percent(story.tallies.get(loop.TRAINED)),
-      "% of trials",
+      "",
       "of the policy that was trained on",
       "near that of the robot without what was hidden",
     ),
@@ -196,7 +201,7 @@ def _outcomes(tallies: Sequence[Tally]) -> Section:
     )
     for outcome in OUTCOMES
   ]
-  chart = charts.bars("How the trials ended", "per cent", series, names, stacked=True)
+  chart = charts.bars("Outcomes by condition", "per cent of trials", series, names, stacked=True)
   rows = [
     (
       t.name,

@@ -16,9 +16,9 @@ from nerf2real.core.intervals import Interval, clopper_pearson
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
-from nerf2real.evaluation.loop import starts
+from nerf2real.evaluation.loop.robot import starts
+from nerf2real.evaluation.loop.robot.starts import Walked
 from nerf2real.evaluation.loop.settings import LoopSettings
-from nerf2real.evaluation.loop.starts import Walked
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.making import free_name, make_plant
 from nerf2real.evaluation.plants.plant import Plant

@@ -90,6 +90,17 @@ def _motor_gain(build: Build, target: str | None, values: tuple[float, ...]) -> 
   return _motors(build, strength=strength)
 
 
+def _load_friction(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
+  share = build.hidden.motors.gear_share.copy()
+  share[[target in (None, name) for name in constants.JOINT_NAMES]] += values[0]
+  return _motors(build, gear_share=share)
+
+
+def _floor_friction(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
+  friction = values[0] * build.hidden.foot_friction
+  return build._replace(hidden=dataclasses.replace(build.hidden, foot_friction=friction))
+
+
 def _payload(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
   mass, x, y, z = values
   loads = (*build.hidden.loads, Load(str(target), mass, (x, y, z)))
@@ -117,6 +128,9 @@ KINDS: Mapping[str, Kind] = {
   "camera_latency": Kind(("delay",), _camera_latency),  # s
   "camera_focal": Kind(("scale",), _camera_focal, none=1.0),
   "motor_gain": Kind(("gain",), _motor_gain, targets=constants.JOINT_NAMES, none=1.0),
+  # Of the torque that the motor gives, besides what its gear takes anyway.
+  "load_friction": Kind(("coefficient",), _load_friction, targets=constants.JOINT_NAMES),
+  "floor_friction": Kind(("scale",), _floor_friction, none=1.0),
   "payload": Kind(  # kg, m in the link
     ("mass", "x", "y", "z"), _payload, targets=_LINKS, defaults=(0.0, 0.0, 0.0)
   ),

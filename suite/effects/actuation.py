@@ -56,7 +56,11 @@ class CommandDelay(Operator):
 
 
 class MotorGain(Operator):
-  """The actuator's force is `gain` times the declared one, before its limits or with them."""
+  """The actuator's force is `gain` times the declared one, before its limits or with them.
+
+  A motor whose torque is less than its current's should give slows down less by its own back-EMF,
+  too, which servos' models have in the joint's damping: `scales_damping` says that it follows.
+  """
 
   def bind(self, binding: Binding) -> None:
     parameters = self.per_actuator(binding)
@@ -65,6 +69,10 @@ class MotorGain(Operator):
     binding.model.actuator_forcerange *= limit[:, None]
     binding.model.actuator_gainprm[:, 0] *= gain
     binding.model.actuator_biasprm[:, :3] *= gain[:, None]
+    driven = binding.actuator_joint >= 0
+    dofs = np.arange(binding.model.nv)[binding.dofs][binding.actuator_joint[driven]]
+    damping = np.where(parameters["scales_damping"] > 0, gain, 1.0)
+    binding.model.dof_damping[dofs] *= damping[driven]
 
 
 class EncoderOffset(Operator):
@@ -178,8 +186,18 @@ KINDS = (
     "joint",
     "model",
     (
-      Parameter("gain", "1", 1.0, 0.4, 1.6, "true over declared force", minimum=0.0),
+      Parameter("gain", "1", 1.0, 0.1, 1.6, "true over declared force", minimum=0.0),
       _scales_limit(),
+      Parameter(
+        "scales_damping",
+        "1",
+        0.0,
+        0.0,
+        1.0,
+        "1 if the joint's damping (a motor's back-EMF) falls with it, 0 if it stays",
+        minimum=0.0,
+        maximum=1.0,
+      ),
     ),
     MotorGain,
   ),

@@ -85,7 +85,7 @@ def library(plant: JointPlant) -> list[Term]:
       (0.1 * torque / speed**2,),
     ),
     _play(plant, encoder_on_motor=False),
-    _one("motor_gain", joint, "gain", 0.15, 3.0, 0.1, (0.75, 1.25)),
+    _one("motor_gain", joint, "gain", 0.05, 3.0, 0.1, (0.4, 0.75, 1.25)),
     Term(
       "supply_sag",
       None,
@@ -164,13 +164,17 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   limited = np.isfinite(plant.declared[INDEX["highest"]])
   told = all(log.effort is not None for log in plant.logs) and not plant.logs_duty
   told = told and term.kind != "motor_gain"
-  return [
+  forms = [
     dataclasses.replace(
       term, fixed=(*term.fixed, ("scales_limit", float(scales)), ("effort_tells", float(tells)))
     )
     for scales in ((0, 1) if limited else (0,))
     for tells in ((1, 0) if told else (1,))
   ]
+  if limited and term.kind == "motor_gain" and plant.declared[INDEX["damping"]] > 0:
+    # A weak motor: its back-EMF, part of the joint's damping, falls with its torque.
+    forms.append(dataclasses.replace(term, fixed=(*forms[-1].fixed, ("scales_damping", 1.0))))
+  return forms
 
 
 def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:

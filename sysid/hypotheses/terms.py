@@ -187,6 +187,8 @@ def _gain(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   scales_limit = v.get("scales_limit", 0.0) > 0
   for name in ("gain", "lowest", "highest", "strength") if scales_limit else ("gain",):
     p[I[name]] *= v["gain"]
+  if v.get("scales_damping", 0.0) > 0:  # back-EMF
+    p[I["damping"]] *= v["gain"]
 
 
 def _weakening(name: str, slots: tuple[str, ...]):

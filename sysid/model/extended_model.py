@@ -159,6 +159,8 @@ def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float
         _scale(actuator, value["gain"])
         if value.get("scales_limit"):
           actuator.forcerange = np.array(actuator.forcerange) * value["gain"]
+      if value.get("scales_damping"):
+        joint.damping = np.array(joint.damping) * value["gain"]
     case "torque_limit":
       for actuator in actuators:
         limit = value["limit"] / max(abs(actuator.gear[0]), 1e-9)

@@ -74,7 +74,7 @@ def effect(entry: Mapping[str, Any]) -> Effect:
   found = entry["parameters"].items()
   return Effect(
     entry["kind"],
-    entry.get("geom"),
+    entry.get("geom") or entry.get("joint"),
     {name: p["value"] for name, p in found},
     {name: (p["low"], p["high"]) for name, p in found},
   )

@@ -56,6 +56,11 @@ def normal(model: mujoco.MjModel, data: mujoco.MjData, body: int, up: Array) -> 
   return -outward[met] if np.isfinite(reach[met]) else None
 
 
+def lowest(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
+  """Returns the height [m] of the lowest point of a body and its descendants."""
+  return float(_points(model, data, body)[:, 2].min())
+
+
 def _points(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
   """Returns points [V, 3] of the geoms that touch things, of a body and its descendants."""
   found = [np.zeros((0, 3))]

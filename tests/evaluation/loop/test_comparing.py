@@ -21,7 +21,7 @@ def test_the_right_name_at_the_right_place_with_its_interval():
   found = comparing.compare(_hidden("command_delay:0.045"), [_found("command_delay", delay=0.044)])
   (row,) = found.rows
   assert row.right and row.covered and not found.wrong
-  assert row.named == "command_delay: delay 0.044 (0.0396 to 0.0484)"
+  assert row.named == "command_delay: delay 0.044 s (0.0396 to 0.0484)"
 
 
 def test_an_interval_that_misses_is_told():

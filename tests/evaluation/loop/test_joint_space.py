@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from nerf2real.core.robot_logs.reading import read_log
-from nerf2real.evaluation.loop import closing, gap, motions, recording
+from nerf2real.evaluation.loop.joint_space import closing, gap
+from nerf2real.evaluation.loop.robot import motions, recording
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.launch import close_loop as script
 from nerf2real.suite.effects import Effect, read_effects, write_effects

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from nerf2real.evaluation.loop import machines, naming, recording
+from nerf2real.evaluation.loop import naming
+from nerf2real.evaluation.loop.robot import machines, recording
 from nerf2real.real.virtual import undeclared
 
 

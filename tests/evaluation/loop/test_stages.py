@@ -9,16 +9,8 @@ import pytest
 
 from nerf2real.agents.environments.loading import make_environment
 from nerf2real.evaluation.episodes import Store
-from nerf2real.evaluation.loop import (
-  comparing,
-  machines,
-  naming,
-  severity,
-  story,
-  telling,
-  training,
-  trials,
-)
+from nerf2real.evaluation.loop import comparing, naming, severity, story, telling, training, trials
+from nerf2real.evaluation.loop.robot import machines
 from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
 from nerf2real.evaluation.loop.trials import Condition
 from nerf2real.real.virtual import undeclared
@@ -136,12 +128,14 @@ def test_what_the_reference_shows_too_is_not_named(tmp_path):
     Effect("command_delay", None, {"delay": 0.045}),
     Effect("load_friction", "l_knee", {"coefficient": 0.2}),
     Effect("coulomb_friction", "r_knee", {"torque": 0.2}),
+    Effect("motor_gain", "l_knee", {"gain": 0.5}),
   ]
   write_effects(folder / "effects.json", effects)
+  servo = {"kind": "motor_gain", "joint": "l_knee", "parameters": {"gain": {"value": 0.9}}}
   content = {
     "verdict": "effects",
     "effects": [{"kind": "command_delay", "joint": None}],
-    "in_reference": [{"kind": "load_friction", "joint": "l_knee"}],
+    "in_reference": [{"kind": "load_friction", "joint": "l_knee"}, servo],
     "error": {"held": None, "floor": 0.0005, "train": None},
     "notes": [],
     "seconds": 1.0,
@@ -213,7 +207,7 @@ def test_five_numbers_and_what_came_back(tmp_path):
   assert len(figures) == 5
   assert figures[1].value.startswith("0 % (0 of 4") and figures[-1].value == "67 %"
   text = telling.as_text(told)
-  assert "hidden: command_delay:0.045; named: command_delay: delay 0.044 (0.04 to 0.05)" in text
+  assert "hidden: command_delay:0.045; named: command_delay: delay 0.044 s (0.04 to 0.05)" in text
   summary = story.summary(told)
   assert json.loads(json.dumps(summary)) == summary
   # Of robot (3 falls, 1 collision) and simulation (3 falls, 1 success) one trial in four differs.

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf2real.evaluation.loop import naming, starts
-from nerf2real.evaluation.loop.starts import Walked
+from nerf2real.evaluation.loop import naming
+from nerf2real.evaluation.loop.robot import starts
+from nerf2real.evaluation.loop.robot.starts import Walked
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 from nerf2real.evaluation.settings import EvaluationSettings
@@ -41,20 +42,20 @@ def _episode(index, duration):
 def test_a_stop_belongs_to_the_trial_that_follows():
   logs = [_commands(5.0, 7.5), _commands(3.0)]
   episodes = [_episode(0, 5.0), _episode(14, 7.5), _episode(28, 3.0)]
-  first, second = starts.starts(logs, episodes)
+  first, second = starts.walks(logs, episodes)
   listed = [trial.yaw for _, trial in plants.trials(NAVIGATION)]
   assert [stop.heading for stop in (*first, *second)] == [listed[i] for i in (0, 14, 28)]
   assert len(first) == 2 and len({stop.heading for stop in first}) == 2
   for stop in (*first, *second):
-    assert stop.end - stop.begin == pytest.approx(1.0)
-  assert first[0].end == pytest.approx(59 * STEP + 2.725)
+    assert stop.first - stop.begin == pytest.approx(1.0)
+  assert first[0].first == pytest.approx(59 * STEP + 2.725)
 
 
 def test_a_trial_that_was_cut_short_is_left_out():
   logs = [_commands(5.0, 2.0), _commands(7.5)]  # the second ended with the process
-  first, second = starts.starts(logs, [_episode(0, 5.0), _episode(13, 7.5)])
+  first, second = starts.walks(logs, [_episode(0, 5.0), _episode(13, 7.5)])
   assert [len(first), len(second)] == [1, 1]
-  assert starts.starts(logs, []) == [[], []]
+  assert starts.walks(logs, []) == [[], []]
 
 
 def test_logs_are_read_in_the_order_of_their_numbers(tmp_path):
@@ -104,7 +105,7 @@ def test_a_robot_that_begins_trials_on_a_slope_names_it(tmp_path, slope):
       plant.step(plant.environment.standing_action)
     episodes.append(_episode(index, STEP * (60 + index)))
   plant.close()
-  found = starts.find(Walked(starts.logs(tmp_path, "a"), tuple(episodes)))
+  found = starts.find(starts.read(Walked(starts.logs(tmp_path, "a"), tuple(episodes))))
   low, high = found.estimates["floor_slope", "y"][1:3]
   assert low <= slope <= high and high - low < 0.02
   assert [effect.kind for effect in found.effects] == (["floor_slope"] if slope else [])

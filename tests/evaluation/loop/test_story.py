@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from nerf2real.evaluation.episodes import Store
-from nerf2real.evaluation.loop import recording, story
+from nerf2real.evaluation.loop import story
+from nerf2real.evaluation.loop.robot import recording
 from nerf2real.suite.effects import Effect, write_effects
 
 SCRIPT = Path(__file__).parents[3] / "launch" / "close_loop.py"

@@ -122,6 +122,15 @@ def test_a_weak_knee_has_its_share_of_the_torque():
   np.testing.assert_allclose(ratio, expected, rtol=1e-9)
 
 
+def test_a_gear_under_load_and_slippery_feet():
+  own = Hidden.draw(3)
+  build = _build("load_friction@l_knee:0.3", "floor_friction:0.25", seed=3).hidden
+  added = np.zeros(20)
+  added[KNEE] = 0.3
+  np.testing.assert_allclose(build.motors.gear_share, own.motors.gear_share + added)
+  assert build.foot_friction == pytest.approx(0.25 * own.foot_friction)
+
+
 def test_a_load_hangs_on_the_forearm():
   build = _build("payload@l_el_link:0.25,0,0.05,0")
   model, healthy = Body(hidden=build.hidden).model, Body().model

@@ -162,6 +162,11 @@ def test_motor_gain():
   model = _hinge("position", joint='damping="0.3"', option="", com="0.05 0 0")
   q, _, _, _ = _run(model, [Effect("motor_gain", None, {"gain": 0.5})], np.zeros(4000))
   assert 2.5 * abs(q[-1]) == pytest.approx(9.81 * 0.05 * np.cos(q[-1]), rel=1e-4)
+  # Where back-EMF follows, a weak motor turns as fast without load as a strong one.
+  weak = {"gain": 0.2, "scales_damping": 1.0}
+  model = _hinge(joint='damping="0.3"')
+  _, v, _, _ = _run(model, [Effect("motor_gain", "drive", weak)], np.full(4000, 0.1))
+  assert v[-1] == pytest.approx(0.1 / 0.3, rel=1e-3)
 
 
 def test_torque_limit():

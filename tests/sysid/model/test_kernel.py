@@ -39,6 +39,7 @@ CASES = [
   ("encoder_offset", {"offset": 0.05}, 1e-6),
   ("motor_gain", {"gain": 0.7}, 1e-6),
   ("motor_gain", {"gain": 0.7, "scales_limit": 1.0}, 1e-6),
+  ("motor_gain", {"gain": 0.3, "scales_limit": 1.0, "scales_damping": 1.0}, 1e-6),
   ("supply_sag", {"droop": 0.05, "fade": 0.01, "scales_limit": 1.0}, 3e-4),
   (
     "thermal_derating",

@@ -1,4 +1,4 @@
-"""The floor's slope from the logs that the trials left: a robot stands before its first step.
+"""The starts of trials in the logs that they left, and the floor's slope from them.
 
 Before every trial the robot is let go on its feet and stands still for a while without a command,
 at the heading of the protocol; then commands come at 40 Hz until the episode ends. The silences of
@@ -16,7 +16,7 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log, read_log
 from nerf2real.evaluation.episodes import Episode
-from nerf2real.evaluation.loop.motions import standing_model
+from nerf2real.evaluation.loop.robot.motions import standing_model
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.real.loop.settings import RobotSettings
 from nerf2real.suite.op3.constants import CONTROL_TIMESTEP
@@ -24,6 +24,7 @@ from nerf2real.suite.protocols import NavigationTrial
 from nerf2real.sysid.sensors import floor
 from nerf2real.sysid.sensors.sensed import Part
 from nerf2real.sysid.sensors.stops import Stood
+from nerf2real.sysid.sensors.walks.replay import Walk
 
 _SETTINGS = RobotSettings()
 _SAME = 2 * CONTROL_TIMESTEP  # s by which an episode and its commands may differ in length
@@ -43,32 +44,37 @@ def logs(folder: Path, stem: str) -> tuple[Path, ...]:
   return tuple(path for _, path in sorted(numbered))
 
 
-def find(walked: Walked) -> Part | None:
-  """Returns the floor's slope in the axes of the room; None where no trial begins in the logs.
+def read(walked: Walked) -> list[list[Walk]]:
+  """Returns what was walked in the trials, log by log.
 
   Raises:
     LogError: A log cannot be read.
   """
-  read = [read_log(path, recover=True) for path in walked.logs]
-  stood = starts(read, walked.episodes)
-  if not any(stood):
+  return walks([read_log(path, recover=True) for path in walked.logs], walked.episodes)
+
+
+def find(walked: Sequence[Sequence[Walk]]) -> Part | None:
+  """Returns the floor's slope in the axes of the room; None where no trial begins in the logs."""
+  listed = [walks for walks in walked if walks]
+  if not listed:
     return None
-  found = floor.find(standing_model(), read, stood)
+  stood = [[Stood(walk.begin, walk.first, walk.heading) for walk in walks] for walks in listed]
+  found = floor.find(standing_model(), [walks[0].log for walks in listed], stood)
   if found is not None and found.estimates:
     count = sum(len(stops) for stops in stood)
     found.notes.append(f"The floor's slope is from {count} starts of trials, in the room's axes.")
   return found
 
 
-def starts(logs: Sequence[Log], episodes: Sequence[Episode]) -> list[list[Stood]]:
-  """Returns where the robot stood before each trial, log by log.
+def walks(logs: Sequence[Log], episodes: Sequence[Episode]) -> list[list[Walk]]:
+  """Returns where the robot stood before each trial and how long it walked then, log by log.
 
   A trial that was cut short left commands and no episode: it is left out.
   """
   trials = plants.trials(episodes[0].setting.protocol) if episodes else ()
   left, found = list(episodes), []
   for log in logs:
-    stops = []
+    walked = []
     for begin, first, last in _runs(log.commands.stamp):
       lasted = last - first + CONTROL_TIMESTEP
       match = next((i for i, e in enumerate(left) if abs(e.duration - lasted) < _SAME), None)
@@ -77,8 +83,8 @@ def starts(logs: Sequence[Log], episodes: Sequence[Episode]) -> list[list[Stood]
       trial = trials[left[match].index][1]
       left = left[match + 1 :]
       if isinstance(trial, NavigationTrial):
-        stops.append(Stood(begin, first, trial.yaw))
-    found.append(stops)
+        walked.append(Walk(log, begin, first, last, trial.yaw))
+    found.append(walked)
   return found
 
 

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf2real.core.files import atomic_path, write_atomically
-from nerf2real.evaluation.loop import gap, machines, naming, recording
+from nerf2real.evaluation.loop import naming
+from nerf2real.evaluation.loop.joint_space import gap
+from nerf2real.evaluation.loop.robot import machines, recording
 from nerf2real.evaluation.loop.settings import LoopSettings, claim
 from nerf2real.real.loading import Connection
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real import real
-from nerf2real.evaluation.loop.motions import HELD, STANDING, TRAIN, motion
+from nerf2real.evaluation.loop.robot.motions import HELD, STANDING, TRAIN, motion
 from nerf2real.real.loading import Connection
 from nerf2real.real.recorder.recorder import Recorder
 from nerf2real.suite.op3 import constants

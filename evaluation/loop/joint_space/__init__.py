@@ -1,0 +1,1 @@
+"""The loop of joint positions, without a policy: excite, identify, simulate, compare."""
