@@ -20,11 +20,22 @@ import PIL.Image
 from nerf2real.scenes.capture.video import CaptureError
 
 APPLE_SUFFIXES = (".heic", ".heif")  # what iPhones write; OpenCV does not read them
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *APPLE_SUFFIXES)
 _TURNED = (5, 6, 7, 8)  # EXIF orientations with width and height exchanged
 # Camera axes of the upright picture in those of the one that was turned counter-clockwise.
 _TURNED_FROM_UPRIGHT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 pi_heif.register_heif_opener()
+
+
+def list_images(folder: Path) -> list[Path]:
+  """Lists the pictures of a folder (not of its subfolders), sorted by name."""
+  return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+
+
+def list_images_below(source: Path) -> list[Path]:
+  """Lists the pictures in source/images, the usual place beside a model."""
+  return list_images(source / "images") if (source / "images").is_dir() else []
 
 
 class Look(NamedTuple):

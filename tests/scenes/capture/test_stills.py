@@ -9,10 +9,11 @@ import PIL.Image
 import pytest
 
 from nerf2real.scenes.capture import keyframes, stills
-from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
+from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.capture.video import CaptureError
-from nerf2real.scenes.poses.matching import FeatureSettings
+from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.poses.unit_frame import mean_up
