@@ -73,10 +73,20 @@ def write_robot_views(path: Path, *, seed: int = 0) -> None:
 
 
 def measure(result: Reconstruction) -> TruthFigures:
-  """Measures poses, scale, floor, robot views and contact geometry against the truth."""
+  """Measures a reconstruction from the shipped film against the truth."""
   truth = filming.read_truth(TRUTH)
   frames = np.round(np.asarray(result.frame_times) * truth["frame_rate"]).astype(int)
   true_poses = truth["world_from_camera"][np.clip(frames, 0, len(truth["world_from_camera"]) - 1)]
+  return compare(result, true_poses)
+
+
+def compare(result: Reconstruction, true_poses: np.ndarray) -> TruthFigures:
+  """Measures poses, scale, floor, robot views and contact geometry against the truth.
+
+  Args:
+    result: A reconstruction of the built-in room.
+    true_poses: Where its localised keyframes were taken [N, 4, 4], the room's frame.
+  """
   world = result.alignment.world_from_unit.apply_pose(result.localisation.world_from_camera)
   found, true = world[:, :3, 3], true_poses[:, :3, 3]
   free = Similarity.fit(found, true)  # poses may differ by any similarity

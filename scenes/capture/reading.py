@@ -107,7 +107,7 @@ def _read_pictures(
   camera = known.camera
 
   def read(index: int) -> np.ndarray:
-    return limit_size(_read_posed(files[index], camera), settings.max_size)
+    return limit_size(_read_posed(files[index], camera, settings.max_size), settings.max_size)
 
   frames = _sharpest_pictures(len(files), read, settings, progress)
   capture = _write(kind, frames, folder, settings, list(known.warnings))
@@ -131,7 +131,7 @@ def _read_stills(
   size = min(settings.max_size, found.long_side)
 
   def read(index: int) -> np.ndarray:
-    image = limit_size(stills.read_still(found.files[index]), size)
+    image = limit_size(stills.read_still(found.files[index], least=size), size)
     return stills.quarter_turned(image) if found.turned[index] else image
 
   frames = _sharpest_pictures(len(found.files), read, settings, progress)
@@ -162,9 +162,15 @@ def _written_camera(camera: Camera, capture: Capture) -> Camera:
   return camera.resized(capture.width, capture.height)
 
 
-def _read_posed(path: Path, camera: Camera) -> np.ndarray:
-  """Reads a picture as BGR as its camera has it: EXIF turns it only where the shapes then agree."""
-  image = stills.read_still(path)
+def _read_posed(path: Path, camera: Camera, least: int) -> np.ndarray:
+  """Reads a picture as BGR as its camera has it: EXIF turns it only where the shapes then agree.
+
+  Args:
+    path: The picture.
+    camera: Its camera, in its full size.
+    least: Long side that is needed [pixel].
+  """
+  image = stills.read_still(path, least=least)
   if (image.shape[1] > image.shape[0]) != (camera.width > camera.height):
     raw = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return image if raw is None else raw
