@@ -1,11 +1,12 @@
 """Fits 3D Gaussian splats to pictures that a radiance field renders from a robot's places.
 
-Every step renders a new picture of the field, so there is no training set to overfit.
+Every picture of the field is used for a few steps only: there is no training set to overfit.
 """
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -17,6 +18,7 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views
 from nerf2real.scenes.export.splats import projection, rasteriser, start
 from nerf2real.scenes.export.splats.splats import Splats
+from nerf2real.scenes.field.render.renderer import Renderer
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,6 +29,8 @@ class FitSettings:
   """At most so many; at most 200,000 are sensible in a browser."""
   steps: int = 2000
   """Pictures that are fitted to, one a step."""
+  uses: int = 3
+  """Steps with a picture of the field, on average; to render one takes as long as a step."""
   seconds: float | None = None
   """The fit ends after this wall time [s] at the latest."""
   seed_views: int = 150
@@ -58,7 +62,16 @@ _RATES = np.repeat([0.04, 0.04, 0.03, 0.1, 0.02], [3, 3, 4, 1, 3]).astype(np.flo
 _MOMENTUM, _SQUARES, _EPSILON = 0.9, 0.99, 1e-12  # of Adam (Kingma and Ba 2015)
 _FINAL = 0.05  # of the learning rates, at the last step
 _LOWEST_TILT, _HIGHEST_TILT = 0.1, 0.55  # rad downwards: the paper's head tilt and a gait's sway
+_KEPT = 64  # pictures that are used again, in any order
 _MARGIN = 1.15  # of the field of view within which splats may reach into the picture
+
+
+class Picture(NamedTuple):
+  """What the field looks like."""
+
+  camera: Camera
+  world_from_camera: np.ndarray  # [4, 4]
+  color: np.ndarray  # [H, W, 3], 0 to 1
 
 
 def robot_poses(
@@ -195,31 +208,45 @@ def fit(
   points = start.thin_to(points, count=settings.max_splats, finest=settings.finest)
   fitted = Fit(points)
 
-  def picture() -> tuple[Camera, np.ndarray]:
+  def place() -> tuple[Camera, np.ndarray]:
     if rng.random() >= settings.fine_share:
       return robot, poses(1)[0]
     if rng.random() < 0.5:
       return robot.resized(2 * width, 2 * height), poses(1)[0]
     return wide.resized(2 * wide.width, 2 * height), capture[rng.integers(len(capture))]
 
-  _run(bundle, fitted, renderer, picture, settings, rng, progress)
+  _run(fitted, _pictures(bundle, renderer, place, settings.uses, rng), settings, progress)
   return fitted.splats
 
 
-def _run(
+def _pictures(
   bundle: Bundle,
-  fitted: Fit,
-  renderer,
-  picture: Callable[[], tuple[Camera, np.ndarray]],
-  settings: FitSettings,
+  renderer: Renderer,
+  place: Callable[[], tuple[Camera, np.ndarray]],
+  uses: int,
   rng: np.random.Generator,
-  progress: Progress,
-) -> None:
+) -> Iterator[Picture]:
+  """Yields pictures of the field from places, each `uses` times on average."""
   unit_from_world = bundle.world_from_unit.inverse()
+  kept: list[Picture] = []
+  while True:
+    if len(kept) < _KEPT or rng.random() < 1 / uses:
+      camera, pose = place()
+      color = renderer.render(camera, unit_from_world.apply_pose(pose))[0]
+      if len(kept) == _KEPT:
+        kept.pop(rng.integers(_KEPT))
+      kept.append(Picture(camera, pose, color / 255.0))
+      yield kept[-1]
+    else:
+      yield kept[rng.integers(_KEPT)]
+
+
+def _run(
+  fitted: Fit, pictures: Iterator[Picture], settings: FitSettings, progress: Progress
+) -> None:
   began, mean = time.monotonic(), 0.0
   for step in range(settings.steps):
-    camera, pose = picture()
-    truth = renderer.render(camera, unit_from_world.apply_pose(pose))[0] / 255.0
+    camera, pose, truth = next(pictures)
     spent = time.monotonic() - began
     done = max(step / settings.steps, spent / settings.seconds if settings.seconds else 0.0)
     if done >= 1:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-_TILE = 8  # edge of a tile [pixel]
+_TILE = 4  # edge of a tile [pixel]; chosen: splats are a pixel or two wide in small pictures
 _FAINTEST = 1 / 255  # alpha below which a splat does not reach a pixel; as in the source
 _FULLEST = 0.99  # largest alpha; as in the source
 _DARKEST = 1e-4  # transmittance at which a pixel is full; as in the source
