@@ -164,8 +164,8 @@ def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str,
   began = time.perf_counter()
   made = pipeline.make_scene(folder, settings.work / "scene", settings=used, measure=measure)
   seconds = time.perf_counter() - began
-  names = ("registered_fraction", "held_out_psnr_db", "robot_psnr_db", "camera_rmse_m")
-  names += ("collision_true_within_5cm", "surface_true_within_5cm", "free_area_m2", "scale_error")
+  names = ["registered_fraction", "held_out_psnr_db", "robot_psnr_db", "camera_rmse_m"]
+  names += ["collision_true_within_5cm", "surface_true_within_5cm", "free_area_m2", "scale_error"]
   figures: dict[str, harness.Value] = {name: float(made.figures[name]) for name in names}
   for warning in made.scene["warnings"]:
     print("warning:", warning)

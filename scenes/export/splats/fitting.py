@@ -43,7 +43,7 @@ class FitSettings:
   """Of the robot's camera [rad]: 43.3 degrees, a Logitech C920 as mounted."""
   size: tuple[int, int] = (60, 80)
   """Height and width of the robot's pictures [pixel]."""
-  fine_share: float = 0.3
+  fine_share: float = 0.2
   """Share of the steps with pictures of twice the size, half of them from the capture's places:
   for eyes that come nearer than the robot."""
   blur: float = 0.01
@@ -146,7 +146,8 @@ class Fit:
     error = image - truth.astype(np.float32)
     drawn = (*inputs, left, looked, (2 / error.size) * error)
     slopes = rasteriser.composite_backward(*drawn)  # type: ignore[call-arg]
-    gradient = projection.pull(*arguments, projection.Projected(*slopes))
+    rows, starts, spacing, _ = arguments
+    gradient = projection.pull(rows, starts, spacing, eye, projection.Projected(*slopes))
     _descend(self.rows, self._mean, self._square, self._seen, shown, gradient, rate * _RATES)
     return float(np.mean(error**2))
 
