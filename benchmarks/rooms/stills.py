@@ -11,7 +11,6 @@ content is as sharp as 1920x1440. Memory is the peak of a process of its own.
 
 import dataclasses
 import multiprocessing
-import resource
 import time
 from pathlib import Path
 
@@ -106,13 +105,20 @@ def photograph(folder: Path, megapixels: float, *, count: int, seed: int) -> np.
   return poses
 
 
+def _peak_memory() -> float:
+  """Peak memory of this process [MB]; that of getrusage counts the parent's from before exec."""
+  status = Path("/proc/self/status").read_text()
+  line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+  return int(line.split()[1]) / 1024
+
+
 def _read(files: list[Path], least: int | None) -> tuple[float, float]:
   """Seconds of processor time a picture, and peak memory [MB] of this process."""
   began = time.process_time()
   for path in files:
     stills.read_still(path, least=least)
   spent = (time.process_time() - began) / len(files)
-  return spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+  return spent, _peak_memory()
 
 
 def _keyframes(source: Path, folder: Path) -> tuple[float, float]:
@@ -120,7 +126,7 @@ def _keyframes(source: Path, folder: Path) -> tuple[float, float]:
   began = time.process_time()
   found = read_capture(source, folder)
   spent = (time.process_time() - began) / len(found.images)
-  return spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+  return spent, _peak_memory()
 
 
 def _features(folder: Path, database: Path) -> tuple[float, float]:
@@ -129,7 +135,7 @@ def _features(folder: Path, database: Path) -> tuple[float, float]:
   began = time.process_time()
   features.extract_features(database, folder, names, settings=features.FeatureSettings())
   spent = (time.process_time() - began) / len(names)
-  return spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+  return spent, _peak_memory()
 
 
 def costs(folder: Path, work: Path) -> dict[str, harness.Value]:
