@@ -202,7 +202,7 @@ def draw(found: Coverage, poses: np.ndarray, extent: tuple[np.ndarray, np.ndarra
   lower, upper = (
     np.asarray(corner, np.float64)[:2] - s for corner, s in zip(extent, (0.3, -0.3), strict=True)
   )
-  blank = Floor(reachable=np.ones((1, 1), bool), resolution=1.0, origin=lower)
+  blank = Floor(reachable=np.zeros((1, 1), bool), resolution=1.0, origin=lower)
   area = (float(lower[0]), float(upper[0]), float(lower[1]), float(upper[1]))
   picture = FloorMap.of(blank, height=_MAP_HEIGHT, extent=area)
   for places, covered, radius in (
@@ -214,7 +214,8 @@ def draw(found: Coverage, poses: np.ndarray, extent: tuple[np.ndarray, np.ndarra
   picture.path(poses[:, :2, 3], _SEEN)
   start = poses[0, :2, 3]
   picture.robot(start, float(np.arctan2(poses[0, 1, 2], poses[0, 0, 2])), _SEEN)
-  middle, reach = np.median(poses[:, :2, 3], axis=0), 0.42 * float(np.min(upper - lower))
+  middle = np.median(poses[:, :2, 3], axis=0)
+  reach = 0.85 * float(np.minimum(middle - lower, upper - middle).min())
   hours = np.arange(1, _CLOCK + 1)
   for hour, way in zip(hours, _clock(poses, hours), strict=True):
     picture.label(middle + reach * way, str(hour))
