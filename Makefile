@@ -1,5 +1,6 @@
-# make see: a walking robot in the browser; make demo: the main job on the built-in room; make loop: the
-# closed loop with the shipped policy; make test: all tests. All install first.
+# make see: a walking robot in the browser; make demo: the main job on the built-in room, with a page
+# that shows it grow; make loop: the closed loop with the shipped policy; make test: all tests. All
+# install first.
 SHELL := /bin/bash
 # the first interpreter that runs, is new enough and can make environments
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -14,7 +15,8 @@ see: install
 	$(BIN)/python launch/view.py --task nerf_nav --policy shipped
 
 demo: install
-	$(BIN)/python launch/make_scene.py --capture builtin --preset $(PRESET) --out out/$(PRESET)
+	$(BIN)/python launch/make_scene.py --capture builtin --preset $(PRESET) --out out/$(PRESET) \
+	  --viewer
 	@echo "open out/$(PRESET)/report.html"
 
 # the closed loop on late commands at reduced size: 7 trials, motions of 6 s, 5 minutes of training

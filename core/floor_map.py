@@ -146,6 +146,18 @@ class FloorMap:
     self.disc(position, _ROBOT_RADIUS, color)
     return self.path(np.stack([position, nose]), color, width=3)
 
+  def label(self, xy: np.ndarray, words: str) -> Self:
+    """Writes words in the middle of a place [2], on a pale ground."""
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, max(0.4, self.picture.shape[0] / 900)
+    (width, height), below = cv2.getTextSize(words, font, size, 1)
+    x, y = (self._fine(np.asarray(xy)[None])[0] >> _FINE).tolist()
+    left, bottom = x - width // 2, y + height // 2
+    corners = (left - 3, bottom - height - 3), (left + width + 3, bottom + below)
+    cv2.rectangle(self.picture, *corners, REACHABLE, -1)
+    ink = palette.rgb(palette.INK)
+    cv2.putText(self.picture, words, (left, bottom), font, size, ink, 1, cv2.LINE_AA)
+    return self
+
   def heat(self, density: np.ndarray) -> Self:
     """Lays a heat map [rows, columns] of the whole extent over the dimmed floor.
 

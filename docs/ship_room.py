@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from nerf2real.scenes.bundle import BUILT_IN, Bundle
-from nerf2real.scenes.capture.sources import KnownPoses
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.poses import localisation, mapping
 
 _ITEMS = ("collision", "field.safetensors", "visual.glb", "free_space.pgm", "free_space.yaml")

@@ -25,6 +25,8 @@ class Arguments:
     default_factory=filming.FilmSettings
   )
   """How it is filmed."""
+  robot_views: Path | None = None
+  """Also writes what the robot's camera truly sees at the policies' picture sizes (.npz)."""
 
 
 def run(arguments: Arguments) -> None:
@@ -32,12 +34,15 @@ def run(arguments: Arguments) -> None:
   import rich.console
 
   from nerf2real.core.progress import progress_bar
+  from nerf2real.scenes.builtin import ground_truth
   from nerf2real.scenes.builtin.mujoco_renderer import EglMissingError
 
   console = rich.console.Console(stderr=True)
   try:
     with progress_bar("filming", console=console) as progress:
       filming.film(arguments.out, seed=arguments.seed, settings=arguments.film, progress=progress)
+    if arguments.robot_views is not None:
+      ground_truth.write_robot_views(arguments.robot_views, seed=arguments.seed)
   except EglMissingError as error:
     raise command.CommandError(error) from error
   console.print(f"{arguments.out}: {arguments.out.stat().st_size / 1e6:.1f} MB")

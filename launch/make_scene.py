@@ -104,10 +104,10 @@ def _check(arguments: Arguments, source: Path, settings: "SceneSettings") -> int
   from nerf2real.scenes.checking import check_capture
 
   verdict = check_capture(source, arguments.out, settings=settings)
-  print(verdict.paragraph)
+  print(verdict.words)
   if verdict.picture is not None:
     verdict.save_picture(arguments.out / "check.png")
-    print(f"where: {arguments.out / 'check.png'}")
+    print(f"where: {arguments.out / 'check.png'}, the room from above")
   return 0 if verdict.good else FILM_AGAIN
 
 

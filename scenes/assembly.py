@@ -10,6 +10,7 @@ import trimesh
 from nerf2real.core import files
 from nerf2real.core.serialization import to_plain
 from nerf2real.scenes import bundle
+from nerf2real.scenes.field.views import held_out_rows
 from nerf2real.scenes.geometry import convex, floor_picture, map_server, mesh
 from nerf2real.scenes.quality import held_out, report, sight_lines
 from nerf2real.scenes.settings import SceneSettings
@@ -180,6 +181,7 @@ def _reconstruction(
     results.depth,
     times,
     collision_top,
+    held_out_rows(len(poses.names), results.pictures.held_out_every),
   )
 
 

@@ -41,7 +41,7 @@ def make_scene(
     name: The scene's name; that of the output folder if None.
     measure: Adds figures against a known truth.
     show_progress: Whether to draw progress bars.
-    watcher: Is shown poses and field while they are made, such as `training_viewer`'s.
+    watcher: Is shown keyframes, poses and field while they are made, such as `training_viewer`'s.
 
   Returns:
     The finished bundle.
@@ -78,6 +78,8 @@ def _run_stages(
   watcher: Watcher | None,
 ) -> bundle.Bundle:
   capture = localising.keyframes(cache, film, settings.capture)
+  if watcher is not None:
+    watcher.keyframes(capture.value)
   poses = localising.poses(cache, capture, settings.localise)
   if watcher is not None:
     watcher.poses(poses.value)

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.rotations import camera_axes
 from nerf2real.core.serialization import to_plain
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import filming, furniture, room
 from nerf2real.scenes.geometry import convex
-from nerf2real.scenes.quality import collision_error, image_quality
+from nerf2real.scenes.quality import collision_error, image_quality, sight_lines
 from nerf2real.scenes.quality import held_out as evaluate
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
@@ -67,14 +68,25 @@ def write_robot_views(path: Path, *, seed: int = 0) -> None:
       camera = robot_camera(height, width)
       pictures = [room.true_view(camera, pose, seed=seed, eye=eye)[0] for pose in poses]
       arrays[f"images_{height}x{width}"] = np.stack(pictures)
-  np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+  with files.atomic_path(path) as partial:
+    np.savez_compressed(partial, **arrays)  # type: ignore[arg-type]
 
 
 def measure(result: Reconstruction) -> TruthFigures:
-  """Measures poses, scale, floor, robot views and contact geometry against the truth."""
+  """Measures a reconstruction from the shipped film against the truth."""
   truth = filming.read_truth(TRUTH)
   frames = np.round(np.asarray(result.frame_times) * truth["frame_rate"]).astype(int)
   true_poses = truth["world_from_camera"][np.clip(frames, 0, len(truth["world_from_camera"]) - 1)]
+  return compare(result, true_poses)
+
+
+def compare(result: Reconstruction, true_poses: np.ndarray) -> TruthFigures:
+  """Measures poses, scale, floor, robot views and contact geometry against the truth.
+
+  Args:
+    result: A reconstruction of the built-in room.
+    true_poses: Where its localised keyframes were taken [N, 4, 4], the room's frame.
+  """
   world = result.alignment.world_from_unit.apply_pose(result.localisation.world_from_camera)
   found, true = world[:, :3, 3], true_poses[:, :3, 3]
   free = Similarity.fit(found, true)  # poses may differ by any similarity
@@ -97,7 +109,7 @@ def measure(result: Reconstruction) -> TruthFigures:
     size = "" if (height, width) == evaluate.ROBOT_SIZES[0] else f"_{height}x{width}"
     figures[f"robot_psnr{size}_db"] = float(np.mean([score.psnr_db for score in scores]))
     views = views or scores
-  figures |= _contact_figures(result, rigid)
+  figures |= _contact_figures(result, rigid) | _judge_figures(result, rigid)
   # Where the truth's frame lies: benchmarks compare other pictures of the bundle with the truth.
   return TruthFigures({**figures, "room_from_world": to_plain(rigid)}, views)
 
@@ -136,15 +148,41 @@ def _moved(parts: Sequence[convex.Part], transform: Similarity) -> list[convex.P
   return moved
 
 
+def _box(result: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
+  """Lower and upper corner [3] of where contact geometry is judged, in the truth's frame."""
+  half = np.array(furniture.ROOM_SIZE[:2]) / 2 + 0.1
+  return np.array([*-half, 0.0]), np.array([*half, result.collision_top])
+
+
+def _judge_figures(result: Reconstruction, rigid: Similarity) -> dict[str, float]:
+  """Faults that the judge by sight lines finds in the true surfaces: all of them are its own."""
+  lower, upper = _box(result)
+  lines = sight_lines.sight_lines(
+    result.localisation,
+    result.held_out,
+    rigid @ result.alignment.world_from_unit,
+    lower=lower,
+    upper=upper,
+  )
+  if not len(lines.eyes):
+    return {}
+  judged = sight_lines.judge_truth(lines, lambda points: np.abs(room.collision_truth(points)))
+  return {
+    "sight_lines_blocked_by_truth": judged.blocked,
+    "sight_lines_blocked_by_truth_p95_m": judged.blocked_p95,
+    "points_missed_by_truth": judged.missed,
+  }
+
+
 def _contact_figures(result: Reconstruction, rigid: Similarity) -> dict[str, float]:
   """Distances between the convex parts and the true surfaces, in the truth's frame."""
-  half = np.array(furniture.ROOM_SIZE[:2]) / 2
+  lower, upper = _box(result)
   error = collision_error.collision_error(
     _moved(result.parts, rigid),
     room.sample_surface(_SURFACE_POINTS)[0],
     eyes=rigid.apply(result.depth.positions),
-    lower=np.array([*(-half - 0.1), 0.0]),
-    upper=np.array([*(half + 0.1), result.collision_top]),
+    lower=lower,
+    upper=upper,
     floor_threshold=result.alignment.floor_threshold,
     distance_to_surface=lambda points: np.abs(room.collision_truth(points)),
   )

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
-from nerf2real.scenes.capture.rgbd import find_rgbd
-from nerf2real.scenes.capture.sources import find_colmap_model, find_transforms, list_images
+from nerf2real.scenes.capture.posed.colmap_model import find_colmap_model
+from nerf2real.scenes.capture.posed.rgbd import find_rgbd
+from nerf2real.scenes.capture.posed.transforms import find_transforms
+from nerf2real.scenes.capture.stills import list_images, list_images_below
 from nerf2real.scenes.capture.video import CaptureError
 
 EXPORT_STREAM = (
@@ -54,8 +56,3 @@ def _holds(folder: Path) -> bool:
   """Whether a folder is a capture."""
   finders = (find_transforms, find_rgbd, find_colmap_model, list_images, list_images_below)
   return any(finder(folder) for finder in finders)
-
-
-def list_images_below(source: Path) -> list[Path]:
-  """Lists the pictures in source/images, the usual place beside a model."""
-  return list_images(source / "images") if (source / "images").is_dir() else []

@@ -20,11 +20,28 @@ import PIL.Image
 from nerf2real.scenes.capture.video import CaptureError
 
 APPLE_SUFFIXES = (".heic", ".heif")  # what iPhones write; OpenCV does not read them
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *APPLE_SUFFIXES)
+_JPEG_SUFFIXES = (".jpg", ".jpeg")  # decoded at a reduced size; OpenCV resamples other formats
+_REDUCED = (
+  (8, cv2.IMREAD_REDUCED_COLOR_8),
+  (4, cv2.IMREAD_REDUCED_COLOR_4),
+  (2, cv2.IMREAD_REDUCED_COLOR_2),
+)
 _TURNED = (5, 6, 7, 8)  # EXIF orientations with width and height exchanged
 # Camera axes of the upright picture in those of the one that was turned counter-clockwise.
 _TURNED_FROM_UPRIGHT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 pi_heif.register_heif_opener()
+
+
+def list_images(folder: Path) -> list[Path]:
+  """Lists the pictures of a folder (not of its subfolders), sorted by name."""
+  return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+
+
+def list_images_below(source: Path) -> list[Path]:
+  """Lists the pictures in source/images, the usual place beside a model."""
+  return list_images(source / "images") if (source / "images").is_dir() else []
 
 
 class Look(NamedTuple):
@@ -122,8 +139,15 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   return Stills(kept, np.array(across), common.long_side, warnings)
 
 
-def read_still(path: Path) -> np.ndarray:
+def read_still(path: Path, *, least: int | None = None) -> np.ndarray:
   """Reads a picture upright (EXIF) as BGR uint8 [H, W, 3]; transparent parts become black.
+
+  A JPEG that is at least twice as large as needed is decoded at a half, a quarter or an eighth of
+  its size, each pixel the mean over its area (libjpeg's scaled inverse transform).
+
+  Args:
+    path: The picture.
+    least: Long side that is needed [pixel]; the picture's own if None.
 
   Raises:
     CaptureError: It is damaged or no picture.
@@ -136,10 +160,19 @@ def read_still(path: Path) -> np.ndarray:
     except (OSError, ValueError, SyntaxError):
       image = None
   else:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = cv2.imread(str(path), _reduction(path, least))
   if image is None:
     raise CaptureError(f"{path} cannot be read as a picture: remove it or copy it again.")
   return image
+
+
+def _reduction(path: Path, least: int | None) -> int:
+  """OpenCV's flag to read a picture with: reduced as far as the long side that is needed allows."""
+  if least is None or path.suffix.lower() not in _JPEG_SUFFIXES:
+    return cv2.IMREAD_COLOR
+  long_side = look_of(path).long_side
+  fitting = (flag for divisor, flag in _REDUCED if long_side >= divisor * least)
+  return next(fitting, cv2.IMREAD_COLOR)
 
 
 def quarter_turned(image: np.ndarray) -> np.ndarray:

@@ -10,9 +10,10 @@ import numpy as np
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses.matching import image_ids, quiet
+from nerf2real.scenes.poses.matching.features import image_ids, quiet
 
 MIN_OBSERVATIONS = 20  # points a picture must see to count as registered
 MAX_ERROR = 4.0  # observations further off are dropped [pixel]; COLMAP

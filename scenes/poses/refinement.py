@@ -13,12 +13,14 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture import agreement
-from nerf2real.scenes.capture.sources import KnownPoses, to_colmap, to_opencv
+from nerf2real.scenes.capture.posed import agreement
+from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, matching
+from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.localisation import poses_of
-from nerf2real.scenes.poses.pairs import Pair
+from nerf2real.scenes.poses.matching import features
+from nerf2real.scenes.poses.matching.pairs import Pair
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
 
@@ -45,7 +47,7 @@ def localise_known(
     images_folder, work, names, dataclasses.replace(settings, features=plain), known
   )
   steps.begin("features")
-  matching.extract_features(
+  features.extract_features(
     database,
     images_folder,
     names,
@@ -54,7 +56,7 @@ def localise_known(
     camera=to_colmap(known.camera),
   )
   steps.begin("matching")
-  matching.match_pairs(
+  features.match_pairs(
     database,
     pairs_of(known),
     settings=plain,

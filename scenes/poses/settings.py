@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from nerf2real.scenes.poses.matching import FeatureSettings
-from nerf2real.scenes.poses.pairs import PairSettings
+from nerf2real.scenes.poses.matching.features import FeatureSettings
+from nerf2real.scenes.poses.matching.pairs import PairSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import PIXEL_CENTRE, Camera
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture.sources import to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.mapping import registered
 

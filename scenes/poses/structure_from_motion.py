@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture.sources import KnownPoses, list_images, to_colmap, to_opencv
-from nerf2real.scenes.capture.stills import upright_poses
+from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
+from nerf2real.scenes.capture.stills import list_images, upright_poses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, matching, refinement, shutter
+from nerf2real.scenes.poses import mapping, refinement, shutter
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -25,9 +26,10 @@ from nerf2real.scenes.poses.localisation import (
   reprojection_error,
   save,
 )
-from nerf2real.scenes.poses.matching import quiet
-from nerf2real.scenes.poses.pairs import repair_pairs
-from nerf2real.scenes.poses.parallax import parallax_share
+from nerf2real.scenes.poses.matching import features
+from nerf2real.scenes.poses.matching.features import quiet
+from nerf2real.scenes.poses.matching.pairs import repair_pairs
+from nerf2real.scenes.poses.matching.parallax import parallax_share
 from nerf2real.scenes.poses.registered import check_registered
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
@@ -104,7 +106,7 @@ def _map(
 ) -> Mapped:
   """Features, pairs, matches, a model, repairs, refinement."""
   steps.begin("features")
-  matching.extract_features(
+  features.extract_features(
     database,
     images_folder,
     names,
@@ -113,10 +115,10 @@ def _map(
     camera=None if known is None else to_colmap(known.camera),
   )
   steps.begin("matching")
-  pairs, words = matching.find_pairs(database, settings.pairs, report=steps.report)
+  pairs, words = features.find_pairs(database, settings.pairs, report=steps.report)
 
   def match(chosen: list[tuple[int, int]]) -> int:
-    return matching.match_pairs(
+    return features.match_pairs(
       database, chosen, settings=settings.features, seed=settings.seed, report=steps.report
     )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nerf2real.core.progress import Progress, part
 from nerf2real.core.serialization import to_plain
-from nerf2real.scenes.capture.sources import KnownPoses
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.settings import LocaliseSettings

@@ -30,6 +30,12 @@ _MAP_HEIGHT = 480  # of the picture [pixel]
 _CLOCK = 12
 _GAP, _SEEN = palette.rgb(palette.VERMILION), palette.rgb(palette.BLUE)
 _COVERED = (190, 215, 200)
+_LEGEND_ROW = 22  # height of a line [pixel]
+_LEGEND = (
+  (_GAP, "fewer than three pictures show it: film it again"),
+  (_COVERED, "shown well enough"),
+  (_SEEN, "your walk; the disc is its start, its nose is 12 o'clock"),
+)
 
 
 class Finding(NamedTuple):
@@ -53,11 +59,12 @@ class Verdict:
     return all(finding.good for finding in self.findings)
 
   @property
-  def paragraph(self) -> str:
-    """The findings in words, what is wrong first."""
-    head = "Good to go." if self.good else "Film again before you spend an hour on it."
+  def words(self) -> str:
+    """A line for the whole and one for each finding, what is wrong first."""
+    head = "Good to go:" if self.good else "Film again before you spend an hour on it:"
     ordered = sorted(self.findings, key=lambda finding: finding.good)
-    return " ".join([head, *(finding.text for finding in ordered)])
+    lines = (f"- {'good' if finding.good else 'bad'}: {finding.text}" for finding in ordered)
+    return "\n".join([head, *lines])
 
   def save_picture(self, path: Path) -> None:
     """Writes the picture as PNG."""
@@ -137,9 +144,8 @@ def judge_poses(capture: Capture, poses: Localisation) -> list[Finding]:
 
 def _direction(gaps: np.ndarray, poses: np.ndarray) -> str:
   """Where most gaps lie, as on a clock: 12 is where the first picture looks."""
-  middle = np.median(poses[:, :2, 3], axis=0)
   forward = poses[0, :2, 2]
-  offset = gaps[:, :2] - middle
+  offset = gaps[:, :2] - np.median(poses[:, :2, 3], axis=0)
   angle = np.arctan2(forward[1], forward[0]) - np.arctan2(offset[:, 1], offset[:, 0])
   hours = np.round(angle / (2 * np.pi) * _CLOCK).astype(int) % _CLOCK
   counts = np.bincount(hours, minlength=_CLOCK)
@@ -172,12 +178,31 @@ def judge_coverage(found: Coverage, poses: np.ndarray) -> list[Finding]:
   return findings
 
 
+def _clock(poses: np.ndarray, hours: np.ndarray) -> np.ndarray:
+  """Directions [N, 2] of hours [N] from the middle of the walk: 12 is where the first one looks."""
+  forward = np.arctan2(poses[0, 1, 2], poses[0, 0, 2])
+  angle = forward - 2 * np.pi * hours / _CLOCK
+  return np.stack([np.cos(angle), np.sin(angle)], -1)
+
+
+def _with_legend(picture: np.ndarray) -> np.ndarray:
+  """Adds what the colours stand for below a picture [H, W, 3]."""
+  strip = np.full((_LEGEND_ROW * len(_LEGEND), picture.shape[1], 3), 255, np.uint8)
+  for row, (color, words) in enumerate(_LEGEND):
+    top = row * _LEGEND_ROW
+    cv2.rectangle(strip, (8, top + 5), (22, top + _LEGEND_ROW - 5), color, -1)
+    place = (30, top + _LEGEND_ROW - 7)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(strip, words, place, font, 0.4, palette.rgb(palette.INK), 1, cv2.LINE_AA)
+  return np.concatenate([picture, strip])
+
+
 def draw(found: Coverage, poses: np.ndarray, extent: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-  """Draws the room from above: covered floor light, gaps marked, the walk and its first view."""
+  """Draws the room from above: covered floor light, gaps marked, the walk, hours as on a clock."""
   lower, upper = (
     np.asarray(corner, np.float64)[:2] - s for corner, s in zip(extent, (0.3, -0.3), strict=True)
   )
-  blank = Floor(reachable=np.ones((1, 1), bool), resolution=1.0, origin=lower)
+  blank = Floor(reachable=np.zeros((1, 1), bool), resolution=1.0, origin=lower)
   area = (float(lower[0]), float(upper[0]), float(lower[1]), float(upper[1]))
   picture = FloorMap.of(blank, height=_MAP_HEIGHT, extent=area)
   for places, covered, radius in (
@@ -189,7 +214,12 @@ def draw(found: Coverage, poses: np.ndarray, extent: tuple[np.ndarray, np.ndarra
   picture.path(poses[:, :2, 3], _SEEN)
   start = poses[0, :2, 3]
   picture.robot(start, float(np.arctan2(poses[0, 1, 2], poses[0, 0, 2])), _SEEN)
-  return picture.scale_bar().picture
+  middle = np.median(poses[:, :2, 3], axis=0)
+  reach = 0.85 * float(np.minimum(middle - lower, upper - middle).min())
+  hours = np.arange(1, _CLOCK + 1)
+  for hour, way in zip(hours, _clock(poses, hours), strict=True):
+    picture.label(middle + reach * way, str(hour))
+  return _with_legend(picture.scale_bar().picture)
 
 
 def judge(

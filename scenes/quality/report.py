@@ -118,6 +118,15 @@ FIGURES: Mapping[str, Meaning] = {
   "surface_true_within_5cm": Meaning(
     "", "share of the true surface within 5 cm of the parts", "near 1"
   ),
+  "sight_lines_blocked_by_truth": Meaning(
+    "", "the same share of sight lines, judged on the true surface: the judge's own error", "near 0"
+  ),
+  "sight_lines_blocked_by_truth_p95_m": Meaning(
+    "m", "95th percentile of how far before its point a sight line meets the true surface", "near 0"
+  ),
+  "points_missed_by_truth": Meaning(
+    "", "the same share of points, judged on the true surface: the judge's own error", "near 0"
+  ),
   "free_area_m2": Meaning("m^2", "floor area that the robot can stand on"),
   "baseline_psnr_db": Meaning("dB", "PSNR of the COLMAP Poisson mesh on the same held-out views"),
 }

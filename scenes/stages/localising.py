@@ -10,8 +10,9 @@ import numpy as np
 
 from nerf2real.core.progress import Progress
 from nerf2real.scenes.capture import keyframes as keyframe_files
-from nerf2real.scenes.capture.capture import Capture, CaptureSettings, read_capture
+from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses import localisation, structure_from_motion
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError
 from nerf2real.scenes.poses.settings import LocaliseSettings

@@ -12,8 +12,8 @@ import numpy as np
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress
 from nerf2real.core.serialization import write_json
-from nerf2real.scenes.capture import depth_pictures
 from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.field import training
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.geometry import fusion

@@ -43,6 +43,9 @@ class Given(NamedTuple):
 class Watcher(Protocol):
   """Is shown what is made while it is made."""
 
+  def keyframes(self, capture: Capture) -> None:
+    """The keyframes are chosen."""
+
   def poses(self, found: Localisation) -> None:
     """The keyframes are localised."""
 
@@ -111,6 +114,7 @@ class Reconstruction(NamedTuple):
   depth: DepthViews  # in the world frame
   frame_times: np.ndarray  # of the registered keyframes in the video [N] [s]
   collision_top: float  # height up to which contact geometry is made [m]
+  held_out: np.ndarray  # keyframes that trained nothing, bool [N]
 
 
 class TruthFigures(NamedTuple):

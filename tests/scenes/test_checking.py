@@ -6,7 +6,7 @@ import pytest
 
 from nerf2real.scenes import checking
 from nerf2real.scenes.bundle import STAGES
-from nerf2real.scenes.capture.capture import CaptureError
+from nerf2real.scenes.capture.video import CaptureError
 from nerf2real.scenes.settings import preset
 
 
@@ -21,10 +21,10 @@ def test_pictures_of_nothing_get_a_verdict_with_the_reason(tmp_path):
     folder, tmp_path / "out", settings=preset("fast"), show_progress=False
   )
   assert not verdict.good and verdict.picture is None
-  assert "0 of 12 keyframes were localised" in verdict.paragraph
-  assert "Without a place: 00.jpg, 01.jpg, 02.jpg, 03.jpg and 8 more" in verdict.paragraph
-  assert "take pictures from places in between" in verdict.paragraph
-  assert "blurred, as 00.jpg" in verdict.paragraph
+  assert "0 of 12 keyframes were localised" in verdict.words
+  assert "Without a place: 00.jpg, 01.jpg, 02.jpg, 03.jpg and 8 more" in verdict.words
+  assert "take pictures from places in between" in verdict.words
+  assert "blurred, as 00.jpg" in verdict.words
   assert (tmp_path / "out" / STAGES / "keyframes").is_dir()
 
 

@@ -1,13 +1,14 @@
 """Fits 3D Gaussian splats to pictures that a radiance field renders from a robot's places.
 
-Every step renders a new picture of the field, so there is no training set to overfit.
+Every picture of the field is used for a few steps only: there is no training set to overfit.
 """
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
-import jax
+import numba
 import numpy as np
 
 from nerf2real.core.cameras import Camera
@@ -17,6 +18,7 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views
 from nerf2real.scenes.export.splats import projection, rasteriser, start
 from nerf2real.scenes.export.splats.splats import Splats
+from nerf2real.scenes.field.render.renderer import Renderer
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,6 +29,8 @@ class FitSettings:
   """At most so many; at most 200,000 are sensible in a browser."""
   steps: int = 2000
   """Pictures that are fitted to, one a step."""
+  uses: int = 3
+  """Steps with a picture of the field, on average; to render one takes as long as a step."""
   seconds: float | None = None
   """The fit ends after this wall time [s] at the latest."""
   seed_views: int = 150
@@ -39,12 +43,13 @@ class FitSettings:
   """Of the robot's camera [rad]: 43.3 degrees, a Logitech C920 as mounted."""
   size: tuple[int, int] = (60, 80)
   """Height and width of the robot's pictures [pixel]."""
-  fine_share: float = 0.3
+  fine_share: float = 0.2
   """Share of the steps with pictures of twice the size, half of them from the capture's places:
   for eyes that come nearer than the robot."""
-  viewer_blur: float = 0.3
-  """Variance [pixel^2] that rasterisers of splats add (Kerbl et al. 2023; gsplat's eps2d). Half of
-  the steps are without it, as renderers that cast rays have none."""
+  blur: float = 0.01
+  """Variance added to the 2D Gaussians [pixel^2]. Chosen: next to none, as in renderers that cast
+  rays, or in a viewer's large picture, where a rasteriser's 0.3 (Kerbl et al. 2023) is little; a
+  Gaussian thinner than a pixel must not vanish, though."""
   rate: float = 1.0
   """Factor on all learning rates."""
   seed: int = 0
@@ -57,9 +62,16 @@ _RATES = np.repeat([0.04, 0.04, 0.03, 0.1, 0.02], [3, 3, 4, 1, 3]).astype(np.flo
 _MOMENTUM, _SQUARES, _EPSILON = 0.9, 0.99, 1e-12  # of Adam (Kingma and Ba 2015)
 _FINAL = 0.05  # of the learning rates, at the last step
 _LOWEST_TILT, _HIGHEST_TILT = 0.1, 0.55  # rad downwards: the paper's head tilt and a gait's sway
+_KEPT = 64  # pictures that are used again, in any order
 _MARGIN = 1.15  # of the field of view within which splats may reach into the picture
-_FEWEST = 8192  # splats that are projected at least
-_NO_BLUR = 0.01  # variance that stands for none: a Gaussian thinner than a pixel must not vanish
+
+
+class Picture(NamedTuple):
+  """What the field looks like."""
+
+  camera: Camera
+  world_from_camera: np.ndarray  # [4, 4]
+  color: np.ndarray  # [H, W, 3], 0 to 1
 
 
 def robot_poses(
@@ -87,8 +99,6 @@ class Fit:
     self._spacing = points.spacing.astype(np.float32)
     self._mean, self._square = np.zeros_like(self.rows), np.zeros_like(self.rows)
     self._seen = np.zeros(len(self.rows), np.float32)  # steps that each splat took part in
-    self._project = jax.jit(projection.project)
-    self._pull = jax.jit(_pull)
 
   def _draw(self, camera: Camera, eye: projection.Eye):
     """Draws the splats that may be in the picture."""
@@ -98,20 +108,10 @@ class Fit:
       (local[:, 2] > 0)
       & (np.abs(local[:, :2]) < _MARGIN * eye.slope * local[:, 2:] + self._spacing[:, None]).all(-1)
     )
-    # few shapes, so that few programs are compiled; what is added lies behind every camera
-    count = max(_FEWEST, 1 << int(np.ceil(np.log2(max(len(shown), 1)))))
-    padded = np.zeros(count, np.int64)
-    padded[: len(shown)] = shown
-    starts = self._starts[padded]
-    starts[len(shown) :] = -1e3 * eye.rotation[2] - eye.rotation.T @ eye.translation
-    arguments = (self.rows[padded], starts, self._spacing[padded], eye)
-    gaussians, depth = self._project(*arguments)
-    arrays = [np.asarray(array) for array in gaussians]
-    centres, conics, opacities, _ = arrays
-    tiles = rasteriser.assign(
-      centres, conics, opacities, np.asarray(depth), width=camera.width, height=camera.height
-    )
-    inputs = (*tiles, *arrays, camera.width, camera.height)
+    arguments = (self.rows[shown], self._starts[shown], self._spacing[shown], eye)
+    gaussians, depths = projection.project(*arguments)
+    tiles = rasteriser.assign(*gaussians[:3], depths, width=camera.width, height=camera.height)
+    inputs = (*tiles, *gaussians, camera.width, camera.height)
     return shown, arguments, inputs, rasteriser.composite(*inputs)
 
   def render(self, camera: Camera, world_from_camera: np.ndarray, *, blur: float) -> np.ndarray:
@@ -146,19 +146,10 @@ class Fit:
     error = image - truth.astype(np.float32)
     drawn = (*inputs, left, looked, (2 / error.size) * error)
     slopes = rasteriser.composite_backward(*drawn)  # type: ignore[call-arg]
-    gradient = self._pull(*arguments, projection.Projected(*slopes))
-    self._descend(shown, np.asarray(gradient)[: len(shown)], rate)
+    rows, starts, spacing, _ = arguments
+    gradient = projection.pull(rows, starts, spacing, eye, projection.Projected(*slopes))
+    _descend(self.rows, self._mean, self._square, self._seen, shown, gradient, rate * _RATES)
     return float(np.mean(error**2))
-
-  def _descend(self, shown: np.ndarray, gradient: np.ndarray, rate: float) -> None:
-    self._seen[shown] += 1
-    mean = _MOMENTUM * self._mean[shown] + (1 - _MOMENTUM) * gradient
-    square = _SQUARES * self._square[shown] + (1 - _SQUARES) * gradient**2
-    self._mean[shown], self._square[shown] = mean, square
-    times = self._seen[shown, None]
-    ratio = mean / (1 - _MOMENTUM**times)
-    ratio /= np.sqrt(square / (1 - _SQUARES**times)) + _EPSILON
-    self.rows[shown] -= rate * _RATES * ratio
 
   @property
   def splats(self) -> Splats:
@@ -166,10 +157,18 @@ class Fit:
     return start.splats_of(self.rows, self.points)
 
 
-def _pull(rows, starts, spacing, eye, slopes):
-  """Derivatives of a loss by packed parameters, of those by the 2D Gaussians."""
-  _, pull = jax.vjp(lambda r: projection.project(r, starts, spacing, eye)[0], rows)
-  return pull(slopes)[0]
+@numba.njit(cache=True)
+def _descend(rows, mean, square, seen, shown, gradient, rates):
+  """Takes a step of Adam on the rows that are shown."""
+  for k, row in enumerate(shown):
+    seen[row] += 1
+    first, second = 1 - _MOMENTUM ** seen[row], 1 - _SQUARES ** seen[row]
+    for column in range(gradient.shape[1]):
+      slope = gradient[k, column]
+      mean[row, column] += (1 - _MOMENTUM) * (slope - mean[row, column])
+      square[row, column] += (1 - _SQUARES) * (slope * slope - square[row, column])
+      size = np.sqrt(square[row, column] / second) + _EPSILON
+      rows[row, column] -= rates[column] * mean[row, column] / first / size
 
 
 def fit(
@@ -210,38 +209,51 @@ def fit(
   points = start.thin_to(points, count=settings.max_splats, finest=settings.finest)
   fitted = Fit(points)
 
-  def picture() -> tuple[Camera, np.ndarray]:
+  def place() -> tuple[Camera, np.ndarray]:
     if rng.random() >= settings.fine_share:
       return robot, poses(1)[0]
     if rng.random() < 0.5:
       return robot.resized(2 * width, 2 * height), poses(1)[0]
     return wide.resized(2 * wide.width, 2 * height), capture[rng.integers(len(capture))]
 
-  _run(bundle, fitted, renderer, picture, settings, rng, progress)
+  _run(fitted, _pictures(bundle, renderer, place, settings.uses, rng), settings, progress)
   return fitted.splats
 
 
-def _run(
+def _pictures(
   bundle: Bundle,
-  fitted: Fit,
-  renderer,
-  picture: Callable[[], tuple[Camera, np.ndarray]],
-  settings: FitSettings,
+  renderer: Renderer,
+  place: Callable[[], tuple[Camera, np.ndarray]],
+  uses: int,
   rng: np.random.Generator,
-  progress: Progress,
-) -> None:
+) -> Iterator[Picture]:
+  """Yields pictures of the field from places, each `uses` times on average."""
   unit_from_world = bundle.world_from_unit.inverse()
+  kept: list[Picture] = []
+  while True:
+    if len(kept) < _KEPT or rng.random() < 1 / uses:
+      camera, pose = place()
+      color = renderer.render(camera, unit_from_world.apply_pose(pose))[0]
+      if len(kept) == _KEPT:
+        kept.pop(rng.integers(_KEPT))
+      kept.append(Picture(camera, pose, color / 255.0))
+      yield kept[-1]
+    else:
+      yield kept[rng.integers(_KEPT)]
+
+
+def _run(
+  fitted: Fit, pictures: Iterator[Picture], settings: FitSettings, progress: Progress
+) -> None:
   began, mean = time.monotonic(), 0.0
   for step in range(settings.steps):
-    camera, pose = picture()
-    truth = renderer.render(camera, unit_from_world.apply_pose(pose))[0] / 255.0
-    blur = settings.viewer_blur if rng.random() < 0.5 else _NO_BLUR
+    camera, pose, truth = next(pictures)
     spent = time.monotonic() - began
     done = max(step / settings.steps, spent / settings.seconds if settings.seconds else 0.0)
     if done >= 1:
       break
     rate = settings.rate * _FINAL**done
-    error = fitted.step(camera, pose, truth, blur=blur, rate=rate)
+    error = fitted.step(camera, pose, truth, blur=settings.blur, rate=rate)
     mean += (error - mean) / min(step + 1, 100)
     if step % 20 == 0:
       progress(done, f"step {step}, {-10 * np.log10(max(mean, 1e-10)):.1f} dB")

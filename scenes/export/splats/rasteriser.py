@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-_TILE = 8  # edge of a tile [pixel]
+_TILE = 4  # edge of a tile [pixel]; chosen: splats are a pixel or two wide in small pictures
 _FAINTEST = 1 / 255  # alpha below which a splat does not reach a pixel; as in the source
 _FULLEST = 0.99  # largest alpha; as in the source
 _DARKEST = 1e-4  # transmittance at which a pixel is full; as in the source
@@ -26,10 +26,24 @@ class Tiles(NamedTuple):
 
 
 @numba.njit(cache=True)
+def _power(opacity):
+  """Exponent at which a splat becomes too faint to be drawn."""
+  return np.log(max(opacity / _FAINTEST, 1.0))
+
+
+@numba.njit(cache=True)
+def _powers(opacities):
+  found = np.empty(len(opacities), np.float32)
+  for splat, opacity in enumerate(opacities):
+    found[splat] = _power(opacity)
+  return found
+
+
+@numba.njit(cache=True)
 def _bounds(centres, conics, opacities, splat, width, height):
   """First and last tile (x, y) that a splat reaches; an empty range where it reaches none."""
   a, b, c = conics[splat]
-  reach = 2.0 * np.log(max(opacities[splat] / _FAINTEST, 1.0))
+  reach = 2.0 * _power(opacities[splat])
   determinant = a * c - b * b
   if reach <= 0 or determinant <= 0:
     return 0, -1, 0, -1
@@ -84,12 +98,11 @@ def assign(
 
 
 @numba.njit(cache=True, fastmath=True)
-def _alpha(centres, conics, opacities, splat, x, y):
-  """Offset from the centre, the Gaussian's value and its alpha at a pixel."""
+def _exponent(centres, conics, splat, x, y):
+  """Offset of a pixel from a splat's centre, and the negative exponent of the Gaussian there."""
   dx, dy = x - centres[splat, 0], y - centres[splat, 1]
   power = 0.5 * (conics[splat, 0] * dx * dx + conics[splat, 2] * dy * dy)
-  value = np.exp(-power - conics[splat, 1] * dx * dy)
-  return dx, dy, value, min(_FULLEST, opacities[splat] * value)
+  return dx, dy, power + conics[splat, 1] * dx * dy
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -103,7 +116,7 @@ def composite(first, members, centres, conics, opacities, colors, width, height)
   image = np.zeros((height, width, 3), colors.dtype)
   left = np.ones((height, width), colors.dtype)
   looked = np.zeros((height, width), np.int64)
-  columns = (width - 1) // _TILE + 1
+  columns, faintest = (width - 1) // _TILE + 1, _powers(opacities)
   for row in range(height):
     for column in range(width):
       tile = (row // _TILE) * columns + column // _TILE
@@ -111,8 +124,9 @@ def composite(first, members, centres, conics, opacities, colors, width, height)
       entry = first[tile]
       while entry < first[tile + 1] and light > _DARKEST:
         splat = members[entry]
-        alpha = _alpha(centres, conics, opacities, splat, column + 0.5, row + 0.5)[3]
-        if alpha > _FAINTEST:
+        power = _exponent(centres, conics, splat, column + 0.5, row + 0.5)[2]
+        if power < faintest[splat]:
+          alpha = min(_FULLEST, opacities[splat] * np.exp(-power))
           for k in range(3):
             image[row, column, k] += light * alpha * colors[splat, k]
           light *= 1 - alpha
@@ -138,7 +152,7 @@ def composite_backward(
   """
   by_centre, by_conic = np.zeros_like(centres), np.zeros_like(conics)
   by_opacity, by_color = np.zeros_like(opacities), np.zeros_like(colors)
-  columns = (width - 1) // _TILE + 1
+  columns, faintest = (width - 1) // _TILE + 1, _powers(opacities)
   for row in range(height):
     for column in range(width):
       tile = (row // _TILE) * columns + column // _TILE
@@ -146,9 +160,11 @@ def composite_backward(
       behind = np.zeros(3, colors.dtype)  # light that comes from the splats behind
       for entry in range(first[tile] + looked[row, column] - 1, first[tile] - 1, -1):
         splat = members[entry]
-        dx, dy, value, alpha = _alpha(centres, conics, opacities, splat, column + 0.5, row + 0.5)
-        if alpha <= _FAINTEST:
+        dx, dy, power = _exponent(centres, conics, splat, column + 0.5, row + 0.5)
+        if power >= faintest[splat]:
           continue
+        value = np.exp(-power)
+        alpha = min(_FULLEST, opacities[splat] * value)
         before = light / (1 - alpha)
         by_alpha = 0.0
         for k in range(3):

@@ -3,11 +3,11 @@
 Shapes: N splats, P pixels.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from nerf2real.scenes.export.splats.projection import Parameters
 from nerf2real.scenes.export.splats.splats import Splats
 from nerf2real.scenes.geometry import fusion
 
@@ -15,6 +15,9 @@ _OCTAVE = np.sqrt(2.0)  # ratio of neighbouring spacings
 _THICKNESS = 0.25  # of a splat along the normal, of its width; chosen: flat, but not singular
 _WIDTH = 0.6  # standard deviation along the surface, of the spacing: neighbours overlap
 _OPACITY = 0.8
+_WINDOW = 3  # pixels across which the colour's deviation is taken
+_CONTRAST = 0.04  # deviation of a colour, 0 to 1, from which on splats are as fine as pixels
+_COARSEST = 4.0  # factor on the spacing where the colour does not change
 
 
 class Seeds(NamedTuple):
@@ -27,7 +30,9 @@ class Seeds(NamedTuple):
 
 
 def seeds(views: fusion.DepthViews, *, far: float, spacing: float) -> Seeds:
-  """Lifts every pixel of pictures to a point; its spacing is its pixel's width there.
+  """Lifts every pixel of pictures to a point.
+
+  Its spacing is its pixel's width there, and more where the colour hardly changes.
 
   Args:
     views: Pictures with depth and colour, world frame.
@@ -42,11 +47,31 @@ def seeds(views: fusion.DepthViews, *, far: float, spacing: float) -> Seeds:
     normal, cosine = fusion.pixel_normals(known, rays)
     facing = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     normal = np.where((cosine > 0)[..., None], normal, facing)
-    size = spacing * known * views.camera.pixel_angle
+    size = spacing * known * views.camera.pixel_angle * _plainness(color, cosine)
     points = (rays * known[..., None]) @ pose[:3, :3].T + pose[:3, 3]
     turned = normal.reshape(-1, 3) @ pose[:3, :3].T
     found.append((points.reshape(-1, 3), turned, color.reshape(-1, 3) / 255.0, size.ravel()))
   return Seeds(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def _plainness(color: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+  """Factor [H, W] on the spacing: 1 at edges of things and of colours, more where it is plain."""
+  values = color.astype(np.float32) / 255
+  size = (_WINDOW, _WINDOW)
+  variance = cv2.blur(values**2, size) - cv2.blur(values, size) ** 2
+  deviation = np.sqrt(np.maximum(variance.max(-1), 1e-8))
+  plain = np.clip(_CONTRAST / deviation, 1, _COARSEST)
+  factor: np.ndarray = np.where(cosine > 0, plain, 1.0)
+  return factor
+
+
+def _cells(positions: np.ndarray, edge: float) -> np.ndarray:
+  """Number [N] of the cell in which each position lies."""
+  cells = np.floor(positions / edge).astype(np.int64)
+  cells -= cells.min(0)
+  size = cells.max(0) + 1
+  number: np.ndarray = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+  return number
 
 
 def thin(points: Seeds, *, finest: float) -> Seeds:
@@ -62,8 +87,10 @@ def thin(points: Seeds, *, finest: float) -> Seeds:
     edge = finest * _OCTAVE**step
     taken = np.concatenate(kept) if kept else np.zeros(0, int)
     offered = np.flatnonzero(level == step)
-    cells = np.floor(points.positions[np.concatenate([taken, offered])] / edge).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
+    if not len(offered):
+      continue
+    cells = _cells(points.positions[np.concatenate([taken, offered])], edge)
+    _, first = np.unique(cells, return_index=True)
     kept.append(offered[np.sort(first[first >= len(taken)]) - len(taken)])
   chosen = np.concatenate(kept)
   widths = finest * _OCTAVE ** level[chosen]
@@ -99,12 +126,12 @@ def rows_of(points: Seeds) -> np.ndarray:
 
 def splats_of(rows: np.ndarray, points: Seeds) -> Splats:
   """Returns the splats of fitted parameters [N, 14]."""
-  split: Any = Parameters.of_rows(rows.astype(np.float64))  # type: ignore[arg-type]
-  offsets, log_scales, rotations, logits, colors = split
+  columns = np.split(rows.astype(np.float64), [3, 6, 10, 11], axis=1)
+  offsets, log_scales, rotations, logits, colors = columns
   return Splats(
     positions=points.positions + points.spacing[:, None] * offsets,
     rotations=rotations / np.linalg.norm(rotations, axis=-1, keepdims=True),
     scales=np.exp(log_scales),
-    opacities=1 / (1 + np.exp(-logits)),
+    opacities=1 / (1 + np.exp(-logits[:, 0])),
     colors=colors,
   )

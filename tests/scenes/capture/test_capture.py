@@ -8,16 +8,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from nerf2real.scenes.capture import capture as capture_module
-from nerf2real.scenes.capture.capture import CaptureError, CaptureSettings, read_capture
-from nerf2real.scenes.capture.sources import (
-  KnownPoses,
-  read_colmap,
-  read_transforms,
-  to_colmap,
-  to_opencv,
-)
-from nerf2real.scenes.capture.video import inspect_video, sharpest_frames, sharpness
+from nerf2real.scenes.capture import reading
+from nerf2real.scenes.capture.capture import CaptureSettings
+from nerf2real.scenes.capture.posed.colmap_model import read_colmap, to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
+from nerf2real.scenes.capture.posed.transforms import read_transforms
+from nerf2real.scenes.capture.reading import read_capture
+from nerf2real.scenes.capture.video import CaptureError, inspect_video, sharpest_frames, sharpness
 from tests.scenes import synthetic_capture as synthetic
 
 SETTINGS = CaptureSettings(num_keyframes=8)
@@ -194,7 +191,7 @@ def test_an_error_leaves_the_last_good_keyframes(frames, tmp_path, monkeypatch):
   path = tmp_path / "film.mp4"
   synthetic.write_video(path, frames)
   first = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
-  monkeypatch.setattr(capture_module.cv2, "imwrite", lambda *_: False)
+  monkeypatch.setattr(reading.cv2, "imwrite", lambda *_: False)
   with pytest.raises(OSError, match="disk full"):
     read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
   assert all(path.is_file() for path in first.images)

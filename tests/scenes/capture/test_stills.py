@@ -3,16 +3,18 @@
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import PIL.ExifTags
 import PIL.Image
 import pytest
 
 from nerf2real.scenes.capture import keyframes, stills
-from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
+from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.capture.video import CaptureError
-from nerf2real.scenes.poses.matching import FeatureSettings
+from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.poses.unit_frame import mean_up
@@ -111,3 +113,18 @@ def test_apples_pictures_are_read(tmp_path):
   (tmp_path / "IMG_0002.HEIC").write_bytes(b"ftypheic")
   with pytest.raises(CaptureError, match=r"IMG_0002\.HEIC cannot be read as a picture"):
     stills.of_one_camera(sorted(tmp_path.iterdir()))
+
+
+@pytest.mark.parametrize(
+  ("least", "size"), [(None, (640, 480)), (400, (640, 480)), (200, (320, 240)), (60, (80, 60))]
+)
+def test_large_photographs_are_decoded_no_larger_than_needed(tmp_path, least, size):
+  coarse = np.random.default_rng(4).integers(0, 255, (12, 16, 3), np.uint8)
+  pixels = cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
+  exif = PIL.Image.Exif()
+  exif[PIL.ExifTags.Base.Orientation] = 6
+  PIL.Image.fromarray(pixels).save(tmp_path / "large.jpg", quality=95, exif=exif)
+  image = stills.read_still(tmp_path / "large.jpg", least=least)
+  assert image.shape == (*size, 3)  # upright
+  expected = cv2.resize(np.rot90(pixels, -1), size[::-1], interpolation=cv2.INTER_AREA)
+  assert np.abs(image[..., ::-1].astype(int) - expected).mean() < 2

@@ -10,7 +10,7 @@ import trimesh
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
-from nerf2real.scenes.capture.sources import read_transforms
+from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.export import exporting, gltf, heightfield, mjcf, nerfstudio, texture, usd
 from nerf2real.scenes.geometry import convex
 from nerf2real.scenes.geometry.mesh import Mesh

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture.sources import read_transforms
+from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.export import nerfstudio
 from nerf2real.scenes.poses import localisation, shutter
 from tests.scenes.poses.test_shutter import CAMERA, PICTURES, filmed

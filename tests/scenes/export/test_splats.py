@@ -2,13 +2,16 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.export.splats import fitting, projection, rasteriser, start
 from nerf2real.scenes.export.splats.splats import Splats
 from tests.scenes import furnished_room
+from tests.scenes.export import splat_projection
 
 CAMERA = Camera(width=20, height=16, fx=18.0, fy=18.0, cx=10.0, cy=8.0)
 
@@ -53,6 +56,32 @@ def test_derivatives_are_those_of_finite_differences():
         ends.append(loss(gaussians._replace(**{kind: moved}))[0])
       expected = (ends[1] - ends[0]) / (2 * step)
       assert slope[index] == pytest.approx(expected, rel=1e-3, abs=1e-5 * np.abs(slope).max())
+
+
+def test_projection_and_its_derivatives_are_those_of_jax():
+  rng = np.random.default_rng(5)
+  points = _parameters(rng, 40)
+  points.positions[:, :2] *= 1.5  # some beyond the limit of the affine approximation
+  rows = start.rows_of(points)
+  rows += rng.normal(0, 0.3, rows.shape).astype(np.float32)
+  pose = np.eye(4)
+  pose[:3, :3] = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+  pose[:3, 3] = 0.1, -0.2, 0.3
+  arguments = rows, points.positions, points.spacing, projection.Eye.at(CAMERA, pose, blur=0.1)
+  found, depths = projection.project(*arguments)
+  assert (depths > 0).all()
+  exact = (rows.astype(np.float64), *arguments[1:])
+  with jax.enable_x64():
+    for mine, theirs in zip(found, splat_projection.project(*exact), strict=True):
+      np.testing.assert_allclose(mine, theirs, rtol=2e-4, atol=1e-5)
+    slopes = projection.Projected(*(rng.normal(size=array.shape) for array in found))
+    expected = np.asarray(splat_projection.pull(*exact, slopes))
+  gradient = projection.pull(*arguments, slopes)
+  np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+  behind = points.positions - [0, 0, 9]
+  _, none = projection.project(rows, behind, *arguments[2:])
+  assert (none == 0).all()
+  assert not projection.pull(rows, behind, *arguments[2:], slopes).any()
 
 
 def test_a_round_splat_covers_what_its_size_says():

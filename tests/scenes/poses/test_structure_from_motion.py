@@ -11,10 +11,12 @@ import pytest
 from benchmarks.rooms import fountain
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture.capture import CaptureSettings, read_capture
-from nerf2real.scenes.poses import mapping, matching
+from nerf2real.scenes.capture.capture import CaptureSettings
+from nerf2real.scenes.capture.reading import read_capture
+from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
-from nerf2real.scenes.poses.matching import FeatureSettings
+from nerf2real.scenes.poses.matching import features
+from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.poses.tracks import Tracks
@@ -104,8 +106,8 @@ def test_second_run_repeats_no_feature_and_no_match(corner, monkeypatch, capfd):
   def never(*_, **__):
     raise AssertionError("done before")
 
-  monkeypatch.setattr(matching.pycolmap, "extract_features", never)
-  monkeypatch.setattr(matching.pycolmap, "match_image_pairs", never)
+  monkeypatch.setattr(features.pycolmap, "extract_features", never)
+  monkeypatch.setattr(features.pycolmap, "match_image_pairs", never)
   again = localise(folder / "images", folder / "out", settings=FEW)
   assert again.names == result.names
   assert capfd.readouterr() == ("", "")  # nothing of COLMAP's log
@@ -115,15 +117,15 @@ def test_an_interrupted_run_continues_with_one_camera(corner, tmp_path):
   folder, _, _, _ = corner
   names = [f"view_{row:03d}.png" for row in range(10)]
   database = tmp_path / "database.db"
-  features = FeatureSettings(few_num_features=300)
-  matching.extract_features(database, folder / "images", names[:4], settings=features)
-  matching.extract_features(database, folder / "images", names, settings=features)
-  assert list(matching.image_ids(database)) == names
-  with matching.pycolmap.Database.open(str(database)) as db:
+  few = FeatureSettings(few_num_features=300)
+  features.extract_features(database, folder / "images", names[:4], settings=few)
+  features.extract_features(database, folder / "images", names, settings=few)
+  assert list(features.image_ids(database)) == names
+  with features.pycolmap.Database.open(str(database)) as db:
     assert len(db.read_all_cameras()) == 1
-  assert (matching.feature_counts(database) > 100).all()
-  assert matching.match_pairs(database, [(0, 1), (1, 2)], settings=features, seed=0) == 2
-  assert matching.match_pairs(database, [(0, 1), (1, 2), (0, 9)], settings=features, seed=0) == 1
+  assert (features.feature_counts(database) > 100).all()
+  assert features.match_pairs(database, [(0, 1), (1, 2)], settings=few, seed=0) == 2
+  assert features.match_pairs(database, [(0, 1), (1, 2), (0, 9)], settings=few, seed=0) == 1
 
 
 def test_other_pictures_start_a_new_database(corner, tmp_path):

@@ -67,8 +67,23 @@ def test_the_side_that_was_not_filmed_is_named_and_drawn():
   # -x lies 123 degrees to the right of the first picture: 4 o'clock
   assert hours & {3, 4, 5} and not hours & {10, 11, 1}
   picture = advice.draw(found, poses, EXTENT)
+  legend = len(advice._LEGEND) * advice._LEGEND_ROW
+  assert (picture[-legend:] == advice._GAP).all(-1).any()
+  picture = picture[:-legend]
   marked = (picture == advice._GAP).all(-1)
   assert marked[:, : picture.shape[1] // 2].sum() > 2 * marked[:, picture.shape[1] // 2 :].sum()
+
+
+def test_hours_of_the_picture_are_those_of_the_words():
+  poses = _poses(np.array([0.4, 1.0, 2.0]), 0.3)
+  hours = np.arange(1, 13)
+  middle = np.median(poses[:, :2, 3], axis=0)
+  places = middle + 2 * advice._clock(poses, hours)
+  for hour, place in zip(hours, places, strict=True):
+    assert advice._direction(place[None], poses) == f"{hour} o'clock"
+  np.testing.assert_allclose(
+    places[-1] - middle, 2 * poses[0, :2, 2] / np.linalg.norm(poses[0, :2, 2])
+  )
 
 
 @pytest.mark.parametrize(("last", "closed"), [(19, True), (5, False)])
@@ -81,5 +96,5 @@ def test_a_loop_is_closed_where_the_end_sees_what_the_beginning_saw(last, closed
 def test_without_poses_the_verdict_is_the_reason(tmp_path):
   verdict = advice.judge(_capture(tmp_path), CaptureSettings(), reason="3 of 20 were localised.")
   assert not verdict.good and verdict.picture is None
-  assert verdict.paragraph.startswith("Film again") and "3 of 20" in verdict.paragraph
+  assert verdict.words.startswith("Film again") and "- bad: 3 of 20" in verdict.words
   assert advice._shared_points(Tracks.none(), 0) is None

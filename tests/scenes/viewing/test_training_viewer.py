@@ -1,12 +1,14 @@
 import time
 
+import cv2
 import numpy as np
 import pytest
 
+from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field import training
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks
-from nerf2real.scenes.viewing.training_viewer import TrainingViewer
+from nerf2real.scenes.viewing.training_viewer import TrainingViewer, sheet
 from tests.scenes import box_views
 from tests.scenes.field.test_training import FAST
 
@@ -45,6 +47,25 @@ def test_training_hands_out_fields_that_get_better(snapshots):
   assert all((first[name] != last[name]).any() for name in first)
 
 
+def _capture(folder, count):
+  """Keyframes of 64x48 pixels, each a little redder than the one before."""
+  images = [folder / f"frame_{k:06d}.png" for k in range(count)]
+  for k, path in enumerate(images):
+    cv2.imwrite(str(path), np.full((48, 64, 3), (0, 0, 10 * k), np.uint8))
+  return Capture("video", folder, images, 64, 48, np.ones(count), np.ones(count), None, [])
+
+
+def test_keyframes_are_shown_in_the_order_of_the_film(viewer, tmp_path):
+  drawn = sheet(_capture(tmp_path, 22))
+  assert drawn.shape == (5 * 120, 3 * 160, 3)
+  reds = drawn[60::120, 80::160, 0].ravel().astype(int)
+  assert reds[0] == 0 and reds[-1] == 210 and (np.diff(reds) > 0).all()
+  few = sheet(_capture(tmp_path, 4))
+  assert (few[60, 80::160, 0] == [0, 10, 20]).all() and (few[180, 240] == 255).all()
+  viewer.keyframes(_capture(tmp_path, 4))
+  _wait_for(viewer, "4 keyframes. Their poses")
+
+
 def test_the_page_shows_points_then_the_newest_field(viewer, snapshots, views):
   assert "Keyframes" in viewer.text
   points = np.random.default_rng(0).normal(size=(30, 3))
@@ -66,5 +87,25 @@ def test_the_page_shows_points_then_the_newest_field(viewer, snapshots, views):
   _wait_for(viewer, f"{len(views)} keyframes and 30 points")
   for snapshot in (snapshots[0], snapshots[-1]):
     viewer.field(snapshot)
-    _wait_for(viewer, f"Step {snapshot.step:,}")
+    assert f"Step {snapshot.step:,}" in viewer.text
     assert f"{snapshot.psnr_db:.1f} dB" in viewer.text
+
+
+def test_a_field_that_nobody_looks_at_is_not_drawn(viewer, snapshots, monkeypatch):
+  drawn = []
+  monkeypatch.setattr(viewer, "_show", drawn.append)
+  for snapshot in snapshots:
+    viewer.field(snapshot)
+  time.sleep(0.2)
+  assert not drawn
+  monkeypatch.setattr(viewer, "_watched", lambda: True)
+  viewer._wake()  # as a browser does that opens the page
+  end = time.monotonic() + 60
+  while not drawn:
+    assert time.monotonic() < end
+    time.sleep(0.05)
+  assert drawn == [snapshots[-1]]  # older ones that waited are dropped
+  monkeypatch.undo()
+  viewer._show(snapshots[0])
+  viewer._show(snapshots[-1])
+  assert viewer._view is not None

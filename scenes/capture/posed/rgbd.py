@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core.rotations import is_rigid
-from nerf2real.scenes.capture.depth_pictures import MILLIMETRE
-from nerf2real.scenes.capture.recording import Recording, camera_of
-from nerf2real.scenes.capture.tum import is_tum, read_tum
+from nerf2real.scenes.capture.posed.depth_pictures import MILLIMETRE
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
+from nerf2real.scenes.capture.posed.recording import Recording, camera_of
+from nerf2real.scenes.capture.posed.tum import is_tum, read_tum
 from nerf2real.scenes.capture.video import CaptureError
 
 _COLOR = ("color", "rgb", "images")  # ScanNet's folder of pictures, and what others call it
@@ -98,3 +99,25 @@ def read_scannet(source: Path) -> Recording:
 
 
 READERS = {"tum": read_tum, "7scenes": read_seven_scenes, "scannet": read_scannet}
+
+
+def read_rgbd(source: Path) -> KnownPoses:
+  """Reads an RGB-D sequence with known poses, in TUM's, 7-Scenes' or ScanNet's layout."""
+  layout = find_rgbd(source)
+  if layout is None:
+    raise CaptureError(f"{source} holds no RGB-D sequence: expected rgb.txt and groundtruth.txt.")
+  found = READERS[layout](source)
+  assert found.camera is not None  # every reader finds one or raises
+  empty = np.zeros((0, 3))
+  return KnownPoses(
+    kind="rgbd",
+    camera=found.camera,
+    files=tuple(found.files),
+    world_from_camera=found.poses,
+    points=empty,
+    point_colors=empty.astype(np.uint8),
+    point_errors=np.zeros(0),
+    depth_files=tuple(found.depth),
+    depth_unit=found.unit,
+    warnings=found.warnings,
+  )

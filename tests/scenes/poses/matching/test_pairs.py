@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.scenes.poses.pairs import (
+from nerf2real.scenes.poses.matching.pairs import (
   PairSettings,
   choose_pairs,
   exhaustive_pairs,

@@ -15,7 +15,7 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses.pairs import Pair, PairSettings, choose_pairs, overlap_scores
+from nerf2real.scenes.poses.matching.pairs import Pair, PairSettings, choose_pairs, overlap_scores
 
 _EXTRACTION_CHUNK = 8  # pictures between two progress reports
 _MATCHING_CHUNK = 300  # pairs between two progress reports

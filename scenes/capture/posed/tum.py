@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.scenes.capture import trajectory
-from nerf2real.scenes.capture.recording import Recording, camera_of
+from nerf2real.scenes.capture.posed import trajectory
+from nerf2real.scenes.capture.posed.recording import Recording, camera_of
 from nerf2real.scenes.capture.video import CaptureError
 
 _PICTURES, _DEPTH = "rgb.txt", "depth.txt"

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
-from nerf2real.scenes.capture import depth_pictures
-from nerf2real.scenes.capture.sources import KnownPoses
+from nerf2real.scenes.capture.posed import depth_pictures
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.video import CaptureError
 
 _PAIRS = 24  # of pictures; chosen: some thousand matches in seconds

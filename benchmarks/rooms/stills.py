@@ -1,0 +1,197 @@
+"""Photographs of the built-in room: a scene from few of them, and the cost of large ones.
+
+  python benchmarks/rooms/stills.py --work out/stills --preset tiny
+  python benchmarks/rooms/stills.py --work out/stills --megapixels 12 48 --no-scene
+
+The photographer stands along the furniture and looks across the room, two thirds of the pictures
+from eye height, the others from knee height, every third one upright; the phone sets each one's
+exposure. The files are JPEGs of a phone's size with EXIF's orientation and focal length; their
+content is as sharp as 1920x1440. Memory is the peak of a process of its own.
+"""
+
+import dataclasses
+import multiprocessing
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.ExifTags
+import PIL.Image
+
+from benchmarks import harness
+from nerf2real.core.rotations import camera_axes
+from nerf2real.scenes import pipeline
+from nerf2real.scenes.builtin import filming, ground_truth, room
+from nerf2real.scenes.capture import stills
+from nerf2real.scenes.capture.capture import CaptureSettings
+from nerf2real.scenes.capture.reading import read_capture
+from nerf2real.scenes.poses.matching import features
+from nerf2real.scenes.settings import preset
+from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
+
+_LENS = filming.LENS.resized(1920, 1440)
+_MILLIMETRES = round(36 * _LENS.fx / _LENS.width)  # EXIF's focal length, for film of 36 mm width
+_RING = (0.32, -0.17), (1.3, 1.2)  # centre and radii of the walk along the furniture [m]
+_HEIGHTS, _PITCHES = (1.5, 0.6), (0.38, 0.15)  # m, rad downwards
+_SWAY, _TURN = 0.3, 0.03  # rad: looking left and right in turn; how crookedly a phone is held
+_STEP_ASIDE = 0.05  # standard deviation of a place [m]
+_EXPOSURE = 0.1  # standard deviation of the logarithm of the exposure
+# of a phone held upright: the sensor's x is down, its y is left
+_UPRIGHT_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_QUALITY = 92  # of the JPEG files
+_ASPECT = 4 / 3
+_READ = 8  # files that are read for a time
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(harness.Options):
+  """What to photograph and to measure."""
+
+  work: Path
+  """Folder of the pictures and of the bundle."""
+  count: int = 35
+  """Photographs of the room."""
+  megapixels: tuple[float, ...] = (12.0,)
+  """Sizes of the files; the scene is made of the first, of others a few are read for a time."""
+  preset: str = "tiny"
+  """Preset of the scene."""
+  scene: bool = True
+  """Make a scene, and measure it against the truth."""
+  seed: int = 0
+  """Of places and noise."""
+
+
+def places(count: int, rng: np.random.Generator) -> np.ndarray:
+  """Poses [N, 4, 4] of the upright camera in the room."""
+  centre, radii = (np.array(pair) for pair in _RING)
+  poses = np.tile(np.eye(4), (count, 1, 1))
+  high = round(count * 2 / 3)
+  for k, pose in enumerate(poses):
+    ring, number, of = (0, k, high) if k < high else (1, k - high, count - high)
+    angle = 2 * np.pi * number / of
+    heading, pitch = angle + np.pi + _SWAY * (-1) ** k, _PITCHES[ring]
+    level = np.cos(pitch)
+    axes = camera_axes(np.array([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)]))
+    roll = rng.normal(0, _TURN)
+    turn = [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
+    pose[:3, :3] = axes @ np.array(turn)
+    pose[:2, 3] = centre + radii * [np.cos(angle), np.sin(angle)]
+    pose[2, 3] = _HEIGHTS[ring]
+    pose[:3, 3] += rng.normal(0, _STEP_ASIDE, 3)
+  return poses
+
+
+def photograph(folder: Path, megapixels: float, *, count: int, seed: int) -> np.ndarray:
+  """Writes the photographs; returns the poses [N, 4, 4] of the phone's sensor."""
+  folder.mkdir(parents=True, exist_ok=True)
+  rng = np.random.default_rng([seed, 9])
+  poses = places(count, rng)
+  width = round(np.sqrt(1e6 * megapixels * _ASPECT) / 16) * 16
+  size = (width, round(width / _ASPECT))
+  with room.room_eye(seed) as eye:
+    for k, pose in enumerate(poses):
+      upright, exif = k % 3 == 2, PIL.Image.Exif()
+      exif[PIL.ExifTags.Base.Orientation] = 6 if upright else 1
+      exif.get_ifd(PIL.ExifTags.IFD.Exif)[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = _MILLIMETRES
+      if upright:
+        pose[:3, :3] = pose[:3, :3] @ _UPRIGHT_FROM_SENSOR
+      gain = np.exp(rng.normal(0, _EXPOSURE))
+      picture = eye.render(_LENS, pose, supersample=1)[0].astype(np.float32)
+      picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+      picture = gain * picture + 2 * rng.standard_normal(picture.shape, np.float32)
+      image = PIL.Image.fromarray(np.clip(np.rint(picture), 0, 255).astype(np.uint8))
+      image.save(folder / f"IMG_{k:04d}.jpg", quality=_QUALITY, exif=exif)
+  return poses
+
+
+def _peak_memory() -> float:
+  """Peak memory of this process [MB]; that of getrusage counts the parent's from before exec."""
+  status = Path("/proc/self/status").read_text()
+  line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+  return int(line.split()[1]) / 1024
+
+
+def _read(files: list[Path], least: int | None) -> tuple[float, float]:
+  """Seconds of processor time a picture, and peak memory [MB] of this process."""
+  began = time.process_time()
+  for path in files:
+    stills.read_still(path, least=least)
+  spent = (time.process_time() - began) / len(files)
+  return spent, _peak_memory()
+
+
+def _keyframes(source: Path, folder: Path) -> tuple[float, float]:
+  """Seconds of processor time a picture for keyframes, and peak memory [MB] of this process."""
+  began = time.process_time()
+  found = read_capture(source, folder)
+  spent = (time.process_time() - began) / len(found.images)
+  return spent, _peak_memory()
+
+
+def _features(folder: Path, database: Path) -> tuple[float, float]:
+  """Seconds of processor time a picture for features, and peak memory [MB] of this process."""
+  names = sorted(path.name for path in folder.glob("*.jpg"))[:_READ]
+  began = time.process_time()
+  features.extract_features(database, folder, names, settings=features.FeatureSettings())
+  spent = (time.process_time() - began) / len(names)
+  return spent, _peak_memory()
+
+
+def costs(folder: Path, work: Path) -> dict[str, harness.Value]:
+  """Times a picture and peak memory of what happens to photographs before anything else."""
+  files = sorted(folder.glob("*.jpg"))
+  work.mkdir(parents=True, exist_ok=True)
+  database = work / "database.db"
+  database.unlink(missing_ok=True)
+  least = CaptureSettings().max_size
+  steps = (
+    ("reading_in_full", _read, (files[:_READ], None)),
+    ("reading", _read, (files[:_READ], least)),
+    ("keyframes", _keyframes, (folder, work / "keyframes")),
+    ("features", _features, (work / "keyframes", database)),
+  )
+  found: dict[str, harness.Value] = {"file_mb": files[0].stat().st_size / 1e6}
+  for name, step, arguments in steps:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+      spent, memory = pool.apply(step, arguments)
+    found |= {f"{name}_s": spent, f"{name}_peak_mb": memory}
+  return found
+
+
+def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str, harness.Value]:
+  """Makes a scene of the photographs and measures it against the truth."""
+
+  def measure(result: Reconstruction) -> TruthFigures:
+    rows = [int(name.removesuffix(".jpg").split("_")[-1]) for name in result.localisation.names]
+    return ground_truth.compare(result, poses[rows])
+
+  used = dataclasses.replace(preset(settings.preset), marker_side=ground_truth.MARKER_SIDE)
+  began = time.perf_counter()
+  made = pipeline.make_scene(folder, settings.work / "scene", settings=used, measure=measure)
+  seconds = time.perf_counter() - began
+  names = ["registered_fraction", "held_out_psnr_db", "robot_psnr_db", "camera_rmse_m"]
+  names += ["collision_true_within_5cm", "surface_true_within_5cm", "free_area_m2", "scale_error"]
+  figures: dict[str, harness.Value] = {name: float(made.figures[name]) for name in names}
+  for warning in made.scene["warnings"]:
+    print("warning:", warning)
+  return {**figures, "wall_time_s": seconds}
+
+
+def main(settings: Settings) -> None:
+  """Photographs, measures and prints."""
+  figures: dict[str, dict[str, harness.Value]] = {}
+  first: tuple[Path, np.ndarray] | None = None
+  for megapixels in settings.megapixels:
+    folder = settings.work / f"photographs_{megapixels:g}"
+    count = _READ if first else settings.count
+    poses = photograph(folder, megapixels, count=count, seed=settings.seed)
+    figures[f"photographs_of_{megapixels:g}_megapixels"] = costs(folder, settings.work / "costs")
+    first = first or (folder, poses)
+  if settings.scene and first is not None:
+    figures["scene_of_photographs"] = make_scene(*first, settings)
+  harness.finish("stills", figures, settings, seed=settings.seed)
+
+
+if __name__ == "__main__":
+  harness.run(main, Settings, __doc__)

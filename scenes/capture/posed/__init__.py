@@ -1,0 +1,1 @@
+"""Captures whose poses came along: COLMAP models, transforms.json, RGB-D sequences."""

@@ -1,0 +1,105 @@
+"""Known poses of a transforms.json, as nerfstudio and instant-ngp write it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from nerf2real.core.cameras import Camera, focal_length
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV, is_rigid
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses, one_camera
+from nerf2real.scenes.capture.stills import IMAGE_SUFFIXES
+from nerf2real.scenes.capture.video import CaptureError
+
+
+def find_transforms(source: Path) -> Path | None:
+  """Returns the transforms file that `source` is or holds, None if there is none."""
+  if source.is_file():
+    return source if source.suffix == ".json" else None
+  for name in ("transforms.json", "transforms_train.json"):
+    if (source / name).is_file():
+      return source / name
+  return None
+
+
+def _transforms_camera(values: dict[str, Any], path: Path) -> Camera:
+  """Reads the intrinsics of a transforms.json or of one of its frames."""
+  if values.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+    raise CaptureError(f"{path}: camera_model {values['camera_model']} found, expected OPENCV.")
+  if "w" not in values or "h" not in values:
+    raise CaptureError(f"{path}: no picture size 'w' and 'h' found; add it.")
+  width, height = int(values["w"]), int(values["h"])
+  if "fl_x" in values:
+    fx = float(values["fl_x"])
+  elif "camera_angle_x" in values:
+    fx = focal_length(float(values["camera_angle_x"]), width)
+  else:
+    raise CaptureError(f"{path}: no focal length: expected 'fl_x' or 'camera_angle_x'.")
+  if "fl_y" in values:
+    fy = float(values["fl_y"])
+  elif "camera_angle_y" in values and "fl_x" not in values:
+    fy = focal_length(float(values["camera_angle_y"]), height)
+  else:
+    fy = fx
+  distortion = {name: float(values.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2")}
+  cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+  return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, **distortion)
+
+
+def _frame_file(folder: Path, name: str) -> Path:
+  """Resolves a frame's file_path; synthetic scenes of instant-ngp leave the suffix out."""
+  path = folder / name
+  for candidate in (path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES)):
+    if candidate.is_file():
+      return candidate
+  raise CaptureError(f"Picture {name} of the transforms file was not found in {folder}.")
+
+
+def read_transforms(source: Path) -> KnownPoses:
+  """Reads a transforms.json of nerfstudio or instant-ngp.
+
+  The file's transform_matrix is world-from-camera with OpenGL camera axes (x right, y up, z back);
+  the result has OpenCV axes. Sources: nerfstudio documentation, data conventions; instant-ngp
+  documentation, nerf_dataset_tips.
+  """
+  path = find_transforms(source)
+  if path is None:
+    raise CaptureError(f"{source} holds no transforms.json.")
+  try:
+    values = json.loads(path.read_text())
+    frames = sorted(values["frames"], key=lambda frame: frame["file_path"])
+    matrices = [np.array(frame["transform_matrix"], np.float64) for frame in frames]
+  except (KeyError, TypeError, ValueError) as error:
+    raise CaptureError(f"{path} is no transforms file of nerfstudio: {error!r}.") from error
+  if not frames:
+    raise CaptureError(f"{path} lists no frames.")
+  files = tuple(_frame_file(path.parent, frame["file_path"]) for frame in frames)
+  if "w" not in values and "w" not in frames[0]:
+    picture = cv2.imread(str(files[0]))
+    if picture is None:
+      raise CaptureError(f"{files[0]} cannot be read as a picture.")
+    values = {**values, "w": picture.shape[1], "h": picture.shape[0]}
+  camera = one_camera([_transforms_camera({**values, **frame}, path) for frame in frames], path)
+  named = [frame.get("depth_file_path") for frame in frames]
+  depth_files = tuple(_frame_file(path.parent, name) for name in named if name)
+  poses = []
+  for frame, matrix in zip(frames, matrices, strict=True):
+    if matrix.shape == (3, 4):
+      matrix = np.vstack([matrix, [0, 0, 0, 1]])
+    if matrix.shape != (4, 4) or not is_rigid(matrix):
+      raise CaptureError(f"{path}: transform_matrix of {frame['file_path']} is no rigid pose.")
+    matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
+    poses.append(matrix)
+  empty = np.zeros((0, 3))
+  return KnownPoses(
+    kind="transforms",
+    camera=camera,
+    files=files,
+    world_from_camera=np.stack(poses),
+    points=empty,
+    point_colors=empty.astype(np.uint8),
+    point_errors=np.zeros(0),
+    depth_files=depth_files if len(depth_files) == len(frames) else (),
+  )

@@ -1,0 +1,237 @@
+"""Selects the sharpest keyframes of a video, of pictures or of a posed data set."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from nerf2real.core import files
+from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.capture import stills
+from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
+from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.posed import agreement
+from nerf2real.scenes.capture.posed.colmap_model import read_colmap
+from nerf2real.scenes.capture.posed.rgbd import read_rgbd
+from nerf2real.scenes.capture.posed.transforms import read_transforms
+from nerf2real.scenes.capture.stills import list_images, list_images_below
+from nerf2real.scenes.capture.video import (
+  CaptureError,
+  Frame,
+  inspect_video,
+  limit_size,
+  sharpest_frames,
+  sharpness,
+)
+
+
+def read_capture(
+  source: Path,
+  folder: Path,
+  *,
+  settings: CaptureSettings | None = None,
+  progress: Progress = no_progress,
+) -> Capture:
+  """Reads a source and writes its keyframes.
+
+  Args:
+    source: A video, a folder of pictures, a folder with a COLMAP model, or a transforms.json.
+    folder: Where the keyframes are written; replaced as a whole and only when all went well.
+    settings: What to keep and when to warn.
+    progress: Called with the fraction done and a text.
+
+  Raises:
+    CaptureError: If the source cannot become a capture; the message is one line.
+  """
+  settings = settings or CaptureSettings()
+  source, folder = Path(source), Path(folder)
+  if settings.num_keyframes < settings.min_images:
+    raise CaptureError(
+      f"num_keyframes is {settings.num_keyframes}, expected at least {settings.min_images}."
+    )
+  kind = source_kind(source)
+  with files.atomic_folder(folder) as partial:
+    if kind == "video":
+      capture = _read_video(source, partial, settings, progress)
+    else:
+      capture = _read_pictures(source, kind, partial, settings, progress)
+  images = [folder / path.name for path in capture.images]
+  return dataclasses.replace(capture, folder=folder, images=images)
+
+
+def _read_video(
+  source: Path, folder: Path, settings: CaptureSettings, progress: Progress
+) -> Capture:
+  info = inspect_video(source)
+  if info.num_frames < settings.min_images:
+    raise CaptureError(
+      f"{source} has {info.num_frames} frames, expected a walk through the room "
+      f"(at least {settings.min_images} frames, better a minute)."
+    )
+  warnings: list[str] = []
+  if 0 < info.duration < settings.warn_duration:
+    warnings.append(
+      f"Too short: the video lasts {info.duration:.1f} s, expected {settings.warn_duration:.0f} s "
+      "or more; walk slowly through the whole room."
+    )
+  frames = sharpest_frames(
+    source,
+    settings.num_keyframes,
+    max_size=settings.max_size,
+    info=info,
+    warnings=warnings,
+    progress=progress,
+  )
+  return _write("video", frames, folder, settings, warnings)
+
+
+def _read_pictures(
+  source: Path, kind: str, folder: Path, settings: CaptureSettings, progress: Progress
+) -> Capture:
+  known = None
+  readers = {"colmap": read_colmap, "transforms": read_transforms, "rgbd": read_rgbd}
+  if kind in readers:
+    known = readers[kind](source)
+  files = list(known.files) if known else list_images(source) or list_images_below(source)
+  if len(files) < settings.min_images:
+    raise CaptureError(
+      f"{source} holds {len(files)} pictures, expected at least {settings.min_images} that "
+      "overlap: take more, from different places in the room."
+    )
+  if known is None:
+    return _read_stills(source, files, folder, settings, progress)
+  camera = known.camera
+
+  def read(index: int) -> np.ndarray:
+    return limit_size(_read_posed(files[index], camera, settings.max_size), settings.max_size)
+
+  frames = _sharpest_pictures(len(files), read, settings, progress)
+  capture = _write(kind, frames, folder, settings, list(known.warnings))
+  known = known.selected(_numbers(capture), _written_camera(camera, capture))
+  known, warnings = agreement.settled(known, capture.images)
+  capture.warnings.extend(warnings)
+  origins = [path.name for path in known.files]
+  return dataclasses.replace(capture, times=None, known=known.lifted(), origins=origins)
+
+
+def _read_stills(
+  source: Path, files: list[Path], folder: Path, settings: CaptureSettings, progress: Progress
+) -> Capture:
+  """Writes the keyframes of a folder of photographs."""
+  found = stills.of_one_camera(files)
+  if len(found.files) < settings.min_images:
+    raise CaptureError(
+      f"{source}: {' '.join(found.warnings)} At least {settings.min_images} different pictures of "
+      "one camera are needed."
+    )
+  size = min(settings.max_size, found.long_side)
+
+  def read(index: int) -> np.ndarray:
+    image = limit_size(stills.read_still(found.files[index], least=size), size)
+    return stills.quarter_turned(image) if found.turned[index] else image
+
+  frames = _sharpest_pictures(len(found.files), read, settings, progress)
+  capture = _write("images", frames, folder, settings, found.warnings)
+  numbers = _numbers(capture)
+  turned = found.turned[numbers]
+  return dataclasses.replace(
+    capture,
+    times=None,
+    turned=turned if turned.any() else None,
+    origins=[found.files[k].name for k in numbers],
+  )
+
+
+def _numbers(capture: Capture) -> list[int]:
+  """Each keyframe's number in its source."""
+  return [int(path.stem.split("_")[-1]) for path in capture.images]
+
+
+def _written_camera(camera: Camera, capture: Capture) -> Camera:
+  """Scales the source's camera to the keyframes as written, and checks that it is theirs."""
+  ratio = (capture.width / camera.width) / (capture.height / camera.height)
+  if abs(ratio - 1) > 0.01:
+    raise CaptureError(
+      f"The pictures are {capture.width}x{capture.height}, but the known camera is for "
+      f"{camera.width}x{camera.height}: expected the same aspect."
+    )
+  return camera.resized(capture.width, capture.height)
+
+
+def _read_posed(path: Path, camera: Camera, least: int) -> np.ndarray:
+  """Reads a picture as BGR as its camera has it: EXIF turns it only where the shapes then agree.
+
+  Args:
+    path: The picture.
+    camera: Its camera, in its full size.
+    least: Long side that is needed [pixel].
+  """
+  image = stills.read_still(path, least=least)
+  if (image.shape[1] > image.shape[0]) != (camera.width > camera.height):
+    raw = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return image if raw is None else raw
+  return image
+
+
+def _sharpest_pictures(
+  count: int,
+  read: Callable[[int], np.ndarray],
+  settings: CaptureSettings,
+  progress: Progress,
+) -> Iterator[Frame]:
+  """Yields the sharpest of each of equal parts of `count` pictures that `read` reads."""
+  parts = min(settings.num_keyframes, count)
+  edges = np.linspace(0, count, parts + 1).astype(int)
+  for first, last in itertools.pairwise(edges):
+    best: Frame | None = None
+    for index in range(first, last):
+      image = read(index)
+      value = sharpness(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+      if best is None or value > best.sharpness:
+        best = Frame(index, 0.0, value, image)
+    progress(last / count, f"picture {last} of {count}")
+    if best is not None:
+      yield best
+
+
+def _write(
+  kind: str, frames: Iterator[Frame], folder: Path, settings: CaptureSettings, warnings: list[str]
+) -> Capture:
+  """Writes keyframes as they come and gathers what the warnings need."""
+  images, values, brightness, times = [], [], [], []
+  size: tuple[int, int] | None = None
+  for frame in frames:
+    height, width = frame.image.shape[:2]
+    if size is None:
+      size = (width, height)
+    elif size != (width, height):
+      raise CaptureError(
+        f"Picture {frame.index} is {width}x{height}, the ones before it {size[0]}x{size[1]}: "
+        "expected one camera, one zoom and one orientation for the whole capture."
+      )
+    path = folder / f"frame_{frame.index:06d}.jpg"
+    if not cv2.imwrite(str(path), frame.image, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]):
+      raise OSError(f"{path} could not be written: is the disk full?")
+    images.append(path)
+    values.append(frame.sharpness)
+    brightness.append(float(frame.image.mean()))
+    times.append(frame.time)
+  if size is None:
+    raise CaptureError("The capture holds no picture.")
+  capture = Capture(
+    kind=kind,
+    folder=folder,
+    images=images,
+    width=size[0],
+    height=size[1],
+    sharpness=np.array(values),
+    brightness=np.array(brightness),
+    times=np.array(times),
+    warnings=warnings,
+  )
+  warnings.extend(quality_warnings(capture, settings))
+  return capture

@@ -1,0 +1,1 @@
+"""Features of keyframes, the pairs to match, their verified matches and parallax."""
