@@ -23,7 +23,9 @@ _LEAN = 0.08  # rad that the walking torso leans forward, and the camera with it
 _PAN = 2.3  # rad at which a sweep turns back; chosen: short of the limit in ball pushing, 2.5
 _REACHED = 0.1  # rad from that angle at which it does
 _LEAD = 0.4  # rad that a sweep's target is ahead of the head; chosen: some 2 rad/s
-_SWEEP_TILT = -0.3  # rad: from 0.4 m ahead to the walls
+# rad of a sweep to the left and to the right: balls 0.2 to 1.1 m away, and those beyond 0.4 m. A
+# ball at the feet leaves the picture below, and a sweep at one height in between did not show it.
+_SWEEP_TILTS = (-0.6, -0.25)
 # rad below the picture's middle at which a ball is held; chosen: two thirds of the way to its edge.
 # In the middle, a ball at the robot's feet would leave little but floor in the picture, which does
 # not show where the robot is.
@@ -96,4 +98,4 @@ class Gaze:
     at_end = abs(pan) > _PAN - _REACHED
     onward = np.sign(moved) if abs(moved) > _RESTS and not at_end else -side
     target = float(np.clip(pan + onward * _LEAD, -_PAN, _PAN))
-    return Command(turn=1.0, head=(target, _SWEEP_TILT))
+    return Command(turn=1.0, head=(target, _SWEEP_TILTS[0 if onward > 0 else 1]))

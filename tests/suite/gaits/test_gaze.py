@@ -135,3 +135,15 @@ def test_the_cameras_angles_are_those_of_the_robot():
   to_ball = np.array([*ball, 0.12]) - data.cam_xpos[camera]
   angle = np.arccos(look @ to_ball / np.linalg.norm(to_ball))
   assert angle < 0.08  # the view is 0.76 rad high
+
+
+@pytest.mark.parametrize("distance", [0.25, 0.32, 0.4, 1.0, 2.5])
+def test_sweeps_to_either_side_show_the_middle_of_balls_near_and_far(distance):
+  """A ball of which a search shows a sliver alone is not found by a policy that has to see it."""
+  behind = view_of((0.0, 0.0, 0.0), np.array([-distance, 0.0]))
+  above = []
+  for moved in (0.05, -0.05):
+    command = Gaze().apply(WALK, behind, pan=0.3, tilt=-0.3, moved=moved)
+    assert np.sign(command.head[0] - 0.3) == np.sign(moved)
+    above.append(-depression(distance) - (command.head[1] - 0.08))
+  assert min(np.abs(above)) < np.deg2rad(43.3) / 2
