@@ -1,12 +1,14 @@
 """Labels an earlier run's episodes anew: a teacher that changed needs no data of its own.
 
 A teacher that answers for recorded observations, poses and balls needs no simulation. Everything
-but labels and commands stays as it was recorded.
+but labels and commands stays as it was recorded; where there is a ball to look at, the head's tilt,
+too, is the teacher's, and what the head sees is rendered (`turned_heads.py`).
 """
 
 import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +16,9 @@ from nerf2real.agents.distill.collecting import episodes
 from nerf2real.agents.distill.dataset import fields, transition_fields
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import Teacher, make_teacher
+from nerf2real.agents.distill.turned_heads import TILT, TurnedHead
 from nerf2real.agents.dmpo.policy.acting import task_of
-from nerf2real.agents.dmpo.specs import FlatObservation, Layout
+from nerf2real.agents.dmpo.specs import BALL, FlatObservation, Layout
 from nerf2real.agents.environments.loading import make_environment
 from nerf2real.core import files
 from nerf2real.suite import specs
@@ -35,7 +38,7 @@ def observations(layout: Layout, state: np.ndarray) -> Iterator[dict[str, np.nda
 
 
 def relabelled(
-  episode: Mapping[str, np.ndarray], layout: Layout, teacher: Teacher
+  episode: Mapping[str, np.ndarray], layout: Layout, teacher: Teacher, *, task: Any = None
 ) -> dict[str, np.ndarray]:
   """Returns an episode with a teacher's labels and commands, at true poses.
 
@@ -43,9 +46,14 @@ def relabelled(
     episode: arrays of `dataset.fields` and `transition_fields`.
     layout: of the environment that it was collected in.
     teacher: answers for recorded states, such as a scripted walker.
+    task: of ball pushing, to turn the head in; None: it stays as it was.
   """
   found = {name: np.array(array) for name, array in episode.items()}
-  for step, observation in enumerate(observations(layout, episode["state"])):
+  head = None if task is None else TurnedHead(task, layout, episode)
+  for step, observation in enumerate(observations(layout, found["state"])):
+    if head is not None:
+      head.show(observation)  # a view of what was found
+      found["image"][step] = head.picture(step)
     flat = FlatObservation(None, episode["state"][step], episode["privileged"][step])
     pose = episodes.pose_of(layout, flat)
     if step == 0:
@@ -53,20 +61,27 @@ def relabelled(
     goal, ball = np.asarray(observation["goal"], np.float64), episodes.ball_of(layout, flat)
     label = teacher.label(observation, goal=goal, pose=pose, ball=ball)
     found["label"][step], found["command"][step] = label.action, label.command
+    if head is not None:
+      found["action"][step, TILT] = head.follow(label.action)
   return found
 
 
 def relabel_for(settings: DistillSettings, source: Path, target: Path, *, seed: int) -> int:
   """Labels the episodes of a folder anew for a run: `relabel` with its environment and teacher."""
   environment = make_environment(settings.environment, seed=seed)
-  layout, scene = Layout.of(environment), task_of(environment).scene
-  environment.close()
+  layout, task = Layout.of(environment), task_of(environment)
   target.mkdir(parents=True, exist_ok=True)
-  teacher = make_teacher(settings.teacher, scene)
-  return relabel(source, target, layout=layout, teacher=teacher)
+  teacher = make_teacher(settings.teacher, task.scene)
+  turned = None if layout.privileged_column(BALL) is None else task
+  try:
+    return relabel(source, target, layout=layout, teacher=teacher, task=turned)
+  finally:
+    environment.close()
 
 
-def relabel(source: Path, target: Path, *, layout: Layout, teacher: Teacher) -> int:
+def relabel(
+  source: Path, target: Path, *, layout: Layout, teacher: Teacher, task: Any = None
+) -> int:
   """Writes the episodes of a folder to another one, labelled anew; returns their frames.
 
   Args:
@@ -74,6 +89,7 @@ def relabel(source: Path, target: Path, *, layout: Layout, teacher: Teacher) -> 
     target: of the new run.
     layout: of both runs' environments.
     teacher: see `relabelled`.
+    task: see `relabelled`.
 
   Raises:
     ValueError: the folder holds no episodes, or they are of another environment.
@@ -90,7 +106,7 @@ def relabel(source: Path, target: Path, *, layout: Layout, teacher: Teacher) -> 
     if shapes != {name: shape for name, (shape, _) in wanted.items()}:
       raise ValueError(f"{path} is of another environment than {target} is for: found {shapes}.")
     with files.atomic_path(target / path.name) as partial:
-      np.savez(partial, **relabelled(episode, layout, teacher))  # type: ignore[arg-type]
+      np.savez(partial, **relabelled(episode, layout, teacher, task=task))  # type: ignore[arg-type]
     frames += len(episode["state"])
     _log.info("Labelled %d frames anew.", frames)
   return frames

@@ -34,6 +34,10 @@ _PERIODS = 3  # of every command that the read-out is fitted to, after as many
 class EntrainedGait(Gait):
   """The gait, entrained by what was applied; `follow` is to be called after every `act`."""
 
+  # Its first step is a full one: after a crouch in `stop_time` it fell 3 of 24 robots with 0.33 kg
+  # or more, high in the torso, within 2.2 s, after one in twice that time none.
+  _crouching = 0.5
+
   def reset(self) -> None:
     super().reset()
     self._controls = np.tile(self._standing_control(), (HISTORY, 1))

@@ -1,4 +1,4 @@
-"""Keeps the ball in the robot's view: pan and tilt point at it, and sweep while it is not seen.
+"""Keeps the ball in the robot's view, low in it; pan and tilt sweep while it is not seen.
 
 All that it does while the ball is out of view can be told from the head's own motion, so that a
 policy with the same sensors can learn it: a sweep goes on where the head moves, one of a head that
@@ -23,7 +23,13 @@ _LEAN = 0.08  # rad that the walking torso leans forward, and the camera with it
 _PAN = 2.3  # rad at which a sweep turns back; chosen: short of the limit in ball pushing, 2.5
 _REACHED = 0.1  # rad from that angle at which it does
 _LEAD = 0.4  # rad that a sweep's target is ahead of the head; chosen: some 2 rad/s
-_SWEEP_TILT = -0.3  # rad: from 0.4 m ahead to the walls
+# rad of a sweep to the left and to the right: balls 0.2 to 1.1 m away, and those beyond 0.4 m. A
+# ball at the feet leaves the picture below, and a sweep at one height in between did not show it.
+_SWEEP_TILTS = (-0.6, -0.25)
+# rad below the picture's middle at which a ball is held; chosen: two thirds of the way to its edge.
+# In the middle, a ball at the robot's feet would leave little but floor in the picture, which does
+# not show where the robot is.
+_LOW = 0.25
 _LOST = 2.0  # s without a view after which the head sweeps; chosen
 _RESTS = (
   0.0025  # rad in a control step below which the head rests; chosen: two of the encoder's steps
@@ -87,9 +93,9 @@ class Gaze:
     self._unseen = 0.0 if is_seen(view, pan=pan, tilt=tilt) else self._unseen + _TIMESTEP
     if not self.searches:
       bearing = float(np.clip(view.bearing, -_PAN, _PAN))
-      return dataclasses.replace(command, head=(bearing, _LEAN - depression(view.distance)))
+      return dataclasses.replace(command, head=(bearing, _LEAN + _LOW - depression(view.distance)))
     side = 1.0 if pan > 0 else -1.0
     at_end = abs(pan) > _PAN - _REACHED
     onward = np.sign(moved) if abs(moved) > _RESTS and not at_end else -side
     target = float(np.clip(pan + onward * _LEAD, -_PAN, _PAN))
-    return Command(turn=1.0, head=(target, _SWEEP_TILT))
+    return Command(turn=1.0, head=(target, _SWEEP_TILTS[0 if onward > 0 else 1]))

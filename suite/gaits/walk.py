@@ -89,6 +89,8 @@ class Command:
 class Gait:
   """The gait: one action a control step."""
 
+  _crouching = 1.0  # how fast it takes its own posture at first, of the rate of its other changes
+
   def __init__(self, settings: GaitSettings | None = None, *, head_pan_limit: float | None = None):
     """Creates a gait.
 
@@ -146,7 +148,7 @@ class Gait:
     """
     settings = self.settings
     change = _TIMESTEP / settings.stop_time
-    self._crouched = min(1.0, self._crouched + change)
+    self._crouched = min(1.0, self._crouched + self._crouching * change)
     ready = self._crouched >= 1.0 and command.step
     self._amplitude = self._next_amplitude(ready, change)
     self._forward += float(np.clip(command.forward - self._forward, -change, change))

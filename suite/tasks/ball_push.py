@@ -102,14 +102,14 @@ class BallPush(RobotTask):
     for attempt in range(2 * _MAX_ATTEMPTS):
       if attempt == _MAX_ATTEMPTS:  # there is no room in front of the robot: beside it there may be
         in_front = False
-      self._put_ball((0.0, 0.0), height=10.0)  # out of the way while the robot is placed
+      self.put_ball((0.0, 0.0), height=10.0)  # out of the way while the robot is placed
       self._stand_somewhere(
         lambda: Pose.of(self._free_place(random_state), random_state.uniform(-np.pi, np.pi))
       )
       if self.ball_start is not None:
-        self._put_ball(self.ball_start)
+        self.put_ball(self.ball_start)
         return
-      self._put_ball(self._in_front(random_state) if in_front else self._free_place(random_state))
+      self.put_ball(self._in_front(random_state) if in_front else self._free_place(random_state))
       if not self._ball_touches_anything():
         return
     raise composer.EpisodeInitializationError(
@@ -140,7 +140,8 @@ class BallPush(RobotTask):
     left = np.array([-forward[1], forward[0]])
     return self._data.qpos[root : root + 2] + ahead * forward + aside * left
 
-  def _put_ball(self, xy: Any, *, height: float | None = None) -> None:
+  def put_ball(self, xy: Any, *, height: float | None = None) -> None:
+    """Writes the ball's place [2], and height if it is not on the floor, into qpos [m]."""
     radius = self._model.geom_size[self._ball_id, 0]
     address = self._ball_qpos
     self._data.qpos[address : address + 2] = xy

@@ -361,6 +361,21 @@ class RobotTask(composer.Task):
         )
     return readings
 
+  def picture_of(
+    self, *, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray
+  ) -> np.ndarray:
+    """Returns the picture uint8 [H, W, 3] of a robot in another state, all else being as it is.
+
+    Args:
+      position: Of the torso [3] [m].
+      rotation: World from torso [3, 3].
+      joints: [20] rad.
+    """
+    assert self._picture is not None
+    qpos = self._data.qpos.copy()
+    self._indices.write(qpos, position=position, rotation=rotation, joints=joints)
+    return self._picture.of(qpos)
+
   def _take_picture(self) -> np.ndarray:
     """Returns the picture that has arrived by now."""
     assert self.draws is not None and self._picture is not None

@@ -84,7 +84,16 @@ class DelayedPicture:
     if jitter:
       delay = max(0.0, delay + random_state.uniform(-1, 1) * jitter)
     age = min(round(delay / self._timestep), len(self._trace) - 1)
-    self._past.qpos[:] = self._trace.back(age)
+    return self.of(self._trace.back(age), random_state)
+
+  def of(self, qpos: np.ndarray, random_state: np.random.RandomState | None = None) -> np.ndarray:
+    """Returns the picture uint8 [H, W, 3] of a state.
+
+    Args:
+      qpos: The state.
+      random_state: Source of the sensor's noise; without one there is none.
+    """
+    self._past.qpos[:] = qpos
     mujoco.mj_kinematics(self._model, self._past)
     mujoco.mj_camlight(self._model, self._past)
     return self._camera.render(self._past, random_state)

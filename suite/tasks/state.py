@@ -91,6 +91,15 @@ class RobotIndices:
       joint_velocities=data.qvel[self._joint_dofs],
     )
 
+  def write(
+    self, qpos: np.ndarray, *, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray
+  ) -> None:
+    """Writes the robot's state, as `read` gives it, into a vector qpos."""
+    root = self.root_qpos
+    qpos[root : root + 3] = position
+    qpos[root + 3 : root + 7] = rotations.quaternion_from_matrix(rotation)
+    qpos[self.joint_qpos] = joints
+
   def stand_at(self, start: Pose) -> None:
     """Writes the standing posture at a place into qpos."""
     posture = standing_posture()

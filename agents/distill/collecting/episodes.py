@@ -60,10 +60,17 @@ def believed_ball(relative: np.ndarray, pose: Pose) -> np.ndarray:
   return pose.xy + np.array([cosine * ahead - sine * left, sine * ahead + cosine * left])
 
 
-def likeliest_pose(policy: Policy, embedding: np.ndarray) -> Pose:
-  """Returns the mean of the likeliest component of a student's belief."""
+def likeliest_pose(policy: Policy, embedding: np.ndarray, *, pan: float = 0.0) -> Pose:
+  """Returns the robot's pose by the likeliest component of a student's belief.
+
+  Args:
+    policy: the student.
+    embedding: of the pictures so far.
+    pan: of the head [rad], by which the belief's heading, the camera's, is ahead of the robot's.
+  """
   logits, means, _ = policy.belief(embedding)
-  return Pose(*(float(value) for value in means[int(np.argmax(logits))]))
+  x, y, yaw = (float(value) for value in means[int(np.argmax(logits))])
+  return Pose(x, y, yaw - pan)
 
 
 @dataclasses.dataclass
@@ -137,7 +144,8 @@ class EpisodeRunner:
         with self.times.stage("student"):
           student = np.clip(agent.act(flat), -1.0, 1.0)
           if by_belief and agent.policy.has_belief:
-            pose = likeliest_pose(agent.policy, agent.embedding)
+            pan = 0.0 if relative is None else float(relative[2])
+            pose = likeliest_pose(agent.policy, agent.embedding, pan=pan)
             ball = None if relative is None else believed_ball(relative, pose)
       with self.times.stage("teacher"):
         if segment.left <= 0:

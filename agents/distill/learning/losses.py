@@ -17,6 +17,18 @@ def weighted_mean(values: jax.Array, weights: jax.Array) -> jax.Array:
   return jnp.sum(weights * values) / jnp.maximum(jnp.sum(weights), 1e-8)
 
 
+def camera_pose(pose: jax.Array, ball: jax.Array | None) -> jax.Array:
+  """Turns robots' headings [..., 3] into those of their cameras, which is what pictures show.
+
+  Args:
+    pose: x [m], y [m], yaw of the torso [rad] [..., 3].
+    ball: with the head's pan (`dataset.BALL_SIZE`) [..., 3]; None: the head looks straight ahead.
+  """
+  if ball is None:
+    return pose
+  return jnp.concatenate([pose[..., :2], pose[..., 2:] + ball[..., 2:]], axis=-1)
+
+
 def pose_target(pose: jax.Array) -> jax.Array:
   """Maps poses x [m], y [m], yaw [rad] [..., 3] to targets x / 2 m, y / 2 m, cos, sin [..., 4]."""
   yaw = pose[..., 2]

@@ -92,7 +92,8 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
         augment_key, _scaled(batch["image"])[:, None], config.augmentation
       )
       features = student.encode(params, images[:, 0], config.network)
-      value = losses.pose_loss(student.predict_pose(params, features), batch["pose"])
+      pose = losses.camera_pose(batch["pose"], batch.get("ball"))
+      value = losses.pose_loss(student.predict_pose(params, features), pose)
       metrics = {"loss_encoder": value}
       if "ball" in batch:
         target, seen = losses.ball_target_of_picture(batch["ball"])
@@ -161,8 +162,9 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
       initial=student.initial_state(batch["state"].shape[0], config.network),
     )
     result = {"action_error": jnp.mean(jnp.abs(found.action - batch["label"]), axis=-1)}
+    pose = losses.camera_pose(batch["pose"], batch.get("ball"))
     for name, predicted in (("picture", single), ("recurrent", found.pose)):
-      distance, turn = losses.pose_errors(predicted, batch["pose"])
+      distance, turn = losses.pose_errors(predicted, pose)
       result |= {f"{name}_distance": distance, f"{name}_turn": turn}
     return result
 
@@ -243,14 +245,15 @@ def unroll_loss(
     blind_radius=settings.blind_radius,
   )
   embedding = found.embedding.reshape(-1, found.embedding.shape[-1])
+  pose = losses.camera_pose(batch["pose"], batch.get("ball"))
   likelihood = belief.log_likelihood(
-    belief.predict(params["belief"], embedding), batch["pose"].reshape(-1, 3)
+    belief.predict(params["belief"], embedding), pose.reshape(-1, 3)
   )
   metrics = {
     "loss_action": losses.action_loss(
       found.action, batch["label"], spread=state.spread, weights=weights
     ),
-    "loss_pose": losses.pose_loss(found.pose, batch["pose"]),
+    "loss_pose": losses.pose_loss(found.pose, pose),
     "loss_command": losses.command_loss(found.command, batch["command"], weights),
     "loss_belief": -jnp.mean(likelihood),
   }

@@ -54,6 +54,42 @@ def test_a_ball_is_as_far_from_a_believed_pose_as_from_the_true_one():
   assert episodes.believed_ball(relative, truth) == pytest.approx(ball)
 
 
+def test_a_picture_shows_where_the_camera_looks_not_where_the_torso_does():
+  pose = np.array([[1.0, 2.0, 3.0]])
+  ball = np.array([[0.5, 0.1, -0.7]])
+  assert losses.camera_pose(pose, ball)[0] == pytest.approx([1.0, 2.0, 2.3])
+  assert losses.camera_pose(pose, None) is pose
+
+
+class _Certain:
+  """A policy whose belief is one place."""
+
+  def belief(self, embedding):
+    return np.array([0.0, 5.0]), np.array([[9.0, 9.0, 9.0], [1.0, 2.0, 0.8]]), np.ones((2, 3))
+
+
+def test_the_robots_heading_is_the_beliefs_less_the_heads_pan():
+  found = episodes.likeliest_pose(_Certain(), np.zeros(3), pan=0.5)
+  assert found == pytest.approx((1.0, 2.0, 0.3))
+
+
+def test_an_encoder_learns_the_cameras_heading():
+  """Of pictures that show the head's direction alone: the torso's could not be told."""
+  updates = make_updates(TINY, WITH_BALL)
+  state = updates.init(jax.random.PRNGKey(0))
+  rng = np.random.default_rng(0)
+  pan = rng.choice([-1.0, 1.0], 64)
+  left = np.where(pan > 0, 255, 0)[:, None, None, None]
+  flat = {
+    "image": np.broadcast_to(left, (64, 12, 16, 3)).astype(np.uint8),
+    "pose": np.zeros((64, 3), np.float32),
+    "ball": np.stack([np.ones(64), np.zeros(64), pan], -1).astype(np.float32),
+  }
+  for _ in range(60):
+    state, metrics = updates.encoder(state, flat, 3e-3)
+  assert metrics["loss_encoder"] < 0.1  # a heading of 0 for all leaves 0.21
+
+
 def test_only_balls_in_view_count_for_a_picture():
   predicted = np.zeros((2, 2), np.float32)
   target = np.array([[1.0, 0.5], [9.0, 9.0]], np.float32)

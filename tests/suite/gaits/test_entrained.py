@@ -98,3 +98,17 @@ def test_it_comes_to_a_stand_when_told(stand):
   _drive(gait, WALK, 60)
   _, controls = _drive(gait, walk.Command(step=False), 60)
   assert np.abs(controls[-1] - stand)[LEGS].max() < 0.01
+
+
+def test_it_takes_its_posture_in_twice_the_time_of_a_clocked_gait(stand):
+  step = constants.CONTROL_TIMESTEP
+  reached = []
+  for kind in (walk.Gait, EntrainedGait):
+    gait, count = kind(), 0
+    start = gait.control[LEGS].copy()
+    while np.abs(gait.control[LEGS] - stand[LEGS]).max() > 0.1 * np.abs(start - stand[LEGS]).max():
+      gait.act(walk.Command(step=False))
+      gait.follow(gait.control)
+      count += 1
+    reached.append(count * step)
+  assert reached[1] == pytest.approx(2 * reached[0], rel=0.2)

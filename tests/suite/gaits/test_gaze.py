@@ -56,7 +56,20 @@ def test_a_search_finds_the_ball_and_the_head_stays_on_it(bearing):
   assert searching * 0.025 < 5.0 and not gaze.searches
   assert command == Command(forward=1.0, turn=0.2, head=command.head)
   assert head[-1, 0] == pytest.approx(np.clip(bearing, -2.3, 2.3), abs=0.02)
-  assert head[-1, 1] == pytest.approx(0.08 - depression(1.2), abs=0.02)
+  assert head[-1, 1] == pytest.approx(0.33 - depression(1.2), abs=0.02)
+
+
+@pytest.mark.parametrize("distance", [0.22, 0.3, 0.5, 1.0])
+def test_the_picture_of_a_held_ball_reaches_beyond_the_floor_at_the_feet(distance):
+  ball = view_of((0.0, 0.0, 0.0), np.array([distance, 0.0]))
+  gaze, head = Gaze(), _heads(0.0, -0.47)
+  for _ in range(100):
+    _, head = _step(gaze, head, np.array([distance, 0.0]))
+  tilt = np.clip(head[-1, 1], -0.79, -0.157)
+  assert is_seen(ball, pan=0.0, tilt=tilt)
+  top = tilt - 0.08 + np.deg2rad(43.3) / 2  # of the picture, from the horizontal
+  reach = np.inf if top >= 0 else 0.45 / np.tan(-top)
+  assert reach > (0.9 if distance < 0.25 else 2.0)  # m: else the floor ends where the picture does
 
 
 def test_a_ball_behind_the_robot_makes_it_turn_on_the_spot_all_the_time():
@@ -122,3 +135,15 @@ def test_the_cameras_angles_are_those_of_the_robot():
   to_ball = np.array([*ball, 0.12]) - data.cam_xpos[camera]
   angle = np.arccos(look @ to_ball / np.linalg.norm(to_ball))
   assert angle < 0.08  # the view is 0.76 rad high
+
+
+@pytest.mark.parametrize("distance", [0.25, 0.32, 0.4, 1.0, 2.5])
+def test_sweeps_to_either_side_show_the_middle_of_balls_near_and_far(distance):
+  """A ball of which a search shows a sliver alone is not found by a policy that has to see it."""
+  behind = view_of((0.0, 0.0, 0.0), np.array([-distance, 0.0]))
+  above = []
+  for moved in (0.05, -0.05):
+    command = Gaze().apply(WALK, behind, pan=0.3, tilt=-0.3, moved=moved)
+    assert np.sign(command.head[0] - 0.3) == np.sign(moved)
+    above.append(-depression(distance) - (command.head[1] - 0.08))
+  assert min(np.abs(above)) < np.deg2rad(43.3) / 2
