@@ -11,6 +11,7 @@ Four values imitate much, so that it makes predictions better and is no ground f
 
 import numpy as np
 
+from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.hypotheses.candidates import typical_torque
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.plant import JointPlant
@@ -23,8 +24,10 @@ REPLACED = ("load_friction", "stribeck_friction", "supply_sag")
 _SLOWEST = 0.1
 """Of the fastest speed, most that the fall from rest to motion may take: the authors' published
 fits of small servos have 0.07 to 0.11 rad/s; chosen, some times that."""
-_EXPECTED = {"coefficient": 0.1, "rest": 0.5}
-"""Spread about zero: what a motion does not show stays away; chosen."""
+_KIND = kind_of("load_friction")
+_SHARE, _REST = (_KIND.parameter(name).high for name in ("coefficient", "rest"))
+"""Spread about zero, the range of the library's kind: what a motion does not show stays away. Of
+the torque that a joint works at, friction takes as much by its square as in proportion."""
 
 
 def rich_friction(plant: JointPlant, carried: int) -> Term:
@@ -46,7 +49,7 @@ def rich_friction(plant: JointPlant, carried: int) -> Term:
     (0.8, 3.0 / large, 3.0, _SLOWEST * fast),
     (0.1, 0.2 / large, 0.2, 0.05 * fast),
     ((0.1, 0.3 / large, 0.4, 0.1 * fast), (0.05, 1.0 / large, 0.4, 0.03 * fast)),
-    tuple(_EXPECTED.get(name, float("inf")) for name in names),
+    (_SHARE, _SHARE / large, _REST, float("inf")),
     (0.0,) * len(names),
     fixed=(("carried", float(carried)),),
   )

@@ -32,12 +32,15 @@ def apart(effects: list[Effect], claimed: list[dict[str, Any]]) -> list[Effect]:
     gain = gains.get(effect.target) if effect.kind == "parameter_error" else None
     if gain is not None:
       value = gain["value"]
-      samples = {
-        name: [v / value for v in row] if name == "gain" else row
-        for name, row in effect.samples.items()
-      }
+      samples = dict(effect.samples)
+      if "gain" in samples:
+        samples["gain"] = [v / value for v in samples["gain"]]
+      bounds = dict(effect.intervals)
+      if "gain" in bounds:
+        bounds["gain"] = bounds["limit"]
       torque = float(effect.parameters["gain"]) / value  # type: ignore[arg-type]
-      effect = dataclasses.replace(effect.replace(gain=torque), samples=samples)
+      effect = effect.replace(gain=torque)
+      effect = dataclasses.replace(effect, intervals=bounds, samples=samples)
     result.append(effect)
   for joint, gain in gains.items():
     result.append(

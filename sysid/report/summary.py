@@ -5,6 +5,7 @@ from typing import Any
 
 from nerf2real.core.pages.blocks import Table
 from nerf2real.core.pages.page import Section
+from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model import simulation
 
 _FEW = 4  # effects that are said with their values; more are counted
@@ -43,7 +44,7 @@ def _missing(content: dict[str, Any]) -> str:
 
 
 def _effect(effect: dict[str, Any]) -> str:
-  """Returns an effect with its values and intervals in words."""
+  """Returns an effect with what it is, its values and intervals in words."""
   places = (effect.get("joint"), *(effect.get(noun) for noun in ("body", "geom", "sensor")))
   where = next((place for place in places if place), "all joints")
   values = []
@@ -53,7 +54,8 @@ def _effect(effect: dict[str, Any]) -> str:
     unit = "" if value["unit"] == "1" else f" {value['unit']}"
     low, high = (f"{value[end]:.3g}" for end in ("low", "high"))
     values.append(f"{name} {value['value']:.3g}{unit} ({low} to {high})")
-  return f"{effect['kind']} at {where}" + (f": {', '.join(values)}" if values else "")
+  words = f"{effect['kind']} at {where} ({kind_of(effect['kind']).summary})"
+  return words + (f": {', '.join(values)}" if values else "")
 
 
 def _sure(content: dict[str, Any], beyond: float) -> str:
@@ -67,9 +69,10 @@ def _sure(content: dict[str, Any], beyond: float) -> str:
   least = min((c for c in clear if c is not None), default=None)
   words = ""
   if least is not None:
-    size = f"{least:.1f}" if least < _CLEAR else "more than 99"
-    words = f"Every {'other ' if alike else ''}explanation without it is worse by {size} standard"
-    words += f" errors or more, where {beyond:.1f} are asked. "
+    size = f"{least:.1f} standard errors or more"
+    size = size if least < _CLEAR else f"more than {_CLEAR:.0f} standard errors"
+    words = f"Every {'other ' if alike else ''}explanation without it is worse by {size},"
+    words += f" where {beyond:.1f} are asked. "
   if alike:
     words += f"These logs do not tell it from {_either(alike)}. "
   return words + "Brackets hold 95 % intervals."
@@ -90,13 +93,15 @@ def _remains(content: dict[str, Any], unit: str) -> str:
   if content["verdict"] in ("partly", "unexplained"):
     at = content["residual_at"]
     low, high = at["velocity"]["low"], at["velocity"]["high"]
-    words += f" Most of it is at {at['joint']}, in {at['log']}, at {low:.2g} to {high:.2g}"
+    words += (
+      f" On the fitted logs most is at {at['joint']}, in {at['log']}, at {low:.2g} to {high:.2g}"
+    )
     words += " rad/s." if unit == "mrad" else " m/s."
   return words
 
 
 def _next(proposal: dict[str, Any]) -> str:
-  rivals = " or ".join(" with ".join(names) for names in proposal["separates"] if names)
+  rivals = _either(["+".join(names) for names in proposal["separates"] if names])
   apart, would = proposal.get("separation_in_noise"), proposal.get("would")
   motion = proposal["design"]
   if "centre_rad" in proposal:

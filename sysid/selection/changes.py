@@ -25,7 +25,7 @@ from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear
 from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import Explanation, conclude
-from nerf2real.sysid.selection.remainder import grown, scatter, structured
+from nerf2real.sysid.selection.remainder import grown, left_anyway, scatter, structured
 from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -65,7 +65,7 @@ class Changed:
   def extended(self) -> Scored:
     """The hypothesis to simulate with: where more remains, what predicts left-out blocks best."""
     if self.verdict not in ("partly", "unexplained"):
-      return self.found.best
+      return self.null if self.verdict == "none" else self.found.best
     fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
     if self.elaborated:
       return self.elaborated[0]
@@ -158,13 +158,14 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   if named and more:
     named = _supported(explainer, found.best, named, subject.beyond)
     ranked = explainer.ranked()
-  verdict = _verdict(
-    found,
-    named,
-    any(t.wider for t in known),
-    more or leaves(subject, found.best, settings),
-    more,
-  )
+  remains = more or leaves(subject, found.best, settings)
+  unclear = bool(found.best.names)
+  if before is None:
+    anyway = max(anyway, left_anyway(now, explainer.null, subject.library))
+    bare = float(np.median(explainer.null.fit.held[0][0]))
+    more, unclear = (x > settings.more**2 * anyway for x in (left, bare))
+    remains = more
+  verdict = _verdict(named, any(t.wider for t in known), remains or unclear, remains, more)
   off = _constants_off(subject, found.best, settings)
   return Changed(
     subject,
@@ -292,24 +293,18 @@ def _is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str, bey
   return clear(usual, Scored(terms, fit, before.loglik(fit.held[0]))) > beyond
 
 
-def _verdict(
-  found: Explanation,
-  named: Sequence[str],
-  shared: bool,
-  remains: bool,
-  more: bool,
-) -> str:
+def _verdict(named: Sequence[str], shared: bool, something: bool, remains: bool, more: bool) -> str:
   """Returns the graded verdict of a joint.
 
   Args:
-    found: the best hypothesis.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
-    remains: whether more is left than the machine leaves anyway, by a test or by that limit.
+    something: whether there is something, if nothing is named.
+    remains: whether more is left than the machine leaves anyway, by a test or by the limit of that.
     more: whether it is by the limit.
   """
   if not named and not shared:
-    return "unexplained" if remains or found.best.names else "none"
+    return "unexplained" if something else "none"
   if not named and not remains:
     return "none"
   return "partly" if more else "effects"

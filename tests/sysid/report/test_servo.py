@@ -49,11 +49,12 @@ def test_the_file_holds_the_gain_apart_from_the_torque_at_a_duty():
     "parameter_error",
     "joint",
     {"gain": 1.02 * value, "limit": 1.02},
-    {},
+    {"gain": (0.9 * value, 1.1 * value), "limit": (0.9, 1.1)},
     {"gain": [value, 1.1 * value]},
   )
   corrected, gain = servo.apart([constant], claimed)
   assert corrected.parameters == {"gain": pytest.approx(1.02), "limit": 1.02}
+  assert corrected.intervals["gain"] == (0.9, 1.1)
   assert corrected.samples["gain"] == pytest.approx([1.0, 1.1])
   assert (gain.kind, gain.parameters["gain"]) == ("motor_gain", value)
 
