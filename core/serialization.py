@@ -12,13 +12,15 @@ import json
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cattrs
-import numpy as np
 from cattrs.cols import is_namedtuple, namedtuple_dict_structure_factory
 
 from nerf2real.core import files
+
+if TYPE_CHECKING:  # commands read settings before they set the threads of NumPy's BLAS
+  import numpy as np
 
 T = TypeVar("T")
 
@@ -37,7 +39,7 @@ def to_plain(value: Any) -> Any:
     return {str(key): to_plain(item) for key, item in value.items()}
   if isinstance(value, list | tuple):
     return [to_plain(item) for item in value]
-  if isinstance(value, np.ndarray | np.generic):
+  if hasattr(value, "tolist"):  # NumPy's arrays and scalars
     return value.tolist()
   return _converter().unstructure(value)
 
@@ -88,9 +90,7 @@ def _converter() -> cattrs.Converter:
   # cattrs would convert: bool("no") is True and int("3") is 3.
   for kind in (int, float, bool, str):
     converter.register_structure_hook(kind, _scalar)
-  converter.register_structure_hook_func(
-    lambda kind: kind is np.ndarray or typing.get_origin(kind) is np.ndarray, _array
-  )
+  converter.register_structure_hook_func(_is_array, _array)
   converter.register_structure_hook_factory(is_namedtuple, namedtuple_dict_structure_factory)
   return converter
 
@@ -105,7 +105,14 @@ def _scalar(value: Any, kind: type) -> Any:
   raise TypeError(f"expected {kind.__name__}, found {value!r}")
 
 
-def _array(value: Any, kind: Any) -> np.ndarray:
+def _is_array(kind: Any) -> bool:
+  kind = typing.get_origin(kind) or kind
+  return (getattr(kind, "__module__", ""), getattr(kind, "__name__", "")) == ("numpy", "ndarray")
+
+
+def _array(value: Any, kind: Any) -> "np.ndarray":
+  import numpy as np
+
   parameters = typing.get_args(kind)  # (shape, numpy.dtype[kind of number])
   dtype = typing.get_args(parameters[1])[0] if parameters else None
   array = np.array(value, None if dtype is Any else dtype)

@@ -103,13 +103,16 @@ class Store:
     """
     self.path = Path(folder) / FILE
     self.path.parent.mkdir(parents=True, exist_ok=True)
+    self.read()
+
+  def read(self) -> None:
+    """Reads the folder, also anew after other processes wrote into it."""
     self.episodes: list[Episode] = []
     self.duplicates = 0  # episodes that were left out
     if self.path.exists():
-      self._read()
+      self._read(self.path.read_text())
 
-  def _read(self) -> None:
-    text = self.path.read_text()
+  def _read(self, text: str) -> None:
     lines, keys = text.splitlines(), self.done()
     for number, line in enumerate(lines):
       try:

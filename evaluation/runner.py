@@ -161,6 +161,7 @@ def run_all(
   store: episodes.Store,
   report: Callable[[Episode, int, int], None] = lambda episode, number, count: None,
   watch: Watch = unwatched,
+  share: tuple[int, int] = (0, 1),
 ) -> int:
   """Runs the trials that the store does not hold yet; returns how many were run.
 
@@ -171,13 +172,14 @@ def run_all(
     store: Keeps every episode as it ends.
     report: Called with an episode, its number and the number of trials.
     watch: Called at every step of every episode.
+    share: k and n, of n processes that share the trials the k-th: every n-th trial from the k-th.
   """
   setting, done = setting_of(plant, policy), store.done()
   listed = list(trials)
   count = 0
   for number, (index, (group, trial)) in enumerate(listed, start=1):
     probe = Episode(setting=setting, group=group, index=index, goal=(0.0, 0.0), outcome="")
-    if probe.key in done:
+    if probe.key in done or (number - 1) % share[1] != share[0]:
       continue
     while True:
       try:

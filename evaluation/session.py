@@ -6,6 +6,8 @@ short goes on where it stopped.
 
 import contextlib
 import dataclasses
+import functools
+import math
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +18,7 @@ import numpy as np
 
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
-from nerf2real.evaluation import episodes, runner
+from nerf2real.evaluation import episodes, runner, side_by_side
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.making import free_name, make_plant
 from nerf2real.evaluation.plants.plant import Plant
@@ -91,8 +93,11 @@ def evaluate(settings: EvaluationSettings, say: Callable[[str], None]) -> Path |
 
   Raises:
     FolderInUseError: Another process evaluates into the folder.
-    ValueError: No trials; a dry run that is of no robot, or a film that is not of "sim".
+    ValueError: No trials or processes, a dry run that is of no robot, a film that is not of "sim",
+      several processes where trials follow one another.
+    RuntimeError: A process ended before its trials were over.
   """
+  _check_processes(settings)
   if settings.trials is not None and settings.trials < 1:
     raise ValueError(f"--trials {settings.trials}: expected at least 1, or none for all.")
   if settings.video is not None:
@@ -115,7 +120,7 @@ def _evaluate(settings: EvaluationSettings, scene: Any, say: Callable[[str], Non
     say(f"left out {store.duplicates} episodes that {store.path} holds twice")
   path = settings.out / "report.html"
   try:
-    _run_trials(settings, scene, store, settings.trials, say)
+    _run_trials(settings, scene, store, say)
   finally:
     if store.episodes:
       report.write(
@@ -140,7 +145,8 @@ def _dry_run(settings: EvaluationSettings, scene: Any, say: Callable[[str], None
       "that could break."
     )
   with tempfile.TemporaryDirectory() as folder:
-    _run_trials(settings, scene, episodes.Store(Path(folder)), settings.trials or 1, say)
+    single = dataclasses.replace(settings, trials=settings.trials or 1)
+    _run_trials(single, scene, episodes.Store(Path(folder)), say)
 
 
 @contextlib.contextmanager
@@ -165,28 +171,75 @@ def _filming(settings: EvaluationSettings, plant: Plant) -> Iterator[runner.Watc
     yield watch
 
 
+def _check_processes(settings: EvaluationSettings) -> None:
+  count = settings.processes
+  if count < 1:
+    raise ValueError(f"--processes {count}: expected at least 1.")
+  if count > 1 and (settings.plant == "robot" or settings.video is not None):
+    what = "--plant robot" if settings.plant == "robot" else "--video"
+    raise ValueError(f"--processes {count} with {what}: expected 1, for trials follow one another.")
+
+
 def _run_trials(
+  settings: EvaluationSettings, scene: Any, store: episodes.Store, say: Callable[[str], None]
+) -> None:
+  """Runs what is missing on every plant; processes share the trials of each."""
+  singles = each_plant(settings)
+  shares = settings.processes // math.gcd(settings.processes, len(singles))
+  if shares == settings.processes == 1:
+    for single in singles:
+      _run_share(single, scene, store, say, (0, 1))
+    return
+  functions = [
+    functools.partial(_run_apart, single, store, (k, shares))
+    for single in singles
+    for k in range(shares)
+  ]
+  try:
+    side_by_side.run(functions, processes=settings.processes, say=say)
+  finally:
+    store.read()
+
+
+def _run_apart(
+  settings: EvaluationSettings,
+  store: episodes.Store,
+  share: tuple[int, int],
+  say: Callable[[str], None],
+) -> None:
+  """Runs a share of a plant's trials in a process of its own, which adds to the store's file."""
+  _run_share(settings, open_scene(settings.scene), store, say, share)
+
+
+def _run_share(
   settings: EvaluationSettings,
   scene: Any,
   store: episodes.Store,
-  count: int | None,
   say: Callable[[str], None],
+  share: tuple[int, int],
 ) -> None:
+  """Runs a share of the trials that are missing on one plant."""
   policy = load_policy(settings, scene)
   size = policy.image_size or settings.camera_size
   size = _FILMED if settings.video and size is None else size
-  chosen = choose(plants.trials(settings.protocol), count)
-  for single in each_plant(settings):
-    log = None
-    if single.record and single.plant != "sim":
-      log = free_name(single.out / f"{single.plant}_{single.protocol}.mcap")
-    plant = make_plant(single, scene, size, trained_on=policy.trained_on, record=log)
-    say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
-    try:
-      with _filming(settings, plant) as watch:
-        runner.run_all(
-          plant, policy, chosen, store=store, report=lambda *told: say(_line(*told)), watch=watch
-        )
-    finally:
-      plant.close()
-    plant.check_recording()
+  chosen = choose(plants.trials(settings.protocol), settings.trials)
+  log = None
+  if settings.record and settings.plant != "sim":
+    name = f"{settings.plant}_{settings.protocol}" + (f"_share{share[0]}" if share[1] > 1 else "")
+    log = free_name(settings.out / f"{name}.mcap")
+  plant = make_plant(settings, scene, size, trained_on=policy.trained_on, record=log)
+  say(f"{tables.PLANTS[plant.name]} ({plant.plant_id})")
+  try:
+    with _filming(settings, plant) as watch:
+      runner.run_all(
+        plant,
+        policy,
+        chosen,
+        store=store,
+        report=lambda *told: say(_line(*told)),
+        watch=watch,
+        share=share,
+      )
+  finally:
+    plant.close()
+  plant.check_recording()

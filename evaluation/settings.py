@@ -32,6 +32,9 @@ class EvaluationSettings:
   """An effects.json for the simulation: what the nominal model lacks."""
   trials: int | None = None
   """Runs only the first trials of the protocol, spread over it; all if not given."""
+  processes: int = 1
+  """Processes that share the trials in simulation and on virtual robots; each has a plant of its
+  own, so that a virtual robot's noise is another than with one."""
   seed: int = 0
   """Seed of the simulation's episodes and of drawn actions."""
   robot_seed: tuple[int, ...] = (1,)

@@ -4,6 +4,7 @@ report.json holds the findings, details.json what they rest on and all that `dri
 logs: the declared model's path, the extended model as effects, the joints' hypotheses.
 """
 
+import collections
 import json
 import time
 from collections.abc import Sequence
@@ -158,7 +159,8 @@ def _identify(
       f" {joints}. The errors before and after are of whole courses, which stray.",
     ]
   if found.in_reference:
-    kinds = ", ".join(row["kind"] for row in found.in_reference)
+    counts = collections.Counter(row["kind"] for row in found.in_reference)
+    kinds = ", ".join(f"{k} ({n} times)" if n > 1 else k for k, n in counts.items())
     text = f"In the reference, too, so that nothing has changed: {kinds}. The model lacks it."
     content["notes"] = [*content["notes"], text]
   if found.verdict == "partly":

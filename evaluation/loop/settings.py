@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
-from nerf2real.evaluation.policies import names as policy_names
 
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"
@@ -41,6 +40,8 @@ class LoopSettings:
   """Length of a recorded motion [s]."""
   trials: int = 18
   """Trials of the navigation protocol, spread over its 54."""
+  processes: int = 2
+  """Conditions whose trials run side by side, each in a process of its own (a core, 1.5 GB)."""
   time_limit: float | None = None
   """Length of a trial [s]; the task's own if not given."""
   minutes: float = 30.0
@@ -62,6 +63,8 @@ def policy_folder(settings: LoopSettings) -> Path | None:
   Raises:
     ValueError: There is none.
   """
+  from nerf2real.evaluation.policies import names as policy_names
+
   if settings.policy in policy_names.WALKERS:
     return None
   return policy_names.policy_folder(settings.policy, task=TASK)

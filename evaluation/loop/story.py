@@ -4,6 +4,7 @@ Stages, each of which leaves files and is not repeated: trials before, recording
 in the simulation with the effects put in, training, trials after.
 """
 
+import functools
 import json
 import time
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 from nerf2real.agents.supervision.training import Scripts
 from nerf2real.core.camera_info import read_camera_info
 from nerf2real.core.serialization import to_plain, write_json
+from nerf2real.evaluation import side_by_side
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Store
 from nerf2real.evaluation.loop import machines, naming, recording, training, trials
 from nerf2real.evaluation.loop.comparing import Comparison, compare
@@ -66,18 +68,28 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
   store = Store(settings.out)
   stages = _Stages(settings.out / _TIMES)
   found: dict[str, list[Episode]] = {}
+  virtual = settings.robot == recording.VIRTUAL
+  processes = settings.processes if virtual else 1  # a person attends to a robot alone
 
-  def run(condition: Condition) -> None:
-    with stages.timed(condition.name):
-      found[condition.name] = trials.run(settings, condition, scene, store, say)
-    say(str(tally(condition.name, found[condition.name])))
+  def run(*conditions: Condition) -> None:
+    functions = [functools.partial(trials.run_apart, settings, c, store) for c in conditions]
+    try:
+      ran = side_by_side.run(functions, processes=processes, say=say)
+    finally:
+      store.read()
+    for condition, (episodes, seconds) in zip(conditions, ran, strict=True):
+      found[condition.name] = episodes
+      stages.add(condition.name, seconds)
+      say(f"{condition.name}: {tally(condition.name, episodes)}")
 
-  if settings.robot == recording.VIRTUAL:
-    run(Condition(name=HEALTHY, policy=policy))
-  run(Condition(name=BEFORE, policy=policy, altered=hidden))
+  before = Condition(name=BEFORE, policy=policy, altered=hidden)
+  nominal = Condition(name=NOMINAL, policy=policy, simulated=True)
+  healthy = [Condition(name=HEALTHY, policy=policy)] if virtual else []
+  run(*healthy, before, nominal)
   with stages.timed("recording"):
     reference = _record(settings, hidden, say)
-  walked = {name: trials.walked(settings, name, found[name], store) for name in found}
+  on_robot = [name for name in (HEALTHY, BEFORE) if name in found]
+  walked = {name: trials.walked(settings, name, found[name], store) for name in on_robot}
   with stages.timed("identification"):
     named = naming.name(
       settings.out / "identified",
@@ -87,19 +99,19 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
       walked_before=walked.get(HEALTHY),
     )
   say(f"verdict: {named.verdict}: {', '.join(e.kind for e in named.named) or 'nothing'}")
-  run(Condition(name=NOMINAL, policy=policy, simulated=True))
   trained: Trained | None = None
   after = policy
+  last: list[Condition] = []
   if named.named:
     effects = named.effects_path
     run(Condition(name=WITH_EFFECTS, policy=policy, simulated=True, effects=effects))
     with stages.timed("training"):
       trained = training.train(settings, policy, effects, scene=scene, scripts=scripts)
     after = trained.policy
-    run(Condition(name=TRAINED, policy=after, simulated=True, effects=effects))
-  run(Condition(name=AFTER, policy=after, altered=hidden))
+    last.append(Condition(name=TRAINED, policy=after, simulated=True, effects=effects))
+  run(*last, Condition(name=AFTER, policy=after, altered=hidden))
   comparison = None
-  if settings.robot == recording.VIRTUAL:
+  if virtual:
     comparison = compare(hidden, named.named, named.in_reference)
   story = Story(settings, found, named, trained, comparison, stages.seconds)
   write_json(settings.out / "loop.json", summary(story))
@@ -197,5 +209,9 @@ class _Stages:
     try:
       yield
     finally:
-      self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begun
-      write_json(self._path, self.seconds)
+      self.add(name, time.monotonic() - begun)
+
+  def add(self, name: str, seconds: float) -> None:
+    """Adds a time [s] to a stage."""
+    self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+    write_json(self._path, self.seconds)

@@ -7,6 +7,7 @@ interrupted loop runs only what is missing.
 import contextlib
 import dataclasses
 import hashlib
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +28,7 @@ from nerf2real.evaluation.session import choose
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.protocols import NAVIGATION
+from nerf2real.suite.scene import open_scene
 
 Say = Callable[[str], None]
 
@@ -115,10 +117,19 @@ def run(
     def report(episode: Episode, number: int, count: int) -> None:
       if robot is not None:
         session.note(robot.clock.now() - begun)
-      say(f"  {number}/{count} {episode.outcome} after {episode.duration:.1f} s")
+      took = f"{episode.outcome} after {episode.duration:.1f} s"
+      say(f"  {condition.name} {number}/{count}: {took}")
 
     runner.run_all(plant, policy, chosen, store=store, report=report)
   return found()
+
+
+def run_apart(
+  settings: LoopSettings, condition: Condition, store: Store, say: Say
+) -> tuple[list[Episode], float]:
+  """Runs the trials of a condition in a process of their own; returns them, and the time [s]."""
+  begun = time.monotonic()
+  return run(settings, condition, open_scene(settings.scene), store, say), time.monotonic() - begun
 
 
 def walked(settings: LoopSettings, name: str, found: Sequence[Episode], store: Store) -> Walked:

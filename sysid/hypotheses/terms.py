@@ -104,12 +104,11 @@ class Term:
       factors = {n: 1.0 + values[n] for n in self.names if n not in ("skew", "latency", "zero")}
       bounds = {n: (1.0 + a, 1.0 + b) for n, (a, b) in (intervals or {}).items() if n in factors}
       if "gain" in factors and values.get("scales_limit", 0.0) > 0:
-        law = values.get(SERVO_GAIN, 1.0)
-        factors["limit"] = factors["gain"]
-        factors["gain"] *= law
+        servo = values.get(SERVO_GAIN, 1.0)
+        factors["gain"], factors["limit"] = servo * factors["gain"], factors["gain"]
         if "gain" in bounds:
-          bounds["limit"] = bounds["gain"]
-          bounds["gain"] = tuple(law * end for end in bounds["gain"])
+          low, high = bounds["gain"]
+          bounds |= {"gain": (servo * low, servo * high), "limit": (low, high)}
       return Effect("parameter_error", self.target, factors, bounds)
     known = {p.name for p in kind_of(self.kind).parameters}
     values = {n: v for n, v in values.items() if n in known}

@@ -99,7 +99,7 @@ def put(spec: mujoco.MjSpec, effect: Effect) -> None:
       wave = [_value(effect, name) for name in ("amplitude", "periods", "phase")]
       for joint in joints_of(spec, effect):
         _passive(spec, joint, "cogging", cogging=wave)
-    case "backlash":
+    case "backlash" if _value(effect, "gap") > 0:  # MuJoCo takes no range of one point
       for joint in joints_of(spec, effect):
         _play(spec, joint, effect)
 

@@ -10,6 +10,7 @@ from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.findings import Identified
 
 KIND = "motor_gain"
+_SEVERAL = 3  # joints from which their laws are told in one sentence
 
 
 def rows(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -35,10 +36,10 @@ def apart(effects: list[Effect], claimed: list[dict[str, Any]]) -> list[Effect]:
       samples = dict(effect.samples)
       if "gain" in samples:
         samples["gain"] = [v / value for v in samples["gain"]]
+      torque = float(effect.parameters["gain"]) / value  # type: ignore[arg-type]
       bounds = dict(effect.intervals)
       if "gain" in bounds:
-        bounds["gain"] = bounds["limit"]
-      torque = float(effect.parameters["gain"]) / value  # type: ignore[arg-type]
+        bounds["gain"] = bounds["gain"][0] / value, bounds["gain"][1] / value
       effect = effect.replace(gain=torque)
       effect = dataclasses.replace(effect, intervals=bounds, samples=samples)
     result.append(effect)
@@ -50,9 +51,14 @@ def apart(effects: list[Effect], claimed: list[dict[str, Any]]) -> list[Effect]:
 
 
 def notes(found: Identified) -> list[str]:
-  """Returns a sentence a joint on its servo's law."""
-  laws = ((item.joint, item.likelihood.law, item) for item in found.joints)
-  return [_sentence(joint, law, item) for joint, law, item in laws if law is not None]
+  """Returns a sentence a joint on its servo's law; one for joints whose laws are no more than a
+  gain and a delay, where there are several."""
+  laws = [(i.joint, i.likelihood.law, i) for i in found.joints if i.likelihood.law is not None]
+  plain = [law for _, law, item in laws if not (law.dead_band or _winds(law, item))]
+  if len(plain) < _SEVERAL:
+    return [_sentence(*row) for row in laws]
+  rest = [_sentence(*row) for row in laws if not any(row[1] is law for law in plain)]
+  return [_together(plain), *rest]
 
 
 def _constant(item: Changed) -> ServoLaw | None:
@@ -72,9 +78,26 @@ def _row(joint: str, law: ServoLaw) -> dict[str, Any]:
   return {"kind": KIND, "joint": joint, "parameters": {"gain": gain}, "evidence": evidence}
 
 
+def _winds(law: ServoLaw, item: Changed) -> bool:
+  """Tells whether an integral makes more of the duty than its steps and what is left."""
+  return law.wound > max(item.likelihood.floor[1], law.left)
+
+
+def _together(laws: list[ServoLaw]) -> str:
+  def span(values: list[float], digits: str) -> str:
+    ends = [format(value, digits) for value in (min(values), max(values))]
+    return " to ".join(dict.fromkeys(ends))
+
+  return (
+    f"The duty of {len(laws)} joints against their position errors:"
+    f" {span([law.gain for law in laws], '.3f')} of the declared gain,"
+    f" {span([1e3 * law.delay for law in laws], '.0f')} ms after the command;"
+    f" {span([100.0 * law.left for law in laws], '.2g')} % of full duty is left (rms)."
+  )
+
+
 def _sentence(joint: str, law: ServoLaw, item: Changed) -> str:
   low, high = law.interval
-  step = max(item.likelihood.floor[1], law.left)
   parts = [
     f"{law.gain:.3f} of the declared gain ({low:.3f} to {high:.3f})",
     f"{1e3 * law.delay:.0f} ms after the command",
@@ -84,7 +107,7 @@ def _sentence(joint: str, law: ServoLaw, item: Changed) -> str:
     parts.append(
       f"a dead band of {law.dead_band:.2g} {'rad' if item.likelihood.plant.hinge else 'm'}"
     )
-  if law.wound > step:
+  if _winds(law, item):
     parts.append(f"an integral of {law.integral:.2g} 1/s")
   return (
     f"The duty of {joint} against its position error: {', '.join(parts)};"

@@ -40,6 +40,18 @@ def test_help_lists_every_command_with_a_line_and_loads_no_library():
     assert len(line.split()) > 4 and line.endswith(".") and len(line) <= 120
 
 
+def test_no_script_loads_numpy_before_it_has_set_its_threads():
+  limited = [p.stem for p in (ROOT / "launch").glob("*.py") if "ONE_THREAD" in p.read_text()]
+  assert len(limited) > 5
+  code = (
+    "import importlib, sys\nfor name in sys.argv[1:]:\n"
+    "  importlib.import_module(f'nerf2real.launch.{name}')\n"
+    "  if 'numpy' in sys.modules: sys.exit(name)"
+  )
+  found = _run(sys.executable, "-c", code, *limited)
+  assert found.returncode == 0, f"{found.stderr.strip()} imports NumPy: too late for OpenBLAS"
+
+
 def test_every_script_has_a_command():
   helpers = {"__init__", "command", "console"}
   assert {path.stem for path in (ROOT / "launch").glob("*.py")} - helpers == set(

@@ -114,6 +114,12 @@ def test_a_servos_play_is_written_only_behind_its_encoder(tmp_path):
   assert rms(got - want) < 0.1 * rms(want - suites(PENDULUM, [], SLOW))
 
 
+def test_a_play_of_no_gap_is_no_joint(tmp_path):
+  path, left = written(tmp_path, MOTOR, [Effect("backlash", "joint", {"gap": 0.0})])
+  assert left == []
+  assert mujoco.MjModel.from_xml_path(str(path)).njnt == 1
+
+
 def test_effects_on_all_joints_and_several_kinds_together(tmp_path):
   effects = [
     Effect("cogging", "elbow", {"amplitude": 0.2}),

@@ -22,13 +22,16 @@ STEP = 1.0 / 885  # of the PWM's counts
 DECLARED = 21.0 / 4.0  # duty a rad
 
 
-def plant_of(*, gain=1.0, delay=0.0, band=0.0, integral=0.0, top=1.0, noise=0.0, effects=()):
+def plant_of(
+  *, gain=1.0, delay=0.0, drift=0.0, band=0.0, integral=0.0, top=1.0, noise=0.0, effects=()
+):
   """Returns a joint with duties that follow a law from its readings."""
   logs, random = [], np.random.default_rng(0)
   for seed, kind in enumerate(("sweep", "slow")):
     log = log_of(PENDULUM, kind, effects, duration=5.0, seed=seed)
     time, position = log.states.stamp, log.states.position[:, 0]
-    sent = np.searchsorted(log.commands.stamp, time - delay, side="right") - 1
+    late = time * (1.0 - drift) - delay
+    sent = np.searchsorted(log.commands.stamp, late, side="right") - 1
     error = log.commands.position[np.clip(sent, 0, None), 0] - position
     error = np.sign(error) * np.maximum(np.abs(error) - band, 0.0)
     duty = gain * DECLARED * error + integral * DECLARED * np.cumsum(error * np.gradient(time))
@@ -63,6 +66,21 @@ def test_delay_dead_band_and_saturation_are_found():
   assert law.gain == pytest.approx(0.8, rel=0.01)
 
 
+@pytest.mark.parametrize("delay", [0.07, 0.18])
+def test_a_command_as_late_as_is_plausible_is_no_weaker_gain(delay):
+  law = law_of(delay=delay, noise=0.002)
+  assert law.delay == pytest.approx(delay, abs=0.005)
+  assert law.gain == pytest.approx(1.0, abs=0.01)
+  assert not law.is_off(0.05)
+
+
+def test_a_clock_that_drifts_is_no_weaker_gain():
+  drifting = law_of(drift=0.04, noise=0.002)
+  assert not drifting.is_off(0.05)
+  assert drifting.unexplained > 10.0 * law_of(noise=0.002).unexplained
+  assert law_of(gain=0.5, noise=0.002).is_off(0.05)
+
+
 def test_an_integral_is_found_where_there_is_one():
   none, some = law_of(noise=0.001), law_of(integral=0.5, noise=0.001)
   assert abs(none.integral) < 3.0 * none.integral_deviation + 0.01
@@ -85,6 +103,9 @@ def test_constants_hold_the_law_of_a_gain_that_is_off():
   effect = own.effect(np.array(own.starts[0]))
   assert effect.parameters["gain"] == pytest.approx(0.5, rel=0.01)
   assert effect.parameters["limit"] == 1.0
+  with_interval = own.effect(np.array(own.starts[0]), {"gain": (-0.02, 0.04)})
+  assert with_interval.intervals["limit"] == pytest.approx((0.98, 1.04))
+  assert with_interval.intervals["gain"] == pytest.approx((0.49, 0.52), rel=0.01)
   p = plant.declared.copy()
   own.apply(plant, p, np.array(own.starts[0]))
   left = plant.logs[0].duty - duty_of(plant, p, 0)

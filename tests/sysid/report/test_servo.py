@@ -42,6 +42,18 @@ def test_what_the_reference_shows_is_not_new_and_a_healthy_gain_is_nothing():
   assert servo.rows(found_of(reference=False, gain=1.01)) == ([], [])
 
 
+def test_laws_of_many_joints_are_one_sentence_and_a_dead_band_its_own():
+  one, other = found_of(reference=False, gain=0.9), found_of(reference=False, gain=1.1)
+  wide = found_of(reference=False, band=0.012)
+  (note,) = servo.notes(one)
+  assert note.startswith("The duty of joint against")
+  together, own = servo.notes(
+    types.SimpleNamespace(joints=[*one.joints * 3, *other.joints, *wide.joints])
+  )
+  assert together.startswith("The duty of 4 joints") and "0.900 to 1.100" in together
+  assert "dead band" in own
+
+
 def test_the_file_holds_the_gain_apart_from_the_torque_at_a_duty():
   claimed, _ = servo.rows(found_of(reference=False, gain=0.5))
   value = claimed[0]["parameters"]["gain"]["value"]
@@ -49,12 +61,12 @@ def test_the_file_holds_the_gain_apart_from_the_torque_at_a_duty():
     "parameter_error",
     "joint",
     {"gain": 1.02 * value, "limit": 1.02},
-    {"gain": (0.9 * value, 1.1 * value), "limit": (0.9, 1.1)},
+    {"gain": (0.99 * value, 1.05 * value), "limit": (0.99, 1.05)},
     {"gain": [value, 1.1 * value]},
   )
   corrected, gain = servo.apart([constant], claimed)
   assert corrected.parameters == {"gain": pytest.approx(1.02), "limit": 1.02}
-  assert corrected.intervals["gain"] == (0.9, 1.1)
+  assert corrected.intervals["gain"] == pytest.approx(corrected.intervals["limit"])
   assert corrected.samples["gain"] == pytest.approx([1.0, 1.1])
   assert (gain.kind, gain.parameters["gain"]) == ("motor_gain", value)
 
