@@ -24,10 +24,9 @@ REPLACED = ("load_friction", "stribeck_friction", "supply_sag")
 _SLOWEST = 0.1
 """Of the fastest speed, most that the fall from rest to motion may take: the authors' published
 fits of small servos have 0.07 to 0.11 rad/s; chosen, some times that."""
-_KIND = kind_of("load_friction")
-_SHARE, _REST = (_KIND.parameter(name).high for name in ("coefficient", "rest"))
-"""Spread about zero, the range of the library's kind: what a motion does not show stays away. Of
-the torque that a joint works at, friction takes as much by its square as in proportion."""
+_NAMES = ("coefficient", "quadratic", "rest", "velocity")
+_EXPECTED = {name: kind_of("load_friction").parameter(name).high for name in _NAMES[:3]}
+"""Spread about zero, the range of the library's kind: what a motion does not show stays away."""
 
 
 def rich_friction(plant: JointPlant, carried: int) -> Term:
@@ -40,16 +39,15 @@ def rich_friction(plant: JointPlant, carried: int) -> Term:
   speed = np.abs(np.concatenate([log.velocity for log in plant.logs]))
   fast = max(float(np.quantile(speed, 0.98)), 1e-6)
   large = typical_torque(plant)
-  names = ("coefficient", "quadratic", "rest", "velocity")
   return Term(
     "load_friction",
     plant.joint,
-    names,
+    _NAMES,
     (0.0, 0.0, 0.0, 0.002 * fast),
     (0.8, 3.0 / large, 3.0, _SLOWEST * fast),
     (0.1, 0.2 / large, 0.2, 0.05 * fast),
     ((0.1, 0.3 / large, 0.4, 0.1 * fast), (0.05, 1.0 / large, 0.4, 0.03 * fast)),
-    (_SHARE, _SHARE / large, _REST, float("inf")),
-    (0.0,) * len(names),
+    tuple(_EXPECTED.get(name, float("inf")) for name in _NAMES),
+    (0.0,) * len(_NAMES),
     fixed=(("carried", float(carried)),),
   )

@@ -3,10 +3,9 @@
 Shapes: N samples of a log, B parameter sets, P parameters (`kernel.NAMES`).
 """
 
-import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.measured import Measured, measured
-from nerf2real.sysid.model.reduction import Reduction, Surroundings, smooth_motion, start_velocity
+from nerf2real.sysid.model.reduction import Reduction, Surroundings, start_velocity
 
 Array = np.ndarray
 
@@ -150,20 +149,6 @@ class JointPlant:
     ]
     self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
     self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
-
-  def restarted(self, half_width: float) -> Self:
-    """Returns the joint with windows that begin at velocities smoothed otherwise.
-
-    Args:
-      half_width: s of the local polynomial, as `smooth_motion` takes it.
-    """
-    other = copy.copy(self)
-    other.windows = []
-    for reduction, window in zip(self.reductions, self.windows, strict=True):
-      motion = smooth_motion(reduction.log, half_width=half_width)
-      velocity = motion.velocity[window.start, reduction.log.states.column(self.joint)]
-      other.windows.append(dataclasses.replace(window, velocity=velocity))
-    return other
 
   def _windows(self, log: Measured, window_s: float, first_velocity: float) -> Windows:
     if self.holds:

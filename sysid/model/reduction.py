@@ -33,8 +33,7 @@ _MONOMIALS_AT = np.array(
 _MONOMIALS = np.array(
   [[1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z] for x, y, z in _MONOMIALS_AT]
 )
-SMOOTHING = 0.035
-"""s, half width of the local polynomial that differentiates positions; chosen."""
+_SMOOTHING = 0.035  # s, half width of the local polynomial that differentiates positions; ours
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +76,7 @@ class Motion:
   """[N, J]."""
 
 
-def smooth_motion(log: Log, *, half_width: float = SMOOTHING) -> Motion:
+def smooth_motion(log: Log, *, half_width: float = _SMOOTHING) -> Motion:
   """Differentiates measured positions by local cubic fits in time (handles uneven stamps)."""
   time, position = log.states.stamp, log.states.position
   assert position is not None

@@ -45,6 +45,8 @@ class Member(NamedTuple):
 
   effects: Sequence[Effect]
   clocks: dict[str, Clocks]
+  weight: float = 1.0
+  """In the mean of several models' predictions."""
 
 
 def merge_delays(
@@ -218,7 +220,7 @@ def error(
 def errors(
   model: mujoco.MjModel, logs: Sequence[Log], members: Sequence[Member], *, window_s: float = 0.5
 ) -> dict[str, float]:
-  """Returns the RMSE of the mean of several models' predictions, rad (or m).
+  """Returns the RMSE of the weighted mean of several models' predictions, rad (or m).
 
   Args:
     model: compiled model.
@@ -234,7 +236,9 @@ def errors(
     [simulate(model, log, m.effects, clocks=m.clocks, window_s=window_s) for log in logs]
     for m in members
   ]
-  result = {"after": _rmse(logs, [np.mean(c, axis=0) for c in zip(*courses, strict=True)])}
+  weights = [m.weight for m in members]
+  means = [np.average(c, axis=0, weights=weights) for c in zip(*courses, strict=True)]
+  result = {"after": _rmse(logs, means)}
   if len(members) > 1:
     each = [_rmse(logs, c) for c in courses]
     result |= {"single": each[0], "median": float(np.median(each)), "least": min(each)}

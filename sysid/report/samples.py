@@ -23,8 +23,8 @@ def with_samples(
 ) -> list[Effect]:
   """Returns effects with joint draws of those that joints have of their own.
 
-  Fits near the best take turns, so that draws scatter among them as well. Effects of bodies and of
-  the machine and those of sensors keep their intervals alone.
+  Draws scatter among the fits near the best as well, by their weights. Effects of bodies and of the
+  machine and those of sensors keep their intervals alone.
 
   Args:
     found: the joints' fits.
@@ -40,15 +40,18 @@ def with_samples(
 
 def _of_joint(item: Changed, random: np.random.Generator) -> Rows:
   """Returns the draws of a joint's values; of effects that all fits near the best have."""
-  near = item.near
-  each = [
-    intervals.draws(item.likelihood, scored.fit, -(-COUNT // len(near)), random) for scored in near
+  weights = np.array([scored.weight for scored in item.near])
+  counts = random.multinomial(COUNT, weights / weights.sum())
+  drawn = [
+    (scored, x)
+    for scored, count in zip(item.near, counts, strict=True)
+    for x in intervals.draws(item.likelihood, scored.fit, int(count), random)
   ]
   rows: Rows = {}
-  for at in range(COUNT):
-    which, k = at % len(near), at // len(near)
-    fit = dataclasses.replace(near[which].fit, x=each[which][k])
-    effects, _ = effects_of(item.joint, dataclasses.replace(near[which], fit=fit))
+  for at in random.permutation(COUNT):
+    scored, x = drawn[at]
+    fit = dataclasses.replace(scored.fit, x=x)
+    effects, _ = effects_of(item.joint, dataclasses.replace(scored, fit=fit))
     for effect in effects:
       values = rows.setdefault((effect.kind, effect.target), {})
       for name, value in effect.parameters.items():

@@ -25,7 +25,7 @@ from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear
 from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.growth import grow
 from nerf2real.sysid.selection.naming import Explanation, conclude
-from nerf2real.sysid.selection.remainder import grown, left_anyway, scatter, structured
+from nerf2real.sysid.selection.remainder import grown, scatter, structured, usual_play
 from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -161,7 +161,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   remains = more or leaves(subject, found.best, settings)
   unclear = bool(found.best.names)
   if before is None:
-    anyway = max(anyway, left_anyway(now, explainer.null, subject.library))
+    anyway += usual_play(now, explainer.null, subject.library)
     bare = float(np.median(explainer.null.fit.held[0][0]))
     more, unclear = (x > settings.more**2 * anyway for x in (left, bare))
     remains = more

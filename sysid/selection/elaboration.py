@@ -1,7 +1,9 @@
 """Fits near the best with a richer friction, where more remains than names explain.
 
 Fits of equal cost differ several times over on other motions, as where a joint stops hangs on small
-differences of friction. All that are near the best are kept; their mean predicts better than one.
+differences of friction. All that are near the best are kept; their mean predicts better than one,
+each weighed by how likely it made the logs that it was not fitted to (Geisser and Eddy 1979, "A
+predictive approach to model selection").
 """
 
 import copy
@@ -60,6 +62,8 @@ def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> li
   plain = next(s for s in explainer.ranked() if not s.neutral and s.names >= set(named))
   if crossed(joint, plain) > left_out[0][0]:
     return []
+  for nats, item in left_out:
+    item.weight = float(np.exp(nats - left_out[0][0]))
   return [s for nats, s in left_out if nats > left_out[0][0] - reach]
 
 
@@ -84,15 +88,21 @@ def _begun(
 
 
 def crossed(joint: JointLikelihood, item: Scored) -> float:
-  """Returns the nats of blocks that a hypothesis was fitted anew without, fold by fold."""
-  fitter, total = Fitter([joint], item.fit.layout), 0.0
+  """Returns the nats of blocks that a hypothesis was fitted anew without, fold by fold.
+
+  Normal with one unknown variance a channel: errors are told as mean squares over whole logs, to
+  which the blocks that a robust likelihood passes over count most.
+  """
+  fitter, squares = Fitter([joint], item.fit.layout), np.zeros(joint.counts.shape)
   for fold in np.unique(joint.fold):
     part = copy.copy(joint)
     part.gain = joint.gain * (joint.fold != fold)[joint.block_of]
     x = Fitter([part], item.fit.layout).fit(item.fit.x, iterations=_REFITTED).x
-    nats = joint.loglik(joint.squares(fitter.simulated(x[None])[1][0][0]))
-    total += float(nats[joint.fold == fold].sum())
-  return total
+    left_out = joint.squares(fitter.simulated(x[None])[1][0][0])
+    squares[:, joint.fold == fold] = left_out[:, joint.fold == fold]
+  n = joint.independent[:, None] * joint.counts
+  mean = (n * squares).sum(axis=1) / n.sum(axis=1)
+  return -0.5 * float(n.sum(axis=1) @ np.log(mean))
 
 
 def bases(

@@ -24,6 +24,8 @@ class Scored:
   """[B] log-likelihood of the left-out blocks."""
   neutral: bool = False
   """Whether an effect stands at the values that do nothing: a rival, never an explanation."""
+  weight: float = 1.0
+  """In a mean of predictions, over that of the best."""
 
   @property
   def names(self) -> frozenset[str]:

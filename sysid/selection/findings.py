@@ -70,13 +70,15 @@ class Identified:
 
   def _member(self, own: Member, at: int) -> Member:
     """Returns the extended model with other fits near the best at joints that have several."""
-    effects, clocks = list(own.effects), dict(own.clocks)
+    effects, clocks, weight = list(own.effects), dict(own.clocks), 1.0
     for item in (j for j in self.joints if len(j.near) > 1):
       theirs = {(e.kind, e.target) for e in effects_of(item.joint, item.near[0])[0]}
       effects = [e for e in effects if (e.kind, e.target) not in theirs]
-      other, clocks[item.joint] = effects_of(item.joint, item.near[at % len(item.near)])
+      chosen = item.near[at % len(item.near)]
+      other, clocks[item.joint] = effects_of(item.joint, chosen)
       effects += other
-    return Member(effects, clocks)
+      weight *= chosen.weight
+    return Member(effects, clocks, weight)
 
   @property
   def found(self) -> list[Changed]:

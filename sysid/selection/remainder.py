@@ -1,6 +1,5 @@
 """What remains of a joint's residual under its best hypothesis, against what it leaves anyway."""
 
-import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +10,6 @@ from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.measured import quantum
-from nerf2real.sysid.model.reduction import SMOOTHING
 from nerf2real.sysid.selection.evidence import Scored
 from nerf2real.sysid.settings import Settings
 
@@ -48,28 +46,22 @@ def scatter(joint: JointLikelihood, item: Scored) -> float:
   return float(np.median(joint.squares(rows * joint.gain)[0]))
 
 
-def left_anyway(joint: JointLikelihood, item: Scored, library: Sequence[Term]) -> float:
-  """Returns the mean square that a machine without a fault leaves in the median block, where no
-  reference shows it: noise of the readings, the play of healthy gears, which models leave out
-  (`constants.OWN`), and that windows begin at a velocity known from readings alone.
+def usual_play(joint: JointLikelihood, item: Scored, library: Sequence[Term]) -> float:
+  """Returns the mean square by which the play of a healthy gear, which models leave out
+  (`constants.OWN`), moves readings in the median block.
 
   Args:
     joint: the logs.
-    item: a hypothesis without play.
+    item: a hypothesis without play, whose course is compared with the same with it.
     library: the joint's effects.
   """
-  plant, moved = joint.plant, []
   kind, own = next(iter(OWN.items()))
   play = next((t for t in library if t.kind == kind and not any(v for _, v in t.fixed)), None)
-  if plant.hinge and plant.holds and play is not None:
-    values = [own.get(n, c) for n, c in zip(play.names, play.centre, strict=True)]
-    moved.append(joint.residuals((*item.terms, play.held_at(np.array(values))), item.fit.x[None]))
-  if not plant.holds:
-    other = copy.copy(joint)
-    other.plant = plant.restarted(0.5 * SMOOTHING)
-    moved.append(other.residuals(item.terms, item.fit.x[None]))
-  away = [np.median(joint.squares(rows[0] - item.fit.residuals[0])[0]) for rows in moved]
-  return joint.position_noise**2 + float(sum(away))
+  if play is None or not (joint.plant.hinge and joint.plant.holds):
+    return 0.0
+  values = np.array([own.get(n, c) for n, c in zip(play.names, play.centre, strict=True)])
+  moved = joint.residuals((*item.terms, play.held_at(values)), item.fit.x[None])[0]
+  return float(np.median(joint.squares(moved - item.fit.residuals[0])[0]))
 
 
 def grown(best: Scored, usual: Scored, beyond: float, settings: Settings) -> bool:

@@ -87,7 +87,7 @@ def log_of(
     battery=None,
     temperatures={},
   )
-  positions = evaluation.simulate(model, log, effects)
+  positions = evaluation.simulate(model, log, effects, window_s=2.0 * duration)  # without restarts
   if rounding:
     positions = np.round(positions / rounding) * rounding
   return dataclasses.replace(log, states=dataclasses.replace(log.states, position=positions))
