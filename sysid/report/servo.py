@@ -26,8 +26,13 @@ def rows(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
 
 
 def apart(effects: list[Effect], claimed: list[dict[str, Any]]) -> list[Effect]:
-  """Returns effects with the gains that are claimed as effects of their own, not as constants."""
-  gains = {row["joint"]: row["parameters"]["gain"] for row in claimed}
+  """Returns effects with the gains that are claimed as effects of their own, not as constants.
+
+  A joint has one effect of a kind: where its torque at a duty is off, too, which is a gain that
+  scales the limit, the duty's gain stays among the constants.
+  """
+  weak = {effect.target for effect in effects if effect.kind == KIND}
+  gains = {row["joint"]: row["parameters"]["gain"] for row in claimed if row["joint"] not in weak}
   result: list[Effect] = []
   for effect in effects:
     gain = gains.get(effect.target) if effect.kind == "parameter_error" else None
