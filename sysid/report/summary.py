@@ -9,6 +9,8 @@ from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model import simulation
 
 _FEW = 4  # effects that are said with their values; more are counted
+_LARGE = {"mrad": "rad", "mm": "m"}
+_DIGITS = 4  # of a speed: less is standing
 _CLEAR = 99.0  # standard errors, beyond which a number says nothing more
 
 
@@ -24,7 +26,7 @@ def section(content: dict[str, Any], *, beyond: float, unit: str) -> Section:
     ["What does the model lack?", _missing(content)],
     ["How sure is that?", _sure(content, beyond)],
     ["What remains?", _remains(content, unit)],
-    ["What to record next?", _next(content["next_excitation"])],
+    ["What to record next?", _next(content["next_excitation"], _LARGE[unit])],
   ]
   return Section("In short", "", [Table(["", ""], rows)])
 
@@ -92,20 +94,19 @@ def _remains(content: dict[str, Any], unit: str) -> str:
     words += " The extended model is worse than the declared one: do not use it."
   if content["verdict"] in ("partly", "unexplained"):
     at = content["residual_at"]
-    low, high = at["velocity"]["low"], at["velocity"]["high"]
-    words += (
-      f" On the fitted logs most is at {at['joint']}, in {at['log']}, at {low:.2g} to {high:.2g}"
-    )
-    words += " rad/s." if unit == "mrad" else " m/s."
+    low, high = (round(at["velocity"][end], _DIGITS) + 0.0 for end in ("low", "high"))
+    words += f" On the fitted logs most is at {at['joint']}, in {at['log']},"
+    words += f" at {low:.2g} to {high:.2g} {_LARGE[unit]}/s."
   return words
 
 
-def _next(proposal: dict[str, Any]) -> str:
+def _next(proposal: dict[str, Any], unit: str) -> str:
   rivals = _either(["+".join(names) for names in proposal["separates"] if names])
   apart, would = proposal.get("separation_in_noise"), proposal.get("would")
   motion = proposal["design"]
   if "centre_rad" in proposal:
-    motion += f", {proposal['amplitude_rad']:.2g} about {proposal['centre_rad']:.2g}"
+    amplitude, centre = proposal["amplitude_rad"], proposal["centre_rad"]
+    motion += f", {amplitude:.2g} {unit} about {centre:.2g} {unit}"
   reasons = [f"it would {would}"] if would else []
   if rivals and apart is None:
     reasons.append(f"it may tell the effect from {rivals}")

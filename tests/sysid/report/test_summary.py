@@ -53,7 +53,7 @@ def test_a_named_effect_has_its_value_its_certainty_and_what_remains(content):
   assert missing == f"{words}: torque 0.25 N m (0.24 to 0.26)."
   assert "by 8.1 standard errors or more, where 3.0 are asked" in sure
   assert remains == ("1.5 mrad of 30 on logs that were not fitted, 1.5 times the readings' noise.")
-  assert record.startswith("steps of 1.5 s, 0.9 about 0: ")
+  assert record.startswith("steps of 1.5 s, 0.9 rad about 0 rad: ")
   assert "of stribeck_friction, would differ by 3.2 times the noise" in record
 
 
@@ -100,7 +100,7 @@ def test_a_motion_without_a_reason_is_not_proposed(content):
   content["next_excitation"] |= {"separates": [], "separation_in_noise": 0.0}
   assert answers(content)[3] == "Nothing in particular."
   content["next_excitation"]["would"] = "show backlash"
-  assert answers(content)[3] == "steps of 1.5 s, 0.9 about 0: it would show backlash."
+  assert answers(content)[3] == "steps of 1.5 s, 0.9 rad about 0 rad: it would show backlash."
 
 
 def test_rivals_that_no_motion_separates_are_said(content):
