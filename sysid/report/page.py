@@ -25,6 +25,12 @@ Array = np.ndarray
 _FEW = 1e-9
 _SHOWN = 3  # joints whose held-out overlays are shown
 _LADDER = 12  # hypotheses a joint
+_HEADLINES = {
+  "none": "Nothing that these logs show",
+  "effects": "It lacks",
+  "partly": "It lacks this and more",
+  "unexplained": "It lacks something that has no clear name",
+}
 _VERDICTS = {
   "none": "The declared model explains the logs as well as any candidate: nothing is named.",
   "effects": "These effects explain what the declared model leaves.",
@@ -78,7 +84,7 @@ def page(
   names = _summary(content["effects"])
   return Page(
     "What the model lacks",
-    f"Verdict: {content['verdict']}{': ' + names if names else ''}. Model:"
+    f"{_HEADLINES[content['verdict']]}{': ' + names if names else ''}. Model:"
     f" {details['model'].rsplit('/', 1)[-1]}. Residuals are measured minus simulated.",
     sections,
     origin=Origin.of_process(),

@@ -5,9 +5,12 @@ from typing import Any
 
 from nerf2real.core.pages.blocks import Table
 from nerf2real.core.pages.page import Section
+from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model import simulation
 
 _FEW = 4  # effects that are said with their values; more are counted
+_LARGE = {"mrad": "rad", "mm": "m"}
+_DIGITS = 4  # of a speed: less is standing
 _CLEAR = 99.0  # standard errors, beyond which a number says nothing more
 
 
@@ -23,7 +26,7 @@ def section(content: dict[str, Any], *, beyond: float, unit: str) -> Section:
     ["What does the model lack?", _missing(content)],
     ["How sure is that?", _sure(content, beyond)],
     ["What remains?", _remains(content, unit)],
-    ["What to record next?", _next(content["next_excitation"])],
+    ["What to record next?", _next(content["next_excitation"], _LARGE[unit])],
   ]
   return Section("In short", "", [Table(["", ""], rows)])
 
@@ -43,7 +46,7 @@ def _missing(content: dict[str, Any]) -> str:
 
 
 def _effect(effect: dict[str, Any]) -> str:
-  """Returns an effect with its values and intervals in words."""
+  """Returns an effect with what it is, its values and intervals in words."""
   places = (effect.get("joint"), *(effect.get(noun) for noun in ("body", "geom", "sensor")))
   where = next((place for place in places if place), "all joints")
   values = []
@@ -53,7 +56,8 @@ def _effect(effect: dict[str, Any]) -> str:
     unit = "" if value["unit"] == "1" else f" {value['unit']}"
     low, high = (f"{value[end]:.3g}" for end in ("low", "high"))
     values.append(f"{name} {value['value']:.3g}{unit} ({low} to {high})")
-  return f"{effect['kind']} at {where}" + (f": {', '.join(values)}" if values else "")
+  words = f"{effect['kind']} at {where} ({kind_of(effect['kind']).summary})"
+  return words + (f": {', '.join(values)}" if values else "")
 
 
 def _sure(content: dict[str, Any], beyond: float) -> str:
@@ -67,9 +71,10 @@ def _sure(content: dict[str, Any], beyond: float) -> str:
   least = min((c for c in clear if c is not None), default=None)
   words = ""
   if least is not None:
-    size = f"{least:.1f}" if least < _CLEAR else "more than 99"
-    words = f"Every {'other ' if alike else ''}explanation without it is worse by {size} standard"
-    words += f" errors or more, where {beyond:.1f} are asked. "
+    size = f"{least:.1f} standard errors or more"
+    size = size if least < _CLEAR else f"more than {_CLEAR:.0f} standard errors"
+    words = f"Every {'other ' if alike else ''}explanation without it is worse by {size},"
+    words += f" where {beyond:.1f} are asked. "
   if alike:
     words += f"These logs do not tell it from {_either(alike)}. "
   return words + "Brackets hold 95 % intervals."
@@ -89,18 +94,19 @@ def _remains(content: dict[str, Any], unit: str) -> str:
     words += " The extended model is worse than the declared one: do not use it."
   if content["verdict"] in ("partly", "unexplained"):
     at = content["residual_at"]
-    low, high = at["velocity"]["low"], at["velocity"]["high"]
-    words += f" Most of it is at {at['joint']}, in {at['log']}, at {low:.2g} to {high:.2g}"
-    words += " rad/s." if unit == "mrad" else " m/s."
+    low, high = (round(at["velocity"][end], _DIGITS) + 0.0 for end in ("low", "high"))
+    words += f" On the fitted logs most is at {at['joint']}, in {at['log']},"
+    words += f" at {low:.2g} to {high:.2g} {_LARGE[unit]}/s."
   return words
 
 
-def _next(proposal: dict[str, Any]) -> str:
-  rivals = " or ".join(" with ".join(names) for names in proposal["separates"] if names)
+def _next(proposal: dict[str, Any], unit: str) -> str:
+  rivals = _either(["+".join(names) for names in proposal["separates"] if names])
   apart, would = proposal.get("separation_in_noise"), proposal.get("would")
   motion = proposal["design"]
   if "centre_rad" in proposal:
-    motion += f", {proposal['amplitude_rad']:.2g} about {proposal['centre_rad']:.2g}"
+    amplitude, centre = proposal["amplitude_rad"], proposal["centre_rad"]
+    motion += f", {amplitude:.2g} {unit} about {centre:.2g} {unit}"
   reasons = [f"it would {would}"] if would else []
   if rivals and apart is None:
     reasons.append(f"it may tell the effect from {rivals}")

@@ -49,10 +49,11 @@ def content():
 
 def test_a_named_effect_has_its_value_its_certainty_and_what_remains(content):
   missing, sure, remains, record = answers(content)
-  assert missing == "coulomb_friction at knee: torque 0.25 N m (0.24 to 0.26)."
+  words = "coulomb_friction at knee (constant dry friction beyond the declared one)"
+  assert missing == f"{words}: torque 0.25 N m (0.24 to 0.26)."
   assert "by 8.1 standard errors or more, where 3.0 are asked" in sure
   assert remains == ("1.5 mrad of 30 on logs that were not fitted, 1.5 times the readings' noise.")
-  assert record.startswith("steps of 1.5 s, 0.9 about 0: ")
+  assert record.startswith("steps of 1.5 s, 0.9 rad about 0 rad: ")
   assert "of stribeck_friction, would differ by 3.2 times the noise" in record
 
 
@@ -90,20 +91,27 @@ def test_nothing_and_no_name_are_different_answers(content):
   missing, sure, remains, _ = answers(content)
   assert "at knee for which no name is clear. The nearest: coulomb_friction" in missing
   assert sure.startswith("Not sure")
-  assert remains.endswith("Most of it is at knee, in train_1.mcap, at -0.1 to 0.2 rad/s.")
+  assert remains.endswith(
+    "On the fitted logs most is at knee, in train_1.mcap, at -0.1 to 0.2 rad/s."
+  )
 
 
 def test_a_motion_without_a_reason_is_not_proposed(content):
   content["next_excitation"] |= {"separates": [], "separation_in_noise": 0.0}
   assert answers(content)[3] == "Nothing in particular."
   content["next_excitation"]["would"] = "show backlash"
-  assert answers(content)[3] == "steps of 1.5 s, 0.9 about 0: it would show backlash."
+  assert answers(content)[3] == "steps of 1.5 s, 0.9 rad about 0 rad: it would show backlash."
 
 
 def test_rivals_that_no_motion_separates_are_said(content):
   content["next_excitation"]["separation_in_noise"] = 0.02
   words = "No motion that was tried tells the effect from stribeck_friction"
   assert answers(content)[3].startswith(words)
+
+
+def test_rivals_with_equal_effects_are_said_once(content):
+  content["next_excitation"] |= {"separation_in_noise": 0.02, "separates": [["spring"]] * 2}
+  assert "from spring: they differ" in answers(content)[3]
 
 
 def test_a_force_driven_joint_has_a_motion_in_words(content):
