@@ -63,7 +63,17 @@ def _freed(known: Term, names: Collection[str]) -> Term:
   )
 
 
+_SCALE = "gain"
+
+
 def widened(own: Term) -> Term:
-  """Returns declared constants that may be off by as much as their bounds allow."""
-  reach = tuple(max(abs(a), abs(b)) for a, b in zip(own.low, own.high, strict=True))
+  """Returns declared constants that may be off by as much as their bounds allow.
+
+  All torques larger by one factor make the same motion: the actuator's keeps its tolerance, and the
+  others are off beside it.
+  """
+  reach = tuple(
+    s if n == _SCALE else max(abs(a), abs(b))
+    for n, s, a, b in zip(own.names, own.prior, own.low, own.high, strict=True)
+  )
   return dataclasses.replace(own, prior=reach, freed=True)

@@ -87,8 +87,8 @@ class Explainer:
     return result
 
   def rescore(self) -> None:
-    """Scores all hypotheses anew after the scale has changed."""
-    for s in self.scored.values():
+    """Scores all hypotheses anew after the scale has changed, the baseline among them."""
+    for s in (self.null, *self.scored.values()):
       s.nats = self.joint.loglik(s.fit.held[0])
 
   def cost(self, item: Scored) -> float:
