@@ -122,11 +122,15 @@ def _reopened(
   for member in further.members:
     member.take(further.held)
   again = [changes.explain(c.subject, settings) for c in changed]
-  if not scopes.needless([*shared, further], again):
-    return [*shared, further], again
+  stands = not scopes.needless([*shared, further], again)
+  after = [c.subject.state for c in changed]
   for item, state in zip(changed, before, strict=True):
     item.subject.state = state
-  return shared, changed
+  if not stands or not scopes.better(again, changed):
+    return shared, changed
+  for item, state in zip(changed, after, strict=True):
+    item.subject.state = state
+  return [*shared, further], again
 
 
 def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:

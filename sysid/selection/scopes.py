@@ -212,6 +212,17 @@ def _is_new(item: Wide) -> bool:
   return more_likely(np.concatenate(list(rows.values())), prior, level)
 
 
+def better(these: Sequence[Changed], others: Sequence[Changed]) -> bool:
+  """Tells whether joints' explanations are clearly better than others of the same joints, under the
+  present scales: what was found beside others may not be found again from the start."""
+  rows, prior = {}, 0.0
+  for one, other in zip(these, others, strict=True):
+    best, now = one.found.best, other.subject.now
+    rows[one.joint] = now.loglik(best.fit.held[0]) - now.loglik(other.found.best.fit.held[0])
+    prior += best.prior - other.found.best.prior
+  return Evidence(rows, prior).clear > max(c.subject.beyond for c in others)
+
+
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
   """Returns the shared effects without which the joints' explanations do about as well.
 
