@@ -152,6 +152,9 @@ class DmpoConfig:
   frozen_encoder: bool = False
   """Whether the image encoder stays what the run began with: the replay then holds its features in
   place of pictures."""
+  frozen_memory: bool = False
+  """Whether the LSTM stays, too: the replay then holds its outputs, and an update is one of MLPs on
+  single transitions."""
   feature_copies: int = 2
   """Features of a frozen encoder for each picture: of the picture as it is, and of augmented ones.
   Source: chosen."""
@@ -167,6 +170,11 @@ class DmpoConfig:
       raise ValueError(f"trajectory_length must be 2 or more, found {self.trajectory_length}.")
     if self.n_step < 1:
       raise ValueError(f"n_step must be 1 or more, found {self.n_step}.")
+    if self.frozen_memory and not (self.frozen_encoder and self.network.recurrent):
+      raise ValueError(
+        "frozen_memory keeps the LSTM behind a frozen encoder: it needs frozen_encoder=true and "
+        "network.recurrent=true."
+      )
     if self.steps_per_update <= 0:
       raise ValueError(f"steps_per_update must be positive, found {self.steps_per_update}.")
     if self.network.vmin >= self.network.vmax:
@@ -310,28 +318,41 @@ def nerf_nav_finetune() -> DmpoConfig:
 
   - Networks of the student; its noise begins at 0.1, which leaves a walking robot on its feet, and
     may shrink as in `op3_small`.
-  - The critic, which begins at random, learns alone first: a policy that follows it is undone.
-  - The policy is drawn to the student while that is still of use.
-  - The encoder is frozen: an update without convolutions takes a tenth of the time.
-  - Rates of the paper for the policy; multipliers, temperatures and the penalty's bound as in
-    `op3_small`, batches of a third of the paper's frames.
+  - The critic, which begins at random, learns alone first: a policy that follows it is undone. Its
+    values reach n_step * updates / target_critic_period = 300 steps ahead by then.
+  - The policy stays near the student: where the E-step moves the mean by d deviations along the
+    values' gradient, a weight c of the KL holds it at d / c, here at about one. With c falling from
+    0.1 and three times the rate the policy was 17 nats away after 4,000 updates and 12,000 steps,
+    the critic's values had risen to twice those of its data, and 1 of 46 episodes reached the goal.
+  - Encoder and LSTM are frozen. An update then takes 37 ms of a core where 16 trajectories of 32
+    observations with 20 sampled actions, the encoder alone frozen, take 163 ms.
+  - Windows of 12 observations: without unrolls there is no need for longer ones, and 24 of them are
+    less alike than 9 of 32.
+  - Values from those of a fall to those of a robot that stays at the goal (1.3 a step).
+  - The paper's rate for the policy; multipliers, temperatures and the penalty's bound as in
+    `op3_small`.
   """
   return DmpoConfig(
-    network=NetworkConfig(critic_layers=(256, 256, 256), init_stddev=0.1),
+    network=NetworkConfig(critic_layers=(256, 256, 256), init_stddev=0.1, vmin=-30.0, vmax=130.0),
     critic_learning_rate=3e-4,
     epsilon_stddev=1e-5,
     epsilon_action_penalty=0.1,
     init_log_temperature=0.0,
     init_log_alpha_stddev=10.0,
-    trajectory_length=32,
-    batch_size=16,
-    min_replay_steps=5_000,
+    trajectory_length=12,
+    batch_size=24,
+    num_samples=10,
+    steps_per_update=3.0,
+    target_critic_period=50,
+    min_replay_steps=8_000,
     replay_steps=200_000,
     scale_observations=True,
-    critic_warmup=5_000,
-    student_kl=0.1,
-    student_kl_updates=30_000,
+    critic_warmup=3_000,
+    student_kl=0.5,
+    student_kl_updates=40_000,
     frozen_encoder=True,
+    frozen_memory=True,
+    feature_copies=1,
   )
 
 

@@ -186,15 +186,15 @@ def lstm_step(params: Params, state: LstmState, x: jax.Array) -> LstmState:
   return LstmState(jax.nn.sigmoid(o) * jnp.tanh(cell), cell)
 
 
-def unroll_lstm(
-  params: Params, initial: LstmState, features: jax.Array, burn_in: jax.Array | None = None
-) -> jax.Array:
-  """Runs the LSTM over features [B, T, F] from a stored state; returns its outputs [B, T, U].
+def scan_lstm(
+  params: Params, state: LstmState, x: jax.Array, burn_in: jax.Array | None = None
+) -> tuple[LstmState, jax.Array]:
+  """Runs the LSTM over inputs, time first [T, B, F]; returns its last state and outputs [T, B, U].
 
   Args:
     params: of the LSTM.
-    initial: the stored state.
-    features: its inputs.
+    state: before the first step [B, U].
+    x: its inputs.
     burn_in: steps of each trajectory [B] beyond which no gradient flows back.
   """
 
@@ -206,8 +206,17 @@ def unroll_lstm(
     state = lstm_step(params, state, x)
     return state, state.hidden
 
-  times = jnp.arange(features.shape[1])
-  _, outputs = jax.lax.scan(step, initial, (features.swapaxes(0, 1), times))
+  return jax.lax.scan(step, state, (x, jnp.arange(len(x))))
+
+
+def unroll_lstm(
+  params: Params, initial: LstmState, features: jax.Array, burn_in: jax.Array | None = None
+) -> jax.Array:
+  """Runs the LSTM over features [B, T, F] from a stored state; returns its outputs [B, T, U].
+
+  See `scan_lstm`.
+  """
+  _, outputs = scan_lstm(params, initial, features.swapaxes(0, 1), burn_in)
   return outputs.swapaxes(0, 1)
 
 
@@ -232,6 +241,7 @@ def unroll_policy(
   images: jax.Array | None,
   initial: LstmState | None,
   features: jax.Array | None = None,
+  embedding: jax.Array | None = None,
   burn_in: jax.Array | None = None,
 ) -> PolicyOutput:
   """Applies the policy to trajectories.
@@ -243,8 +253,11 @@ def unroll_policy(
     images: pictures in [0, 1] [B, T, H, W, 3], or None.
     initial: the LSTM's state before the first step, as the actor stored it; None without an LSTM.
     features: of the pictures [B, T, F], in place of them; None where they are to be computed.
+    embedding: output of the LSTM [B, T, U], in place of all that it is computed from; or None.
     burn_in: steps of each trajectory [B] that only unroll the LSTM; None for none.
   """
+  if embedding is not None:
+    return PolicyOutput(policy_head(params, embedding, state, config), embedding)
   batch, time = state.shape[:2]
   embedding = features
   if embedding is None and images is not None:

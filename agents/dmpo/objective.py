@@ -47,12 +47,11 @@ def _evaluate(
   state = scaling.apply(scales or {}, "state", batch["state"])
   privileged = scaling.apply(scales or {}, "privileged", batch["privileged"])
   inputs: dict[str, Any] = {"state": state, "images": None, "initial": None}
-  if "features" in batch:  # [B, T, C, F], a copy for each trajectory
-    stored = batch["features"]
+  for name in {"features", "embedding"} & set(batch):  # [B, T, C, F], a copy for each trajectory
+    stored = batch[name]
     copies = jax.random.randint(view_key, (stored.shape[0], 1, 1, 1), 0, stored.shape[2])
-    features = jnp.take_along_axis(stored, copies, axis=2).squeeze(2)
-    inputs["features"] = features.astype(jnp.float32)
-  elif "image" in batch:
+    inputs[name] = jnp.take_along_axis(stored, copies, axis=2).squeeze(2).astype(jnp.float32)
+  if "image" in batch:
     images = batch["image"].astype(jnp.float32) / 255.0
     inputs["images"] = augmentation.augment(view_key, images, config.augmentation)
   if "lstm_hidden" in batch:
@@ -114,7 +113,8 @@ def total_loss(
     target_critic: parameters of the target critic.
     batch: `state` [B, T, S], `privileged` [B, T, P], `action` [B, T, A], `reward` and `discount`
       [B, T], `last` [B]; `image` uint8 [B, T, H, W, 3] or `features` [B, T, C, F], `lstm_hidden`
-      and `lstm_cell` [B, U]; `burn_in` [B], steps that only unroll the LSTM; `student_weight` [].
+      and `lstm_cell` [B, U], or in place of these `embedding` [B, T, C, U]; `burn_in` [B], steps
+      that only unroll the LSTM; `student_weight` [].
     key: random key.
     config: the agent's settings.
     layout: the environment's layout.

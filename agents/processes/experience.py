@@ -8,7 +8,7 @@ import numpy as np
 
 from nerf2real.agents.dmpo.config import DmpoConfig
 from nerf2real.agents.dmpo.networks import Params
-from nerf2real.agents.dmpo.replay.features import FrozenEncoder
+from nerf2real.agents.dmpo.replay.features import FrozenEncoder, stored_fields
 from nerf2real.agents.dmpo.replay.prior import PriorData, sample_mixed, write_layout
 from nerf2real.agents.dmpo.replay.ring import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
@@ -45,17 +45,16 @@ class Experience:
     """
     _check(settings, config, layout)
     self._config, self._share = config, settings.prior_share
-    self._lstm_size = policy["lstm"]["b"].shape[0] // 4 if "lstm" in policy else 0
-    self._fields = trajectory_fields(layout, lstm_size=self._lstm_size)
+    lstm_size = policy["lstm"]["b"].shape[0] // 4 if "lstm" in policy else 0
+    self._lstm_size = 0 if config.frozen_memory else lstm_size  # in the batches
+    self._fields = trajectory_fields(layout, lstm_size=lstm_size)
     self._encoder: FrozenEncoder | None = None
-    kept = dict(self._fields)
     if config.frozen_encoder:
       self._encoder = FrozenEncoder(
         policy, config, length=config.trajectory_length, seed=settings.seed
       )
-      del kept["image"]
-      kept["features"] = self._encoder.field()
-    self.replay = beginning.open_replay(settings, config, fields=kept, resume=resume)
+    fields = stored_fields(self._fields, config)
+    self.replay = beginning.open_replay(settings, config, fields=fields, resume=resume)
     if self.replay.on_disk:
       write_layout(settings.run / "replay", layout)
     self._prior: PriorData | None = None
@@ -63,7 +62,7 @@ class Experience:
       self._prior = PriorData(settings.prior_data, layout, max_steps=settings.prior_steps)
       _log.info("%s: %d steps of prior data.", settings.prior_data, self._prior.steps)
       if self._encoder is not None:
-        self._prior.encode(self._encoder)
+        self._prior.encode(self._encoder, burn_in=config.burn_in)
 
   def insert(self, trajectory: Mapping[str, np.ndarray], actor: int, number: int) -> int:
     """Checks and keeps a trajectory; returns its transitions.

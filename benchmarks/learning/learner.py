@@ -5,7 +5,8 @@
 State-only settings (preset "state") on cartpole's sizes. The reference is DMPO as the public one is
 written, with rlax (the test extra): single transitions with n-step rewards summed beforehand, in a
 batch of as many transitions, the same networks, samples and optimisers. Both take turns in one run.
---pictures 30x40 60x80 measures the paper's settings instead (no reference), for a GPU.
+--pictures 30x40 60x80 measures the paper's settings instead (no reference), for a GPU; --preset
+those of a preset on the observations of `suite:nerf_nav`, both its updates.
 """
 
 import dataclasses
@@ -23,8 +24,10 @@ import tyro
 from benchmarks import harness
 from nerf2real.agents.dmpo import config, learning, losses, networks
 from nerf2real.agents.dmpo.config import DmpoConfig
+from nerf2real.agents.dmpo.replay.features import stored_fields
 from nerf2real.agents.dmpo.replay.ring import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
+from nerf2real.agents.environments.loading import make_environment
 
 STATE_LAYOUT = Layout(None, None, ("position", "velocity"), (3, 2), (), (), 1)
 PROPRIOCEPTION, PRIVILEGED, ACTIONS = 247, 70, 20  # about the suite's
@@ -39,6 +42,8 @@ class Settings(harness.Options):
   """Time for each."""
   pictures: tuple[str, ...] = ()
   """The paper's settings at these sizes, such as 30x40 60x80."""
+  preset: str | None = None
+  """This preset on the observations of suite:nerf_nav, such as nerf_nav_finetune."""
   set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
   """NAME=VALUE changes a setting of the agent, such as batch_size=4."""
 
@@ -49,24 +54,26 @@ def random_batch(settings: DmpoConfig, layout: Layout) -> dict[str, Any]:
   lstm = settings.network.lstm_size if layout.image_shape and settings.network.recurrent else 0
   size, time_steps = settings.batch_size, settings.trajectory_length
   batch: dict[str, Any] = {}
-  for name, field in trajectory_fields(layout, lstm_size=lstm).items():
+  for name, field in stored_fields(trajectory_fields(layout, lstm_size=lstm), settings).items():
     shape = (size, time_steps, *field.shape) if field.per_step else (size, *field.shape)
     if field.dtype == "uint8":
       batch[name] = rng.integers(0, 256, shape, dtype=np.uint8)
     else:
-      batch[name] = rng.normal(size=shape).astype(np.float32)
+      batch[name] = rng.normal(size=shape).astype(field.dtype)
   batch["discount"][:] = 1.0
+  if settings.student_kl:
+    batch["student_weight"] = np.float32(settings.student_kl)
   return batch | {"last": np.full(size, time_steps - 1, np.int32)}
 
 
-def updates(settings: DmpoConfig, layout: Layout) -> Callable[[], None]:
-  """A function that does one update of this learner."""
+def updates(settings: DmpoConfig, layout: Layout, *, name: str = "update") -> Callable[[], None]:
+  """A function that does one update of this learner, `update` or `update_critic`."""
   functions = learning.make_learning(settings, layout)
   state = [jax.jit(functions.init)(jax.random.PRNGKey(0))]
-  batch = random_batch(settings, layout)
+  batch, update = random_batch(settings, layout), getattr(functions, name)
 
   def step() -> None:
-    state[0], metrics = functions.update(state[0], batch)
+    state[0], metrics = update(state[0], batch)
     jax.block_until_ready(metrics["loss"])
 
   return step
@@ -177,6 +184,13 @@ def steps_to_time(settings: Settings) -> dict[str, Callable[[], None]]:
       )
       steps[size] = updates(agent, layout)
     return steps
+  if settings.preset is not None:
+    agent = config.override(config.preset(settings.preset), changes)
+    environment = make_environment("suite:nerf_nav", seed=0)
+    layout = Layout.of(environment)
+    environment.close()
+    names = ("update", "update_critic")
+    return {f"{settings.preset}.{name}": updates(agent, layout, name=name) for name in names}
   agent = config.override(config.preset("state"), changes)
   steps = {"ours": updates(agent, STATE_LAYOUT)}
   try:

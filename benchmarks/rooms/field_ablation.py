@@ -52,21 +52,20 @@ class Settings(harness.Options):
   """Seed of the training."""
 
 
-def read_views(scene: Path) -> Views:
-  """Reads the localised keyframes of a scene."""
+def read_posed(scene: Path, *, width: int) -> PosedPictures:
+  """Finds the localised keyframes of a scene, to be read at a width [pixel]."""
 
   def stage(name: str) -> StageResult:
     return StageResult(scene / STAGES / name, "", "", 0.0, cached=True)
 
   taken, poses = stage("keyframes"), stage("poses")
   capture = keyframes.load(taken.folder, taken.folder / "images")
-  settings = SceneSettings()
   return PosedPictures(
     Made(capture, taken),
     Made(localisation.load(poses.folder / "sfm"), poses),
-    settings.train_width,
-    settings.held_out_every,
-  ).views()
+    width,
+    SceneSettings().held_out_every,
+  )
 
 
 def without_falloff(views: Views) -> Views:
@@ -78,7 +77,7 @@ def without_falloff(views: Views) -> Views:
 
 def main(settings: Settings) -> None:
   """Trains and prints the table."""
-  everything = read_views(settings.scene)
+  everything = read_posed(settings.scene, width=SceneSettings().train_width).views()
   figures: dict[str, dict[str, harness.Value]] = {}
   for part in ("", *settings.change):
     views = without_falloff(everything) if part == "falloff" else everything

@@ -9,6 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.harness import Rate
+from benchmarks.learning.paired import Trial, difference, summary
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -29,6 +32,21 @@ def test_policy(tmp_path):
   # Processor time, which other work on the machine does not stretch as much; the p99 targets of
   # 10 and 25 ms belong to the benchmark.
   assert rows["30x40"]["processor_median_ms"] < 10 and rows["60x80"]["processor_median_ms"] < 25
+
+
+def test_paired_trials_are_compared_one_by_one():
+  def trial(time):
+    reached = time is not None
+    return Trial(reached, time if reached else np.nan, None if reached else "fall", 0.1)
+
+  reference = [trial(t) for t in (10.0, 12.0, 14.0, None, 9.0)]
+  found = [trial(t) for t in (9.0, 11.5, None, 8.0, 8.5)]
+  assert summary(found)["success"] == Rate(4, 5) and summary(found)["median_time_s"] == 8.75
+  less = difference(found, reference)
+  assert (less["won"], less["lost"], less["both"]) == (1, 1, 3)
+  np.testing.assert_allclose(less["time_s"], -2 / 3)
+  assert -1 <= less["low_s"] < less["time_s"] < less["high_s"] <= -0.5
+  assert np.isnan(difference([trial(None)], [trial(3.0)])["time_s"])
 
 
 def test_link(tmp_path):

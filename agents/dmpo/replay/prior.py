@@ -82,14 +82,33 @@ class PriorData:
     self._arrays = {name: np.concatenate([p[name] for p in parts]) for name in names}
     ends = np.cumsum([len(part["reward"]) for part in parts]).tolist()
     begins = [0, *ends[:-1]]
-    self._segments = [Segment(*s) for s in zip(begins, ends, starts, strict=True)]
+    self._set_segments([Segment(*s) for s in zip(begins, ends, starts, strict=True)])
+
+  def _set_segments(self, segments: list[Segment]) -> None:
+    self._segments = segments
     counts = np.array([s.end - s.begin - 1 for s in self._segments])
     self._last_steps = np.cumsum(counts)
     self.steps = int(counts.sum())
+    if not self.steps:
+      raise ValueError("The prior data hold no transitions beyond the burn-in: lower burn_in.")
 
-  def encode(self, encoder: FrozenEncoder) -> None:
-    """Replaces the pictures by features of a frozen encoder."""
-    self._arrays = encoder.replace(self._arrays)
+  def encode(self, encoder: FrozenEncoder, *, burn_in: int) -> None:
+    """Replaces the pictures by what a frozen encoder makes of them.
+
+    Args:
+      encoder: its LSTM, if it has one, begins every segment with zeros.
+      burn_in: observations after which its state counts as known where no episode begins; those
+        before are not drawn.
+
+    Raises:
+      ValueError: nothing is left to be drawn.
+    """
+    images = self._arrays.pop("image")
+    encoded = [encoder.encode(images[s.begin : s.end]) for s in self._segments]
+    self._arrays[encoder.name] = np.concatenate(encoded)
+    if encoder.has_memory:
+      known = [s if s.is_start else Segment(s.begin + burn_in, s.end, True) for s in self._segments]
+      self._set_segments([s for s in known if s.end - s.begin > 1])
 
   def sample(
     self, rng: np.random.Generator, batch_size: int, *, length: int, burn_in: int, lstm_size: int

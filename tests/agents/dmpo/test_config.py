@@ -68,5 +68,7 @@ def test_overrides_reach_inside_and_unknown_names_are_refused():
     config.preset("big")
   with pytest.raises(ValueError, match="vmin must lie below"):
     config.override(config.DmpoConfig(), {"network.vmax": -200.0})
+  with pytest.raises(ValueError, match="frozen_memory keeps the LSTM behind a frozen encoder"):
+    config.override(config.DmpoConfig(), {"frozen_memory": True})
   with pytest.raises(ValueError, match="another version"):
     from_plain({"colour": 1}, config.DmpoConfig)

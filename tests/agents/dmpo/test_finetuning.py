@@ -225,6 +225,37 @@ def test_features_of_a_frozen_encoder_stand_for_the_pictures():
     )
 
 
+def test_outputs_of_a_frozen_lstm_stand_for_pictures_and_states():
+  settings = config.override(
+    CONFIG,
+    {
+      "frozen_encoder": True,
+      "frozen_memory": True,
+      "feature_copies": 2,
+      "augmentation.enabled": False,
+    },
+  )
+  state = jax.jit(learning.make_learning(settings, LAYOUT).init)(jax.random.key(0))
+  encoder = FrozenEncoder(state.policy, settings, length=4, seed=0)  # 4 and 2 frames
+  batch = _batch(LAYOUT, 4, 6)
+  names = ("image", "lstm_hidden", "lstm_cell")
+  whole = [
+    encoder.replace({name: batch[name][i] for name in names}) for i in range(len(batch["image"]))
+  ]
+  stored = np.stack([w["embedding"] for w in whole])
+  assert stored.shape == (4, 6, 2, 4) and {name for w in whole for name in w} == {"embedding"}
+  embedded = {name: a for name, a in batch.items() if name not in names} | {"embedding": stored}
+  by_memory = _gradient(state, embedded, student={}, layout=LAYOUT, settings=settings)
+  by_pictures = _gradient(state, batch, student={}, layout=LAYOUT, settings=settings)
+  for name in ("resnet", "lstm"):
+    assert not any(x.any() for x in jax.tree.leaves(by_memory[0][name])), name
+  jax.tree.map(
+    lambda a, b: np.testing.assert_allclose(a, b, rtol=0.05, atol=0.02),
+    (by_memory[0]["mlp"], by_memory[0]["mean"], by_memory[1]),
+    (by_pictures[0]["mlp"], by_pictures[0]["mean"], by_pictures[1]),
+  )
+
+
 def test_copies_of_features_differ_by_the_augmentation_alone():
   state = jax.jit(learning.make_learning(CONFIG, LAYOUT).init)(jax.random.key(0))
   images = _batch(LAYOUT, 4, 6)["image"][0]

@@ -81,6 +81,30 @@ def test_every_transition_of_long_episodes_is_drawn_about_alike(tmp_path):
   assert folder.exists()
 
 
+class _Memory:
+  """Stands in for a frozen encoder with an LSTM: counts the steps since its state was zero."""
+
+  name, has_memory = "embedding", True
+
+  def encode(self, images):
+    return np.broadcast_to(np.arange(len(images))[:, None, None], (len(images), 1, 1))
+
+
+def test_outputs_of_a_frozen_lstm_are_drawn_where_its_state_is_known(stored):
+  data = PriorData(stored, LAYOUT, max_steps=ROOM)
+  data.encode(_Memory(), burn_in=2)
+  assert data.steps == 4 + 2 + 0  # of the short trajectory only its last observation is left
+  batch = _sample(data, lstm_size=0)
+  assert "image" not in batch and not batch["burn_in"].any()
+  real = np.arange(LENGTH) <= batch["last"][:, None]
+  numbers, since = batch["state"][..., 0], batch["embedding"][..., 0, 0]
+  assert set(numbers[:, 0]) == {0, 6}
+  np.testing.assert_array_equal(since[real], (numbers - 4 * (numbers[:, :1] > 4))[real])
+  with pytest.raises(ValueError, match="no transitions beyond the burn-in"):
+    short = PriorData(stored, LAYOUT, max_steps=1)
+    short.encode(_Memory(), burn_in=2)
+
+
 def test_a_terminal_transition_is_kept(tmp_path):
   episode = _counted(6)
   episode["discount"] = np.array([1, 1, 1, 1, 1, 0], np.float32)
