@@ -86,20 +86,23 @@ def _explained(
   """Returns what joints share and what each has of its own, until nothing shared is needless."""
   before = [s.state for s in subjects]
   refuted: set[str] = set()
+  certain: set[str] = set()
   while True:
     shared: list[Shared] = []
     if len(subjects) > 1:
-      shared = scopes.shared_effects(model, subjects, settings, refuted=refuted)
+      shared = scopes.shared_effects(model, subjects, settings, refuted=refuted, certain=certain)
     for subject in subjects:
       if subject.alone or changes.leaves(subject, subject.explainer.null, settings):
         explain_reference(subject, settings)
     changed = [changes.explain(subject, settings) for subject in subjects]
     needless = scopes.needless(shared, changed)
-    if not needless:
+    fresh = scopes.open_scopes(changed) - certain - refuted
+    if not needless and not fresh:
       shared, changed = _reopened(model, shared, changed, settings, refuted)
       changes.elaborate(changed)
       return shared, changed
     refuted |= {s.term.kind for s in needless}
+    certain |= fresh
     for subject, state in zip(subjects, before, strict=True):
       subject.state = state
 
@@ -122,11 +125,15 @@ def _reopened(
   for member in further.members:
     member.take(further.held)
   again = [changes.explain(c.subject, settings) for c in changed]
-  if not scopes.needless([*shared, further], again):
-    return [*shared, further], again
+  stands = not scopes.needless([*shared, further], again)
+  after = [c.subject.state for c in changed]
   for item, state in zip(changed, before, strict=True):
     item.subject.state = state
-  return shared, changed
+  if not stands or not scopes.better(again, changed):
+    return shared, changed
+  for item, state in zip(changed, after, strict=True):
+    item.subject.state = state
+  return [*shared, further], again
 
 
 def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:

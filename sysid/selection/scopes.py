@@ -6,6 +6,7 @@ scope, and where the joints' explanations need it in the end.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Collection, Sequence
 
 import mujoco
@@ -25,6 +26,9 @@ from nerf2real.sysid.selection.wide import Evidence, Wide
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
+
+OPEN = frozenset(("command_delay", "measurement_delay", "payload"))
+"""Kinds that a joint may have to itself, or share."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +63,7 @@ def shared_effects(
   settings: Settings,
   *,
   refuted: Collection[str] = (),
+  certain: Collection[str] = (),
 ) -> list[Shared]:
   """Finds effects of bodies and of the machine, puts them into their joints' hypotheses.
 
@@ -69,11 +74,13 @@ def shared_effects(
     subjects: its joints.
     settings: effort.
     refuted: kinds that are not tried.
+    certain: kinds that a joint's own explanation names: their scope may stay open.
   """
   found: list[Shared] = []
   while len(found) < settings.depth:
     before = [s.state for s in subjects]
-    best = _next(model, subjects, settings, {s.term.kind for s in found} | set(refuted))
+    known = {s.term.kind for s in found} | set(refuted)
+    best = _next(model, subjects, settings, known, certain)
     if best is None:
       for subject, state in zip(subjects, before, strict=True):
         subject.state = state
@@ -117,7 +124,11 @@ def found_beside(
 
 
 def _next(
-  model: mujoco.MjModel, subjects: Sequence[Subject], settings: Settings, known: Collection[str]
+  model: mujoco.MjModel,
+  subjects: Sequence[Subject],
+  settings: Settings,
+  known: Collection[str],
+  certain: Collection[str] = (),
 ) -> Shared | None:
   """Returns the best effect of a body or of the machine, if it is clear, where a joint leaves more
   than the machine does anyway; joints' scales may have changed after."""
@@ -127,7 +138,7 @@ def _next(
     for term, members in (wide.hypotheses(model, subjects) if leaving else ())
     if term.kind not in known and any(m in leaving for m in members)
   ]
-  return _best(tried, own_latency=subjects[0].before is None)
+  return _best(tried, certain, own_latency=subjects[0].before is None)
 
 
 def _settled(found: Sequence[Shared]) -> list[Shared]:
@@ -148,7 +159,7 @@ def _reach(item: Wide) -> tuple[Array, Array]:
   return intervals.reaches(item.fit, spread, (0, len(item.x)))
 
 
-def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
+def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool) -> Shared | None:
   """Returns the best of the screened effects if it is clear of all that lack it."""
   forms: dict[tuple[str, str | None], Wide] = {}
   for item in sorted(tried, key=lambda w: -w.possible().total):
@@ -169,7 +180,7 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   most = max(range(len(single)), key=lambda at: single[at][0].total)
   behind = (mine - single[most][0]).clear
   others_behind = [(mine - w.evidence()).clear for w in items if w not in alike]
-  clear = min([mine.clear, *others_behind, *([] if _may_be_own(best, most) else [behind])])
+  clear = min([mine.clear, *others_behind, *([] if best.term.kind in certain else [behind])])
   reach = _reach(best)
   nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
   if clear < beyond or behind < 0.0 or nothing or not _is_new(best):
@@ -177,15 +188,6 @@ def _best(tried: Sequence[Wide], *, own_latency: bool) -> Shared | None:
   origin = best.members[most]
   or_alone = (behind, single[most][1]) if behind < beyond else None
   return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total, or_alone)
-
-
-def _may_be_own(item: Wide, at: int) -> bool:
-  """Tells whether one of the joints may have an effect of that kind to itself.
-
-  Then the scopes are alternatives of one name, of which the more likely is told; a kind that is the
-  machine's alone needs what other kinds imitate at one joint to be clearly worse.
-  """
-  return any(t.kind == item.term.kind for t in item.members[at].library)
 
 
 def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency: bool) -> bool:
@@ -210,6 +212,31 @@ def _is_new(item: Wide) -> bool:
     beside = Scored(terms, fit, before.loglik(fit.held[0]))
     rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
   return more_likely(np.concatenate(list(rows.values())), prior, level)
+
+
+def open_scopes(changed: Sequence[Changed]) -> set[str]:
+  """Returns the kinds that one joint's own explanation names while another joint is named by the
+  same or stays unexplained, of those that may be a joint's or shared.
+
+  The kind is then certain, and its scopes are alternatives. A kind that no joint is named by must
+  be clear of what other kinds do at one joint.
+  """
+  result = set()
+  for one, other in itertools.permutations(changed, 2):
+    unexplained = other.verdict == "unexplained"
+    result |= {k for k in one.found.named if unexplained or k in other.found.named}
+  return result & OPEN
+
+
+def better(these: Sequence[Changed], others: Sequence[Changed]) -> bool:
+  """Tells whether joints' explanations are clearly better than others of the same joints, under the
+  present scales: what was found beside others may not be found again from the start."""
+  rows, prior = {}, 0.0
+  for one, other in zip(these, others, strict=True):
+    best, now = one.found.best, other.subject.now
+    rows[one.joint] = now.loglik(best.fit.held[0]) - now.loglik(other.found.best.fit.held[0])
+    prior += best.prior - other.found.best.prior
+  return Evidence(rows, prior).clear > max(c.subject.beyond for c in others)
 
 
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:

@@ -73,17 +73,23 @@ class Subject:
     self.explainer = _explainer(self.now, self.before, self.known, self.library, self.freed)
 
   @property
+  def _judged(self) -> list[JointLikelihood]:
+    return [self.now] if self.before is None else [self.now, self.before]
+
+  @property
   def state(self) -> tuple[Any, ...]:
     """What is known, the hypotheses that were scored, and the residual's scale."""
     known = self.known, self.freed, self.usual, self.paired, self.now.expectation
     scored = self.explainer, self.explainer.null, dict(self.explainer.scored)
-    return known, scored, self.now.scale, self.now.independent.copy()
+    scales = [(j.scale, j.independent.copy()) for j in self._judged]
+    return known, scored, scales
 
   @state.setter
   def state(self, state: tuple[Any, ...]) -> None:
-    known, scored, self.now.scale, independent = state
+    known, scored, scales = state
     self.known, self.freed, self.usual, self.paired, self.now.expectation = known
-    self.now.independent = independent.copy()
+    for joint, (scale, independent) in zip(self._judged, scales, strict=True):
+      joint.scale, joint.independent = scale, independent.copy()
     self.explainer, self.explainer.null, kept = scored
     self.explainer.scored = dict(kept)
     self.explainer.rescore()

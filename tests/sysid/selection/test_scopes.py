@@ -97,6 +97,18 @@ def test_an_effect_of_the_machine_is_looked_for_beside_what_joints_have(model, m
   }
 
 
+@pytest.mark.parametrize(("square", "stands"), [(0.1, True), (1.0, False), (9.0, False)])
+def test_explanations_beside_a_further_effect_must_be_better(square, stands):
+  def explained(left):
+    fit = SimpleNamespace(held=[np.full((1, 20), left)])
+    now = SimpleNamespace(loglik=lambda squares: -np.log1p(squares).sum(axis=0))
+    best = SimpleNamespace(fit=fit, prior=0.0)
+    subject = SimpleNamespace(now=now, beyond=3.0)
+    return SimpleNamespace(joint="elbow", subject=subject, found=SimpleNamespace(best=best))
+
+  assert scopes.better([explained(square)], [explained(1.0)]) == stands
+
+
 def test_two_healthy_joints_have_nothing(model):
   found = analysis.analyse(model, _logs([]))
   assert (found.verdict, found.effects) == ("none", [])
