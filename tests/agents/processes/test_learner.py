@@ -195,7 +195,7 @@ def test_a_standing_action_is_needed_where_it_is_wanted(tmp_path):
 
 
 def test_minutes_end_a_run_over_all_its_parts(tmp_path):
-  # Long enough for steps to come in: a checkpoint of the same steps and updates is not written anew.
+  # Long enough for steps to come in: a checkpoint of the same steps is not written anew.
   run = Run(tmp_path, minutes=6 / 60)
   begin = time.monotonic()
   run.go()
