@@ -23,8 +23,8 @@ from benchmarks import harness
 from nerf2real.core.rotations import camera_axes
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.builtin import filming, ground_truth, room
-from nerf2real.scenes.capture import stills
 from nerf2real.scenes.capture.capture import CaptureSettings
+from nerf2real.scenes.capture.media import stills
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.settings import preset

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from nerf2real.scenes.capture.media.errors import CaptureError
+from nerf2real.scenes.capture.media.stills import list_images, list_images_below
 from nerf2real.scenes.capture.posed.colmap_model import find_colmap_model
 from nerf2real.scenes.capture.posed.rgbd import find_rgbd
 from nerf2real.scenes.capture.posed.transforms import find_transforms
-from nerf2real.scenes.capture.stills import list_images, list_images_below
-from nerf2real.scenes.capture.video import CaptureError
 
 EXPORT_STREAM = (
   "export its pictures, depth and poses with ScanNet's SensReader (reader.py "

@@ -11,22 +11,22 @@ import numpy as np
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture import stills
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
 from nerf2real.scenes.capture.kinds import source_kind
-from nerf2real.scenes.capture.posed import agreement
-from nerf2real.scenes.capture.posed.colmap_model import read_colmap
-from nerf2real.scenes.capture.posed.rgbd import read_rgbd
-from nerf2real.scenes.capture.posed.transforms import read_transforms
-from nerf2real.scenes.capture.stills import list_images, list_images_below
-from nerf2real.scenes.capture.video import (
-  CaptureError,
+from nerf2real.scenes.capture.media import stills
+from nerf2real.scenes.capture.media.errors import CaptureError
+from nerf2real.scenes.capture.media.stills import list_images, list_images_below
+from nerf2real.scenes.capture.media.video import (
   Frame,
   inspect_video,
   limit_size,
   sharpest_frames,
   sharpness,
 )
+from nerf2real.scenes.capture.posed import agreement
+from nerf2real.scenes.capture.posed.colmap_model import read_colmap
+from nerf2real.scenes.capture.posed.rgbd import read_rgbd
+from nerf2real.scenes.capture.posed.transforms import read_transforms
 
 
 def read_capture(

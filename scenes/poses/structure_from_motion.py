@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
-from nerf2real.scenes.capture.stills import list_images, upright_poses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, refinement, shutter
 from nerf2real.scenes.poses.localisation import (

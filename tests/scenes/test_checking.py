@@ -6,7 +6,7 @@ import pytest
 
 from nerf2real.scenes import checking
 from nerf2real.scenes.bundle import STAGES
-from nerf2real.scenes.capture.video import CaptureError
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.settings import preset
 
 

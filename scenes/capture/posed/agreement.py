@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
-from nerf2real.scenes.capture.video import CaptureError
 
 _PAIRS = 24  # of pictures; chosen: some thousand matches in seconds
 _STEP = 2  # keyframes from one picture of a pair to the other: they share most and have parallax

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from nerf2real.core.cameras import Camera
-from nerf2real.scenes.capture.video import CaptureError
+from nerf2real.scenes.capture.media.errors import CaptureError
 
 MILLIMETRE = 1e-3  # m: 7-Scenes', ScanNet's and nerfstudio's depth
 _SIGHTINGS = 400  # points lifted from a picture

@@ -9,7 +9,7 @@ import PIL.Image
 
 from nerf2real.core.camera_info import read_camera_info
 from nerf2real.core.cameras import Camera
-from nerf2real.scenes.capture.video import CaptureError
+from nerf2real.scenes.capture.media.errors import CaptureError
 
 CAMERA_INFO = "camera_info.yaml"
 _OPEN3D = "camera_intrinsic.json"

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerf2real.core.cameras import Camera
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
-from nerf2real.scenes.capture.video import CaptureError
 
 CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import intrinsics
-from nerf2real.scenes.capture.video import CaptureError
 
 _NOMINAL = (640, 480)  # picture size of the data sets' nominal cameras [pixel]
 

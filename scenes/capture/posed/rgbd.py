@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core.rotations import is_rigid
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed.depth_pictures import MILLIMETRE
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.posed.recording import Recording, camera_of
 from nerf2real.scenes.capture.posed.tum import is_tum, read_tum
-from nerf2real.scenes.capture.video import CaptureError
 
 _COLOR = ("color", "rgb", "images")  # ScanNet's folder of pictures, and what others call it
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from nerf2real.core.cameras import Camera, focal_length
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV, is_rigid
+from nerf2real.scenes.capture.media.errors import CaptureError
+from nerf2real.scenes.capture.media.stills import IMAGE_SUFFIXES
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses, one_camera
-from nerf2real.scenes.capture.stills import IMAGE_SUFFIXES
-from nerf2real.scenes.capture.video import CaptureError
 
 
 def find_transforms(source: Path) -> Path | None:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import trajectory
 from nerf2real.scenes.capture.posed.recording import Recording, camera_of
-from nerf2real.scenes.capture.video import CaptureError
 
 _PICTURES, _DEPTH = "rgb.txt", "depth.txt"
 _ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt", "associated.txt")

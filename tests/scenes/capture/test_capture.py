@@ -10,11 +10,12 @@ import pytest
 
 from nerf2real.scenes.capture import reading
 from nerf2real.scenes.capture.capture import CaptureSettings
+from nerf2real.scenes.capture.media.errors import CaptureError
+from nerf2real.scenes.capture.media.video import inspect_video, sharpest_frames, sharpness
 from nerf2real.scenes.capture.posed.colmap_model import read_colmap, to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.capture.video import CaptureError, inspect_video, sharpest_frames, sharpness
 from tests.scenes import synthetic_capture as synthetic
 
 SETTINGS = CaptureSettings(num_keyframes=8)

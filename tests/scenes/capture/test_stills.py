@@ -9,11 +9,12 @@ import PIL.ExifTags
 import PIL.Image
 import pytest
 
-from nerf2real.scenes.capture import keyframes, stills
+from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.media import stills
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.capture.video import CaptureError
 from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise

@@ -19,9 +19,9 @@ from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures, trajectory
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.capture.video import CaptureError
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.stages import radiance_field

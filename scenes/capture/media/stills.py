@@ -17,7 +17,7 @@ import pi_heif
 import PIL.ExifTags
 import PIL.Image
 
-from nerf2real.scenes.capture.video import CaptureError
+from nerf2real.scenes.capture.media.errors import CaptureError
 
 APPLE_SUFFIXES = (".heic", ".heif")  # what iPhones write; OpenCV does not read them
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *APPLE_SUFFIXES)

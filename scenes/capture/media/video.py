@@ -14,14 +14,11 @@ import cv2
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.capture.media.errors import CaptureError
 
 STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; chosen: less than any
 # phone's video, so that resolutions are comparable; pictures are never enlarged
 DAMAGED_FRACTION = 0.02  # of frames lost before a video counts as damaged
-
-
-class CaptureError(ValueError):
-  """An input that cannot become a capture; the message is one line a person can act on."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""What cameras leave behind: videos and photographs."""
