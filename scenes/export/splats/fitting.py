@@ -46,10 +46,6 @@ class FitSettings:
   fine_share: float = 0.2
   """Share of the steps with pictures of twice the size, half of them from the capture's places:
   for eyes that come nearer than the robot."""
-  blur: float = 0.01
-  """Variance added to the 2D Gaussians [pixel^2]. Chosen: next to none, as in renderers that cast
-  rays, or in a viewer's large picture, where a rasteriser's 0.3 (Kerbl et al. 2023) is little; a
-  Gaussian thinner than a pixel must not vanish, though."""
   rate: float = 1.0
   """Factor on all learning rates."""
   seed: int = 0
@@ -109,16 +105,14 @@ class Fit:
       & (np.abs(local[:, :2]) < _MARGIN * eye.slope * local[:, 2:] + self._spacing[:, None]).all(-1)
     )
     arguments = (self.rows[shown], self._starts[shown], self._spacing[shown], eye)
-    gaussians, depths = projection.project(*arguments)
-    tiles = rasteriser.assign(*gaussians[:3], depths, width=camera.width, height=camera.height)
-    inputs = (*tiles, *gaussians, camera.width, camera.height)
-    return shown, arguments, inputs, rasteriser.composite(*inputs)
+    gaussians, bounds = projection.project(*arguments)
+    size = {"width": camera.width, "height": camera.height}
+    tiles = rasteriser.assign(bounds, **size)
+    return shown, arguments, gaussians, rasteriser.composite(tiles, gaussians, **size)
 
-  def render(self, camera: Camera, world_from_camera: np.ndarray, *, blur: float) -> np.ndarray:
+  def render(self, camera: Camera, world_from_camera: np.ndarray) -> np.ndarray:
     """Renders the splats: float32 [H, W, 3], not clipped."""
-    eye = projection.Eye.at(camera, world_from_camera, blur=blur)
-    image: np.ndarray = self._draw(camera, eye)[-1][0]
-    return image
+    return self._draw(camera, projection.Eye.at(camera, world_from_camera))[-1].image
 
   def step(
     self,
@@ -126,7 +120,6 @@ class Fit:
     world_from_camera: np.ndarray,
     truth: np.ndarray,
     *,
-    blur: float,
     rate: float = 1.0,
   ) -> float:
     """Takes one step towards a picture.
@@ -135,19 +128,16 @@ class Fit:
       camera: Of the picture; without distortion.
       world_from_camera: Its pose [4, 4].
       truth: The picture [H, W, 3], 0 to 1.
-      blur: Variance added to the 2D Gaussians [pixel^2].
       rate: Factor on the learning rates.
 
     Returns:
       The mean squared error before the step.
     """
-    eye = projection.Eye.at(camera, world_from_camera, blur=blur)
-    shown, arguments, inputs, (image, left, looked) = self._draw(camera, eye)
-    error = image - truth.astype(np.float32)
-    drawn = (*inputs, left, looked, (2 / error.size) * error)
-    slopes = rasteriser.composite_backward(*drawn)  # type: ignore[call-arg]
-    rows, starts, spacing, _ = arguments
-    gradient = projection.pull(rows, starts, spacing, eye, projection.Projected(*slopes))
+    eye = projection.Eye.at(camera, world_from_camera)
+    shown, arguments, gaussians, drawn = self._draw(camera, eye)
+    error = drawn.image - truth.astype(np.float32)
+    slopes = rasteriser.composite_backward(gaussians, drawn, (2 / error.size) * error)
+    gradient = projection.pull(*arguments, projection.Projected(*slopes))
     _descend(self.rows, self._mean, self._square, self._seen, shown, gradient, rate * _RATES)
     return float(np.mean(error**2))
 
@@ -253,7 +243,7 @@ def _run(
     if done >= 1:
       break
     rate = settings.rate * _FINAL**done
-    error = fitted.step(camera, pose, truth, blur=settings.blur, rate=rate)
+    error = fitted.step(camera, pose, truth, rate=rate)
     mean += (error - mean) / min(step + 1, 100)
     if step % 20 == 0:
       progress(done, f"step {step}, {-10 * np.log10(max(mean, 1e-10)):.1f} dB")

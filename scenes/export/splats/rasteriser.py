@@ -1,10 +1,14 @@
-"""Composites 2D Gaussians front to back, and the derivatives of that, by tiles (numba).
+"""Composites splats along the rays of a picture, and the derivatives of that, by tiles (numba).
 
-  alpha_i = min(0.99, opacity_i exp(-d^T conic_i d / 2)),  colour = sum_i c_i alpha_i T_i,
-  T_i = prod_(j < i) (1 - alpha_j), over the splats in the order of their depth.
+  alpha_i = min(0.99, opacity_i exp(-E_i)),  colour = sum_i c_i alpha_i T_i,
+  T_i = prod_(j < i) (1 - alpha_j), over the splats in the order of their depth along the ray
 
-Source: Kerbl et al. 2023, 3D Gaussian Splatting for Real-Time Radiance Field Rendering, section 6
-and appendix C. Shapes: N splats, H height, W width, E entries of all tiles.
+with E of `projection`. Tiles list their splats by the depths of the centres; a short buffer at each
+pixel puts them into the order along its ray.
+
+Sources: Kerbl et al. 2023, 3D Gaussian Splatting for Real-Time Radiance Field Rendering, section 6
+and appendix C; the order is that of Radl et al. 2024, StopThePop. Shapes: N splats, H height,
+W width, E entries of all tiles, K splats that are drawn in all pixels.
 """
 
 from typing import NamedTuple
@@ -12,10 +16,12 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from nerf2real.scenes.export.splats.projection import FAINTEST, Bounds
+
 _TILE = 4  # edge of a tile [pixel]; chosen: splats are a pixel or two wide in small pictures
-_FAINTEST = 1 / 255  # alpha below which a splat does not reach a pixel; as in the source
-_FULLEST = 0.99  # largest alpha; as in the source
-_DARKEST = 1e-4  # transmittance at which a pixel is full; as in the source
+_FULLEST = 0.99  # largest alpha; Kerbl et al.'s
+_DARKEST = 0.005  # transmittance at which a pixel is full: MuJoCo Warp's
+_WAITING = 24  # splats at a ray that wait for nearer ones; chosen: more change no picture
 
 
 class Tiles(NamedTuple):
@@ -23,146 +29,144 @@ class Tiles(NamedTuple):
 
   first: np.ndarray  # index of each tile's first entry in `members` [tiles + 1]
   members: np.ndarray  # splats [E]
+  depths: np.ndarray  # of the centres [N] [m]
+
+
+class Drawn(NamedTuple):
+  """A picture, and what it is made of."""
+
+  image: np.ndarray  # [H, W, 3]
+  left: np.ndarray  # transmittance that is left [H, W]
+  starts: np.ndarray  # index of each pixel's first splat in `hits` [H * W + 1]
+  hits: np.ndarray  # splats as they follow on each pixel's ray [K]
 
 
 @numba.njit(cache=True)
-def _power(opacity):
-  """Exponent at which a splat becomes too faint to be drawn."""
-  return np.log(max(opacity / _FAINTEST, 1.0))
-
-
-@numba.njit(cache=True)
-def _powers(opacities):
-  found = np.empty(len(opacities), np.float32)
-  for splat, opacity in enumerate(opacities):
-    found[splat] = _power(opacity)
-  return found
-
-
-@numba.njit(cache=True)
-def _bounds(centres, conics, opacities, splat, width, height):
-  """First and last tile (x, y) that a splat reaches; an empty range where it reaches none."""
-  a, b, c = conics[splat]
-  reach = 2.0 * _power(opacities[splat])
-  determinant = a * c - b * b
-  if reach <= 0 or determinant <= 0:
-    return 0, -1, 0, -1
-  half_x, half_y = np.sqrt(reach * c / determinant), np.sqrt(reach * a / determinant)
-  x, y = centres[splat]
-  if x + half_x < 0 or y + half_y < 0 or x - half_x > width or y - half_y > height:
-    return 0, -1, 0, -1
-  last_x, last_y = (width - 1) // _TILE, (height - 1) // _TILE
-  return (
-    max(0, int((x - half_x) // _TILE)),
-    min(last_x, int((x + half_x) // _TILE)),
-    max(0, int((y - half_y) // _TILE)),
-    min(last_y, int((y + half_y) // _TILE)),
-  )
-
-
-@numba.njit(cache=True)
-def _assign(centres, conics, opacities, order, width, height):
+def _assign(boxes, order, width, height):
   columns, rows = (width - 1) // _TILE + 1, (height - 1) // _TILE + 1
   first = np.zeros(columns * rows + 1, np.int64)
-  for splat in order:
-    left, right, top, bottom = _bounds(centres, conics, opacities, splat, width, height)
-    for row in range(top, bottom + 1):
-      for column in range(left, right + 1):
+  limits = np.empty((len(order), 4), np.int64)
+  for index, splat in enumerate(order):
+    left, right, top, bottom = boxes[splat]
+    if right < 0 or bottom < 0 or left > width or top > height or right <= left or bottom <= top:
+      limits[index] = 0, -1, 0, -1
+      continue
+    limits[index, 0] = int(max(left, 0) // _TILE)
+    limits[index, 1] = int(min(right, width - 1) // _TILE)
+    limits[index, 2] = int(max(top, 0) // _TILE)
+    limits[index, 3] = int(min(bottom, height - 1) // _TILE)
+    for row in range(limits[index, 2], limits[index, 3] + 1):
+      for column in range(limits[index, 0], limits[index, 1] + 1):
         first[row * columns + column + 1] += 1
   first = np.cumsum(first)
   members = np.empty(first[-1], np.int64)
   used = first[:-1].copy()
-  for splat in order:
-    left, right, top, bottom = _bounds(centres, conics, opacities, splat, width, height)
-    for row in range(top, bottom + 1):
-      for column in range(left, right + 1):
+  for index, splat in enumerate(order):
+    for row in range(limits[index, 2], limits[index, 3] + 1):
+      for column in range(limits[index, 0], limits[index, 1] + 1):
         tile = row * columns + column
         members[used[tile]] = splat
         used[tile] += 1
   return first, members
 
 
-def assign(
-  centres: np.ndarray,
-  conics: np.ndarray,
-  opacities: np.ndarray,
-  depths: np.ndarray,
-  *,
-  width: int,
-  height: int,
-) -> Tiles:
-  """Sorts splats with a positive depth [N] by it and lists them for each tile that they reach."""
-  ahead = np.flatnonzero(depths > 0)
-  order = ahead[np.argsort(depths[ahead], kind="stable")]
-  return Tiles(*_assign(centres, conics, opacities, order, width, height))
+def assign(bounds: Bounds, *, width: int, height: int) -> Tiles:
+  """Sorts splats with a positive depth by it and lists them for each tile that they reach."""
+  ahead = np.flatnonzero(bounds.depths > 0)
+  order = ahead[np.argsort(bounds.depths[ahead], kind="stable")]
+  return Tiles(*_assign(bounds.boxes, order, width, height), bounds.depths)
 
 
 @numba.njit(cache=True, fastmath=True)
-def _exponent(centres, conics, splat, x, y):
-  """Offset of a pixel from a splat's centre, and the negative exponent of the Gaussian there."""
+def _response(centres, conics, bends, splat, x, y):
+  """Offset of a pixel from a splat's centre, exponent, and |w(q)|^2 / |w(0)|^2."""
   dx, dy = x - centres[splat, 0], y - centres[splat, 1]
   power = 0.5 * (conics[splat, 0] * dx * dx + conics[splat, 2] * dy * dy)
-  return dx, dy, power + conics[splat, 1] * dx * dy
+  power += conics[splat, 1] * dx * dy
+  bend = 1 + dx * (2 * bends[splat, 0] + bends[splat, 2] * dx + 2 * bends[splat, 3] * dy)
+  bend += dy * (2 * bends[splat, 1] + bends[splat, 4] * dy)
+  bend = max(bend, 1e-12)
+  return dx, dy, power / bend, bend
 
 
 @numba.njit(cache=True, fastmath=True)
-def composite(first, members, centres, conics, opacities, colors, width, height):
-  """Draws a picture.
+def _limits(opacities):
+  """Exponents [N] at which splats become too faint to be drawn."""
+  found = np.empty(len(opacities), np.float32)
+  for splat, opacity in enumerate(opacities):
+    found[splat] = np.log(max(opacity / FAINTEST, 1.0))
+  return found
 
-  Returns:
-    Colour [H, W, 3], transmittance that is left [H, W], and the number of the tile's splats that
-    were looked at [H, W].
-  """
+
+@numba.njit(cache=True, fastmath=True)
+def _composite(first, members, depths, centres, conics, bends, opacities, colors, width, height):
   image = np.zeros((height, width, 3), colors.dtype)
   left = np.ones((height, width), colors.dtype)
-  looked = np.zeros((height, width), np.int64)
-  columns, faintest = (width - 1) // _TILE + 1, _powers(opacities)
+  starts = np.zeros(height * width + 1, np.int64)
+  hits = np.empty(16 * height * width, np.int32)
+  columns, limits, count = (width - 1) // _TILE + 1, _limits(opacities), 0
+  waiting, alphas = np.empty(_WAITING + 1, np.int32), np.empty(_WAITING + 1)
+  reaches = np.empty(_WAITING + 1)
   for row in range(height):
     for column in range(width):
       tile = (row // _TILE) * columns + column // _TILE
-      light = 1.0
-      entry = first[tile]
-      while entry < first[tile + 1] and light > _DARKEST:
-        splat = members[entry]
-        power = _exponent(centres, conics, splat, column + 0.5, row + 0.5)[2]
-        if power < faintest[splat]:
-          alpha = min(_FULLEST, opacities[splat] * np.exp(-power))
-          for k in range(3):
-            image[row, column, k] += light * alpha * colors[splat, k]
-          light *= 1 - alpha
-        entry += 1
+      light, entry, held = 1.0, first[tile], 0
+      while light > _DARKEST:
+        if entry < first[tile + 1]:
+          splat = members[entry]
+          entry += 1
+          dx, dy, power, bend = _response(
+            centres, conics, bends, splat, column + 0.5, row + 0.5
+          )
+          if power >= limits[splat]:
+            continue
+          reach = depths[splat] * (1 + bends[splat, 0] * dx + bends[splat, 1] * dy) / bend
+          place = held  # the buffer begins with the farthest
+          held += 1
+          while place > 0 and reaches[place - 1] < reach:
+            place -= 1
+          for k in range(held - 1, place, -1):
+            waiting[k], alphas[k], reaches[k] = waiting[k - 1], alphas[k - 1], reaches[k - 1]
+          waiting[place], reaches[place] = splat, reach
+          alphas[place] = min(_FULLEST, opacities[splat] * np.exp(-power))
+          if held <= _WAITING:
+            continue
+        if held == 0:
+          break
+        held -= 1
+        splat, alpha = waiting[held], alphas[held]
+        for k in range(3):
+          image[row, column, k] += light * alpha * colors[splat, k]
+        light *= 1 - alpha
+        if count == len(hits):
+          more = np.empty(2 * len(hits), np.int32)
+          more[:count] = hits
+          hits = more
+        hits[count] = splat
+        count += 1
       left[row, column] = light
-      looked[row, column] = entry - first[tile]
-  return image, left, looked
+      starts[row * width + column + 1] = count
+  return image, left, starts, hits[:count]
+
+
+def composite(tiles: Tiles, gaussians: tuple[np.ndarray, ...], *, width: int, height: int) -> Drawn:
+  """Draws a picture of the splats of `projection.Projected`."""
+  return Drawn(*_composite(*tiles, *gaussians, width, height))
 
 
 @numba.njit(cache=True, fastmath=True)
-def composite_backward(
-  first, members, centres, conics, opacities, colors, width, height, left, looked, slope
-):
-  """Returns the derivatives of a loss by the splats' values.
-
-  Args:
-    first, members, centres, conics, opacities, colors, width, height: As given to `composite`.
-    left, looked: What `composite` returned.
-    slope: Derivative of the loss by the picture [H, W, 3].
-
-  Returns:
-    Derivatives by centres [N, 2], conics [N, 3], opacities [N] and colours [N, 3].
-  """
-  by_centre, by_conic = np.zeros_like(centres), np.zeros_like(conics)
+def _backward(centres, conics, bends, opacities, colors, left, starts, hits, slope):
+  by_centre, by_conic, by_bend = np.zeros_like(centres), np.zeros_like(conics), np.zeros_like(bends)
   by_opacity, by_color = np.zeros_like(opacities), np.zeros_like(colors)
-  columns, faintest = (width - 1) // _TILE + 1, _powers(opacities)
+  height, width = left.shape
+  behind = np.zeros(3)  # light that comes from the splats behind
   for row in range(height):
     for column in range(width):
-      tile = (row // _TILE) * columns + column // _TILE
-      light = left[row, column]
-      behind = np.zeros(3, colors.dtype)  # light that comes from the splats behind
-      for entry in range(first[tile] + looked[row, column] - 1, first[tile] - 1, -1):
-        splat = members[entry]
-        dx, dy, power = _exponent(centres, conics, splat, column + 0.5, row + 0.5)
-        if power >= faintest[splat]:
-          continue
+      pixel, light = row * width + column, left[row, column]
+      behind[:] = 0.0
+      for hit in range(starts[pixel + 1] - 1, starts[pixel] - 1, -1):
+        splat = hits[hit]
+        dx, dy, power, bend = _response(centres, conics, bends, splat, column + 0.5, row + 0.5)
         value = np.exp(-power)
         alpha = min(_FULLEST, opacities[splat] * value)
         before = light / (1 - alpha)
@@ -175,11 +179,32 @@ def composite_backward(
         if alpha >= _FULLEST:
           continue
         by_opacity[splat] += by_alpha * value
-        by_power = -by_alpha * alpha
+        by_power = -by_alpha * alpha / bend
+        by_scale = -by_power * power
         by_conic[splat, 0] += 0.5 * by_power * dx * dx
         by_conic[splat, 1] += by_power * dx * dy
         by_conic[splat, 2] += 0.5 * by_power * dy * dy
+        by_bend[splat, 0] += 2 * by_scale * dx
+        by_bend[splat, 1] += 2 * by_scale * dy
+        by_bend[splat, 2] += by_scale * dx * dx
+        by_bend[splat, 3] += 2 * by_scale * dx * dy
+        by_bend[splat, 4] += by_scale * dy * dy
         a, b, c = conics[splat]
-        by_centre[splat, 0] -= by_power * (a * dx + b * dy)
-        by_centre[splat, 1] -= by_power * (b * dx + c * dy)
-  return by_centre, by_conic, by_opacity, by_color
+        f, g, p, q, r = bends[splat]
+        by_centre[splat, 0] -= by_power * (a * dx + b * dy) + 2 * by_scale * (f + p * dx + q * dy)
+        by_centre[splat, 1] -= by_power * (b * dx + c * dy) + 2 * by_scale * (g + q * dx + r * dy)
+  return by_centre, by_conic, by_bend, by_opacity, by_color
+
+
+def composite_backward(
+  gaussians: tuple[np.ndarray, ...], drawn: Drawn, slope: np.ndarray
+) -> tuple[np.ndarray, ...]:
+  """Returns the derivatives of a loss by the splats' values, as `projection.Projected` has them.
+
+  Args:
+    gaussians: As given to `composite`.
+    drawn: What it returned.
+    slope: Derivative of the loss by the picture [H, W, 3].
+  """
+  found: tuple[np.ndarray, ...] = _backward(*gaussians, *drawn[1:], slope)
+  return found

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from nerf2real.scenes.export.splats.projection import NEAR, SLOPE_LIMIT, Eye, Projected
+from nerf2real.scenes.export.splats.projection import FAINTEST, Eye, Projected
 
 
 def axes(rotations):
@@ -18,25 +18,51 @@ def axes(rotations):
 
 
 def project(rows, starts, spacing, eye: Eye) -> Projected:
-  """The 2D Gaussians of splats that lie before the camera."""
+  """The responses of splats that lie before the camera, by the inverse of their axes."""
   positions = starts + spacing[:, None] * rows[:, :3]
   local = positions @ eye.rotation.T + eye.translation
-  z = jnp.where(local[:, 2] > NEAR, local[:, 2], 1.0)
-  plane = local[:, :2] / z[:, None]
-  limit = SLOPE_LIMIT * eye.slope
-  bounded = jnp.clip(plane, -limit, limit)
+  plane = local[:, :2] / local[:, 2:]
   spread = (eye.rotation @ axes(rows[:, 6:10])) * jnp.exp(rows[:, 3:6])[:, None]
-  # rows of the projection's Jacobian times the Gaussian's axes [N, 3] each
-  across = (spread[:, 0] - bounded[:, :1] * spread[:, 2]) * (eye.focal[0] / z)[:, None]
-  down = (spread[:, 1] - bounded[:, 1:] * spread[:, 2]) * (eye.focal[1] / z)[:, None]
-  xx = (across * across).sum(-1) + eye.blur
-  xy = (across * down).sum(-1)
-  yy = (down * down).sum(-1) + eye.blur
-  conics = jnp.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy)[:, None]
+  to_round = jnp.linalg.inv(spread)  # in this frame the splat is a unit ball
+  ray = to_round @ jnp.concatenate([plane, jnp.ones_like(plane[:, :1])], -1)[..., None]
+  ray, right, down = ray[..., 0], to_round[..., 0] / eye.focal[0], to_round[..., 1] / eye.focal[1]
+  square = (ray * ray).sum(-1)
+  bends = jnp.stack(
+    [(a * b).sum(-1) / square for a, b in ((ray, right), (ray, down), (right, right))]
+    + [(a * b).sum(-1) / square for a, b in ((right, down), (down, down))],
+    -1,
+  )
+  # the part of a step across the ray that leaves its direction, at the centre's distance
+  across, along = local[:, 2:] * right, local[:, 2:] * down
+  across -= (across * ray).sum(-1, keepdims=True) / square[:, None] * ray
+  along -= (along * ray).sum(-1, keepdims=True) / square[:, None] * ray
+  conics = jnp.stack([(across**2).sum(-1), (across * along).sum(-1), (along**2).sum(-1)], -1)
   centres = plane * eye.focal + eye.centre
-  return Projected(centres, conics, jax.nn.sigmoid(rows[:, 10]), rows[:, 11:])
+  return Projected(centres, conics, bends, jax.nn.sigmoid(rows[:, 10]), rows[:, 11:])
 
 
 def pull(rows, starts, spacing, eye: Eye, slopes: Projected):
-  """Derivatives [N, 14] of a loss by the packed parameters, of those by the 2D Gaussians."""
+  """Derivatives [N, 14] of a loss by the packed parameters, of those by the responses."""
   return jax.vjp(lambda r: project(r, starts, spacing, eye), rows)[1](slopes)[0]
+
+
+def render(rows, starts, spacing, eye: Eye, *, width: int, height: int):
+  """The picture [H, W, 3] by its definition: every splat's nearest point to every ray, sorted."""
+  positions = starts + spacing[:, None] * rows[:, :3]
+  local = positions @ eye.rotation.T + eye.translation
+  spread = (eye.rotation @ axes(rows[:, 6:10])) * jnp.exp(rows[:, 3:6])[:, None]
+  to_round = jnp.linalg.inv(spread)
+  x, y = jnp.meshgrid(jnp.arange(width) + 0.5, jnp.arange(height) + 0.5)
+  rays = jnp.stack(
+    [(x - eye.centre[0]) / eye.focal[0], (y - eye.centre[1]) / eye.focal[1], jnp.ones_like(x)], -1
+  )
+  ways = jnp.einsum("nij,hwj->hwni", to_round, rays)
+  centre = jnp.einsum("nij,nj->ni", to_round, local)
+  reach = (ways * centre).sum(-1) / (ways * ways).sum(-1)
+  power = 0.5 * jnp.square(ways * reach[..., None] - centre).sum(-1)
+  alpha = jax.nn.sigmoid(rows[:, 10]) * jnp.exp(-power)
+  alpha = jnp.where(alpha < FAINTEST, 0.0, jnp.minimum(alpha, 0.99))
+  order = jnp.argsort(reach, axis=-1)
+  alpha = jnp.take_along_axis(alpha, order, -1)
+  light = jnp.cumprod(1 - alpha, -1) / (1 - alpha)
+  return jnp.einsum("hwn,hwnk->hwk", alpha * light, rows[:, 11:][order])
