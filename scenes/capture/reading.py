@@ -14,6 +14,7 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.media import stills
+from nerf2real.scenes.capture.media.blur import blur_width
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.media.stills import list_images, list_images_below
 from nerf2real.scenes.capture.media.video import (
@@ -202,7 +203,7 @@ def _write(
   kind: str, frames: Iterator[Frame], folder: Path, settings: CaptureSettings, warnings: list[str]
 ) -> Capture:
   """Writes keyframes as they come and gathers what the warnings need."""
-  images, values, brightness, times = [], [], [], []
+  images, values, brightness, times, blur = [], [], [], [], []
   size: tuple[int, int] | None = None
   for frame in frames:
     height, width = frame.image.shape[:2]
@@ -220,6 +221,7 @@ def _write(
     values.append(frame.sharpness)
     brightness.append(float(frame.image.mean()))
     times.append(frame.time)
+    blur.append(blur_width(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)))
   if size is None:
     raise CaptureError("The capture holds no picture.")
   capture = Capture(
@@ -232,6 +234,7 @@ def _write(
     brightness=np.array(brightness),
     times=np.array(times),
     warnings=warnings,
+    blur=np.array(blur),
   )
   warnings.extend(quality_warnings(capture, settings))
   return capture

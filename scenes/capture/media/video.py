@@ -54,17 +54,22 @@ class VideoInfo:
     return self.num_frames / self.frames_per_second if self.frames_per_second > 0 else 0.0
 
 
+def at_standard_size(grey: np.ndarray) -> np.ndarray:
+  """A grey picture [H, W], reduced to the standard size where it is larger."""
+  height, width = grey.shape
+  factor = STANDARD_SIZE / min(height, width)
+  if factor >= 1:
+    return grey
+  size = (max(1, round(width * factor)), max(1, round(height * factor)))
+  return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+
+
 def sharpness(grey: np.ndarray) -> float:
   """Variance of the Laplacian of a grey picture [H, W] at the standard size.
 
   Source: Pech-Pacheco et al. 2000, Diatom autofocusing in brightfield microscopy, LAP_VAR.
   """
-  height, width = grey.shape
-  factor = STANDARD_SIZE / min(height, width)
-  if factor < 1:
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-  return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+  return float(cv2.Laplacian(at_standard_size(grey), cv2.CV_32F).var())
 
 
 def inspect_video(path: Path) -> VideoInfo:

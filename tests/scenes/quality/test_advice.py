@@ -14,28 +14,29 @@ CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 EXTENT = (np.array([-2.5, -2.0, 0.0]), np.array([2.5, 2.0, 2.5]))
 
 
-def _capture(tmp_path, *, sharpness=200.0, brightness=120.0, count=20) -> Capture:
+def _capture(tmp_path, *, blur=1.0, brightness=120.0, count=20) -> Capture:
   return Capture(
     kind="video",
     folder=tmp_path,
     images=[tmp_path / f"frame_{k:06d}.jpg" for k in range(count)],
     width=640,
     height=480,
-    sharpness=np.broadcast_to(sharpness, count),
+    sharpness=np.full(count, 100.0),
     brightness=np.broadcast_to(brightness, count),
     times=3.0 * np.arange(count),
     warnings=[],
+    blur=np.broadcast_to(blur, count),
   )
 
 
 def test_good_pictures_are_good_and_bad_ones_are_named_with_their_times(tmp_path):
   good = advice.judge_pictures(_capture(tmp_path), CaptureSettings())
   assert all(finding.good for finding in good)
-  values = np.full(20, 200.0)
+  values = np.full(20, 1.0)
   values[4:12] = 5.0
   light = np.where(np.arange(20) < 5, 30.0, 200.0)
   blur, exposure = advice.judge_pictures(
-    _capture(tmp_path, sharpness=values, brightness=light), CaptureSettings()
+    _capture(tmp_path, blur=values, brightness=light), CaptureSettings()
   )
   assert not blur.good and "40%" in blur.text and "0:12 to 0:33" in blur.text
   assert not exposure.good and "factor of 6.7" in exposure.text
