@@ -18,7 +18,7 @@ import numpy as np
 
 from nerf2real.scenes.export.splats.projection import FAINTEST, Bounds
 
-_TILE = 4  # edge of a tile [pixel]; chosen: splats are a pixel or two wide in small pictures
+_TILE = 2  # edge of a tile [pixel]; chosen: splats are a pixel or two wide in small pictures
 _FULLEST = 0.99  # largest alpha; Kerbl et al.'s
 _DARKEST = 0.005  # transmittance at which a pixel is full: MuJoCo Warp's
 _WAITING = 24  # splats at a ray that wait for nearer ones; chosen: more change no picture
@@ -105,36 +105,39 @@ def _composite(first, members, depths, centres, conics, bends, opacities, colors
   starts = np.zeros(height * width + 1, np.int64)
   hits = np.empty(16 * height * width, np.int32)
   columns, limits, count = (width - 1) // _TILE + 1, _limits(opacities), 0
-  waiting, alphas = np.empty(_WAITING + 1, np.int32), np.empty(_WAITING + 1)
-  reaches = np.empty(_WAITING + 1)
+  room = 4 * _WAITING
+  waiting, alphas, reaches = np.empty(room, np.int32), np.empty(room), np.empty(room)
   for row in range(height):
     for column in range(width):
       tile = (row // _TILE) * columns + column // _TILE
-      light, entry, held = 1.0, first[tile], 0
+      light, entry, head, end = 1.0, first[tile], 0, 0  # from head to end they wait, near to far
       while light > _DARKEST:
         if entry < first[tile + 1]:
           splat = members[entry]
           entry += 1
-          dx, dy, power, bend = _response(
-            centres, conics, bends, splat, column + 0.5, row + 0.5
-          )
+          dx, dy, power, bend = _response(centres, conics, bends, splat, column + 0.5, row + 0.5)
           if power >= limits[splat]:
             continue
+          if end == room:
+            for k in range(head, end):
+              waiting[k - head], alphas[k - head] = waiting[k], alphas[k]
+              reaches[k - head] = reaches[k]
+            head, end = 0, end - head
           reach = depths[splat] * (1 + bends[splat, 0] * dx + bends[splat, 1] * dy) / bend
-          place = held  # the buffer begins with the farthest
-          held += 1
-          while place > 0 and reaches[place - 1] < reach:
+          place = end
+          while place > head and reaches[place - 1] > reach:
+            waiting[place], alphas[place] = waiting[place - 1], alphas[place - 1]
+            reaches[place] = reaches[place - 1]
             place -= 1
-          for k in range(held - 1, place, -1):
-            waiting[k], alphas[k], reaches[k] = waiting[k - 1], alphas[k - 1], reaches[k - 1]
           waiting[place], reaches[place] = splat, reach
           alphas[place] = min(_FULLEST, opacities[splat] * np.exp(-power))
-          if held <= _WAITING:
+          end += 1
+          if end - head <= _WAITING:
             continue
-        if held == 0:
+        if head == end:
           break
-        held -= 1
-        splat, alpha = waiting[held], alphas[held]
+        splat, alpha = waiting[head], alphas[head]
+        head += 1
         for k in range(3):
           image[row, column, k] += light * alpha * colors[splat, k]
         light *= 1 - alpha
