@@ -21,9 +21,10 @@ class EvaluationSettings:
   control: Literal["none", "black", "other_goal"] = "none"
   """What of the observations is falsified, for a control experiment: the pictures are black, or the
   goal is another one than the trial's."""
-  swap: Literal["none", "picture", "delay", "physics"] = "none"
-  """What of the gap between simulation and virtual robot is closed: in the simulation the true
-  room's pictures, or the robot's camera delay; on the virtual robot its hidden physics."""
+  swap: tuple[Literal["picture", "delay", "physics"], ...] = ()
+  """Parts of the gap between simulation and virtual robot that are swapped: in the simulation the
+  robot's pictures or camera delay; on the virtual robot the simulation's, or the data sheets'
+  physics."""
   out: Path = Path("out/evaluation")
   """Folder of the episodes and the report."""
   scene: Path | None = None
