@@ -40,6 +40,10 @@ class EvaluationSettings:
   """Seed of the simulation's episodes and of drawn actions."""
   robot_seed: tuple[int, ...] = (1,)
   """Which virtual robots: the seeds of what is hidden in them."""
+  placing: tuple[float, float] = (0.03, 0.05)
+  """Largest errors of place [m, each axis] and heading [rad] with which a virtual robot is put down
+  for repetitions of a navigation trial; the first has none. Chosen: as exactly as a person puts a
+  robot on a mark. Without them repetitions on one virtual robot are the same to the bit."""
   stochastic: bool = False
   """Draws actions instead of taking the policy's mean."""
   camera_size: tuple[int, int] | None = None

@@ -1,10 +1,11 @@
 """How far the same open-loop walk gets: simulation, virtual robots, and one part changed at a time.
 
-The gait's actions of `gap.py`, straight ahead and without feedback, on a level floor. The virtual
-robot as in its data sheets is the reference; every other row changes one of its parts to the end of
-the range that `Hidden.draw` has, or to what the simulation has. Distances [m] are by an observer,
-means over walks of several commanded speeds; everything is deterministic but for the drawn robots'
-noise.
+The gait's actions, straight ahead and without feedback, on a level floor. One reference is the
+nominal simulation: rows `simulation_...` give one of its parts what the virtual robot has. The
+other is the virtual robot as in its data sheets: the further rows change one part to the end of the
+range that `Hidden.draw` has, or to what the simulation has. Distances [m] are by an observer, over
+walks of several commanded speeds: a walk on contacts moves by some percent with any change, so
+that a part counts where it moves all. Only the drawn robots have noise.
 
   python benchmarks/robot/walk_by_parts.py
 """
@@ -12,7 +13,8 @@ noise.
 # ruff: noqa: E402  (threads and GL are chosen before numpy and mujoco are imported)
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from benchmarks import harness
 
@@ -22,16 +24,22 @@ import numpy as np
 
 from benchmarks.robot import gap
 from nerf2real import real, suite
+from nerf2real.real.virtual.body import STEP
 from nerf2real.real.virtual.hidden import Hidden
-from nerf2real.real.virtual.motors import MotorParameters
+from nerf2real.real.virtual.motors import RESISTANCE, SPEED_CONSTANT, MotorParameters
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite.arena import FLOOR_FRICTION
+from nerf2real.suite.effects.effect import Effect
 from nerf2real.suite.gaits.walk import Command, Gait
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL
 
 _COUNT = len(constants.JOINT_NAMES)
+_SHEET = Hidden.none(_COUNT)
+# Of the virtual robot's voltage law at P = 800 and 12 V (real/virtual/motors.py), without friction.
+_STIFFNESS = 26.4  # N m/rad
+_BACK_EMF = SPEED_CONSTANT**2 / RESISTANCE + _SHEET.bearing_damping  # N m s/rad
 _SIMULATED_CONTACT = 0.02  # s, MuJoCo's default, which the simulation has
 
 
@@ -51,9 +59,59 @@ def _each(value: float) -> np.ndarray:
   return np.full(_COUNT, value)
 
 
+class Variant(NamedTuple):
+  """The simulation with a part of the virtual robot's."""
+
+  change: Callable[[Any], None] = lambda model: None  # of a compiled model
+  options: dict[str, Any] | None = None  # of suite.load
+
+
+def _set_contact(model: Any) -> None:
+  model.geom_solref[:, 0] = _SHEET.contact_time
+
+
+def _set_stiffness(model: Any) -> None:
+  model.actuator_gainprm[:, 0] = _STIFFNESS
+  model.actuator_biasprm[:, 1] = -_STIFFNESS
+
+
+def _set_damping(model: Any) -> None:
+  model.dof_damping[6:] = _BACK_EMF
+
+
+def _set_friction(model: Any) -> None:
+  model.geom_friction[:, 0] = _SHEET.foot_friction
+
+
+def _set_drive(model: Any) -> None:
+  for change in (_set_stiffness, _set_damping):
+    change(model)
+
+
+def _set_all(model: Any) -> None:
+  for change in (_set_contact, _set_drive, _set_friction):
+    change(model)
+
+
+def variants() -> dict[str, Variant]:
+  """Returns simulations by what they have of the virtual robot."""
+  step, late = {"physics_timestep": STEP}, Effect("command_delay", parameters={"delay": 0.008})
+  return {
+    "simulation": Variant(),
+    "simulation_contact": Variant(_set_contact),
+    "simulation_friction": Variant(_set_friction),
+    "simulation_stiffness": Variant(_set_stiffness),
+    "simulation_back_emf": Variant(_set_damping),
+    "simulation_drive": Variant(_set_drive),
+    "simulation_step": Variant(options=step),
+    "simulation_commands_8_ms_late": Variant(options={"effects": (late,)}),
+    "simulation_all": Variant(_set_all, step),
+  }
+
+
 def parts() -> dict[str, Hidden]:
   """Returns virtual robots by what differs from the data sheets, one part each."""
-  sheet = Hidden.none(_COUNT)
+  sheet = _SHEET
 
   def motors(**changes: Any) -> Hidden:
     found: MotorParameters = dataclasses.replace(sheet.motors, **changes)
@@ -107,8 +165,10 @@ def row(found: list[tuple[float, bool]]) -> dict[str, harness.Value]:
   }
 
 
-def in_simulation(motions: list[np.ndarray], settings: Settings) -> dict[str, harness.Value]:
-  """Returns the nominal simulation's figures."""
+def in_simulation(
+  motions: list[np.ndarray], settings: Settings, variant: Variant
+) -> dict[str, harness.Value]:
+  """Returns the figures of the simulation without randomisation, with a part changed."""
   environment = suite.load(
     "nerf_nav",
     image_size=None,
@@ -116,7 +176,9 @@ def in_simulation(motions: list[np.ndarray], settings: Settings) -> dict[str, ha
     randomisation=NOMINAL,
     privileged=False,
     time_limit=settings.seconds + 1.0,
+    **(variant.options or {}),
   )
+  variant.change(environment.physics.model.ptr)
   task: Any = environment.task
   task.set_start(Pose(*gap.Settings().start))
   return row([walked(environment, m, lambda: task.state.position[:2].copy()) for m in motions])
@@ -144,7 +206,8 @@ def on_a_robot(
 def main(settings: Settings) -> None:
   """Walks everywhere and prints the table."""
   motions = [actions(speed, round(settings.seconds * 40)) for speed in settings.speeds]
-  rows = {"simulation": in_simulation(motions, settings)}
+  rows = {name: in_simulation(motions, settings, variant) for name, variant in variants().items()}
+  print(harness.table(rows), flush=True)
   for name, hidden in parts().items():
     rows[name] = on_a_robot(motions, settings, hidden=hidden)
     print(name, rows[name], flush=True)

@@ -18,8 +18,25 @@ from nerf2real.real.virtual.camera import LENS
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.protocols import BALL, NavigationTrial
 from nerf2real.suite.sensors.camera import CameraSettings
+
+
+def put_down(pose: Pose, trial: Trial, errors: tuple[float, float]) -> Pose:
+  """Returns where a person puts the robot: for a repetition of a navigation trial, beside its pose.
+
+  Args:
+    pose: Of the trial.
+    trial: Its seed draws the errors, so that all robots and conditions have the same.
+    errors: Largest errors of place [m, each axis] and heading [rad]; uniform within.
+  """
+  if not isinstance(trial, NavigationTrial) or trial.trial == 0:
+    return pose
+  drawn = np.random.default_rng([trial.seed, trial.trial]).uniform(-1.0, 1.0, 3)
+  place, heading = errors
+  x, y, yaw = np.array(pose) + drawn * (place, place, heading)
+  return Pose(float(x), float(y), float(yaw))
 
 
 class CoveredCamera:
@@ -60,8 +77,8 @@ class RehearsedPlant(RobotPlant):
 
     Args:
       scene: An opened bundle of the room that the robot stands in.
-      settings: The evaluation's; read are protocol, perturbation, time limit, the first robot's
-        seed, and what of it is swapped for the simulation's.
+      settings: The evaluation's; read are protocol, perturbation, time limit, placing, the first
+        robot's seed, and what of it is swapped for the simulation's.
       image_size: Height and width of the policy's picture; None for no camera.
       simulated: The simulation's camera, for what is swapped; the suite's own if None.
       altered: Undeclared effects that the robot has besides.
@@ -72,6 +89,7 @@ class RehearsedPlant(RobotPlant):
     super().__init__(scene, settings, record=record)
     robot_seed = settings.robot_seed[0]
     self.plant_id = f"robot {robot_seed}"
+    self._placing = settings.placing
     known = swaps.PHYSICS in settings.swap
     self.plant_id += ", data sheet's physics" if known else ""
     self.plant_id += swaps.told("the simulation's", settings.swap)
@@ -124,6 +142,7 @@ class RehearsedPlant(RobotPlant):
     self._hit = False
     self._disturb(0.0)
     pose, ball = self._places(trial)
+    pose = put_down(pose, trial, self._placing)
     if ball is not None:
       self.robot.place_ball(*ball)
     if isinstance(trial, NavigationTrial) and self.robot.camera is not None:
