@@ -30,11 +30,14 @@ class Difference(NamedTuple):
 def difference(found: Sequence[Episode], reference: Sequence[Episode]) -> Difference:
   """Returns the differences over the trials of one robot and index that both have.
 
+  A trial of a virtual robot is paired with the same robot's, or with the simulation's.
+
   Raises:
     ValueError: They have no trial in common.
   """
   others = {_trial(episode): episode for episode in reference}
-  pairs = [(a, others[_trial(a)]) for a in found if _trial(a) in others]
+  partners = [(a, others.get(_trial(a)) or others.get(("", a.index))) for a in found]
+  pairs = [(a, b) for a, b in partners if b is not None]
   if not pairs:
     raise ValueError("The two conditions have no trial in common: evaluate both on the same.")
   won = sum(a.success and not b.success for a, b in pairs)

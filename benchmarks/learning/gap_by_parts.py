@@ -5,9 +5,9 @@
 Every condition is an evaluation as by `launch/evaluate.py --swap` in a folder of its own; what is
 there already is not run again. In the simulation the robot's pictures or camera delay are put in,
 compared with the plain simulation; on the virtual robot the simulation's, or the data sheets'
-physics, compared with the plain virtual robot. Differences are paired by trial: success with
-Tango's score interval; time and localisation error, over trials that both conditions reach, with
-the 95 % interval of a bootstrap over trials.
+physics, compared with the plain virtual robot; and the two with each other. Differences are paired
+by trial: success with Tango's score interval; time and localisation error, over trials that both
+conditions reach, with the 95 % interval of a bootstrap over trials.
 """
 
 # ruff: noqa: E402  (threads are chosen before numpy is imported)
@@ -129,6 +129,8 @@ def main(settings: Settings) -> None:
     for name, episodes in found.items()
     if CONDITIONS[name].parts and _PLAIN[CONDITIONS[name].plant] in found
   }
+  if set(_PLAIN.values()) <= set(found):
+    differences["robot_less_simulation"] = difference(found["robot"], found["simulation"])
   harness.finish("gap_by_parts", rows | differences, settings, seed=0)
 
 

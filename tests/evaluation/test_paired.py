@@ -59,5 +59,7 @@ def test_trials_are_paired_by_index_and_robot():
   simulated = [episode(index=1, plant_id="seed 0"), episode("fall", index=0, plant_id="seed 0")]
   nominal = [episode(index=0, plant_id="seed 0, the robot's delay")]
   assert paired.difference(nominal, simulated).won == 1
+  both = paired.difference(reference, simulated)
+  assert (both.trials, both.won, both.lost) == (3, 2, 1)
   with pytest.raises(ValueError, match="no trial in common"):
     paired.difference(simulated, reference)
