@@ -21,9 +21,9 @@ class EvaluationSettings:
   control: Literal["none", "black", "other_goal"] = "none"
   """What of the observations is falsified, for a control experiment: the pictures are black, or the
   goal is another one than the trial's."""
-  swap: tuple[Literal["picture", "delay", "physics"], ...] = ()
+  swap: tuple[Literal["picture", "lens", "delay", "physics"], ...] = ()
   """Parts of the gap between simulation and virtual robot that are swapped: in the simulation the
-  robot's pictures or camera delay; on the virtual robot the simulation's, or the data sheets'
+  robot's pictures, lens or camera delay; on the virtual robot the simulation's, or the data sheets'
   physics."""
   out: Path = Path("out/evaluation")
   """Folder of the episodes and the report."""

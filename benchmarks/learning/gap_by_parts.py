@@ -3,11 +3,12 @@
   python benchmarks/learning/gap_by_parts.py --policy shipped --trials 15
 
 Every condition is an evaluation as by `launch/evaluate.py --swap` in a folder of its own; what is
-there already is not run again. In the simulation the robot's pictures or camera delay are put in,
-compared with the plain simulation; on the virtual robot the simulation's, or the data sheets'
-physics, compared with the plain virtual robot; and the two with each other. Differences are paired
-by trial: success with Tango's score interval; time and localisation error, over trials that both
-conditions reach, with the 95 % interval of a bootstrap over trials.
+there already is not run again. In the simulation the robot's pictures (with and without its lens),
+lens or camera delay are put in, compared with the plain simulation; on the virtual robot the
+simulation's, or the data sheets' physics, compared with the plain virtual robot; and the two with
+each other. Differences are paired by trial: success with Tango's score interval; time and
+localisation error, over trials that both conditions reach, with the 95 % interval of a bootstrap
+over trials.
 """
 
 # ruff: noqa: E402  (threads are chosen before numpy is imported)
@@ -27,7 +28,7 @@ from nerf2real.evaluation import episodes, paired, session
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.settings import EvaluationSettings
 
-Part = Literal["picture", "delay", "physics"]
+Part = Literal["picture", "lens", "delay", "physics"]
 
 
 class Condition(NamedTuple):
@@ -39,10 +40,14 @@ class Condition(NamedTuple):
 
 CONDITIONS = {
   "simulation": Condition("sim"),
-  "simulation_with_the_robots_pictures": Condition("sim", ("picture",)),
+  "simulation_with_the_robots_pictures": Condition("sim", ("picture", "lens")),
+  "simulation_with_the_robots_room": Condition("sim", ("picture",)),
+  "simulation_with_the_robots_lens": Condition("sim", ("lens",)),
   "simulation_with_the_robots_camera_delay": Condition("sim", ("delay",)),
-  "robot_with_the_simulations_pictures_and_delay": Condition("virtual", ("picture", "delay")),
-  "robot_with_the_simulations_pictures": Condition("virtual", ("picture",)),
+  "robot_with_the_simulations_pictures_and_delay": Condition(
+    "virtual", ("picture", "lens", "delay")
+  ),
+  "robot_with_the_simulations_pictures": Condition("virtual", ("picture", "lens")),
   "robot_with_the_simulations_camera_delay": Condition("virtual", ("delay",)),
   "robot_with_the_data_sheets_physics": Condition("virtual", ("physics",)),
   "robot": Condition("virtual"),

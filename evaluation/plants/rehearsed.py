@@ -101,7 +101,7 @@ class RehearsedPlant(RobotPlant):
     camera = swaps.camera_on_the_robot(build.camera, simulated, settings.swap)
     view = None
     if image_size is not None and swaps.PICTURE in settings.swap:
-      view = swaps.field_view(scene, image_size, simulated)
+      view = swaps.field_view(scene, image_size, camera.lens)
     self.robot = VirtualRobot(
       world=world,
       seed=robot_seed,

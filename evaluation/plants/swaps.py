@@ -1,10 +1,10 @@
 """Which part of the gap between simulation and virtual robot does it: parts swapped one at a time.
 
-PICTURE: in the simulation the true room through the robot's lens and white balance, in place of the
-radiance field's pictures; on the virtual robot the field's through the simulation's lens, without
-the sensor's noise. DELAY: the other one's camera rate and mean latency. PHYSICS: takes from the
-virtual robot what is hidden in it, so that its servos, masses and sensors are those of the data
-sheets (its step, contacts, drives and battery remain its own).
+PICTURE: in the simulation the true room with the robot's white balance, in place of the radiance
+field's pictures; on the virtual robot the field's, without the sensor's noise. LENS: the other
+one's. DELAY: the other one's camera rate and mean latency. PHYSICS: takes from the virtual robot
+what is hidden in it, so that its servos, masses and sensors are those of the data sheets (its step,
+contacts, drives and battery remain its own).
 """
 
 import dataclasses
@@ -22,8 +22,9 @@ from nerf2real.suite import loading
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.sensors.camera import CameraSettings, RobotCamera
 
-PICTURE, DELAY, PHYSICS = "picture", "delay", "physics"
-_KNOWN = {"sim": (PICTURE, DELAY), "virtual": (PICTURE, DELAY, PHYSICS)}
+PICTURE, LENS, DELAY, PHYSICS = "picture", "lens", "delay", "physics"
+_OF_THE_CAMERA = (PICTURE, LENS, DELAY)
+_KNOWN = {"sim": _OF_THE_CAMERA, "virtual": (*_OF_THE_CAMERA, PHYSICS)}
 _SAMPLES = 8  # of a pixel along each side: as many as the robot's 320x240 give at 30x40
 
 
@@ -68,16 +69,16 @@ class FieldView:
 
 
 def field_view(
-  scene: Any, image_size: tuple[int, int], simulated: CameraSettings
+  scene: Any, image_size: tuple[int, int], lens: Camera
 ) -> Callable[[Body], FieldView]:
   """Returns what makes the simulation's pictures of a body.
 
   Args:
     scene: The bundle with the field.
     image_size: Height and width of the policy's picture.
-    simulated: The simulation's camera, for its lens; its rate and response are not read.
+    lens: Through which they are rendered.
   """
-  neutral = CameraSettings(lens=simulated.lens, compositing=simulated.compositing)
+  neutral = CameraSettings(lens=lens)
   camera = RobotCamera(
     loading.load_renderer(scene),
     neutral.camera(image_size),
@@ -91,7 +92,9 @@ def camera_in_simulation(camera: CameraSettings, parts: Sequence[str]) -> Camera
   """Returns a simulated camera with the virtual one's parts; the noise of a pixel averages out."""
   virtual = VirtualCamera()
   if PICTURE in parts:
-    camera = dataclasses.replace(camera, lens=virtual.lens, white_balance=virtual.white_balance)
+    camera = dataclasses.replace(camera, white_balance=virtual.white_balance)
+  if LENS in parts:
+    camera = dataclasses.replace(camera, lens=virtual.lens)
   if DELAY in parts:
     latency = max(0.0, virtual.latency - _mean_delay())
     camera = dataclasses.replace(camera, rate=virtual.rate, latency=latency)
@@ -104,6 +107,9 @@ def camera_on_the_robot(
   """Returns a virtual robot's camera with a simulated one's parts."""
   if PICTURE in parts:
     camera = dataclasses.replace(camera, noise=0.0, white_balance=(1.0, 1.0, 1.0))
+  if LENS in parts:
+    lens = simulated.camera((camera.lens.height, camera.lens.width))
+    camera = dataclasses.replace(camera, lens=lens)
   if DELAY in parts:
     latency = simulated.latency + _mean_delay()
     camera = dataclasses.replace(camera, rate=simulated.rate, latency=latency)
@@ -116,8 +122,8 @@ def _mean_delay() -> float:
 
 
 def told(whose: str, parts: Sequence[str]) -> str:
-  """Returns the end of a plant's name that tells swapped pictures and delay; empty without."""
-  found = " and ".join(part for part in (PICTURE, DELAY) if part in parts)
+  """Returns the end of a plant's name that tells swapped parts of the camera; empty without."""
+  found = " and ".join(part for part in _OF_THE_CAMERA if part in parts)
   return f", {whose} {found}" if found else ""
 
 
@@ -125,7 +131,7 @@ def check(parts: Sequence[str], *, plant: str, built_in: bool) -> None:
   """Raises ValueError where a part cannot be swapped.
 
   Args:
-    parts: Of PICTURE, DELAY, PHYSICS.
+    parts: Of PICTURE, LENS, DELAY, PHYSICS.
     plant: "sim", "virtual", "both" or "robot".
     built_in: Whether the scene is that of the built-in room.
   """

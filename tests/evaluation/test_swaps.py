@@ -41,11 +41,15 @@ def test_cameras_take_each_others_parts():
   assert (late.gain, late.lens) == (1.2, None) and late.rate == virtual.rate == 30
   assert late.latency + 0.030 == pytest.approx(virtual.latency)
   seeing = swaps.camera_in_simulation(simulated, ("picture",))
-  assert seeing.lens == virtual.lens and seeing.white_balance == virtual.white_balance
+  assert seeing.lens is None and seeing.white_balance == virtual.white_balance
+  assert swaps.camera_in_simulation(simulated, ("lens",)).lens == virtual.lens
   assert (seeing.rate, seeing.latency) == (15.0, 0.01)
   late = swaps.camera_on_the_robot(virtual, simulated, ("delay", "physics"))
   assert (late.rate, late.latency) == (15.0, pytest.approx(0.04)) and late.noise == virtual.noise
+  lens = swaps.camera_on_the_robot(virtual, simulated, ("lens",)).lens
+  assert (lens.width, lens.height) == (320, 240) and lens.k1 == 0 and lens.cx == 160
   seeing = swaps.camera_on_the_robot(virtual, simulated, ("picture",))
+  assert seeing.lens == virtual.lens
   assert (seeing.rate, seeing.latency) == (virtual.rate, virtual.latency)
   grey = np.full((2, 2, 3), 100, np.uint8)
   assert (Sensor(seeing).develop(grey) == grey).all()
@@ -74,12 +78,12 @@ def test_a_robot_sees_the_fields_pictures():
   scene = open_scene(None)
   plant = RehearsedPlant(
     scene,
-    EvaluationSettings(swap=("delay", "picture")),
+    EvaluationSettings(swap=("delay", "lens", "picture")),
     image_size=(30, 40),
     simulated=CameraSettings(rate=20.0),
     world="floor",
   )
-  assert plant.plant_id == "robot 1, the simulation's picture and delay"
+  assert plant.plant_id == "robot 1, the simulation's picture and lens and delay"
   first = plant.start(plants.trials("navigation")[0][1])
   assert plant.robot.camera is not None and plant.robot.eyes is not None
   picture = plant.robot.eyes.picture()
