@@ -142,7 +142,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
-  if _may_leave(subject, explainer.null, settings):
+  anyway, left = _remaining(subject, explainer.null)
+  if _may_leave(subject, explainer.null, settings) or np.any(settings.more**2 * anyway < left):
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
@@ -150,20 +151,21 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   named = tuple(k for k in found.named if _is_something(subject, found.best, k))
   if before is not None and usual is not None and not subject.paired:
     named = tuple(k for k in named if _is_new(before, usual, found.best, k))
-  anyway, left = _remaining(subject, found)
+  anyway, left = _remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
   if named and (typical or few):
-    # That constants are off is no effect: a misfit in few blocks does not speak against it.
-    doubted = [k for k in named if typical or k != CONSTANTS_OFF]
-    stands = _supported(explainer, found.best, doubted, subject.beyond, float(anyway[1]))
-    named = tuple(k for k in named if k in stands or k not in doubted)
+    # That constants are off is no effect: beside it a misfit in few blocks needs no force.
+    forced = [k for k in named if typical or k != CONSTANTS_OFF]
+    named = _supported(
+      explainer, found.best, named, subject.beyond, anyway=float(anyway[1]), forced=forced
+    )
     ranked = explainer.ranked()
   more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
     found,
     named,
     any(t.wider for t in known),
-    bool(typical) or leaves(subject, found.best, settings),
+    bool(typical or (few and before is not None)) or leaves(subject, found.best, settings),
     more,
   )
   off = _constants_off(subject, found.best, settings)
@@ -180,8 +182,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   )
 
 
-def _remaining(subject: Subject, found: Explanation) -> tuple[Array, Array]:
-  """Returns what a machine leaves anyway, and what its best hypothesis does: mean squares [2] of
+def _remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
+  """Returns what a machine leaves anyway, and what a hypothesis does: mean squares [2] of
   the median block, and of all blocks by `mean_left`."""
   now, before, usual = subject.now, subject.before, subject.usual
 
@@ -192,8 +194,8 @@ def _remaining(subject: Subject, found: Explanation) -> tuple[Array, Array]:
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])
   if now.follows:
-    anyway = np.maximum(anyway, both(now, scatter(now, found.best)))
-  return anyway, both(now, found.left)
+    anyway = np.maximum(anyway, both(now, scatter(now, item)))
+  return anyway, both(now, item.fit.held[0][0])
 
 
 def elaborate(found: Sequence[Changed]) -> None:
@@ -227,7 +229,13 @@ def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
 
 
 def _supported(
-  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float, anyway: float
+  explainer: Explainer,
+  best: Scored,
+  named: Sequence[str],
+  beyond: float,
+  *,
+  anyway: float,
+  forced: Sequence[str],
 ) -> tuple[str, ...]:
   """Returns the names that stand where something is left that no name is for.
 
@@ -242,14 +250,15 @@ def _supported(
     named: kinds that are clear.
     beyond: standard errors that count as clear.
     anyway: mean square that the machine leaves anyway.
+    forced: kinds that are tried beside a force.
   """
   kept = []
   left = mean_left(explainer.joint, best.fit.held[0][0])
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
     explained = mean_left(explainer.joint, without.fit.held[0][0]) - left
-    if kind != CONSTANTS_OFF and explained <= left - anyway:
-      stands = False
+    if explained <= left - anyway or kind not in forced:
+      stands = explained > left - anyway
     elif kind in VARIABLE:
       rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond
