@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-
 from scipy.stats import rankdata
 
 from nerf2real.sysid.fit.layout import Fit
