@@ -26,11 +26,11 @@ from nerf2real.sysid.selection.baseline import (
   known_terms,
   widened,
 )
-from nerf2real.sysid.selection.evidence import Scored
-from nerf2real.sysid.selection.explain import Explainer
-from nerf2real.sysid.selection.growth import grow
-from nerf2real.sysid.selection.naming import conclude, threshold
-from nerf2real.sysid.selection.remainder import structured
+from nerf2real.sysid.selection.judging.evidence import Scored
+from nerf2real.sysid.selection.judging.naming import conclude, threshold
+from nerf2real.sysid.selection.judging.remainder import structured
+from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.selection.search.growth import grow
 from nerf2real.sysid.settings import Settings
 
 WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")

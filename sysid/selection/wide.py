@@ -20,7 +20,7 @@ from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.point_mass import carrying
-from nerf2real.sysid.selection.evidence import Scored, clearness
+from nerf2real.sysid.selection.judging.evidence import Scored, clearness
 from nerf2real.sysid.selection.subject import WHOLE, Subject
 
 Array = np.ndarray

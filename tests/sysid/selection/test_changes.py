@@ -13,8 +13,10 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection import analysis, changes, naming, remainder, rivals, subject
-from nerf2real.sysid.selection.evidence import Scored, clearness, more_likely, standardised
+from nerf2real.sysid.selection import analysis, changes, subject
+from nerf2real.sysid.selection.judging import naming, remainder
+from nerf2real.sysid.selection.judging.evidence import Scored, clearness, more_likely, standardised
+from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
