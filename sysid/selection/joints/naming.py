@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.selection.evidence import Scored, clear, of_size, standardised
+from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size, standardised
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
