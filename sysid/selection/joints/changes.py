@@ -55,7 +55,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   named = tuple(k for k in found.named if is_something(subject, found.best, k))
   if before is not None and usual is not None and not subject.paired:
     named = tuple(k for k in named if is_new(before, usual, found.best, k))
-  anyway, left = remaining(subject, found)
+  anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
   if named and (typical or few):
     # That constants are off is no effect: a misfit in few blocks does not speak against it.

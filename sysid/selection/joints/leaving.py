@@ -3,7 +3,6 @@
 import numpy as np
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.selection.joints.naming import Explanation
 from nerf2real.sysid.selection.joints.remainder import grown, mean_left, scatter, structured
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search.evidence import Scored
@@ -22,8 +21,8 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
     return structured(subject.now, item, settings)
   if subject.usual is not None:
     return grown(item, subject.usual, subject.beyond, settings)
-  left = float(np.sqrt(np.median(item.fit.held[0][0])))
-  return left > settings.more * subject.now.position_noise
+  left, noise = np.median(item.fit.held[0][0]), np.median(subject.now.noise_squares)
+  return bool(left > settings.more**2 * noise)
 
 
 def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
@@ -34,17 +33,18 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   return leaves(subject, item, settings)
 
 
-def remaining(subject: Subject, found: Explanation) -> tuple[Array, Array]:
-  """Returns what a machine leaves anyway, and what its best hypothesis does: mean squares [2] of
+def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
+  """Returns what a machine leaves anyway, and what a hypothesis does: mean squares [2] of
   the median block, and of all blocks by `mean_left`."""
   now, before, usual = subject.now, subject.before, subject.usual
 
   def both(joint: JointLikelihood, squares: Array) -> Array:
     return np.array([np.median(squares), mean_left(joint, squares)])
 
-  anyway = np.full(2, (2.0 if subject.paired else 1.0) * now.position_noise**2)
+  readings = now.noise_squares * (2.0 if subject.paired else 1.0)
+  anyway = np.array([np.median(readings), readings.mean()])
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])
   if now.follows:
-    anyway = np.maximum(anyway, both(now, scatter(now, found.best)))
-  return anyway, both(now, found.left)
+    anyway = np.maximum(anyway, both(now, scatter(now, item)))
+  return anyway, both(now, item.fit.held[0][0])

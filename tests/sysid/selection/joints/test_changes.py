@@ -14,7 +14,7 @@ from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
-from nerf2real.sysid.selection.joints import changes, doubts, naming, remainder, subject
+from nerf2real.sysid.selection.joints import doubts, naming, remainder, subject
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.search.evidence import Scored, more_likely, standardised
 from nerf2real.sysid.settings import SETTINGS
@@ -194,7 +194,7 @@ def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, wit
 
   monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(without))
   monkeypatch.setattr(rivals, "with_force", lambda *_: None)
-  monkeypatch.setattr(changes, "clear", lambda *_: 0.0)  # no force does better
+  monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)  # no force does better
   explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20)))
   found = doubts.supported(explainer, leaving(1.0), ("cogging",), 3.0, 0.1)
   assert found == stands
