@@ -47,7 +47,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
-  if may_leave(subject, explainer.null, settings):
+  anyway, left = remaining(subject, explainer.null)
+  if may_leave(subject, explainer.null, settings) or np.any(settings.more**2 * anyway < left):
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
@@ -58,17 +59,18 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
   if named and (typical or few):
-    # That constants are off is no effect: a misfit in few blocks does not speak against it.
-    doubted = [k for k in named if typical or k != CONSTANTS_OFF]
-    stands = supported(explainer, found.best, doubted, subject.beyond, float(anyway[1]))
-    named = tuple(k for k in named if k in stands or k not in doubted)
+    # That constants are off is no effect: beside it a misfit in few blocks needs no force.
+    forced = [k for k in named if typical or k != CONSTANTS_OFF]
+    named = supported(
+      explainer, found.best, named, subject.beyond, anyway=float(anyway[1]), forced=forced
+    )
     ranked = explainer.ranked()
   more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
     found,
     named,
     any(t.wider for t in known),
-    bool(typical) or leaves(subject, found.best, settings),
+    bool(typical or (few and before is not None)) or leaves(subject, found.best, settings),
     more,
   )
   off = constants_off(subject, found.best, settings)

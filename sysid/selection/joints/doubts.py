@@ -13,7 +13,6 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
-from nerf2real.sysid.selection.joints.changed import CONSTANTS_OFF
 from nerf2real.sysid.selection.joints.remainder import mean_left
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search import rivals
@@ -26,7 +25,13 @@ _MOMENTS = ("payload",)
 
 
 def supported(
-  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float, anyway: float
+  explainer: Explainer,
+  best: Scored,
+  named: Sequence[str],
+  beyond: float,
+  *,
+  anyway: float,
+  forced: Sequence[str],
 ) -> tuple[str, ...]:
   """Returns the names that stand where something is left that no name is for.
 
@@ -41,14 +46,15 @@ def supported(
     named: kinds that are clear.
     beyond: standard errors that count as clear.
     anyway: mean square that the machine leaves anyway.
+    forced: kinds that are tried beside a force.
   """
   kept = []
   left = mean_left(explainer.joint, best.fit.held[0][0])
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
     explained = mean_left(explainer.joint, without.fit.held[0][0]) - left
-    if kind != CONSTANTS_OFF and explained <= left - anyway:
-      stands = False
+    if explained <= left - anyway or kind not in forced:
+      stands = explained > left - anyway
     elif kind in VARIABLE:
       rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond

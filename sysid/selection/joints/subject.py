@@ -158,6 +158,7 @@ def _subject(
     freed = widened(own)
     explainer = _explainer(now, None, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
+  now.ahead = None if before.law is None else before.law.ahead
   usual = _bare(before, settings)
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
