@@ -70,7 +70,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     found,
     named,
     any(t.wider for t in known),
-    bool(typical or (few and before is not None)) or leaves(subject, found.best, settings),
+    bool(typical or few) or leaves(subject, found.best, settings),
     more,
   )
   off = constants_off(subject, found.best, settings)

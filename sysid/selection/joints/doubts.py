@@ -59,8 +59,8 @@ def supported(
       rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond
     else:
-      forced = (rivals.with_force(explainer, s) for s in (best, without))
-      stands = clear(*forced) > beyond
+      beside, bare = (rivals.with_force(explainer, s) for s in (best, without))
+      stands = clear(beside, bare) > beyond
     if stands:
       kept.append(kind)
   return tuple(kept)

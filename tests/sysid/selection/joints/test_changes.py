@@ -235,6 +235,20 @@ def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, wit
   assert found == stands
 
 
+def test_each_of_several_names_is_tried_beside_a_force(monkeypatch):
+  def leaving(square):
+    return SimpleNamespace(fit=SimpleNamespace(held=[np.full((1, 20), square)]))
+
+  tried = []
+  monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(9.0))
+  monkeypatch.setattr(rivals, "with_force", lambda _, item, *__: tried.append(item))
+  monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)
+  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20)))
+  kinds = ("payload", "backlash")
+  found = doubts.supported(explainer, leaving(1.0), kinds, 3.0, anyway=0.1, forced=kinds)
+  assert found == () and len(tried) == 4
+
+
 @pytest.mark.parametrize(("independent", "follows"), [(0.002, True), (0.05, False)])
 def test_a_machine_whose_courses_stray_for_long_is_judged_from_each_reading_on(
   monkeypatch, independent, follows
