@@ -36,9 +36,11 @@ def supported(
   """Returns the names that stand where something is left that no name is for.
 
   What is named may then be a part of that: half of a soft stop is a spring. A kind must explain
-  more squares than remain. One that is a force over one variable stands unless a force of any form
-  over that variable does clearly better; any other where hypotheses with a force of any form over
-  both are clearly worse without it.
+  more squares than remain, both of fits to all logs: left-out blocks are predicted with effects
+  that were fitted without them beside constants that were fitted to all, which is for the
+  hypothesis that lacks the effect. One that is a force over one variable stands unless a force of
+  any form over that variable does clearly better; any other where hypotheses with a force of any
+  form over both are clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
@@ -49,10 +51,10 @@ def supported(
     forced: kinds that are tried beside a force.
   """
   kept = []
-  left = mean_left(explainer.joint, best.fit.held[0][0])
+  left = _left(explainer, best)
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
-    explained = mean_left(explainer.joint, without.fit.held[0][0]) - left
+    explained = _left(explainer, without) - left
     if explained <= left - anyway or kind not in forced:
       stands = explained > left - anyway
     elif kind in VARIABLE:
@@ -64,6 +66,12 @@ def supported(
     if stands:
       kept.append(kind)
   return tuple(kept)
+
+
+def _left(explainer: Explainer, item: Scored) -> float:
+  """Returns the mean square that a hypothesis leaves where it is fitted to all logs."""
+  joint = explainer.joint
+  return mean_left(joint, joint.squares(item.fit.residuals[0])[0])
 
 
 def is_something(subject: Subject, best: Scored, kind: str) -> bool:

@@ -223,12 +223,12 @@ def test_a_misfit_in_few_blocks_remains():
 @pytest.mark.parametrize(("without", "stands"), [(1.3, ()), (2.5, ("cogging",))])
 def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, without, stands):
   def leaving(square):
-    return SimpleNamespace(fit=SimpleNamespace(held=[np.full((1, 20), square)]))
+    return SimpleNamespace(fit=SimpleNamespace(residuals=[np.full((1, 20), np.sqrt(square))]))
 
   monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(without))
   monkeypatch.setattr(rivals, "with_force", lambda *_: None)
   monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)  # no force does better
-  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20)))
+  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20), squares=np.square))
   found = doubts.supported(
     explainer, leaving(1.0), ("cogging",), 3.0, anyway=0.1, forced=["cogging"]
   )
@@ -237,13 +237,13 @@ def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, wit
 
 def test_each_of_several_names_is_tried_beside_a_force(monkeypatch):
   def leaving(square):
-    return SimpleNamespace(fit=SimpleNamespace(held=[np.full((1, 20), square)]))
+    return SimpleNamespace(fit=SimpleNamespace(residuals=[np.full((1, 20), np.sqrt(square))]))
 
   tried = []
   monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(9.0))
   monkeypatch.setattr(rivals, "with_force", lambda _, item, *__: tried.append(item))
   monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)
-  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20)))
+  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20), squares=np.square))
   kinds = ("payload", "backlash")
   found = doubts.supported(explainer, leaving(1.0), kinds, 3.0, anyway=0.1, forced=kinds)
   assert found == () and len(tried) == 4
