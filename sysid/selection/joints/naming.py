@@ -1,7 +1,8 @@
 """Which effects of a joint are named: those that no hypothesis without them does as well as.
 
 One rule, one level of significance: an effect of the best hypothesis is named where every tried
-hypothesis without it is clearly worse (paired differences of left-out likelihood, `clearness`), at
+hypothesis without it is clearly worse, than the best one or than the same with it (paired
+differences of left-out likelihood, `clearness`), at
 the family-wise level of all effects tried. Where a hypothesis
 without it predicts the same motion, these logs cannot tell the two apart; both are said.
 """
@@ -19,11 +20,12 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 Array = np.ndarray
 
 USUAL = (
-  *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
-  *("encoder_offset", "gravity_tilt", "spring"),
+  *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "encoder_offset"),
+  *("gravity_tilt", "payload", "spring"),
 )
 """Kinds in the order in which they are named where logs cannot tell them apart, chosen: a late
-command is more usual than a late reading, a shifted zero than a machine that has been tilted."""
+command is more usual than a late reading, a shifted zero than a machine that has been tilted, and
+that a load, with its place, looks like a shifted zero would be a coincidence."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,18 +96,12 @@ def conclude(
 
 
 def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
-  """Returns the simplest of the hypotheses that predict what the best one does, by the number of
-  values that the logs determine, and of those the most usual: that a load has just the three
-  values with which it looks like a shifted zero would be a coincidence."""
+  """Returns the most usual of the hypotheses that predict what the best one does."""
   order = {kind: index for index, kind in enumerate(USUAL)}
   alike = [
     s for s in of_size(ranked, len(best.names)) if clear(best, s) < beyond and _same(joint, best, s)
   ]
-
-  def rank(item: Scored) -> tuple[int, list[int]]:
-    return item.determined, sorted(order.get(k, len(order)) for k in item.names)
-
-  return min([best, *alike], key=rank)
+  return min([best, *alike], key=lambda s: sorted(order.get(k, len(order)) for k in s.names))
 
 
 def _name(
@@ -115,11 +111,23 @@ def _name(
   behind = [(clear(best, s), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
   alike = tuple(s for s in near if _same(joint, best, s))
-  told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
+  told = [
+    max(z, _gained(s, kind, ranked)) if z < beyond else z
+    for z, s in behind
+    if not any(s is a or _holds(s, a) for a in alike)
+  ]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
   certain = least >= beyond and carries_over(joint, best, plain)
   return Name(kind, least, certain, alike)
+
+
+def _gained(item: Scored, kind: str, ranked: Sequence[Scored]) -> float:
+  """Returns how clearly a hypothesis is better with an effect beside its own: what another effect
+  does as well as the best hypothesis may have nothing to do with it."""
+  wanted = item.names | {kind}
+  both = [s for s in ranked if s.names == wanted and not (s.neutral or s.beside_force)]
+  return max((clear(s, item) for s in both), default=-float("inf"))
 
 
 def _holds(item: Scored, twin: Scored) -> bool:

@@ -130,18 +130,32 @@ def test_hypotheses_without_a_difference_are_not_clear():
   assert clearness([np.zeros(36)], 0.0) == 0.0
 
 
-def test_of_hypotheses_that_predict_the_same_the_simplest_is_said(monkeypatch):
-  load, shift, tilt = (
-    SimpleNamespace(
-      names=frozenset([kind]), determined=count, neutral=False, beside_force=False, kind=kind
-    )
-    for kind, count in (("payload", 3), ("encoder_offset", 1), ("gravity_tilt", 1))
+def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):
+  load, shift, spring = (
+    SimpleNamespace(names=frozenset([kind]), neutral=False, beside_force=False)
+    for kind in ("payload", "encoder_offset", "spring")
   )
   monkeypatch.setattr(naming, "_same", lambda *_: True)
   monkeypatch.setattr(naming, "clear", lambda *_: 0.0)
-  assert naming._usual(None, load, [load, tilt, shift], 3.0) is shift
-  shift.determined = 4
-  assert naming._usual(None, load, [load, tilt, shift], 3.0) is tilt
+  assert naming._usual(None, load, [load, spring, shift], 3.0) is shift
+  assert naming._usual(None, spring, [load, spring], 3.0) is load
+
+
+def test_a_name_need_not_be_clear_of_what_it_improves(monkeypatch):
+  best, bare, other, both = (
+    SimpleNamespace(names=frozenset(names), neutral=False, beside_force=False, evidence=value)
+    for names, value in (
+      (("spring",), 50.0),
+      ((), 0.0),
+      (("motor_gain",), 40.0),
+      (("motor_gain", "spring"), 90.0),
+    )
+  )
+  monkeypatch.setattr(naming, "_same", lambda *_: False)
+  monkeypatch.setattr(naming, "carries_over", lambda *_: True)
+  monkeypatch.setattr(naming, "clear", lambda a, b: 0.1 * (a.evidence - b.evidence))
+  assert naming._name(None, best, "spring", [best, bare, other, both], 3.0).certain
+  assert not naming._name(None, best, "spring", [best, bare, other], 3.0).certain
 
 
 def test_the_threshold_grows_with_what_was_tried():
