@@ -1,7 +1,6 @@
 """What a joint leaves under a hypothesis, against what the machine leaves anyway."""
 
 import numpy as np
-from scipy.stats import chi2
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.selection.joints.remainder import grown, mean_left, scatter, structured
@@ -31,14 +30,7 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   and names must be clear by themselves."""
   if subject.usual is not None and not subject.paired:
     return grown(item, subject.usual, settings.suspected, settings)
-  return leaves(subject, item, settings) or bent(item, settings)
-
-
-def bent(item: Scored, settings: Settings) -> bool:
-  """Tells whether constants are farther from the declared ones than their tolerances make likely:
-  they may stand for an effect, as a latency does for a late command."""
-  fitted = int(np.isfinite(item.fit.layout.sigma).sum())
-  return 2.0 * item.prior > float(chi2.isf(settings.level, max(fitted, 1)))
+  return leaves(subject, item, settings)
 
 
 def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:

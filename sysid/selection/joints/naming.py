@@ -1,8 +1,7 @@
 """Which effects of a joint are named: those that no hypothesis without them does as well as.
 
 One rule, one level of significance: an effect of the best hypothesis is named where every tried
-hypothesis without it is clearly worse, than the best one or than the same with it (paired
-differences of left-out likelihood, `clearness`), at
+hypothesis without it is clearly worse (paired differences of left-out likelihood, `clearness`), at
 the family-wise level of all effects tried. Where a hypothesis
 without it predicts the same motion, these logs cannot tell the two apart; both are said.
 """
@@ -111,23 +110,11 @@ def _name(
   behind = [(clear(best, s), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
   alike = tuple(s for s in near if _same(joint, best, s))
-  told = [
-    max(z, _gained(s, kind, ranked)) if z < beyond else z
-    for z, s in behind
-    if not any(s is a or _holds(s, a) for a in alike)
-  ]
+  told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
   certain = least >= beyond and carries_over(joint, best, plain)
   return Name(kind, least, certain, alike)
-
-
-def _gained(item: Scored, kind: str, ranked: Sequence[Scored]) -> float:
-  """Returns how clearly a hypothesis is better with an effect beside its own: what another effect
-  does as well as the best hypothesis may have nothing to do with it."""
-  wanted = item.names | {kind}
-  both = [s for s in ranked if s.names == wanted and not (s.neutral or s.beside_force)]
-  return max((clear(s, item) for s in both), default=-float("inf"))
 
 
 def _holds(item: Scored, twin: Scored) -> bool:

@@ -141,23 +141,6 @@ def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch)
   assert naming._usual(None, spring, [load, spring], 3.0) is load
 
 
-def test_a_name_need_not_be_clear_of_what_it_improves(monkeypatch):
-  best, bare, other, both = (
-    SimpleNamespace(names=frozenset(names), neutral=False, beside_force=False, evidence=value)
-    for names, value in (
-      (("spring",), 50.0),
-      ((), 0.0),
-      (("motor_gain",), 40.0),
-      (("motor_gain", "spring"), 90.0),
-    )
-  )
-  monkeypatch.setattr(naming, "_same", lambda *_: False)
-  monkeypatch.setattr(naming, "carries_over", lambda *_: True)
-  monkeypatch.setattr(naming, "clear", lambda a, b: 0.1 * (a.evidence - b.evidence))
-  assert naming._name(None, best, "spring", [best, bare, other, both], 3.0).certain
-  assert not naming._name(None, best, "spring", [best, bare, other], 3.0).certain
-
-
 def test_the_threshold_grows_with_what_was_tried():
   assert naming.threshold(1) == pytest.approx(1.960, abs=1e-3)  # one of two tests at 5 %
   assert naming.threshold(400) > naming.threshold(20) > 2.8
