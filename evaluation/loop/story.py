@@ -32,6 +32,7 @@ from nerf2real.suite.scene import open_scene
 HEALTHY, BEFORE, AFTER = "robot as it was", "robot before", "robot after"
 NOMINAL, WITH_EFFECTS = "simulation, nominal", "simulation with the effects"
 TRAINED = "simulation with the effects, trained on"
+_ORDER = (HEALTHY, BEFORE, NOMINAL, WITH_EFFECTS, TRAINED, AFTER)  # of what is told
 _TIMES = "times.json"
 
 
@@ -118,6 +119,7 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
   comparison = None
   if virtual:
     comparison = compare(hidden, named.named, named.in_reference)
+  found = {name: found[name] for name in _ORDER if name in found}
   cooled = {name: trials.session(settings, name).cooled for name in found}
   story = Story(settings, found, named, trained, comparison, cooled, stages.seconds)
   write_json(settings.out / "loop.json", summary(story))

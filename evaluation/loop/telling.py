@@ -166,7 +166,7 @@ def _finding(named: Named) -> Section:
     blocks.append(Text(f"In the reference, too, so that the robot had it before: {own}."))
   if named.notes:
     blocks.append(Details(f"notes: {len(named.notes)}", [Text(note) for note in named.notes]))
-  return Section("What the recordings say", f"Verdict: {named.verdict}. {listed}.", blocks)
+  return Section("What the recordings say", f"Verdict: {named.verdict}. Named: {listed}.", blocks)
 
 
 def _entering(named: Named) -> str:
