@@ -100,7 +100,9 @@ def run(
   Raises:
     RuntimeError: The robot is too hot all the same, or stopped for another reason.
   """
-  chosen = choose(plants.trials(NAVIGATION), settings.trials)
+  simulated = condition.simulated and settings.simulated is not None
+  count = settings.simulated if simulated else settings.trials
+  chosen = choose(plants.trials(NAVIGATION), count)
   policy = load_policy(condition.policy, scene)
   label = plant_label(settings, condition)
   setting = dataclasses.replace(_setting(policy, condition, settings), plant_id=label)

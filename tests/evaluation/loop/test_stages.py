@@ -79,6 +79,8 @@ def test_trials_are_run_once_and_more_are_added(tmp_path):
   assert said == []
   more = trials.run(_settings(tmp_path, trials=3), condition, scene, store, said.append)
   assert [e.index for e in more] == [0, 26, 53] and "1 of 3 trials to run" in said[0]
+  fewer = trials.run(_settings(tmp_path, trials=9, simulated=2), condition, scene, store, print)
+  assert [e.index for e in fewer] == [0, 53]
 
 
 def test_a_tally_has_the_exact_interval():
