@@ -137,7 +137,7 @@ def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
     recording.record_stand(out / "stand", connection, None, seconds=seconds, lens=lens)
     recording.record_floor(out / "stand", connection, None)
     return settings.reference
-  age = trials.session(settings, BEFORE).seconds
+  age = trials.session(settings, BEFORE).seconds / 2  # between the trials: what sags, is half way
   for folder, altered, used in ((out / "stand", hidden, age), (out / "reference", (), 0.0)):
     if all((folder / path.name).exists() for path in wanted):
       continue
