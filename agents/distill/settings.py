@@ -202,7 +202,7 @@ def ball_push() -> DistillSettings:
     # A ball of one colour in one light was all that an encoder knew (benchmarks/results).
     environment="suite:ball_push?light=true",
     teacher="ball",
-    views=40_000,
+    views=20_000,
     # The goal is the ball's: the robot's distance from it takes nothing from a label.
     blind_radius=0.0,
     push_forces=((0, 0.0, 0.0), (80_000, 1.0, 3.0)),
