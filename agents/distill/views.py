@@ -1,4 +1,4 @@
-"""Pictures at drawn places, for the encoder: a pose is taught best by places that are all different.
+"""Pictures at drawn places, for the encoder: places that all differ teach a pose best.
 
 Episodes hold some 40 pictures a second of the same place. Rendering takes no physics: a recorded
 posture is put anywhere on the free floor, with head and ball drawn where there is a ball, whose

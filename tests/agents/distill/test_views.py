@@ -17,9 +17,7 @@ COUNT = 24
 @pytest.fixture(scope="module")
 def world():
   """Task, layout and postures of a drawn light's environment with a ball."""
-  environment = make_environment(
-    "suite:ball_push?image_size=12x16&pushes=false&light=true", seed=0
-  )
+  environment = make_environment("suite:ball_push?image_size=12x16&pushes=false&light=true", seed=0)
   layout = Layout.of(environment)
   rows = [layout.flatten(environment.reset().observation).privileged]
   for _ in range(3):
@@ -59,7 +57,7 @@ def test_a_view_shows_its_own_place(world, made):
   for view in range(COUNT):
     pose, ball = made["pose"][view].astype(np.float64), made["ball"][view].astype(np.float64)
     task.put_ball(views._ahead(pose, np.arctan2(ball[1], ball[0]), np.hypot(*ball[:2])))
-    for place, kept in ((pose, errors), (pose + [0.0, 0.0, 1.0], moved)):
+    for place, kept in ((pose, errors), (pose + np.array([0.0, 0.0, 1.0]), moved)):
       seen = _seen(task, layout, postures[-1], place, made, view)
       kept.append(np.abs(seen - made["image"][view].astype(int)).mean())
   assert np.median(errors) < 0.5 * np.median(moved)
