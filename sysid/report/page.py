@@ -16,9 +16,9 @@ from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import capability, meanings, residual_plots, summary
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
-from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.evidence import clear
+from nerf2real.sysid.selection.changed import Changed
 from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.selection.judging.evidence import clear
 
 Array = np.ndarray
 

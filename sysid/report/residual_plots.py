@@ -14,7 +14,7 @@ from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import balance
-from nerf2real.sysid.selection.changes import Changed
+from nerf2real.sysid.selection.changed import Changed
 from nerf2real.sysid.selection.findings import Identified
 
 BEFORE, AFTER = palette.VERMILION, palette.BLUE  # declared and extended model

@@ -17,10 +17,10 @@ from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import changes, claims, scopes, wide
-from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.evidence import clear
+from nerf2real.sysid.selection.changed import Changed
 from nerf2real.sysid.selection.findings import Identified
-from nerf2real.sysid.selection.naming import Name
+from nerf2real.sysid.selection.judging.evidence import clear
+from nerf2real.sysid.selection.judging.naming import Name
 from nerf2real.sysid.selection.scopes import Shared
 from nerf2real.sysid.selection.subject import WHOLE, Subject, explain_reference, prepare
 from nerf2real.sysid.settings import SETTINGS, Settings

@@ -6,7 +6,6 @@ is clearly worse (`naming`), and where the reference logs are clearly worse with
 Where more remains, a name must also stand beside a force of any form.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,14 +17,14 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
-from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection import rivals
-from nerf2real.sysid.selection.elaboration import elaborated
-from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, clear, more_likely
-from nerf2real.sysid.selection.explain import Explainer
-from nerf2real.sysid.selection.growth import grow
-from nerf2real.sysid.selection.naming import Explanation, conclude
-from nerf2real.sysid.selection.remainder import grown, mean_left, scatter, structured
+from nerf2real.sysid.selection.changed import Changed
+from nerf2real.sysid.selection.judging.evidence import UNREPEATED, Scored, clear, more_likely
+from nerf2real.sysid.selection.judging.naming import Explanation, conclude
+from nerf2real.sysid.selection.judging.remainder import grown, mean_left, scatter, structured
+from nerf2real.sysid.selection.search import rivals
+from nerf2real.sysid.selection.search.elaboration import elaborated
+from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.selection.search.growth import grow
 from nerf2real.sysid.selection.subject import Subject, following
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -38,86 +37,6 @@ _MOMENTS = ("payload",)
 _REST = 0.1
 """Of the squares that all joints leave: less is left to joints that are not elaborated, chosen (5 %
 of the error)."""
-
-
-@dataclasses.dataclass
-class Changed:
-  """What is new at a joint."""
-
-  subject: Subject
-  ranked: list[Scored]
-  found: Explanation
-  named: tuple[str, ...]
-  """Kinds that are certain, and absent from the reference."""
-  verdict: str
-  """none, effects, partly or unexplained."""
-  reference_left: float
-  """What the machine leaves anyway, root of `mean_left`, rad (m)."""
-  left: float
-  """The same of the logs, under the best hypothesis."""
-  more_remains: bool
-  """Whether that is more than the machine leaves anyway, by the limit of what counts as more."""
-  constants_off: bool
-  """Whether declared constants are off by more than machines of one kind differ."""
-  elaborated: list[Scored] = dataclasses.field(default_factory=list)
-  """Fits with richer friction that predict left-out logs about as well as the best of them."""
-
-  @property
-  def extended(self) -> Scored:
-    """The hypothesis to simulate with: where more remains, what predicts left-out blocks best."""
-    if self.verdict not in ("partly", "unexplained"):
-      return self.found.best
-    fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
-    if self.elaborated:
-      return self.elaborated[0]
-    return max(fitting, key=lambda s: s.evidence, default=self.found.best)
-
-  @property
-  def near(self) -> list[Scored]:
-    """The hypotheses whose mean is predicted with: fits near the best, which is the first."""
-    best = self.extended
-    return self.elaborated if any(best is s for s in self.elaborated) else [best]
-
-  @property
-  def likelihood(self) -> JointLikelihood:
-    """The logs."""
-    return self.subject.now
-
-  @property
-  def declared(self) -> Scored:
-    """The model as it is declared."""
-    return self.subject.explainer.declared
-
-  @property
-  def alternatives(self) -> list[Scored]:
-    """The best hypothesis of every other set of effects, the best first."""
-    best: dict[frozenset[str], Scored] = {}
-    for item in self.ranked:
-      if item.names and not item.neutral and not item.beside_force:
-        best.setdefault(item.names, item)
-    best.pop(self.extended.names, None)
-    return list(best.values())
-
-  @property
-  def confounded(self) -> list[Scored]:
-    """Hypotheses without a named effect that predict the same."""
-    alike = {id(s): s for n in self.found.names for s in n.confounded if s.names}
-    return list(alike.values())
-
-  @property
-  def joint(self) -> str:
-    """Its name."""
-    return self.subject.joint
-
-  @property
-  def known(self) -> tuple[Term, ...]:
-    """Constants and effects that were known before."""
-    return self.subject.known
-
-  @property
-  def null(self) -> Scored:
-    """The baseline."""
-    return self.subject.explainer.null
 
 
 def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
@@ -142,7 +61,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
-  if _may_leave(subject, explainer.null, settings):
+  anyway, left = _remaining(subject, explainer.null)
+  if _may_leave(subject, explainer.null, settings) or np.any(settings.more**2 * anyway < left):
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
@@ -150,20 +70,21 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   named = tuple(k for k in found.named if _is_something(subject, found.best, k))
   if before is not None and usual is not None and not subject.paired:
     named = tuple(k for k in named if _is_new(before, usual, found.best, k))
-  anyway, left = _remaining(subject, found)
+  anyway, left = _remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
   if named and (typical or few):
-    # That constants are off is no effect: a misfit in few blocks does not speak against it.
-    doubted = [k for k in named if typical or k != CONSTANTS_OFF]
-    stands = _supported(explainer, found.best, doubted, subject.beyond, float(anyway[1]))
-    named = tuple(k for k in named if k in stands or k not in doubted)
+    # That constants are off is no effect: beside it a misfit in few blocks needs no force.
+    forced = [k for k in named if typical or k != CONSTANTS_OFF]
+    named = _supported(
+      explainer, found.best, named, subject.beyond, anyway=float(anyway[1]), forced=forced
+    )
     ranked = explainer.ranked()
   more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
     found,
     named,
     any(t.wider for t in known),
-    bool(typical) or leaves(subject, found.best, settings),
+    bool(typical or (few and before is not None)) or leaves(subject, found.best, settings),
     more,
   )
   off = _constants_off(subject, found.best, settings)
@@ -180,8 +101,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   )
 
 
-def _remaining(subject: Subject, found: Explanation) -> tuple[Array, Array]:
-  """Returns what a machine leaves anyway, and what its best hypothesis does: mean squares [2] of
+def _remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
+  """Returns what a machine leaves anyway, and what a hypothesis does: mean squares [2] of
   the median block, and of all blocks by `mean_left`."""
   now, before, usual = subject.now, subject.before, subject.usual
 
@@ -192,8 +113,8 @@ def _remaining(subject: Subject, found: Explanation) -> tuple[Array, Array]:
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])
   if now.follows:
-    anyway = np.maximum(anyway, both(now, scatter(now, found.best)))
-  return anyway, both(now, found.left)
+    anyway = np.maximum(anyway, both(now, scatter(now, item)))
+  return anyway, both(now, item.fit.held[0][0])
 
 
 def elaborate(found: Sequence[Changed]) -> None:
@@ -227,7 +148,13 @@ def _constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
 
 
 def _supported(
-  explainer: Explainer, best: Scored, named: Sequence[str], beyond: float, anyway: float
+  explainer: Explainer,
+  best: Scored,
+  named: Sequence[str],
+  beyond: float,
+  *,
+  anyway: float,
+  forced: Sequence[str],
 ) -> tuple[str, ...]:
   """Returns the names that stand where something is left that no name is for.
 
@@ -242,20 +169,21 @@ def _supported(
     named: kinds that are clear.
     beyond: standard errors that count as clear.
     anyway: mean square that the machine leaves anyway.
+    forced: kinds that are tried beside a force.
   """
   kept = []
   left = mean_left(explainer.joint, best.fit.held[0][0])
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
     explained = mean_left(explainer.joint, without.fit.held[0][0]) - left
-    if kind != CONSTANTS_OFF and explained <= left - anyway:
-      stands = False
+    if explained <= left - anyway or kind not in forced:
+      stands = explained > left - anyway
     elif kind in VARIABLE:
       rival = rivals.with_force(explainer, without, VARIABLE[kind])
       stands = clear(rival, best) <= beyond
     else:
-      forced = (rivals.with_force(explainer, s) for s in (best, without))
-      stands = clear(*forced) > beyond
+      both = (rivals.with_force(explainer, s) for s in (best, without))
+      stands = clear(*both) > beyond
     if stands:
       kept.append(kind)
   return tuple(kept)

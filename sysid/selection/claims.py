@@ -9,7 +9,7 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import free_force
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.changes import Changed
+from nerf2real.sysid.selection.changed import Changed
 from nerf2real.sysid.selection.subject import WHOLE
 
 Claim = tuple[Effect, dict[str, Any]]

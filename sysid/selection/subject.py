@@ -26,11 +26,11 @@ from nerf2real.sysid.selection.baseline import (
   known_terms,
   widened,
 )
-from nerf2real.sysid.selection.evidence import Scored
-from nerf2real.sysid.selection.explain import Explainer
-from nerf2real.sysid.selection.growth import grow
-from nerf2real.sysid.selection.naming import conclude, threshold
-from nerf2real.sysid.selection.remainder import structured
+from nerf2real.sysid.selection.judging.evidence import Scored
+from nerf2real.sysid.selection.judging.naming import conclude, threshold
+from nerf2real.sysid.selection.judging.remainder import structured
+from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.selection.search.growth import grow
 from nerf2real.sysid.settings import Settings
 
 WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
@@ -158,6 +158,7 @@ def _subject(
     freed = widened(own)
     explainer = _explainer(now, None, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
+  now.ahead = None if before.law is None else before.law.ahead
   usual = _bare(before, settings)
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)

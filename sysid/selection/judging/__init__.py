@@ -1,0 +1,1 @@
+"""How hypotheses are compared: evidence of blocks, names that stand, what remains."""
