@@ -47,7 +47,7 @@ def make_views(
   """
   assert layout.image_shape is not None
   has_ball = layout.privileged_column(BALL) is not None
-  found = {
+  found: dict[str, np.ndarray] = {
     "image": np.empty((count, *layout.image_shape), np.uint8),
     "pose": np.empty((count, POSE_SIZE), np.float32),
   }

@@ -74,7 +74,7 @@ def record(settings: Settings) -> Film:
   task = task_of(environment)
   plant = RehearsedPlant(
     task.scene,
-    EvaluationSettings(protocol=protocols.BALL, plant="virtual", robot_seed=(settings.robot_seed,)),
+    EvaluationSettings(protocol="ball", plant="virtual", robot_seed=(settings.robot_seed,)),
     image_size=driver.image_size,
   )
   rows: list[tuple[Any, ...]] = []
@@ -90,7 +90,9 @@ def record(settings: Settings) -> Film:
 def _episode(
   task: Any, plant: RehearsedPlant, driver: LearnedPolicy, trial: int, seconds: float
 ) -> list[tuple[Any, ...]]:
-  timestep, rows, states = plant.start(protocols.ball()[trial]), [], []
+  rows: list[tuple[Any, ...]] = []
+  states: list[Any] = []
+  timestep = plant.start(protocols.ball()[trial])
   driver.reset(plant.sight())
   while not timestep.last() and len(rows) * constants.CONTROL_TIMESTEP < seconds:
     truth = plant.robot.truth()
