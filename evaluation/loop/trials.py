@@ -178,6 +178,7 @@ def _make_plant(
     offsets=settings.offsets,
     lens=settings.lens,
     time_limit=settings.time_limit,
+    placing=(0.0, 0.0),  # the floor's slope and the walks are read from where trials begin
   )
   return make_plant(
     evaluation,

@@ -114,6 +114,12 @@ class JointLikelihood:
         start = spans.pop().start
       spans.append(slice(int(start), int(end)))
 
+  @property
+  def noise_squares(self) -> Array:
+    """Mean squares of blocks [B] that the readings' noise leaves: of a joint that moves, with what
+    their stamps are off by, so that samples in motion weigh less."""
+    return self.position_noise**2 * np.add.reduceat(self.mask, self.starts) / self.counts[0]
+
   def parts_of(self, fold: int) -> list[slice]:
     """Returns where the samples of a fold are."""
     return self._parts.get(int(fold), [])

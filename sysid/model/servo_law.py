@@ -72,7 +72,9 @@ class ServoLaw:
 
     What the law leaves of the duty may hide as much of the gain: no deviation by scatter shows it.
     """
-    return all(abs(end - 1.0) > tolerance + self.gain * self.unexplained for end in self.interval)
+    reach = tolerance + self.gain * self.unexplained
+    low, high = self.interval
+    return low > 1.0 + reach or high < 1.0 - reach
 
 
 def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:

@@ -1,1 +1,1 @@
-"""How hypotheses of one joint are found: sets of effects that grow, rivals, fits near the best."""
+"""Search of sets of effects at one joint, scored by left-out likelihood."""

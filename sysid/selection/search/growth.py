@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from nerf2real.sysid.selection.judging.evidence import Scored, clear, of_size
+from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size
 from nerf2real.sysid.selection.search.explain import Explainer
 from nerf2real.sysid.selection.search.rivals import beside_force, neutralise
 

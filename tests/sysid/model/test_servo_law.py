@@ -82,6 +82,13 @@ def test_a_clock_that_drifts_is_no_weaker_gain():
   assert law_of(gain=0.5, noise=0.002).is_off(0.05)
 
 
+def test_a_gain_whose_interval_holds_the_declared_one_is_not_off():
+  law = dataclasses.replace(law_of(noise=0.002), gain=0.99, gain_deviation=0.09, unexplained=0.03)
+  assert not law.is_off(0.03)
+  assert dataclasses.replace(law, gain=0.7).is_off(0.03)
+  assert dataclasses.replace(law, gain=1.3).is_off(0.03)
+
+
 @pytest.mark.parametrize(("gain", "noise"), [(-0.5, 0.002), (0.02, 0.3)])
 def test_a_duty_that_is_not_of_the_position_error_has_no_law(gain, noise):
   assert servo_law(plant_of(gain=gain, noise=noise)) is None

@@ -44,17 +44,6 @@ class Scored:
     return {} if term is None else self.fit.values(term)
 
   @property
-  def determined(self) -> int:
-    """Number of directions of its effects' values that the logs determine: in which the posterior
-    is narrower than the range of what is plausible."""
-    layout = self.fit.layout
-    effects = np.flatnonzero(layout.is_effect)
-    spread = np.sqrt(1.0 / 12.0) * (layout.high - layout.low)[effects]
-    ridge = np.diag(1e-9 / np.maximum(layout.scale, 1e-12) ** 2)
-    covariance = np.linalg.inv(self.fit.precision + ridge)[np.ix_(effects, effects)]
-    return int(np.sum(np.linalg.eigvalsh(covariance / np.outer(spread, spread)) < 1.0))
-
-  @property
   def evidence(self) -> float:
     """Sum of the blocks' nats, less what the priors cost."""
     return float(self.nats.sum()) - self.prior

@@ -13,17 +13,18 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.selection.judging.evidence import Scored, clear, of_size, standardised
+from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size, standardised
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
 USUAL = (
-  *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "payload"),
-  *("encoder_offset", "gravity_tilt", "spring"),
+  *("command_delay", "coulomb_friction", "viscous_friction", "motor_gain", "encoder_offset"),
+  *("gravity_tilt", "payload", "spring"),
 )
 """Kinds in the order in which they are named where logs cannot tell them apart, chosen: a late
-command is more usual than a late reading, a shifted zero than a machine that has been tilted."""
+command is more usual than a late reading, a shifted zero than a machine that has been tilted, and
+that a load, with its place, looks like a shifted zero would be a coincidence."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,18 +95,12 @@ def conclude(
 
 
 def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
-  """Returns the simplest of the hypotheses that predict what the best one does, by the number of
-  values that the logs determine, and of those the most usual: that a load has just the three
-  values with which it looks like a shifted zero would be a coincidence."""
+  """Returns the most usual of the hypotheses that predict what the best one does."""
   order = {kind: index for index, kind in enumerate(USUAL)}
   alike = [
     s for s in of_size(ranked, len(best.names)) if clear(best, s) < beyond and _same(joint, best, s)
   ]
-
-  def rank(item: Scored) -> tuple[int, list[int]]:
-    return item.determined, sorted(order.get(k, len(order)) for k in item.names)
-
-  return min([best, *alike], key=rank)
+  return min([best, *alike], key=lambda s: sorted(order.get(k, len(order)) for k in s.names))
 
 
 def _name(

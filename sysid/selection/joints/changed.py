@@ -1,12 +1,17 @@
-"""What was concluded of one joint: its verdict, names, and the hypotheses behind them."""
+"""What is new at a joint: what was tried, what is named, what remains."""
 
 import dataclasses
 
+import numpy as np
+
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.judging.evidence import Scored
-from nerf2real.sysid.selection.judging.naming import Explanation
-from nerf2real.sysid.selection.subject import Subject
+from nerf2real.sysid.selection.joints.naming import Explanation
+from nerf2real.sysid.selection.joints.subject import Subject
+from nerf2real.sysid.selection.search.evidence import Scored
+
+Array = np.ndarray
+CONSTANTS_OFF = "parameter_error"
 
 
 @dataclasses.dataclass

@@ -4,6 +4,7 @@ report.json holds the findings, details.json what they rest on and all that `dri
 logs: the declared model's path, the extended model as effects, the joints' hypotheses.
 """
 
+import collections
 import json
 import time
 from collections.abc import Sequence
@@ -19,15 +20,17 @@ from nerf2real.core.pages import page
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
-from nerf2real.suite.effects import Effect, write_effects
+from nerf2real.suite.effects import write_effects
 from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
-from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
+from nerf2real.sysid.outputs.details import claimed_effects, details_of
+from nerf2real.sysid.outputs.errors import errors, floor
+from nerf2real.sysid.outputs.notes import of_one, spread
+from nerf2real.sysid.outputs.rivals import alternatives, next_motion, residual_at
+from nerf2real.sysid.report import capability, samples, servo
 from nerf2real.sysid.report import page as report
-from nerf2real.sysid.report import samples, servo
-from nerf2real.sysid.report.content import content_of
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.sensors import sensing
@@ -120,17 +123,64 @@ def _identify(
   found.in_reference += sensed.in_reference
   _add(found, sensed.rows, moves=False)
   progress(_SENSORS, "errors on the logs")
-  content = content_of(found, sensed, shown, held=held, settings=settings)
-  drawn = samples.with_samples(found, _claimed(found), np.random.default_rng(0))
+  whole = [*found.calibration, *found.objects]
+  near = found.near
+  content: dict[str, Any] = {
+    "verdict": found.verdict,
+    "effects": [] if found.verdict == "none" else found.effects,
+    "in_reference": found.in_reference,
+    "alternatives": [*found.scopes, *alternatives(found)],
+    "residual_at": residual_at(found),
+    "error": {
+      "train": errors(found, logs, near, settings),
+      "held": errors(found, held, near, settings) if held else None,
+      "floor": floor(held or logs, [j.joint for j in found.joints]),
+    },
+    "window_s": None if _holds(found) else settings.window_s,
+    "seconds": 0.0,
+    "next_excitation": next_motion(found, shown),
+    "notes": [
+      *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
+      *sensed.notes,
+    ],
+  }
+  # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
+  content["alternatives"] = [*found.nearest, *content["alternatives"]]
+  if found.verdict == "unexplained":
+    # What IMU, camera and floor show is explained all the same.
+    claimed = [row for row in found.effects if row not in sensed.rows]
+    content["alternatives"] = [*claimed, *content["alternatives"]]
+    content["effects"] = list(sensed.rows)
+  if found.followed:
+    joints = ", ".join(item.joint for item in found.followed)
+    content["notes"] = [
+      *content["notes"],
+      f"Found by a simulation that follows the readings, as courses do not repeat (play, or where a"
+      f" motion stops): {joints}. The errors before and after are of whole courses, which stray.",
+    ]
+  if found.in_reference:
+    counts = collections.Counter(row["kind"] for row in found.in_reference)
+    kinds = ", ".join(f"{k} ({n} times)" if n > 1 else k for k, n in counts.items())
+    text = f"In the reference, too, so that nothing has changed: {kinds}. The model lacks it."
+    content["notes"] = [*content["notes"], text]
+  if found.verdict == "partly":
+    joints = ", ".join(item.joint for item in found.unexplained)
+    text = (
+      f"At {joints} more remains than the machine leaves anyway: the names are certain, not all."
+    )
+    content["notes"] = [*content["notes"], text]
+  if len(near) > 1:
+    content["notes"] = [*content["notes"], spread(content["error"])]
+  content["alternatives"] += sensed.alternatives
+  drawn = samples.with_samples(found, claimed_effects(found), np.random.default_rng(0))
   write_effects(out / "effects.json", servo.apart(drawn, by_duty))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
-  details = _details(found, model, sensed)
+  details = details_of(found, model, near, sensed)
   details["identifiability"] = [to_plain(item) for item in shown]
   details["joints"] = stored.to_json(stored.remembered(found, held, settings))
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
   progress(_ERRORS, "report")
   content["seconds"] = round(time.perf_counter() - began, 1)
-  whole = [*found.calibration, *found.objects]
   made = report.page(
     found, content, details, held=held, effects=whole, shown=shown, window_s=settings.window_s
   )
@@ -173,38 +223,5 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
       )
 
 
-def _details(found: Identified, model: Path, sensed: sensing.Sensed) -> dict[str, Any]:
-  """Returns what the findings rest on, and what the extended model is simulated with."""
-  first, near = found.least_explained, found.near
-  return {
-    "model": str(model.resolve()),
-    **stored.member_to_json(near[0]),
-    "near": [stored.member_to_json(member) for member in near[1:]],
-    "calibration": {
-      e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
-      for e in found.calibration
-    },
-    "tests": {
-      "joint": first.joint,
-      **{
-        name: whitening.tests(first.likelihood, item.fit.residuals[0][0])
-        for name, item in (("declared", first.declared), ("extended", first.extended))
-      },
-    },
-    "audit": found.audits,
-    "servo": {j.joint: to_plain(j.likelihood.law) for j in found.joints if j.likelihood.law},
-    "sensors": sensed.errors(),
-  }
-
-
-def _claimed(found: Identified) -> list[Effect]:
-  """Returns the effects that go into effects.json.
-
-  The constants of a joint go with its effects, which were fitted beside them.
-  """
-  if found.verdict == "none":
-    return []
-  joints = {e["joint"] for e in (*found.effects, *found.nearest)}
-  all_off = any(e["kind"] == "parameter_error" and e["joint"] is None for e in found.effects)
-  constants = [c for c in found.calibration if all_off or c.target in joints]
-  return [*constants, *found.objects]
+def _holds(found: Identified) -> bool:
+  return all(j.likelihood.plant.holds for j in found.joints)

@@ -20,8 +20,8 @@ from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.point_mass import carrying
-from nerf2real.sysid.selection.judging.evidence import Scored, clearness
-from nerf2real.sysid.selection.subject import WHOLE, Subject
+from nerf2real.sysid.selection.joints.subject import WHOLE, Subject
+from nerf2real.sysid.selection.search.evidence import Scored, clearness
 
 Array = np.ndarray
 

@@ -20,15 +20,15 @@ from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection.baseline import (
+from nerf2real.sysid.selection.joints.baseline import (
   changed_constants,
   freed_constants,
   known_terms,
   widened,
 )
-from nerf2real.sysid.selection.judging.evidence import Scored
-from nerf2real.sysid.selection.judging.naming import conclude, threshold
-from nerf2real.sysid.selection.judging.remainder import structured
+from nerf2real.sysid.selection.joints.naming import conclude, threshold
+from nerf2real.sysid.selection.joints.remainder import structured
+from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.selection.search.explain import Explainer
 from nerf2real.sysid.selection.search.growth import grow
 from nerf2real.sysid.settings import Settings

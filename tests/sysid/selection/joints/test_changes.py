@@ -13,10 +13,10 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection import analysis, changes, subject
-from nerf2real.sysid.selection.judging import naming, remainder
-from nerf2real.sysid.selection.judging.evidence import Scored, clearness, more_likely, standardised
+from nerf2real.sysid.selection import analysis
+from nerf2real.sysid.selection.joints import doubts, naming, remainder, subject
 from nerf2real.sysid.selection.search import rivals
+from nerf2real.sysid.selection.search.evidence import Scored, clearness, more_likely, standardised
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
@@ -130,18 +130,15 @@ def test_hypotheses_without_a_difference_are_not_clear():
   assert clearness([np.zeros(36)], 0.0) == 0.0
 
 
-def test_of_hypotheses_that_predict_the_same_the_simplest_is_said(monkeypatch):
-  load, shift, tilt = (
-    SimpleNamespace(
-      names=frozenset([kind]), determined=count, neutral=False, beside_force=False, kind=kind
-    )
-    for kind, count in (("payload", 3), ("encoder_offset", 1), ("gravity_tilt", 1))
+def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):
+  load, shift, spring = (
+    SimpleNamespace(names=frozenset([kind]), neutral=False, beside_force=False)
+    for kind in ("payload", "encoder_offset", "spring")
   )
   monkeypatch.setattr(naming, "_same", lambda *_: True)
   monkeypatch.setattr(naming, "clear", lambda *_: 0.0)
-  assert naming._usual(None, load, [load, tilt, shift], 3.0) is shift
-  shift.determined = 4
-  assert naming._usual(None, load, [load, tilt, shift], 3.0) is tilt
+  assert naming._usual(None, load, [load, spring, shift], 3.0) is shift
+  assert naming._usual(None, spring, [load, spring], 3.0) is load
 
 
 def test_the_threshold_grows_with_what_was_tried():
@@ -223,16 +220,30 @@ def test_a_misfit_in_few_blocks_remains():
 @pytest.mark.parametrize(("without", "stands"), [(1.3, ()), (2.5, ("cogging",))])
 def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, without, stands):
   def leaving(square):
-    return SimpleNamespace(fit=SimpleNamespace(held=[np.full((1, 20), square)]))
+    return SimpleNamespace(fit=SimpleNamespace(residuals=[np.full((1, 20), np.sqrt(square))]))
 
   monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(without))
   monkeypatch.setattr(rivals, "with_force", lambda *_: None)
-  monkeypatch.setattr(changes, "clear", lambda *_: 0.0)  # no force does better
-  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20)))
-  found = changes._supported(
+  monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)  # no force does better
+  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20), squares=np.square))
+  found = doubts.supported(
     explainer, leaving(1.0), ("cogging",), 3.0, anyway=0.1, forced=["cogging"]
   )
   assert found == stands
+
+
+def test_each_of_several_names_is_tried_beside_a_force(monkeypatch):
+  def leaving(square):
+    return SimpleNamespace(fit=SimpleNamespace(residuals=[np.full((1, 20), np.sqrt(square))]))
+
+  tried = []
+  monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(9.0))
+  monkeypatch.setattr(rivals, "with_force", lambda _, item, *__: tried.append(item))
+  monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)
+  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20), squares=np.square))
+  kinds = ("payload", "backlash")
+  found = doubts.supported(explainer, leaving(1.0), kinds, 3.0, anyway=0.1, forced=kinds)
+  assert found == () and len(tried) == 4
 
 
 @pytest.mark.parametrize(("independent", "follows"), [(0.002, True), (0.05, False)])

@@ -1,1 +1,0 @@
-"""How hypotheses are compared: evidence of blocks, names that stand, what remains."""
