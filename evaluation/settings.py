@@ -21,9 +21,10 @@ class EvaluationSettings:
   control: Literal["none", "black", "other_goal"] = "none"
   """What of the observations is falsified, for a control experiment: the pictures are black, or the
   goal is another one than the trial's."""
-  swap: Literal["none", "picture", "delay", "physics"] = "none"
-  """What of the gap between simulation and virtual robot is closed: in the simulation the true
-  room's pictures, or the robot's camera delay; on the virtual robot its hidden physics."""
+  swap: tuple[Literal["picture", "lens", "delay", "physics"], ...] = ()
+  """Parts of the gap between simulation and virtual robot that are swapped: in the simulation the
+  robot's pictures, lens or camera delay; on the virtual robot the simulation's, or the data sheets'
+  physics."""
   out: Path = Path("out/evaluation")
   """Folder of the episodes and the report."""
   scene: Path | None = None
@@ -39,6 +40,10 @@ class EvaluationSettings:
   """Seed of the simulation's episodes and of drawn actions."""
   robot_seed: tuple[int, ...] = (1,)
   """Which virtual robots: the seeds of what is hidden in them."""
+  placing: tuple[float, float] = (0.03, 0.05)
+  """Largest errors of place [m, each axis] and heading [rad] with which a virtual robot is put down
+  for repetitions of a navigation trial; the first has none. Chosen: as exactly as a person puts a
+  robot on a mark. Without them repetitions on one virtual robot are the same to the bit."""
   stochastic: bool = False
   """Draws actions instead of taking the policy's mean."""
   camera_size: tuple[int, int] | None = None

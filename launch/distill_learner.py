@@ -32,8 +32,8 @@ class Arguments:
   listen: str = DEFAULT_ENDPOINT
   """Where to listen, such as tcp/0.0.0.0:7447."""
   preset: str = "nerf_nav"
-  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push, adapt to train a policy on, room
-  to do so in another room, or tiny to try the machinery."""
+  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push; adapt, or ball_push_on for ball
+  pushing, to train a policy on, room to do so in another room; or tiny to try the machinery."""
   env: str | None = None
   """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
   teacher: str | None = None

@@ -82,10 +82,11 @@ def _print_content(content: dict[str, Any], out: Path) -> None:
   from rich.table import Table
 
   from nerf2real.sysid.model import simulation as evaluation
+  from nerf2real.sysid.report.alike import together
 
   rich.print(f"[bold]{content['verdict']}[/bold] in {content['seconds']:.0f} s")
   table = Table("effect", "where", "parameter", "value", "95 %", "unit")
-  for effect in content["effects"]:
+  for effect in together(content["effects"]):
     for name, value in effect["parameters"].items():
       if isinstance(value["value"], list):
         continue

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
   from nerf2real.sysid.drift.later import check_drift, evaluate
-  from nerf2real.sysid.outputs import identify
+  from nerf2real.sysid.outputs.identify import identify
   from nerf2real.sysid.settings import Settings
 
 __all__ = ["Settings", "check_drift", "evaluate", "identify"]
@@ -14,7 +14,7 @@ _HOMES = {
   "Settings": "nerf2real.sysid.settings",
   "check_drift": "nerf2real.sysid.drift.later",
   "evaluate": "nerf2real.sysid.drift.later",
-  "identify": "nerf2real.sysid.outputs",
+  "identify": "nerf2real.sysid.outputs.identify",
 }
 
 

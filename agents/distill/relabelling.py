@@ -22,6 +22,7 @@ from nerf2real.agents.dmpo.specs import BALL, FlatObservation, Layout
 from nerf2real.agents.environments.loading import make_environment
 from nerf2real.core import files
 from nerf2real.suite import specs
+from nerf2real.suite.sensors.light import draw_light
 
 _log = logging.getLogger(__name__)
 
@@ -74,13 +75,19 @@ def relabel_for(settings: DistillSettings, source: Path, target: Path, *, seed: 
   teacher = make_teacher(settings.teacher, task.scene)
   turned = None if layout.privileged_column(BALL) is None else task
   try:
-    return relabel(source, target, layout=layout, teacher=teacher, task=turned)
+    return relabel(source, target, layout=layout, teacher=teacher, task=turned, seed=seed)
   finally:
     environment.close()
 
 
 def relabel(
-  source: Path, target: Path, *, layout: Layout, teacher: Teacher, task: Any = None
+  source: Path,
+  target: Path,
+  *,
+  layout: Layout,
+  teacher: Teacher,
+  task: Any = None,
+  seed: int = 0,
 ) -> int:
   """Writes the episodes of a folder to another one, labelled anew; returns their frames.
 
@@ -90,6 +97,7 @@ def relabel(
     layout: of both runs' environments.
     teacher: see `relabelled`.
     task: see `relabelled`.
+    seed: of the light in which an episode's pictures are rendered, where its light is drawn.
 
   Raises:
     ValueError: the folder holds no episodes, or they are of another environment.
@@ -98,13 +106,15 @@ def relabel(
   paths = sorted(source.glob("[0-9]*.npz"))
   if not paths:
     raise ValueError(f"{source} holds no episodes: give the folder data of a distillation.")
-  frames = 0
+  frames, rng = 0, np.random.default_rng(seed)
   for path in paths:
     with np.load(path, allow_pickle=False) as stored:
       episode = {name: stored[name] for name in stored.files}
     shapes = {name: episode[name].shape[1:] for name in wanted if name in episode}
     if shapes != {name: shape for name, (shape, _) in wanted.items()}:
       raise ValueError(f"{path} is of another environment than {target} is for: found {shapes}.")
+    if task is not None and task.settings.randomisation.light:
+      task.robot_camera.set_light(draw_light(rng))
     with files.atomic_path(target / path.name) as partial:
       np.savez(partial, **relabelled(episode, layout, teacher, task=task))  # type: ignore[arg-type]
     frames += len(episode["state"])

@@ -22,7 +22,7 @@ from nerf2real.agents.dmpo.training_state import TrainingState
 NEWEST, BEST = "newest", "best"
 _KEEP = {NEWEST: 2, BEST: 1}
 _SWEEPS, _SWEEP_PAUSE = 20, 0.05  # s; chosen: writes that are under way end within a second
-_NAME = re.compile(r"(newest|best)-\d{10}-\d{12}")  # kind, updates, environment steps
+_NAME = re.compile(r"(newest|best)-\d{10}-\d{12}(-\d{8})?")  # kind, updates, steps, seconds
 
 
 class CheckpointError(RuntimeError):
@@ -64,13 +64,15 @@ class Checkpoints:
 
     Args:
       state: the training state.
-      info: settings and counters, `steps` (environment steps) among them; what JSON can hold.
+      info: settings and counters; what JSON can hold. `steps` (environment steps) and `seconds`
+        (time of the run) name the folder: a part of a run without a step leaves its time.
       kind: NEWEST or BEST.
 
     Raises:
       CheckpointError: if it cannot be written, such as on a full disk; older ones stay.
     """
-    path = self._folder / f"{kind}-{int(state.steps):010d}-{info['steps']:012d}"
+    seconds = int(info.get("seconds", 0))
+    path = self._folder / f"{kind}-{int(state.steps):010d}-{info['steps']:012d}-{seconds:08d}"
     if path in self.list(kind):
       return path
     try:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from nerf2real.evaluation.loop.naming import CONSTANTS
+from nerf2real.evaluation.loop.entering import CONSTANTS, LEARNED
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.effects import Effect, kind_of
@@ -13,7 +13,6 @@ _DESCRIBED_BY = {
   "supply_course": ("supply_sag", "motor_gain"),
   "floor_slope": ("gravity_tilt",),  # of a robot that is held upright to the floor
 }
-LEARNED = "residual_force"  # a force without a name
 
 
 class Row(NamedTuple):

@@ -12,6 +12,7 @@ from nerf2real import sysid
 from nerf2real.core.files import write_atomically
 from nerf2real.core.robot_logs.reading import read_log
 from nerf2real.core.serialization import write_json
+from nerf2real.evaluation.loop.entering import CONSTANTS, UNEXPLAINED, entering, forces, is_listed
 from nerf2real.evaluation.loop.robot import starts
 from nerf2real.evaluation.loop.robot.motions import HELD, TRAIN, declared_model, standing_model
 from nerf2real.evaluation.loop.robot.recording import FLOOR
@@ -24,9 +25,9 @@ from nerf2real.sysid.sensors.walks import finding
 from nerf2real.sysid.sensors.walks.replay import Walk
 
 NONE = "none"
+_ALL, _ENTERING = "effects.json", "entering.json"  # of the extended model; what enters simulation
 _FINDING = "finding.json"  # the loop's own file: written last, so that it stands for a whole stage
 Walks = Sequence[Sequence[Walk]]  # log by log
-CONSTANTS = ("parameter_error",)  # errors of declared constants: no effect, and no name
 
 
 class Named(NamedTuple):
@@ -34,8 +35,10 @@ class Named(NamedTuple):
 
   verdict: str  # "none", "effects", "unexplained", ...
   content: dict[str, Any]  # of the analyser's report.json
-  effects: list[Effect]  # what the model lacks, with intervals; constants of joints among them
+  effects: list[Effect]  # of the extended model, named or not, with intervals; constants, too
   effects_path: Path  # effects.json
+  entering: list[Effect]  # those of them that the simulation gets
+  entering_path: Path  # as a file
   share: float | None  # of the held-out squared error above the noise, explained
   notes: list[str]
   seconds: float  # of the analysis
@@ -47,14 +50,24 @@ class Named(NamedTuple):
     return [
       effect
       for effect in self.effects
-      if effect.kind not in CONSTANTS and (rows is None or _listed(effect, rows))
+      if effect.kind not in CONSTANTS and (rows is None or is_listed(effect, rows))
     ]
+
+  @property
+  def forces(self) -> list[Effect]:
+    """The learned forces that stand in for names where the motion is unexplained."""
+    return forces(self.effects, self.content)
+
+  @property
+  def left_out(self) -> list[Effect]:
+    """The effects of the extended model that the simulation does not get."""
+    return [effect for effect in self.effects if effect not in self.entering]
 
   @property
   def in_reference(self) -> list[Effect]:
     """The effects that the reference shows, too: the robot's own build."""
     rows = self.content.get("in_reference", ())
-    own = [effect for effect in self.effects if _listed(effect, rows)]
+    own = [effect for effect in self.effects if is_listed(effect, rows)]
     return [effect for effect in own if effect not in self.named]
 
 
@@ -92,27 +105,31 @@ def name(
     )
     trials = [None if one is None else starts.read(one) for one in (walked, walked_before)]
     stood = _slope(logs, reference, *trials)
-    effects = read_effects(out / "effects.json")
+    effects = read_effects(out / _ALL)
     if any(effect.kind == "floor_slope" for effect in stood.effects):  # gravity is turned once
       effects = [effect for effect in effects if effect.kind != "gravity_tilt"]
     effects += stood.effects
     _add(content, stood)
     trodden = _walking(content, effects, *trials)
     _add(content, trodden)
-    write_effects(out / "effects.json", [*effects, *trodden.effects])
+    effects += trodden.effects
+    write_effects(out / _ALL, effects)
+    write_effects(out / _ENTERING, entering(effects, content))
     write_json(out / _FINDING, content)
   return read(out)
 
 
 def read(out: Path) -> Named:
-  """Reads what `name` found."""
+  """Reads what `name` found; of a loop that began with all effects, all enter the simulation."""
   content = json.loads((out / _FINDING).read_text())
-  effects = read_effects(out / "effects.json")
+  path = out / _ENTERING if (out / _ENTERING).exists() else out / _ALL
   return Named(
     verdict=content["verdict"],
     content=content,
-    effects=effects,
-    effects_path=out / "effects.json",
+    effects=read_effects(out / _ALL),
+    effects_path=out / _ALL,
+    entering=read_effects(path),
+    entering_path=path,
     share=_share(content["error"]),
     notes=list(content["notes"]),
     seconds=float(content["seconds"]),
@@ -128,22 +145,10 @@ def _share(error: dict[str, Any]) -> float | None:
   return max(0.0, 1.0 - left / (held["before"] ** 2 - noise**2))
 
 
-def _listed(effect: Effect, rows: Sequence[Mapping[str, Any]]) -> bool:
-  """Returns whether an effect has an entry in a report: kind, place and values."""
-
-  def is_of(row: Mapping[str, Any]) -> bool:
-    place = row.get("body") or row.get("geom") or row.get("joint")
-    values = {name: found["value"] for name, found in row.get("parameters", {}).items()}
-    same = all(effect.parameters.get(name, value) == value for name, value in values.items())
-    return (row["kind"], place) == (effect.kind, effect.target) and same
-
-  return any(is_of(row) for row in rows)
-
-
 def _add(content: dict[str, Any], part: Part) -> None:
   """Adds what a sensor says to a report."""
   if part.rows:
-    content["verdict"] = {NONE: "effects", "unexplained": "partly"}.get(
+    content["verdict"] = {NONE: "effects", UNEXPLAINED: "partly"}.get(
       content["verdict"], content["verdict"]
     )
   content["effects"] = [*content["effects"], *part.rows]
@@ -164,7 +169,7 @@ def _walking(
   """
   if now is None or before is None:
     return Part()
-  changed = [e for e in effects if e.kind not in CONSTANTS and _listed(e, content["effects"])]
+  changed = [e for e in effects if e.kind not in CONSTANTS and is_listed(e, content["effects"])]
   model = standing_model()
   return finding.find(
     model,

@@ -40,6 +40,8 @@ class LoopSettings:
   """Length of a recorded motion [s]."""
   trials: int = 18
   """Trials of the navigation protocol, spread over its 54."""
+  simulated: int | None = None
+  """Trials in the simulation, spread likewise; as many as on the robot if not given."""
   processes: int = 2
   """Conditions whose trials run side by side, each in a process of its own (a core, 1.5 GB)."""
   time_limit: float | None = None

@@ -21,6 +21,7 @@ from nerf2real.evaluation.loop import naming, training, trials
 from nerf2real.evaluation.loop.comparing import Comparison, compare
 from nerf2real.evaluation.loop.naming import Named
 from nerf2real.evaluation.loop.robot import machines, recording
+from nerf2real.evaluation.loop.sessions import Cooled
 from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
 from nerf2real.evaluation.loop.training import Trained
 from nerf2real.evaluation.loop.trials import Condition, Say, Tally, tally
@@ -31,6 +32,7 @@ from nerf2real.suite.scene import open_scene
 HEALTHY, BEFORE, AFTER = "robot as it was", "robot before", "robot after"
 NOMINAL, WITH_EFFECTS = "simulation, nominal", "simulation with the effects"
 TRAINED = "simulation with the effects, trained on"
+_ORDER = (HEALTHY, BEFORE, NOMINAL, WITH_EFFECTS, TRAINED, AFTER)  # of what is told
 _TIMES = "times.json"
 
 
@@ -40,8 +42,9 @@ class Story(NamedTuple):
   settings: LoopSettings
   episodes: dict[str, list[Episode]]  # by condition
   named: Named
-  trained: Trained | None  # None: nothing was named, the policy stays
+  trained: Trained | None  # None: nothing entered the simulation, the policy stays
   comparison: Comparison | None  # with what was hidden; None: of a real robot nobody knows
+  cooled: dict[str, list[Cooled]]  # sessions that heat ended, by condition
   times: dict[str, float]  # s of each stage
 
   @property
@@ -85,11 +88,13 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
 
   before = Condition(name=BEFORE, policy=policy, altered=hidden)
   nominal = Condition(name=NOMINAL, policy=policy, simulated=True)
-  healthy = [Condition(name=HEALTHY, policy=policy)] if virtual else []
+  healthy = [Condition(name=HEALTHY, policy=policy)] if virtual and hidden else []
   run(*healthy, before, nominal)
+  if virtual and not hidden:  # the same robot: its trials are run once
+    found[HEALTHY] = found[BEFORE]
   with stages.timed("recording"):
     reference = _record(settings, hidden, say)
-  on_robot = [name for name in (HEALTHY, BEFORE) if name in found]
+  on_robot = [HEALTHY, BEFORE] if healthy else [BEFORE]
   walked = {name: trials.walked(settings, name, found[name], store) for name in on_robot}
   with stages.timed("identification"):
     named = naming.name(
@@ -103,8 +108,8 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
   trained: Trained | None = None
   after = policy
   last: list[Condition] = []
-  if named.named:
-    effects = named.effects_path
+  if named.named or named.forces:
+    effects = named.entering_path
     run(Condition(name=WITH_EFFECTS, policy=policy, simulated=True, effects=effects))
     with stages.timed("training"):
       trained = training.train(settings, policy, effects, scene=scene, scripts=scripts)
@@ -114,7 +119,9 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
   comparison = None
   if virtual:
     comparison = compare(hidden, named.named, named.in_reference)
-  story = Story(settings, found, named, trained, comparison, stages.seconds)
+  found = {name: found[name] for name in _ORDER if name in found}
+  cooled = {name: trials.session(settings, name).cooled for name in found}
+  story = Story(settings, found, named, trained, comparison, cooled, stages.seconds)
   write_json(settings.out / "loop.json", summary(story))
   return story
 
@@ -130,7 +137,7 @@ def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
     recording.record_stand(out / "stand", connection, None, seconds=seconds, lens=lens)
     recording.record_floor(out / "stand", connection, None)
     return settings.reference
-  age = trials.session_seconds(settings, BEFORE)
+  age = trials.session(settings, BEFORE).seconds / 2  # between the trials: what sags, is half way
   for folder, altered, used in ((out / "stand", hidden, age), (out / "reference", (), 0.0)):
     if all((folder / path.name).exists() for path in wanted):
       continue
@@ -153,13 +160,15 @@ def summary(story: Story) -> dict[str, Any]:
     "settings": to_plain(story.settings),
     "success": {name: to_plain(found) for name, found in story.tallies.items()},
     "verdict": named.verdict,
-    "effects": [to_plain(effect) for effect in named.effects],
+    "effects": [to_plain(effect) for effect in named.entering],
+    "left_out": [f"{e.kind} at {e.target or 'all'}" for e in named.left_out],
     "share_explained": named.share,
     "error_held_rad": named.content["error"]["held"],
     "notes": named.notes,
     "trained": None if story.trained is None else to_plain(story.trained),
     "hidden": None if story.comparison is None else to_plain(story.comparison),
     "recovered": recovered(story),
+    "cooled": {name: to_plain(ended) for name, ended in story.cooled.items() if ended},
     "gap_to_robot": {name: to_plain(found) for name, found in gaps(story).items()},
     "recorded_s": story.settings.seconds * len(_logs()),
     "seconds": {name: round(value, 1) for name, value in story.times.items()},

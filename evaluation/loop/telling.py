@@ -73,7 +73,7 @@ def write(path: Path, story: Story) -> None:
     simulated,
     _training(story),
     after,
-    _outcomes(list(story.tallies.values())),
+    _outcomes(list(story.tallies.values()), _cooled(story)),
     *([] if story.comparison is None else [_hidden(story.comparison)]),
     Section("Time", "", [Times(story.times)]),
     Section("Settings", "", [Details("all", [settings])]),
@@ -140,14 +140,15 @@ def _paths(story: Story, floor: FloorMap, title: str, text: str, names: Sequence
 
 def _finding(named: Named) -> Section:
   blocks: list[Block] = []
-  if named.effects:
+  if named.entering:
     rows = [
       (e.kind, e.target or "all", name, value, *e.intervals.get(name, (_NOTHING, _NOTHING)))
-      for e in named.effects
+      for e in named.entering
       for name, value in e.parameters.items()
       if isinstance(value, int | float)
     ]
     table = Table(("effect", "where", "parameter", "value", "low", "high"), rows)
+    blocks.append(Text(_entering(named)))
     blocks.append(table if len(rows) <= 12 else Details(f"all {len(rows)} values", [table]))
   held = named.content["error"]["held"]
   share = _NOTHING if named.share is None else f"{100 * named.share:.0f} %"
@@ -165,7 +166,17 @@ def _finding(named: Named) -> Section:
     blocks.append(Text(f"In the reference, too, so that the robot had it before: {own}."))
   if named.notes:
     blocks.append(Details(f"notes: {len(named.notes)}", [Text(note) for note in named.notes]))
-  return Section("What the recordings say", f"Verdict: {named.verdict}. {listed}.", blocks)
+  return Section("What the recordings say", f"Verdict: {named.verdict}. Named: {listed}.", blocks)
+
+
+def _entering(named: Named) -> str:
+  """Returns what the simulation gets and what not, in words."""
+  text = "The simulation gets the names, with the constants beside them"
+  if named.forces:
+    joints = ", ".join(str(force.target) for force in named.forces)
+    text += f", and as no name explains the motion, learned forces at {joints}"
+  count = len(named.left_out)
+  return f"{text}. {count} other effects of the extended model, none of them named, stay out."
 
 
 def _training(story: Story) -> Section:
@@ -193,7 +204,18 @@ def _training(story: Story) -> Section:
   return Section("Trained on", "Distillation, effects drawn every episode.", [Figures(figures)])
 
 
-def _outcomes(tallies: Sequence[Tally]) -> Section:
+def _cooled(story: Story) -> str:
+  """Returns which sessions the robot's heat ended, in words."""
+  ended = [
+    f"{name}, after {one.trials} trials: {one.detail}"
+    for name, listed in story.cooled.items()
+    for one in listed
+  ]
+  text = "Sessions that a hot joint ended; the trials went on with a cool robot"
+  return f"{text}: {'; '.join(ended)}." if ended else ""
+
+
+def _outcomes(tallies: Sequence[Tally], text: str) -> Section:
   names = [found.name for found in tallies]
   series = [
     charts.Bars(
@@ -212,7 +234,7 @@ def _outcomes(tallies: Sequence[Tally]) -> Section:
     for t in tallies
   ]
   header = ("condition", "trials", *OUTCOMES, "success, 95 % interval [%]")
-  return Section("How the trials ended", "", [chart, Table(header, rows)])
+  return Section("How the trials ended", text, [chart, Table(header, rows)])
 
 
 def _hidden(found: Comparison) -> Section:

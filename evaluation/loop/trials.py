@@ -6,6 +6,7 @@ interrupted loop runs only what is missing.
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import time
 from collections.abc import Callable, Sequence
@@ -13,11 +14,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nerf2real.core.intervals import Interval, clopper_pearson
-from nerf2real.core.serialization import read_json, write_json
 from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
 from nerf2real.evaluation.loop.robot import starts
 from nerf2real.evaluation.loop.robot.starts import Walked
+from nerf2real.evaluation.loop.sessions import MOST_COOLED, Cooled, Session, until_hot
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.making import free_name, make_plant
@@ -93,9 +94,15 @@ def run(
 ) -> list[Episode]:
   """Runs the trials of a condition that the store lacks; returns all of them.
 
-  Runs on robots are recorded in the folder `trials`.
+  Runs on robots are recorded in the folder `trials`. Where a joint of the virtual robot is too hot
+  to begin a trial, the trials go on with a cool one.
+
+  Raises:
+    RuntimeError: The robot is too hot all the same, or stopped for another reason.
   """
-  chosen = choose(plants.trials(NAVIGATION), settings.trials)
+  simulated = condition.simulated and settings.simulated is not None
+  count = settings.simulated if simulated else settings.trials
+  chosen = choose(plants.trials(NAVIGATION), count)
   policy = load_policy(condition.policy, scene)
   label = plant_label(settings, condition)
   setting = dataclasses.replace(_setting(policy, condition, settings), plant_id=label)
@@ -108,20 +115,41 @@ def run(
   if len(found()) == len(chosen):
     return found()
   say(f"{condition.name}: {len(chosen) - len(found())} of {len(chosen)} trials to run")
-  session = _Session(settings.out / "trials" / f"{_slug(condition.name)}.json")
-  with contextlib.closing(_make_plant(settings, condition, scene, policy, session)) as plant:
-    plant.plant_id = label
-    robot = getattr(plant, "robot", None)  # a virtual one, whose battery is to go on
-    begun = 0.0 if robot is None else robot.clock.now()
+  on_robot = session(settings, condition.name)
+  for _ in range(MOST_COOLED + 1):
+    done = len(found())
+    with contextlib.closing(_make_plant(settings, condition, scene, policy, on_robot)) as plant:
+      plant.plant_id = label
+      report = _reporter(plant, condition, on_robot, say)
+      run_all = functools.partial(runner.run_all, plant, policy, chosen, store=store, report=report)
+      hot = until_hot(plant, run_all)
+    if not hot:
+      return found()
+    on_robot.cool(Cooled(len(found()), hot))
+    if len(found()) == done:
+      break
+    say(f"  {condition.name}: {hot}: a session with a cool robot begins")
+  raise RuntimeError(
+    f"{condition.name}: found {hot} before trial {len(found()) + 1} of {len(chosen)}, expected a "
+    f"robot that begins it (a cool one was taken {len(on_robot.cooled)} times): what is hidden is "
+    "too much for it."
+  )
 
-    def report(episode: Episode, number: int, count: int) -> None:
-      if robot is not None:
-        session.note(robot.clock.now() - begun)
-      took = f"{episode.outcome} after {episode.duration:.1f} s"
-      say(f"  {condition.name} {number}/{count}: {took}")
 
-    runner.run_all(plant, policy, chosen, store=store, report=report)
-  return found()
+def _reporter(
+  plant: Plant, condition: Condition, on_robot: Session, say: Say
+) -> Callable[[Episode, int, int], None]:
+  """Returns what notes the session's time and says how a trial ended."""
+  robot = getattr(plant, "robot", None)  # a virtual one, whose battery is to go on
+  begun = 0.0 if robot is None else robot.clock.now()
+
+  def report(episode: Episode, number: int, count: int) -> None:
+    if robot is not None:
+      on_robot.note(robot.clock.now() - begun)
+    took = f"{episode.outcome} after {episode.duration:.1f} s"
+    say(f"  {condition.name} {number}/{count}: {took}")
+
+  return report
 
 
 def run_apart(
@@ -165,7 +193,11 @@ def _setting(
 
 
 def _make_plant(
-  settings: LoopSettings, condition: Condition, scene: Any, policy: EvaluatedPolicy, session: Any
+  settings: LoopSettings,
+  condition: Condition,
+  scene: Any,
+  policy: EvaluatedPolicy,
+  on_robot: Session,
 ) -> Plant:
   name = "sim" if condition.simulated else _robot(settings)
   evaluation = EvaluationSettings(
@@ -178,6 +210,7 @@ def _make_plant(
     offsets=settings.offsets,
     lens=settings.lens,
     time_limit=settings.time_limit,
+    placing=(0.0, 0.0),  # the floor's slope and the walks are read from where trials begin
   )
   return make_plant(
     evaluation,
@@ -187,7 +220,7 @@ def _make_plant(
     record=free_name(settings.out / "trials" / f"{_slug(condition.name)}.mcap"),
     draw_effects=condition.effects is not None,
     altered=condition.altered,
-    session=session.seconds,
+    session=on_robot.seconds,
   )
 
 
@@ -195,24 +228,9 @@ def _robot(settings: LoopSettings) -> Literal["virtual", "robot"]:
   return "virtual" if settings.robot == "virtual" else "robot"
 
 
-class _Session:
-  """How long a condition's robot has been on: its battery goes on where an earlier run stopped."""
-
-  def __init__(self, path: Path):
-    self._path = path
-    self.seconds = read_json(path, float) if path.exists() else 0.0
-    self._before = self.seconds
-
-  def note(self, seconds: float) -> None:
-    """Notes the time of this run so far [s]."""
-    self._path.parent.mkdir(parents=True, exist_ok=True)
-    self.seconds = self._before + seconds
-    write_json(self._path, round(self.seconds, 3))
-
-
-def session_seconds(settings: LoopSettings, name: str) -> float:
-  """Returns how long the robot of a condition has been on [s]."""
-  return _Session(settings.out / "trials" / f"{_slug(name)}.json").seconds
+def session(settings: LoopSettings, name: str) -> Session:
+  """Returns the session of a condition's robot."""
+  return Session(settings.out / "trials", _slug(name))
 
 
 def _slug(name: str) -> str:

@@ -29,13 +29,14 @@ def make_plant(
     scene: An opened bundle.
     image_size: Height and width of the policy's picture; None for no camera.
     trained_on: Name of the policy's environment: a simulated camera has its rate, lens and
-      response. Robots have cameras of their own.
+      response. Robots have cameras of their own, but for what is swapped.
     record: Where a run on a robot is recorded; not recorded if None.
     draw_effects: Whether every episode in simulation draws the effects from their intervals.
     altered: Undeclared effects of the virtual robot.
     session: Time that the virtual robot's battery was in use before [s].
   """
   swaps.check(settings.swap, plant=settings.plant, built_in=settings.scene is None)
+  camera = camera_settings(trained_on)
   if settings.plant == "sim":
     from nerf2real.evaluation.plants.simulated import SimulatedPlant
 
@@ -43,14 +44,20 @@ def make_plant(
       scene,
       settings,
       image_size=image_size,
-      camera=camera_settings(trained_on),
+      camera=camera,
       draw_effects=draw_effects,
     )
   if settings.plant == "virtual":
     from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
 
     return RehearsedPlant(
-      scene, settings, image_size=image_size, altered=altered, session=session, record=record
+      scene,
+      settings,
+      image_size=image_size,
+      simulated=camera,
+      altered=altered,
+      session=session,
+      record=record,
     )
   from nerf2real.evaluation.plants.operated import OperatedPlant
 

@@ -18,7 +18,25 @@ from nerf2real.real.virtual.camera import LENS
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.op3.constants import MIN_HEIGHT, MIN_UPRIGHT
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.protocols import BALL, NavigationTrial
+from nerf2real.suite.sensors.camera import CameraSettings
+
+
+def put_down(pose: Pose, trial: Trial, errors: tuple[float, float]) -> Pose:
+  """Returns where a person puts the robot: for a repetition of a navigation trial, beside its pose.
+
+  Args:
+    pose: Of the trial.
+    trial: Its seed draws the errors, so that all robots and conditions have the same.
+    errors: Largest errors of place [m, each axis] and heading [rad]; uniform within.
+  """
+  if not isinstance(trial, NavigationTrial) or trial.trial == 0:
+    return pose
+  drawn = np.random.default_rng([trial.seed, trial.trial]).uniform(-1.0, 1.0, 3)
+  place, heading = errors
+  x, y, yaw = np.array(pose) + drawn * (place, place, heading)
+  return Pose(float(x), float(y), float(yaw))
 
 
 class CoveredCamera:
@@ -49,6 +67,7 @@ class RehearsedPlant(RobotPlant):
     settings: EvaluationSettings,
     *,
     image_size: tuple[int, int] | None,
+    simulated: CameraSettings | None = None,
     altered: Sequence[Undeclared] = (),
     session: float = 0.0,
     world: str = "room",
@@ -58,9 +77,10 @@ class RehearsedPlant(RobotPlant):
 
     Args:
       scene: An opened bundle of the room that the robot stands in.
-      settings: The evaluation's; read are protocol, perturbation, time limit, the first robot's
-        seed, and whether nothing is hidden in it (`swaps.PHYSICS`).
+      settings: The evaluation's; read are protocol, perturbation, time limit, placing, the first
+        robot's seed, and what of it is swapped for the simulation's.
       image_size: Height and width of the policy's picture; None for no camera.
+      simulated: The simulation's camera, for what is swapped; the suite's own if None.
       altered: Undeclared effects that the robot has besides.
       session: Time that its battery was in use before [s].
       world: "room" or "floor", see `VirtualRobot`.
@@ -69,20 +89,28 @@ class RehearsedPlant(RobotPlant):
     super().__init__(scene, settings, record=record)
     robot_seed = settings.robot_seed[0]
     self.plant_id = f"robot {robot_seed}"
-    known = settings.swap == swaps.PHYSICS
+    self._placing = settings.placing
+    known = swaps.PHYSICS in settings.swap
     self.plant_id += ", data sheet's physics" if known else ""
+    self.plant_id += swaps.told("the simulation's", settings.swap)
     self._intruder = make_intruder(self, self._starts)
     if altered:
       self.plant_id += ", altered"
     build = undeclared.build(None if known else robot_seed, altered, age=session)
+    simulated = simulated or CameraSettings()
+    camera = swaps.camera_on_the_robot(build.camera, simulated, settings.swap)
+    view = None
+    if image_size is not None and swaps.PICTURE in settings.swap:
+      view = swaps.field_view(scene, image_size, camera.lens)
     self.robot = VirtualRobot(
       world=world,
       seed=robot_seed,
       hidden=build.hidden,
       stepped=True,
-      camera=None if image_size is None else build.camera,
+      camera=None if image_size is None else camera,
       ball=self.protocol == BALL,
       furnish=None if self._intruder is None else self._intruder.add_to_spec,
+      view=view,
     )
     if self._intruder is not None:
       self._intruder.bind(self.robot.body.model)
@@ -114,6 +142,7 @@ class RehearsedPlant(RobotPlant):
     self._hit = False
     self._disturb(0.0)
     pose, ball = self._places(trial)
+    pose = put_down(pose, trial, self._placing)
     if ball is not None:
       self.robot.place_ball(*ball)
     if isinstance(trial, NavigationTrial) and self.robot.camera is not None:

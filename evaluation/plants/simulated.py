@@ -42,8 +42,8 @@ class SimulatedPlant(Plant):
     super().__init__(scene, settings)
     effects, seed, swap = settings.effects, settings.seed, settings.swap
     self.plant_id = f"seed {seed}" + ("" if effects is None else ", effects")
-    self.plant_id += "" if swap == swaps.NONE else f", the robot's {swap}"
-    self._room = swaps.TrueRoom(scene) if swap == swaps.PICTURE and image_size else None
+    self.plant_id += swaps.told("the robot's", swap)
+    self._room = swaps.TrueRoom(scene) if swaps.PICTURE in swap and image_size else None
     self._seed = seed
     self._intruder = make_intruder(self, protocols.scene_starts(scene))
     self._environment = suite.load(
@@ -52,7 +52,7 @@ class SimulatedPlant(Plant):
       effects=effects,
       draw_effects=draw_effects,
       image_size=image_size,
-      camera=swaps.camera_of_the_robot(camera) if swap == swaps.DELAY else camera,
+      camera=swaps.camera_in_simulation(camera or CameraSettings(), swap),
       renderer=self._room,
       random=seed,
       randomisation=dataclasses.replace(RandomisationSettings(), pushes=False),

@@ -5,7 +5,7 @@ its own: white balance, gain and exposure act on the light, photons and the ampl
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -33,7 +33,6 @@ LENS = Camera(
 _SUPERSAMPLE = 1  # 45 dB from 4 x 4 samples at 30x40, and half the time of 2 x 2
 _HEAD_CAMERA = "op3/head_camera"
 _GAMMA = 2.2
-_WHITE_BALANCE = (1.02, 1.0, 0.97)  # of this sensor, on red, green and blue light: chosen
 _SHOT_NOISE = 0.5  # share of the noise at mid grey that goes with the root of the light: chosen
 
 
@@ -53,6 +52,8 @@ class VirtualCamera:
   """Factor on the light; 1 is neutral."""
   noise: float = 2.0
   """Standard deviation at mid grey and gain 1 [8-bit levels]."""
+  white_balance: tuple[float, float, float] = (1.02, 1.0, 0.97)
+  """Factors of this sensor on red, green and blue light; chosen."""
 
   def __post_init__(self) -> None:
     if not self.rate > 0:
@@ -67,6 +68,7 @@ class Sensor:
   def __init__(self, settings: VirtualCamera, *, seed: int = 0):
     """Sets the sensor, with a seed for its noise."""
     self.gain, self.exposure, self.noise = settings.gain, settings.exposure, settings.noise
+    self._balance = np.asarray(settings.white_balance)
     self._rng = np.random.default_rng(seed)
 
   def develop(self, picture: np.ndarray) -> np.ndarray:
@@ -76,7 +78,7 @@ class Sensor:
     value = 255 * clip(gain * light + noise)^(1 / 2.2)
     """
     table = (np.arange(256) / 255.0) ** _GAMMA
-    light = table[picture] * (self.exposure * np.asarray(_WHITE_BALANCE))
+    light = table[picture] * (self.exposure * self._balance)
     if self.noise > 0:
       middle = 0.5**_GAMMA
       # Levels to light at mid grey: d light / d value.
@@ -85,6 +87,24 @@ class Sensor:
       light = light + self._rng.normal(size=light.shape) * deviation * np.sqrt(share)
     signal = np.clip(self.gain * light, 0.0, 1.0) ** (1 / _GAMMA)
     return np.rint(255 * signal).astype(np.uint8)
+
+
+class View(Protocol):
+  """Pictures from a robot's head."""
+
+  def picture(self, time: float | None = None) -> np.ndarray:
+    """Returns the picture uint8 [H, W, 3] of now, or of a moment [s] up to 0.6 s ago."""
+
+  def close(self) -> None:
+    """Frees what the pictures are made with."""
+
+
+def move_to(body: Body, data: mujoco.MjData, time: float | None) -> int:
+  """Writes a body's kinematics of now, or of a moment [s], to data; returns its camera's id."""
+  data.qpos[:] = body.pose_at(body.time if time is None else time)
+  mujoco.mj_kinematics(body.model, data)
+  mujoco.mj_camlight(body.model, data)
+  return int(body.model.camera(_HEAD_CAMERA).id)
 
 
 class Eyes:
@@ -102,11 +122,8 @@ class Eyes:
       self._eye = Eye(model, groups=(0, 2))  # not the head, inside which the camera is
       self._data = mujoco.MjData(model)
     data = self._data
-    data.qpos[:] = self._body.pose_at(self._body.time if time is None else time)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_camlight(model, data)
+    camera = move_to(self._body, data, time)
     self._eye.update(data)
-    camera = model.camera(_HEAD_CAMERA).id
     pose = pose_of_mujoco_camera(data.cam_xpos[camera], data.cam_xmat[camera])
     return self._eye.render(self._lens, pose, supersample=_SUPERSAMPLE)[0]
 
@@ -120,7 +137,7 @@ class Eyes:
 class SteppedCamera:
   """The camera of a robot on a `SteppedClock`: the stream's sensor, without a network."""
 
-  def __init__(self, eyes: Eyes, clock: Clock, settings: VirtualCamera, *, seed: int):
+  def __init__(self, eyes: View, clock: Clock, settings: VirtualCamera, *, seed: int):
     """Makes the camera; pictures are taken at multiples of the frame's duration."""
     self._eyes, self._clock, self._settings = eyes, clock, settings
     self.sensor = Sensor(settings, seed=seed)

@@ -22,7 +22,7 @@ from nerf2real.real.virtual.bus.devices import Devices
 from nerf2real.real.virtual.bus.faults import Faults
 from nerf2real.real.virtual.bus.protocol_rehearsal import Cable
 from nerf2real.real.virtual.bus.wire import Wire
-from nerf2real.real.virtual.camera import Eyes, SteppedCamera, VirtualCamera
+from nerf2real.real.virtual.camera import Eyes, SteppedCamera, View, VirtualCamera
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.stream import CameraStream
 from nerf2real.suite.op3 import constants
@@ -41,6 +41,7 @@ class VirtualRobot:
     camera: VirtualCamera | None = None,
     ball: bool = False,
     furnish: Callable[[mujoco.MjSpec], None] | None = None,
+    view: Callable[[Body], View] | None = None,
   ):
     """Builds the robot, hanging in the hand of a person, supply off.
 
@@ -52,13 +53,14 @@ class VirtualRobot:
       camera: The camera (needs EGL); None: a robot without.
       ball: Whether there is a ball.
       furnish: Called with the world's `mujoco.MjSpec` before the robot is put in, to change it.
+      view: Makes the camera's pictures of the body, in place of true ones.
     """
     if hidden is None:
       count = len(constants.JOINT_NAMES)
       hidden = Hidden.none(count) if seed is None else Hidden.draw(seed, count)
     self.clock: RealClock | SteppedClock = SteppedClock() if stepped else RealClock()
     self.faults = Faults()
-    looks = camera is not None
+    looks = camera is not None and view is None
     self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish, looks=looks)
     self.body.time = self.clock.now()
     devices = Devices(self.body, faults=self.faults, seed=seed or 0)
@@ -69,7 +71,9 @@ class VirtualRobot:
       self._wire = Wire(devices, self.clock)
     self.devices = devices
     self.operator = Hand(self.hold)
-    self.eyes = None if camera is None else Eyes(self.body, camera.lens)
+    self.eyes: View | None = None
+    if camera is not None:
+      self.eyes = Eyes(self.body, camera.lens) if view is None else view(self.body)
     self.camera: SteppedCamera | None = None
     self.stream: CameraStream | None = None
     if self.eyes is not None and camera is not None:

@@ -167,17 +167,20 @@ Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64)  # glTF's axes f
 
 
 def save_glb(mesh: Mesh, path: pathlib.Path) -> None:
-  """Writes a glTF binary with vertex colours; y up, as glTF prescribes."""
+  """Writes a glTF binary with vertex colours and normals; y up, as glTF prescribes.
+
+  Without normals the standard asks for flat faces.
+  """
   shown = trimesh.Trimesh(
     mesh.vertices @ Y_UP.T, mesh.faces, vertex_colors=mesh.colors, process=False
   )
-  content = shown.export(file_type="glb")
+  content = shown.export(file_type="glb", include_normals=True)
   assert isinstance(content, bytes)  # other formats give text or a mapping
   path.write_bytes(content)
 
 
 def load_glb(path: pathlib.Path) -> trimesh.Trimesh:
-  """Reads what `save_glb` wrote, turned back to z up.
+  """Reads what `save_glb` wrote, turned back to z up, with vertex normals computed.
 
   Raises:
     ValueError: No such file.
@@ -186,4 +189,5 @@ def load_glb(path: pathlib.Path) -> trimesh.Trimesh:
     raise ValueError(f"The surface mesh {path} does not exist: make the bundle again.")
   shown = trimesh.load_mesh(path, process=False)
   shown.vertices = shown.vertices @ Y_UP
+  shown.vertex_normals  # noqa: B018  trimesh passes on what it has computed: smooth shading
   return shown

@@ -60,7 +60,8 @@ def _cameras(server: viser.ViserServer, bundle: Bundle) -> list[Any]:
         wxyz=transforms.SO3.from_matrix(world[:3, :3]).wxyz,
         position=world[:3, 3],
         color=palette.rgb(palette.VERMILION),
-        thickness=0.004,
+        thickness=1.5,
+        thickness_units="screen",
       )
     )
   return handles

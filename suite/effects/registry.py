@@ -12,13 +12,15 @@ from nerf2real.suite.effects import (
 )
 from nerf2real.suite.effects.effect import Kind
 
-# Order: constants first (errors of declared ones before additions), then forces and strength;
-# backlash after all that changes the motor's torque; measurement chains from the sensor outwards.
+# Order: constants first (errors of declared ones before additions; a gain that scales the damping
+# before a friction that reads it), then forces and strength; backlash after all that changes the
+# motor's torque; measurement chains from the sensor outwards.
 _ORDER = (
   *passive.KINDS,
   *ground.KINDS,
+  *(kind for kind in actuation.KINDS if kind.acts == "model"),
   *friction.KINDS,
-  *actuation.KINDS,
+  *(kind for kind in actuation.KINDS if kind.acts != "model"),
   *residual.KINDS,
   *backlash.KINDS,
   *measurement.KINDS,

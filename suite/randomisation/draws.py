@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.suite.randomisation import inertia
 from nerf2real.suite.sensors import filters
+from nerf2real.suite.sensors.light import FIXED, Light, draw_light
 
 Array = np.ndarray
 
@@ -40,6 +41,9 @@ class RandomisationSettings:
   """Vary the ball's mass."""
   ball_radius: bool = True
   """Vary the ball's radius."""
+  light: bool = False
+  """Vary the light on what moves (`sensors.light`). Off unless it is asked for: the pictures of the
+  evaluations have one light."""
   delay_range: tuple[float, float] = (filters.MIN_DELAY, filters.MAX_DELAY)
   """s, paper."""
   jitter_half_width: float = filters.JITTER
@@ -108,9 +112,11 @@ class EpisodeDraws(NamedTuple):
   ball_mass: float  # kg
   ball_radius: float  # m
   pushes: Pushes
+  light: Light = FIXED  # on what moves in pictures
 
   def vector(self) -> Array:
-    """Returns the constants of the episode as one array [16], for the critic. Pushes not."""
+    """Returns the constants of the episode as one array [16], for the critic. Pushes and light
+    not."""
     scalars = [self.imu_delay, self.joint_delay, self.camera_delay, self.jitter, self.torso_mass]
     return np.concatenate(
       [
@@ -135,7 +141,8 @@ def draw_episode(
   """Draws one episode.
 
   The same numbers are taken from the generator whatever the switches, so that turning one
-  variation off leaves the others as they were for the same seed.
+  variation off leaves the others as they were for the same seed; the light alone, drawn last,
+  takes none where it is off.
   """
   delays = rng.uniform(*settings.delay_range, size=3) * settings.delays
   mass = rng.uniform(0.0, settings.max_torso_mass) * settings.torso_mass
@@ -162,6 +169,7 @@ def draw_episode(
     ball_mass=float(ball_mass) if settings.ball_mass else BALL_MASS,
     ball_radius=float(ball_radius) if settings.ball_radius else BALL_RADIUS,
     pushes=pushes,
+    light=draw_light(rng) if settings.light else FIXED,
   )
 
 

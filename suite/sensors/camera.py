@@ -17,13 +17,10 @@ from nerf2real.core.cameras import Camera
 from nerf2real.core.rotations import pose_of_mujoco_camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.suite.op3 import constants, op3
+from nerf2real.suite.sensors.light import FIXED, Light
 
 DEPTH, OVERLAY = "depth", "overlay"
 _DISPLAY_GAMMA = 2.2  # of the pictures: light = value ** 2.2
-_LIGHT_DIRECTION = np.array(
-  [0.3, 0.2, 0.933]
-)  # towards the light, in the world; chosen: a lamp above
-_AMBIENT, _DIFFUSE = 0.5, 0.5  # shares of light from everywhere and from the lamp; chosen
 _CULLING_SLACK = 1e-3  # rad added to the cone around a geom
 _TILE = 16  # pixels, side of the tiles that are culled before single rays are
 
@@ -156,6 +153,7 @@ class GeomCaster:
     self._geoms = np.flatnonzero(np.isin(model.geom_group, groups) & moving)
     self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
     self._groups[list(groups)] = 1
+    self.light = FIXED
     count = len(self._rays)
     self._ids, self._depth = np.empty(count, np.int32), np.empty(count)
     self._normals = np.empty(3 * count)
@@ -212,9 +210,8 @@ class GeomCaster:
     return rays[hit], depth[hit], ids[hit], normals.reshape(-1, 3)[hit]
 
   def shade(self, ids: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Returns the colours uint8 [K, 3] of surfaces: the geom's colour under one lamp."""
-    light = _AMBIENT + _DIFFUSE * np.maximum(normals @ _LIGHT_DIRECTION, 0.0)
-    colors = self._model.geom_rgba[ids, :3] * light[:, None]
+    """Returns the colours uint8 [K, 3] of surfaces: the geom's colour in the present light."""
+    colors = self._model.geom_rgba[ids, :3] * self.light.on(normals)
     return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)
 
 
@@ -255,6 +252,12 @@ class RobotCamera:
     """Changes the gain from the next picture on."""
     self.settings = dataclasses.replace(self.settings, gain=gain)
     self._response = self.settings.response()
+
+  def set_light(self, light: Light) -> None:
+    """Changes the light on what moves, from the next picture on."""
+    if self.caster is None:
+      raise RuntimeError("The camera has no model yet: call bind(model, camera_id) first.")
+    self.caster.light = light
 
   def bind(self, model: mujoco.MjModel, camera_id: int) -> None:
     """Takes the geoms and the mounting from a compiled model."""

@@ -211,6 +211,8 @@ class RobotTask(composer.Task):
     if self.settings.draw_effects and self.settings.effects:
       self._redraw_effects(random_state)
     self._randomiser.apply(self.draws)
+    if self.robot_camera is not None:
+      self.robot_camera.set_light(self.draws.light)
     self._effects.reset()
     self._place(random_state)
     self._control = self._standing.copy()

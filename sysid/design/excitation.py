@@ -15,7 +15,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.measured import quantum
-from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.search.evidence import Scored
 
 Array = np.ndarray
 

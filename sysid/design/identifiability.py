@@ -21,7 +21,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection.subject import own_library
+from nerf2real.sysid.selection.joints.subject import own_library
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray

@@ -25,7 +25,7 @@ from nerf2real.sysid.drift.values import Value, compare
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection.evidence import variance
+from nerf2real.sysid.selection.search.evidence import variance
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray

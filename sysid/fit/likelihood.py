@@ -49,6 +49,9 @@ class JointLikelihood:
     logs = plant.logs
     self.effort: list[Array] | None = None
     self.law = None if plant.law is None else plant.law[0]
+    self.ahead: float | None = None
+    """s that positions were ahead of duties in a reference: what is more now is a late reading.
+    Without one the law's own holds both."""
     if self.law is not None:
       self.effort = [log.duty for log in logs]  # type: ignore[misc]
     elif all(log.effort is not None for log in logs) and plant.holds:
@@ -110,6 +113,12 @@ class JointLikelihood:
       if spans and spans[-1].stop == start:
         start = spans.pop().start
       spans.append(slice(int(start), int(end)))
+
+  @property
+  def noise_squares(self) -> Array:
+    """Mean squares of blocks [B] that the readings' noise leaves: of a joint that moves, with what
+    their stamps are off by, so that samples in motion weigh less."""
+    return self.position_noise**2 * np.add.reduceat(self.mask, self.starts) / self.counts[0]
 
   def parts_of(self, fold: int) -> list[slice]:
     """Returns where the samples of a fold are."""
@@ -197,7 +206,8 @@ class JointLikelihood:
     if self._nominal != 1.0:
       p = p.copy()
       p[INDEX["gain"]] *= self._nominal
-    ahead = self.law.ahead
+    late = float(p[INDEX["measurement_delay"]] - p[INDEX["effort_delay"]])
+    ahead = self.law.ahead - late if self.ahead is None else self.ahead
     law = [duty_of(self.plant, p, i, ahead=ahead) for i in range(len(self.plant.logs))]
     return np.concatenate(self.effort) - np.concatenate(law)
 

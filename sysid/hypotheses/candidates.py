@@ -122,11 +122,10 @@ def library(plant: JointPlant) -> list[Term]:
   weaker = {"motor_gain", "supply_sag", "thermal_derating"}
   terms = [v for t in terms for v in (_weakenings(plant, t) if t.kind in weaker else [t])]
   if plant.holds:
-    terms += [
-      _one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)),
-      _one("encoder_offset", joint, "offset", -0.4, 0.4, 0.03, (0.03, -0.03)),
-    ]
+    terms.append(_one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)))
     terms.append(_play(plant, encoder_on_motor=True))
+  if plant.holds or plant.hinge:  # a slide without a servo has no place that its zero could show
+    terms.append(_one("encoder_offset", joint, "offset", -0.4, 0.4, 0.03, (0.03, -0.03)))
   if plant.hinge:
     terms.append(_payload(plant))
     terms.append(
@@ -182,17 +181,20 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
 
   Its error has a valley every fraction of a wave: the starts come from the residual torque's
   spectrum over position (`signatures.waves`). Waves that the motion does not show twice are not
-  known to repeat: with a spring they imitate any smooth force.
+  known to repeat: with a spring they imitate any smooth force. Waves whose number over the range
+  of the motion differs by one are different effects, of which the spectrum has chosen.
   """
   torque = typical_torque(plant)
+  longest = min(np.pi * _SEEN / _reach(plant), 299.0)
   return Term(
     "cogging",
     plant.joint,
     ("amplitude", "periods", "phase"),
-    (0.0, min(np.pi * _SEEN / _reach(plant), 299.0), -10.0),
+    (0.0, longest, -10.0),
     (0.5 * torque, 300.0, 10.0),
     (0.03 * torque, 0.05, 0.3),
     tuple(waves),
+    choices=max((300.0 - longest) * _reach(plant) / np.pi, 1.0),
   )
 
 

@@ -52,6 +52,8 @@ class Term:
   """Whether reference logs show it, too."""
   freed: bool = False
   """Whether constants may differ from those that reference logs show."""
+  choices: float = 1.0
+  """How many effects of this kind that predict different motions its starts were chosen from."""
 
   @property
   def name(self) -> str | None:
@@ -84,6 +86,7 @@ class Term:
       starts=((),),
       prior=(),
       centre=(),
+      choices=1.0,
       fixed=(*self.fixed, *values),
     )
 

@@ -72,12 +72,14 @@ class ServoLaw:
 
     What the law leaves of the duty may hide as much of the gain: no deviation by scatter shows it.
     """
-    return all(abs(end - 1.0) > tolerance + self.gain * self.unexplained for end in self.interval)
+    reach = tolerance + self.gain * self.unexplained
+    low, high = self.interval
+    return low > 1.0 + reach or high < 1.0 - reach
 
 
 def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
   """Returns the law, and what gain, delay and ahead leave of the duty [N]; None where the logs hold
-  too little of it.
+  too little of it, or a duty that does not clearly push towards the command.
 
   Args:
     plant: a joint whose logs all hold the duty, or not.
@@ -121,7 +123,7 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
   between = float(np.std(apart, ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else 0.0
   left = duty - np.clip(columns[:, :2] @ beta[:2], -top, top)
   is_clear = abs(wound[0]) > _CLEAR * wide[0]
-  return ServoLaw(
+  law = ServoLaw(
     gain=float(beta[0]),
     gain_deviation=max(float(spread[0]), between),
     delay=delay,
@@ -133,7 +135,8 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
     saturation=top,
     left=(rms := float(np.sqrt(np.mean(left[kept] ** 2)))),
     unexplained=rms / max(float(np.sqrt(np.mean((duty - left)[kept] ** 2))), 1e-12),
-  ), left
+  )
+  return (law, left) if law.interval[0] > 0.0 else None
 
 
 def _best_delay(squares: Callable[[float], float]) -> float:

@@ -14,7 +14,7 @@ from nerf2real.sysid.fit.signatures import TorqueResidual
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.search.evidence import Scored
 
 Array = np.ndarray
 

@@ -15,10 +15,11 @@ from nerf2real.sysid.design.identifiability import Identifiability
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import capability, meanings, residual_plots, summary
+from nerf2real.sysid.report.alike import together
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
-from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.evidence import clear
 from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.selection.joints.changes import Changed
+from nerf2real.sysid.selection.search.evidence import clear
 
 Array = np.ndarray
 
@@ -65,6 +66,7 @@ def page(
     window_s: window of restarts.
   """
   items = found.found
+  content = {**content, **{k: together(content[k]) for k in ("effects", "in_reference")}}
   sections = [
     summary.section(
       content,

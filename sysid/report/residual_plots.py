@@ -14,8 +14,8 @@ from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import balance
-from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.selection.joints.changes import Changed
 
 BEFORE, AFTER = palette.VERMILION, palette.BLUE  # declared and extended model
 _WARMER = 1.0  # K by which a joint's temperature must change to be drawn

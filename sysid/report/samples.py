@@ -8,8 +8,8 @@ import numpy as np
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.effects.registry import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.findings import Identified, effects_of
+from nerf2real.sysid.selection.joints.changes import Changed
 
 COUNT = 64
 """Draws: chosen, enough for a standard deviation within 9 %."""

@@ -6,8 +6,8 @@ from typing import Any
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.hypotheses.terms import SERVO_GAIN
 from nerf2real.sysid.model.servo_law import ServoLaw
-from nerf2real.sysid.selection.changes import Changed
 from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.selection.joints.changes import Changed
 
 KIND = "motor_gain"
 _SEVERAL = 3  # joints from which their laws are told in one sentence

@@ -16,13 +16,15 @@ from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
-from nerf2real.sysid.selection import changes, claims, scopes, wide
-from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.evidence import clear
+from nerf2real.sysid.selection import claims
 from nerf2real.sysid.selection.findings import Identified
-from nerf2real.sysid.selection.naming import Name
-from nerf2real.sysid.selection.scopes import Shared
-from nerf2real.sysid.selection.subject import WHOLE, Subject, explain_reference, prepare
+from nerf2real.sysid.selection.joints import changes
+from nerf2real.sysid.selection.joints.changes import Changed
+from nerf2real.sysid.selection.joints.naming import Name
+from nerf2real.sysid.selection.joints.subject import WHOLE, Subject, explain_reference, prepare
+from nerf2real.sysid.selection.search.evidence import clear
+from nerf2real.sysid.selection.wider import scopes, wide
+from nerf2real.sysid.selection.wider.scopes import Shared
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 _GRADES = ("none", "effects", "partly", "unexplained")

@@ -9,8 +9,8 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import free_force
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.subject import WHOLE
+from nerf2real.sysid.selection.joints.changes import Changed
+from nerf2real.sysid.selection.joints.subject import WHOLE
 
 Claim = tuple[Effect, dict[str, Any]]
 """An effect and its entry in the report."""

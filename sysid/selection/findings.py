@@ -12,8 +12,8 @@ from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import free_force
 from nerf2real.sysid.hypotheses.terms import FREE
 from nerf2real.sysid.model.simulation import Clocks, Member
-from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.joints.changes import Changed
+from nerf2real.sysid.selection.search.evidence import Scored
 
 _MOST = 8  # fits near the best that are simulated, chosen
 

@@ -5,12 +5,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 
 from benchmarks.harness import Rate
 from benchmarks.learning.paired import Trial, difference, summary
+from benchmarks.learning.picture_parts import Film, errors, films
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,6 +34,42 @@ def test_policy(tmp_path):
   # Processor time, which other work on the machine does not stretch as much; the p99 targets of
   # 10 and 25 ms belong to the benchmark.
   assert rows["30x40"]["processor_median_ms"] < 10 and rows["60x80"]["processor_median_ms"] < 25
+
+
+def test_a_ball_is_put_from_one_film_into_the_other():
+  """The robot's ball is brighter and lies a pixel beside the simulation's."""
+  room, other_room = np.full((2, 1, 9, 9, 3), [[[[[60] * 3]]], [[[[90] * 3]]]], np.uint8)
+  simulated, robot = room.copy(), other_room.copy()
+  simulated[:, 3:6, 3:6], robot[:, 3:6, 4:7] = 120, 200
+  nothing = np.zeros(1)
+  found = films(Film(robot, simulated, room, np.zeros((1, 2)), nothing, nothing))
+  mixed = found["robot's room, simulation's ball"][0, ..., 0]
+  assert (mixed[3:6, 3:6] == 120).all() and (mixed == 200).sum() == 0
+  assert (mixed[[0, 1, 7, 8]] == 90).all() and (mixed[:, [0, 1, 7, 8]] == 90).all()
+  mixed = found["simulation's room, robot's ball"][0, ..., 0]
+  assert (mixed == 200).sum() == 9 and (mixed == 120).sum() == 0 and mixed[0, 0] == 60
+  assert (found["simulation's room, no ball"] == 60).all()
+
+
+def test_errors_of_a_belief_begin_afresh_in_every_trial():
+  class Counts:
+    """A policy whose belief is (steps of this trial, 0)."""
+
+    lstm_size, _policy = 2, {"mlp": {"layer0": {"w": np.zeros((5, 1))}}}
+
+    def initial_state(self):
+      return 0
+
+    def step(self, picture, proprioception, state):
+      assert proprioception.shape == (3,)
+      return SimpleNamespace(embedding=state + 1, state=state + 1)
+
+    def believed_position(self, embedding):
+      return np.array([embedding, 0.0])
+
+  pictures, trial = np.zeros((5, 2, 2, 3), np.uint8), np.array([0, 0, 0, 7, 7])
+  film = Film(pictures, pictures, pictures, np.zeros((5, 2)), np.zeros(5), trial)
+  assert errors(Counts(), pictures, film).tolist() == [1, 2, 3, 1, 2]
 
 
 def test_paired_trials_are_compared_one_by_one():

@@ -10,13 +10,14 @@ from nerf2real import suite
 from nerf2real.evaluation import runner
 from nerf2real.evaluation.plants import making, operated, perturbations
 from nerf2real.evaluation.plants import plant as plants
-from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
+from nerf2real.evaluation.plants.rehearsed import RehearsedPlant, put_down
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
 from nerf2real.evaluation.policies.policy import GaitPolicy
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.suite import protocols
+from nerf2real.suite.pose import Pose
 from nerf2real.suite.scene import open_scene
 from nerf2real.suite.tasks.workspace import find_workspace
 
@@ -52,6 +53,23 @@ def test_trials_start_where_the_simulations_tasks_have_them(scene, simulated):
     robot, place = workspace.starts(trial, scene.free_space)
     assert robot == pytest.approx(ball.task.start.xy)
     assert place == pytest.approx(ball.task.ball_start)
+
+
+def test_repetitions_are_put_down_beside_their_pose():
+  """The first stands on its mark, the second within the errors, on every robot the same."""
+  pose, errors = Pose(1.0, -2.0, 0.5), (0.03, 0.05)
+  first, second = (trial for _, trial in plants.trials("navigation")[6:8])
+  assert first[:3] == second[:3]
+  assert put_down(pose, first, errors) == pose == put_down(pose, second, (0.0, 0.0))
+  moved = put_down(pose, second, errors)
+  assert moved == put_down(pose, second, errors)
+  others = [put_down(pose, trial, errors) for _, trial in plants.trials("navigation")[1::2]]
+  offsets = np.array(others) - pose
+  assert len(np.unique(offsets, axis=0)) == 27
+  assert (np.abs(offsets) <= (0.03, 0.03, 0.05)).all()
+  assert (np.abs(offsets).max(axis=0) > (0.02, 0.02, 0.035)).all()
+  ball = plants.trials("ball")[-1][1]
+  assert ball.trial == 1 and put_down(pose, ball, errors) == pose
 
 
 def test_the_gait_reaches_a_goal_in_simulation(scene, simulated):

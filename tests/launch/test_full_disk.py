@@ -68,7 +68,7 @@ def inputs(tmp_path):
 def test_identify(run, fill, inputs, pages, monkeypatch):
   disk = fill(pages)
   if not pages:  # what is found takes seconds to compute, and is not what is tested
-    monkeypatch.setattr("nerf2real.sysid.outputs.analyse", lambda *_, **__: pytest.fail())
+    monkeypatch.setattr("nerf2real.sysid.outputs.identify.analyse", lambda *_, **__: pytest.fail())
   arguments = ("--model", inputs / "model.xml", "--logs", inputs / "log.mcap")
   ended = run("identify", *arguments, "--out", disk / "out")
   whole = [] if not pages else ["out/effects.json"]

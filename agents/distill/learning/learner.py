@@ -23,6 +23,8 @@ from nerf2real.agents.distill.learning.checkpoint import STATE, Counters, load_s
 from nerf2real.agents.distill.learning.training import Trainer
 from nerf2real.agents.distill.schedule import stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
+from nerf2real.agents.distill.views import kept_views
+from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments.loading import make_environment
@@ -35,6 +37,7 @@ from nerf2real.core.serialization import to_plain, write_json
 
 _log = logging.getLogger(__name__)
 POLICY = Path("policy") / "newest"
+VIEWS = "views.npz"
 _WAIT = 0.5  # s between looks for the first frames
 _SLACK = 10_000  # frames that collectors may be on the way with when the run has all
 _VALIDATION_PERIOD = 120.0  # s, at least
@@ -70,7 +73,7 @@ class Learner:
       ValueError: the folder holds a run already, or none to continue.
       LinkError: the endpoint is taken, or open to the network without users.
     """
-    self._settings, self._run, self._minutes = settings, run, minutes
+    self._settings, self._run, self._minutes, self._seed = settings, run, minutes, seed
     if (run / STATE).exists() != resume:
       raise ValueError(
         f"{run} holds no run to continue: leave --resume out."
@@ -174,10 +177,27 @@ class Learner:
       self._drain_metrics()
       self._set_status()
       self._stop.wait(_WAIT)
+    if self._settings.views and not self._stop.is_set():
+      self._trainer.views = self._make_views()
     if self._counters.updates or self._stop.is_set():
       return
     self._trainer.standardise()
     _log.info("Training begins with %d frames.", self._data.frames)
+
+  def _make_views(self) -> dict[str, np.ndarray]:
+    """Returns the run's pictures at drawn places: on a loaded core some 3 ms each, once a run."""
+    environment = make_environment(self._settings.environment, seed=self._seed)
+    try:
+      return kept_views(
+        self._run / VIEWS,
+        task_of(environment),
+        self._layout,
+        self._run / "data",
+        seed=self._seed,
+        count=self._settings.views,
+      )
+    finally:
+      environment.close()
 
   # ---- stages ----
 

@@ -13,6 +13,7 @@ from nerf2real.agents.distill.learning.updates import make_updates, standardised
 from nerf2real.agents.distill.learning.validation import validate
 from nerf2real.agents.distill.schedule import cosine
 from nerf2real.agents.distill.settings import DistillSettings
+from nerf2real.agents.distill.views import mixed
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.processes.timings import StageTimes
 
@@ -48,6 +49,7 @@ class Trainer:
     self._cache = FeatureCache(
       self._updates.features, data, copies=settings.copies, width=width, seed=seed
     )
+    self.views: dict[str, np.ndarray] | None = None  # beside the episodes' pictures
     self._kind = ""
     self._streams: Streams | None = None
     self._carried: Any = None
@@ -94,13 +96,22 @@ class Trainer:
 
   def _update_encoder(self, within: float) -> Metrics:
     with self._times.stage("sampling"):
-      chosen = self._rng.choice(self._training_frames(), self._settings.encoder_batch)
-      batch = {"image": self._data.arrays["image"][chosen], **self._data.take(chosen)}
+      batch = self._pictures()
     with self._times.stage("update"):
       rate = self._settings.learning_rate * cosine(within)
       self.state, metrics = self._updates.encoder(self.state, batch, rate)
       jax.block_until_ready(metrics)
     return metrics
+
+  def _pictures(self) -> dict[str, np.ndarray]:
+    """Returns single frames, of the episodes and of the views."""
+    size, views = self._settings.encoder_batch, self.views
+    count = 0 if views is None else round(self._settings.views_share * size)
+    chosen = self._rng.choice(self._training_frames(), size - count)
+    batch = {"image": self._data.arrays["image"][chosen], **self._data.take(chosen)}
+    if views is None:
+      return batch
+    return mixed(batch, views, self._rng.integers(len(views["image"]), size=count))
 
   def _update_unrolls(self, within: float) -> Metrics:
     assert self._streams is not None

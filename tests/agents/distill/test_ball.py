@@ -151,4 +151,6 @@ def test_the_teacher_pushes_with_the_pan_of_ball_pushing():
 
 def test_the_preset_is_for_the_ball():
   found = settings.preset("ball_push")
-  assert found.environment == "suite:ball_push" and found.teacher == "ball"
+  assert found.environment == "suite:ball_push?light=true" and found.teacher == "ball"
+  more = settings.preset("ball_push_on")
+  assert (more.environment, more.views) == (found.environment, found.views) and found.views > 0

@@ -41,8 +41,8 @@ def test_newest_two_and_the_best_are_kept(state, tmp_path):
     saved.save(_at(state, steps), {"steps": steps})
   saved.save(_at(state, 2), {"steps": 2}, kind=BEST)
   saved.save(_at(state, 3), {"steps": 3}, kind=BEST)
-  assert [p.name[-1] for p in saved.list()] == ["2", "3"]
-  assert [p.name[-1] for p in saved.list(BEST)] == ["3"]
+  assert [p.name.split("-")[2] for p in saved.list()] == ["000000000002", "000000000003"]
+  assert [p.name.split("-")[2] for p in saved.list(BEST)] == ["000000000003"]
   assert saved.restore(state)[1]["steps"] == 3
 
 
@@ -105,7 +105,7 @@ def test_a_failing_write_leaves_the_old_checkpoint_whole(state, tmp_path, monkey
   monkeypatch.setattr(saved._checkpointer, "save", fail)
   with pytest.raises(CheckpointError, match="disk is full.*newest-0000000001"):
     saved.save(_at(state, 2), {"steps": 2})
-  assert [p.name for p in tmp_path.iterdir()] == ["newest-0000000001-000000000001"]
+  assert [p.name for p in tmp_path.iterdir()] == ["newest-0000000001-000000000001-00000000"]
   monkeypatch.undo()
   assert saved.restore(state)[1]["steps"] == 1
 
@@ -114,3 +114,10 @@ def test_info_is_read_without_the_state(state, tmp_path):
   assert checkpoints.read_info(tmp_path) is None
   Checkpoints(tmp_path / "checkpoints").save(_at(state, 1), {"steps": 4})
   assert checkpoints.read_info(tmp_path) == {"steps": 4}
+
+
+def test_the_time_of_a_run_without_a_step_is_kept(state, tmp_path):
+  saved = Checkpoints(tmp_path / "checkpoints")
+  for seconds in (0.0, 90.5):
+    saved.save(_at(state, 1), {"steps": 4, "seconds": seconds})
+  assert checkpoints.read_info(tmp_path)["seconds"] == 90.5

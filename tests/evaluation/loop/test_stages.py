@@ -11,6 +11,7 @@ from nerf2real.agents.environments.loading import make_environment
 from nerf2real.evaluation.episodes import Store
 from nerf2real.evaluation.loop import comparing, naming, severity, story, telling, training, trials
 from nerf2real.evaluation.loop.robot import machines
+from nerf2real.evaluation.loop.sessions import Cooled
 from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
 from nerf2real.evaluation.loop.trials import Condition
 from nerf2real.real.virtual import undeclared
@@ -78,6 +79,8 @@ def test_trials_are_run_once_and_more_are_added(tmp_path):
   assert said == []
   more = trials.run(_settings(tmp_path, trials=3), condition, scene, store, said.append)
   assert [e.index for e in more] == [0, 26, 53] and "1 of 3 trials to run" in said[0]
+  fewer = trials.run(_settings(tmp_path, trials=9, simulated=2), condition, scene, store, print)
+  assert [e.index for e in fewer] == [0, 53]
 
 
 def test_a_tally_has_the_exact_interval():
@@ -87,17 +90,6 @@ def test_a_tally_has_the_exact_interval():
   assert (found.trials, found.successes, found.outcomes["fall"]) == (3, 1, 2)
   assert (found.low, found.high) == pytest.approx((0.0084, 0.9057), abs=1e-4)
   assert str(found) == "33 % (1 of 3; 1 to 91 %)"
-
-
-def test_a_battery_goes_on_where_an_interrupted_run_left_it(tmp_path):
-  settings = _settings(tmp_path)
-  session = trials._Session(tmp_path / "trials" / "robot_before.json")
-  assert session.seconds == 0.0
-  session.note(20.0)
-  session.note(31.0)
-  again = trials._Session(tmp_path / "trials" / "robot_before.json")
-  again.note(10.0)
-  assert trials.session_seconds(settings, "robot before") == 41.0
 
 
 def _finding(folder, effects, verdict="effects"):
@@ -144,7 +136,7 @@ def test_what_the_reference_shows_too_is_not_named(tmp_path):
   named = naming.name(folder, Path("no logs are read again"))
   assert [e.kind for e in named.named] == ["command_delay"]
   assert [e.kind for e in named.in_reference] == ["load_friction"]
-  assert [e.kind for e in named.effects] == [e.kind for e in effects]  # all go into the suite
+  assert [e.kind for e in named.effects] == [e.kind for e in effects]
 
 
 def test_training_draws_the_effects_of_the_finding(tmp_path):
@@ -196,6 +188,7 @@ def _story(tmp_path, after, *, trained=True):
     named,
     made_on if trained else None,
     comparing.compare(DELAY, named.effects),
+    {story.BEFORE: [Cooled(3, "l_knee: 71 degrees C")], story.AFTER: []},
     {"training": 100.0},
   )
 
@@ -214,6 +207,7 @@ def test_five_numbers_and_what_came_back(tmp_path):
   assert story.gaps(told)[story.WITH_EFFECTS] == pytest.approx((0.25, 0.25))
   assert story.gaps(told)[story.NOMINAL] == pytest.approx((1.0, 1.0))
   assert summary["success"][story.AFTER]["successes"] == 2 and summary["hidden"]["wrong"] == []
+  assert summary["cooled"] == {story.BEFORE: [{"trials": 3, "detail": "l_knee: 71 degrees C"}]}
 
 
 def test_where_no_success_was_lost_none_can_come_back(tmp_path):
@@ -232,6 +226,7 @@ def test_the_page_tells_the_story_in_order_and_what_was_hidden_last(tmp_path):
   assert places == sorted(places)
   assert page.count("<img ") == 6
   assert page.index("command_delay:0.045") > places[-1]
+  assert "robot before, after 3 trials: l_knee: 71 degrees C." in page
 
 
 def test_a_policy_that_was_not_trained_is_said_so(tmp_path):

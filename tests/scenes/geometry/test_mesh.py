@@ -114,6 +114,7 @@ def test_paint_simplify_and_glb(views, grid, tmp_path):
   loaded = trimesh.load(path, force="mesh", process=False)
   np.testing.assert_allclose(loaded.vertices[:, 1], small.vertices[:, 2], atol=1e-5)
   np.testing.assert_allclose(loaded.vertices[:, 2], -small.vertices[:, 1], atol=1e-5)
+  assert b'"NORMAL"' in path.read_bytes()  # without them programs shade flat faces
   back = mesh.load_glb(path)
   np.testing.assert_allclose(back.vertices, small.vertices, atol=1e-5)
   np.testing.assert_array_equal(back.visual.vertex_colors[:, :3], painted.colors)

@@ -9,9 +9,9 @@ from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.measured import fresh, quantum
-from nerf2real.sysid.selection.baseline import widened
-from nerf2real.sysid.selection.evidence import Scored
-from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.joints.baseline import widened
+from nerf2real.sysid.selection.search.evidence import Scored
+from nerf2real.sysid.selection.search.explain import Explainer
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.fit.test_likelihood import joint_of
 from tests.sysid.synthetic import COUNT

@@ -48,6 +48,21 @@ def test_logs_are_folds_and_blocks_are_a_second(viscous):
   assert np.median(np.diff(joint.starts)) == pytest.approx(100, abs=2)
 
 
+def test_noise_of_blocks_is_what_readings_and_stamps_that_scatter_leave(viscous):
+  plant, _ = viscous
+  joint = JointLikelihood(plant)
+  joint.stamp_noise = 5.0 * joint.position_noise / np.abs(joint.speed).max()
+  shaky = joint.stamp_noise * joint.speed / joint.position_noise
+  joint.gain = joint.mask[None] / np.sqrt(1.0 + shaky**2)
+  joint._cut()
+  random = np.random.default_rng(0)
+  off = joint.position_noise * random.normal(size=(400, joint.size))
+  off += joint.stamp_noise * joint.speed * random.normal(size=(400, joint.size))
+  measured = joint.squares(off[:, None] * joint.gain)[:, 0].mean(axis=0)
+  np.testing.assert_allclose(joint.noise_squares, measured, rtol=0.05)
+  assert measured.max() > 2.0 * joint.position_noise**2
+
+
 def test_correlation_time_of_an_autoregression():
   random, rho = np.random.default_rng(0), 0.8
   row = np.zeros(40_000)

@@ -87,6 +87,20 @@ def test_kind_moves_the_joint_as_mujoco_does(kind: str, values: dict, tolerance:
 _COMMON = ("supply_sag", "gravity_tilt", "clock_drift")
 
 
+def test_a_gear_is_loaded_by_what_a_scaled_back_emf_leaves() -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=4.0)
+  plant = JointModel(model, "joint", [log])
+  gain = Effect("motor_gain", "joint", {"gain": 1.47, "scales_limit": 1.0, "scales_damping": 1.0})
+  effects = [Effect("load_friction", "joint", {"coefficient": 0.35, "carried": 1.0}), gain]
+  terms = [
+    Term(e.kind, e.target, (), (), (), (), ((),), fixed=tuple(e.parameters.items()))
+    for e in effects
+  ]
+  want = evaluation.simulate(model, log, effects)[:, 0]
+  assert np.sqrt(np.mean((_position(plant, terms) - want) ** 2)) < 3e-4
+
+
 def test_every_weakening_keeps_its_own_choice_of_limits() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "steps", rounding=0.0, duration=4.0)

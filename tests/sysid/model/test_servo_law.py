@@ -75,10 +75,23 @@ def test_a_command_as_late_as_is_plausible_is_no_weaker_gain(delay):
 
 
 def test_a_clock_that_drifts_is_no_weaker_gain():
-  drifting = law_of(drift=0.04, noise=0.002)
+  drifting = law_of(drift=0.002, noise=0.002)
   assert not drifting.is_off(0.05)
   assert drifting.unexplained > 10.0 * law_of(noise=0.002).unexplained
+  assert servo_law(plant_of(drift=0.04, noise=0.002)) is None
   assert law_of(gain=0.5, noise=0.002).is_off(0.05)
+
+
+def test_a_gain_whose_interval_holds_the_declared_one_is_not_off():
+  law = dataclasses.replace(law_of(noise=0.002), gain=0.99, gain_deviation=0.09, unexplained=0.03)
+  assert not law.is_off(0.03)
+  assert dataclasses.replace(law, gain=0.7).is_off(0.03)
+  assert dataclasses.replace(law, gain=1.3).is_off(0.03)
+
+
+@pytest.mark.parametrize(("gain", "noise"), [(-0.5, 0.002), (0.02, 0.3)])
+def test_a_duty_that_is_not_of_the_position_error_has_no_law(gain, noise):
+  assert servo_law(plant_of(gain=gain, noise=noise)) is None
 
 
 def test_an_integral_is_found_where_there_is_one():

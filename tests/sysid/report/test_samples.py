@@ -12,7 +12,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.report.samples import COUNT, with_samples
-from nerf2real.sysid.selection.explain import Scored
+from nerf2real.sysid.selection.search.explain import Scored
 from tests.sysid.fit.test_likelihood import joint_of
 
 

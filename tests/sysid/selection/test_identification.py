@@ -20,7 +20,7 @@ from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.analysis import analyse
-from nerf2real.sysid.selection.wide import ancestors
+from nerf2real.sysid.selection.wider.wide import ancestors
 from tests.sysid.synthetic import ARM, PENDULUM, log_of, logs_of
 
 SAMPLES = Path(__file__).parents[3] / "../shared/data/sysid_samples"

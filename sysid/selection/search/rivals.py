@@ -11,8 +11,8 @@ from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.free_force import free_force
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.evidence import Scored
-from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.search.evidence import Scored
+from nerf2real.sysid.selection.search.explain import Explainer
 
 _PUSH = 0.2  # step of finite differences of a free force, of its values' deviations
 _ITERATIONS = 10  # of its fit

@@ -17,12 +17,13 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection import rivals, wide
-from nerf2real.sysid.selection.changes import Changed, leaves
-from nerf2real.sysid.selection.evidence import Scored, more_likely
-from nerf2real.sysid.selection.naming import USUAL
-from nerf2real.sysid.selection.subject import Subject
-from nerf2real.sysid.selection.wide import Evidence, Wide
+from nerf2real.sysid.selection.joints.changes import Changed, leaves
+from nerf2real.sysid.selection.joints.naming import USUAL
+from nerf2real.sysid.selection.joints.subject import Subject
+from nerf2real.sysid.selection.search import rivals
+from nerf2real.sysid.selection.search.evidence import Scored, more_likely
+from nerf2real.sysid.selection.wider import wide
+from nerf2real.sysid.selection.wider.wide import Evidence, Wide
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray

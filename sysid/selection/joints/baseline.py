@@ -7,7 +7,7 @@ from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.plausible import ends
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 

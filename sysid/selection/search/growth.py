@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from nerf2real.sysid.selection.evidence import Scored, clear, of_size
-from nerf2real.sysid.selection.explain import Explainer
-from nerf2real.sysid.selection.rivals import beside_force, neutralise
+from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size
+from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.selection.search.rivals import beside_force, neutralise
 
 
 def grow(

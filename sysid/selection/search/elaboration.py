@@ -15,8 +15,8 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.rich_friction import FORMS, REPLACED, rich_friction
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING, Term
-from nerf2real.sysid.selection.evidence import Scored, kinds_of
-from nerf2real.sysid.selection.explain import Explainer
+from nerf2real.sysid.selection.search.evidence import Scored, kinds_of
+from nerf2real.sysid.selection.search.explain import Explainer
 
 Array = np.ndarray
 

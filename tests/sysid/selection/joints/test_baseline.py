@@ -4,7 +4,7 @@ import mujoco
 
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.selection.baseline import widened
+from nerf2real.sysid.selection.joints.baseline import widened
 from tests.sysid.synthetic import PENDULUM, log_of
 
 

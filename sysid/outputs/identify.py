@@ -20,20 +20,18 @@ from nerf2real.core.pages import page
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
-from nerf2real.suite.effects import Effect, write_effects
+from nerf2real.suite.effects import write_effects
 from nerf2real.sysid.data.opening import load_model, read_logs
-from nerf2real.sysid.design import excitation, identifiability
-from nerf2real.sysid.design.identifiability import Identifiability
+from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
-from nerf2real.sysid.fit import whitening
 from nerf2real.sysid.model import extended_model
-from nerf2real.sysid.model import simulation as evaluation
-from nerf2real.sysid.model.simulation import Member
+from nerf2real.sysid.outputs.details import claimed_effects, details_of
+from nerf2real.sysid.outputs.errors import errors, floor
+from nerf2real.sysid.outputs.notes import of_one, spread
+from nerf2real.sysid.outputs.rivals import alternatives, next_motion, residual_at
 from nerf2real.sysid.report import capability, samples, servo
 from nerf2real.sysid.report import page as report
 from nerf2real.sysid.selection.analysis import analyse
-from nerf2real.sysid.selection.changes import Changed
-from nerf2real.sysid.selection.evidence import Scored, clear
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.sensors import sensing
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -44,7 +42,6 @@ _SHOWN, _ANALYSIS, _SENSORS, _ERRORS = (
   0.85,
   0.95,
 )  # shares of the work done after each, about
-_LISTED = 6  # alternatives in the report
 
 
 def identify(
@@ -132,18 +129,18 @@ def _identify(
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else found.effects,
     "in_reference": found.in_reference,
-    "alternatives": [*found.scopes, *_alternatives(found)],
+    "alternatives": [*found.scopes, *alternatives(found)],
     "residual_at": residual_at(found),
     "error": {
-      "train": _errors(found, logs, near, settings),
-      "held": _errors(found, held, near, settings) if held else None,
-      "floor": _floor(held or logs, [j.joint for j in found.joints]),
+      "train": errors(found, logs, near, settings),
+      "held": errors(found, held, near, settings) if held else None,
+      "floor": floor(held or logs, [j.joint for j in found.joints]),
     },
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
-    "next_excitation": _next(found, shown),
+    "next_excitation": next_motion(found, shown),
     "notes": [
-      *(capability.sentence(shown), *servo.notes(found), *map(_of_one, found.scopes)),
+      *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
       *sensed.notes,
     ],
   }
@@ -173,12 +170,12 @@ def _identify(
     )
     content["notes"] = [*content["notes"], text]
   if len(near) > 1:
-    content["notes"] = [*content["notes"], _spread(content["error"])]
+    content["notes"] = [*content["notes"], spread(content["error"])]
   content["alternatives"] += sensed.alternatives
-  drawn = samples.with_samples(found, _claimed(found), np.random.default_rng(0))
+  drawn = samples.with_samples(found, claimed_effects(found), np.random.default_rng(0))
   write_effects(out / "effects.json", servo.apart(drawn, by_duty))
   extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
-  details = _details(found, model, near, sensed)
+  details = details_of(found, model, near, sensed)
   details["identifiability"] = [to_plain(item) for item in shown]
   details["joints"] = stored.to_json(stored.remembered(found, held, settings))
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")
@@ -226,157 +223,5 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
       )
 
 
-def _details(
-  found: Identified, model: Path, near: Sequence[Member], sensed: sensing.Sensed
-) -> dict[str, Any]:
-  """Returns what the findings rest on, and what the extended model is simulated with."""
-  first = found.least_explained
-  return {
-    "model": str(model.resolve()),
-    **stored.member_to_json(near[0]),
-    "near": [stored.member_to_json(member) for member in near[1:]],
-    "calibration": {
-      e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
-      for e in found.calibration
-    },
-    "tests": {
-      "joint": first.joint,
-      **{
-        name: whitening.tests(first.likelihood, item.fit.residuals[0][0])
-        for name, item in (("declared", first.declared), ("extended", first.extended))
-      },
-    },
-    "audit": found.audits,
-    "servo": {j.joint: to_plain(j.likelihood.law) for j in found.joints if j.likelihood.law},
-    "sensors": sensed.errors(),
-  }
-
-
-def _claimed(found: Identified) -> list[Effect]:
-  """Returns the effects that go into effects.json.
-
-  The constants of a joint go with its effects, which were fitted beside them.
-  """
-  if found.verdict == "none":
-    return []
-  joints = {e["joint"] for e in (*found.effects, *found.nearest)}
-  all_off = any(e["kind"] == "parameter_error" and e["joint"] is None for e in found.effects)
-  constants = [c for c in found.calibration if all_off or c.target in joints]
-  return [*constants, *found.objects]
-
-
-def _errors(
-  found: Identified, logs: Sequence[Log], near: Sequence[Member], settings: Settings
-) -> dict[str, float]:
-  """Returns RMSE before and after, over the joints that the logs command."""
-  window = settings.window_s
-  before = evaluation.error(found.model, logs, window_s=window)
-  return {"before": before} | evaluation.errors(found.model, logs, near, window_s=window)
-
-
-def _of_one(row: dict[str, Any]) -> str:
-  """Returns a sentence on an effect of several joints that may be of one alone."""
-  return (
-    f"These logs do not tell whether {row['kind']} is of all joints or of {row['joint']} alone,"
-    f" which is behind by {row['evidence']['behind_by_standard_errors']:.1f} standard errors."
-  )
-
-
-def _spread(error: dict[str, Any]) -> str:
-  """Returns a sentence on the errors of fits near the best."""
-  name = "held" if error["held"] else "train"
-  found = error[name]
-  return (
-    f"Errors after are of the mean of {found['models']} fits near the best, which differ:"
-    f" {found['median']:.3g} rad (or m) in the median, {found['least']:.3g} to {found['most']:.3g}"
-    f" on the {name} logs; the model that is written alone has {found['single']:.3g}."
-  )
-
-
-def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:
-  """Returns what no smooth model can explain, rad (or m) rms over joints.
-
-  Readings scatter about any smooth motion by rounding, noise and stamps that are off while the
-  joint moves: that is what their differences of fourth order keep (70 times its variance). The
-  largest hundredth, stale readings, is left out.
-  """
-  squares = []
-  for log in logs:
-    position = log.states.position
-    assert position is not None
-    columns = [log.states.column(joint) for joint in joints]
-    fourth = np.sort(np.square(np.diff(position[:, columns], n=4, axis=0)), axis=0)
-    squares.append(fourth[: max(1, int(0.99 * len(fourth)))].mean(axis=0) / 70.0)
-  return float(np.sqrt(np.mean(squares)))
-
-
 def _holds(found: Identified) -> bool:
   return all(j.likelihood.plant.holds for j in found.joints)
-
-
-def _alternatives(found: Identified) -> list[dict[str, Any]]:
-  return [
-    {
-      "kinds": sorted(other.names),
-      "kind": "+".join(sorted(other.names)),
-      "joint": item.joint,
-      "confounded": any(other is c for c in item.confounded),
-      "parameters": {
-        k: {n: round(v, 5) for n, v in other.values(k).items()} for k in sorted(other.names)
-      },
-      "evidence": _evidence(item, other),
-    }
-    for item in found.found
-    for other in item.alternatives[:_LISTED]
-  ]
-
-
-def _evidence(item: Changed, other: Scored) -> dict[str, Any]:
-  """Returns how a hypothesis of a joint stands beside the best one, as numbers."""
-  return {
-    "behind_by_standard_errors": round(clear(item.found.best, other), 2),
-    "held_out_gain_nats": round(other.evidence - item.null.evidence, 2),
-    "median_block_left": float(np.sqrt(np.median(other.fit.held[0][0]))),
-  }
-
-
-def residual_at(found: Identified) -> dict[str, Any]:
-  """Returns where the residual of the extended model sits: joint, position, velocity, time."""
-  item = found.least_explained
-  logs = item.likelihood.plant.logs
-  joined = {
-    "position": np.concatenate([log.position for log in logs]),
-    "velocity": np.concatenate([log.velocity for log in logs]),
-    "time": np.concatenate([log.time - log.time[0] for log in logs]),
-  }
-  squares = np.square(item.extended.fit.residuals[0][0])
-  result: dict[str, Any] = {"joint": item.joint, "rms": float(np.sqrt(np.mean(squares)))}
-  for name, values in joined.items():
-    low, high, share = _concentrated(values, squares)
-    result[name] = {"low": low, "high": high, "share_of_square": share}
-  ends = np.cumsum([len(log.time) for log in logs])[:-1]
-  result["log"] = logs[int(np.argmax([np.mean(part) for part in np.split(squares, ends)]))].name
-  return result
-
-
-def _concentrated(values: np.ndarray, squares: np.ndarray) -> tuple[float, float, float]:
-  """Returns the fifth of a quantity's samples that holds most of the squared residual."""
-  edges = np.quantile(values, np.linspace(0, 1, 11))
-  which = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, 9)
-  sums = np.bincount(which, squares, 10)
-  pairs = sums[:-1] + sums[1:]
-  best = int(np.argmax(pairs))
-  share = float(pairs[best] / max(sums.sum(), 1e-12))
-  return float(edges[best]), float(edges[best + 2]), round(share, 3)
-
-
-def _next(found: Identified, shown: Sequence[Identifiability]) -> dict[str, Any]:
-  """Returns the motion that separates rivals best; without rivals, what shows most of the rest."""
-  item = found.least_explained
-  rivals = item.confounded or item.alternatives[:2]
-  result = excitation.propose(item.likelihood, item.extended, rivals[:3])
-  own = next(s for s in shown if s.joint == item.joint)
-  if not rivals and own.motion is not None:
-    result["design"] = own.motion
-  result["would"] = capability.deeds(own.resolved.get(result["design"], ()))
-  return result

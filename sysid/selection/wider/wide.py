@@ -20,8 +20,8 @@ from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.point_mass import carrying
-from nerf2real.sysid.selection.evidence import Scored, variance
-from nerf2real.sysid.selection.subject import WHOLE, Subject
+from nerf2real.sysid.selection.joints.subject import WHOLE, Subject
+from nerf2real.sysid.selection.search.evidence import Scored, clearness
 
 Array = np.ndarray
 
@@ -87,8 +87,7 @@ class Evidence:
   @property
   def clear(self) -> float:
     """Standard errors from zero: joints are independent, so that their variances add."""
-    error = np.sqrt(sum(variance(row) for row in self.rows.values()))
-    return self.total / max(float(error), 1.0)
+    return clearness(list(self.rows.values()), self.prior)
 
 
 def hypotheses(

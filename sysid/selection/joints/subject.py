@@ -20,17 +20,17 @@ from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection.baseline import (
+from nerf2real.sysid.selection.joints.baseline import (
   changed_constants,
   freed_constants,
   known_terms,
   widened,
 )
-from nerf2real.sysid.selection.evidence import Scored
-from nerf2real.sysid.selection.explain import Explainer
-from nerf2real.sysid.selection.growth import grow
-from nerf2real.sysid.selection.naming import conclude, threshold
-from nerf2real.sysid.selection.remainder import structured
+from nerf2real.sysid.selection.joints.naming import conclude, threshold
+from nerf2real.sysid.selection.joints.remainder import structured
+from nerf2real.sysid.selection.search.evidence import Scored
+from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.selection.search.growth import grow
 from nerf2real.sysid.settings import Settings
 
 WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
@@ -158,6 +158,7 @@ def _subject(
     freed = widened(own)
     explainer = _explainer(now, None, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
+  now.ahead = None if before.law is None else before.law.ahead
   usual = _bare(before, settings)
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)

@@ -8,9 +8,12 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection import analysis, rivals, scopes, subject, wide
+from nerf2real.sysid.selection import analysis
+from nerf2real.sysid.selection.joints import subject
+from nerf2real.sysid.selection.search import rivals
+from nerf2real.sysid.selection.wider import scopes, wide
 from nerf2real.sysid.settings import SETTINGS
-from tests.sysid.selection.test_changes import few
+from tests.sysid.selection.joints.test_changes import few
 from tests.sysid.synthetic import ARM, log_of
 
 LATE = Effect("command_delay", None, {"delay": 0.021})

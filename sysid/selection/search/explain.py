@@ -9,7 +9,7 @@ from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.evidence import UNREPEATED, Scored, kinds_of
+from nerf2real.sysid.selection.search.evidence import UNREPEATED, Scored, kinds_of
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray

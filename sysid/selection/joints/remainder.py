@@ -6,7 +6,7 @@ from scipy.stats import norm
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model.measured import quantum
-from nerf2real.sysid.selection.evidence import Scored
+from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray

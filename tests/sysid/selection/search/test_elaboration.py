@@ -11,11 +11,11 @@ from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.simulation import Member
-from nerf2real.sysid.selection.baseline import widened
-from nerf2real.sysid.selection.elaboration import bases, crossed, elaborated
-from nerf2real.sysid.selection.evidence import kinds_of
-from nerf2real.sysid.selection.explain import Explainer
 from nerf2real.sysid.selection.findings import effects_of
+from nerf2real.sysid.selection.joints.baseline import widened
+from nerf2real.sysid.selection.search.elaboration import bases, crossed, elaborated
+from nerf2real.sysid.selection.search.evidence import kinds_of
+from nerf2real.sysid.selection.search.explain import Explainer
 from tests.sysid.fit.test_likelihood import joint_of
 from tests.sysid.synthetic import PENDULUM, log_of
 

@@ -1,0 +1,67 @@
+"""Which effects of a finding enter the simulation: what is named, with the constants beside it.
+
+The analyser's extended model holds more than it claims: small effects of joints whose names are not
+certain, and forces of any form that explain what no name does. In the air they make errors smaller;
+under weight, where a robot walks, nothing has judged them, and they cost time at every step. They
+stay out, but for the learned forces where the verdict is that no name explains the motion.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from nerf2real.suite.effects import Effect
+
+CONSTANTS = ("parameter_error",)  # errors of declared constants: no effect, and no name
+LEARNED = "residual_force"  # a force without a name
+UNEXPLAINED = "unexplained"
+_BESIDE = (*CONSTANTS, "encoder_offset")  # fitted beside every hypothesis of a joint
+
+Rows = Sequence[Mapping[str, Any]]
+"""Entries of the analyser's report."""
+
+
+def entering(effects: Sequence[Effect], content: Mapping[str, Any]) -> list[Effect]:
+  """Returns the effects that the simulation gets, with their intervals and samples.
+
+  Those are what the report claims, what it finds in the reference, too (the robot has it), and the
+  constants of the joints at which something is claimed. Where the verdict is `unexplained` the
+  joints with a learned force have all that was fitted beside it.
+
+  Args:
+    effects: Of the extended model.
+    content: Of the report; one without entries names all effects.
+  """
+  if "effects" not in content:
+    return list(effects)
+  claimed: Rows = content["effects"]
+  rows = [*claimed, *content.get("in_reference", ())]
+  joints = {row["joint"] for row in claimed if row.get("joint")}
+  if any(row["kind"] in CONSTANTS and not row.get("joint") for row in claimed):  # of all joints
+    joints |= {effect.target for effect in effects if effect.kind in CONSTANTS}
+  forced = {e.target for e in forces(effects, content)}
+  return [
+    effect
+    for effect in effects
+    if is_listed(effect, rows)
+    or (effect.kind in _BESIDE and effect.target in joints)
+    or effect.target in forced
+  ]
+
+
+def forces(effects: Sequence[Effect], content: Mapping[str, Any]) -> list[Effect]:
+  """Returns the learned forces that stand in for names; none where names explain the motion."""
+  if content["verdict"] != UNEXPLAINED:
+    return []
+  return [effect for effect in effects if effect.kind == LEARNED]
+
+
+def is_listed(effect: Effect, rows: Rows) -> bool:
+  """Returns whether an effect has an entry in a report: kind, place and values."""
+
+  def is_of(row: Mapping[str, Any]) -> bool:
+    place = row.get("body") or row.get("geom") or row.get("joint")
+    values = {name: found["value"] for name, found in row.get("parameters", {}).items()}
+    same = all(effect.parameters.get(name, value) == value for name, value in values.items())
+    return (row["kind"], place) == (effect.kind, effect.target) and same
+
+  return any(is_of(row) for row in rows)

@@ -1,0 +1,22 @@
+"""Sentences of a report that follow from what was found."""
+
+from typing import Any
+
+
+def of_one(row: dict[str, Any]) -> str:
+  """Returns a sentence on an effect of several joints that may be of one alone."""
+  return (
+    f"These logs do not tell whether {row['kind']} is of all joints or of {row['joint']} alone,"
+    f" which is behind by {row['evidence']['behind_by_standard_errors']:.1f} standard errors."
+  )
+
+
+def spread(error: dict[str, Any]) -> str:
+  """Returns a sentence on the errors of fits near the best."""
+  name = "held" if error["held"] else "train"
+  found = error[name]
+  return (
+    f"Errors after are of the mean of {found['models']} fits near the best, which differ:"
+    f" {found['median']:.3g} rad (or m) in the median, {found['least']:.3g} to {found['most']:.3g}"
+    f" on the {name} logs; the model that is written alone has {found['single']:.3g}."
+  )

@@ -1,0 +1,94 @@
+"""What is new at a joint: what was tried, what is named, what remains."""
+
+import dataclasses
+
+import numpy as np
+
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.selection.joints.naming import Explanation
+from nerf2real.sysid.selection.joints.subject import Subject
+from nerf2real.sysid.selection.search.evidence import Scored
+
+Array = np.ndarray
+CONSTANTS_OFF = "parameter_error"
+
+
+@dataclasses.dataclass
+class Changed:
+  """What is new at a joint."""
+
+  subject: Subject
+  ranked: list[Scored]
+  found: Explanation
+  named: tuple[str, ...]
+  """Kinds that are certain, and absent from the reference."""
+  verdict: str
+  """none, effects, partly or unexplained."""
+  reference_left: float
+  """What the machine leaves anyway, root of `mean_left`, rad (m)."""
+  left: float
+  """The same of the logs, under the best hypothesis."""
+  more_remains: bool
+  """Whether that is more than the machine leaves anyway, by the limit of what counts as more."""
+  constants_off: bool
+  """Whether declared constants are off by more than machines of one kind differ."""
+  elaborated: list[Scored] = dataclasses.field(default_factory=list)
+  """Fits with richer friction that predict left-out logs about as well as the best of them."""
+
+  @property
+  def extended(self) -> Scored:
+    """The hypothesis to simulate with: where more remains, what predicts left-out blocks best."""
+    if self.verdict not in ("partly", "unexplained"):
+      return self.found.best
+    fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
+    if self.elaborated:
+      return self.elaborated[0]
+    return max(fitting, key=lambda s: s.evidence, default=self.found.best)
+
+  @property
+  def near(self) -> list[Scored]:
+    """The hypotheses whose mean is predicted with: fits near the best, which is the first."""
+    best = self.extended
+    return self.elaborated if any(best is s for s in self.elaborated) else [best]
+
+  @property
+  def likelihood(self) -> JointLikelihood:
+    """The logs."""
+    return self.subject.now
+
+  @property
+  def declared(self) -> Scored:
+    """The model as it is declared."""
+    return self.subject.explainer.declared
+
+  @property
+  def alternatives(self) -> list[Scored]:
+    """The best hypothesis of every other set of effects, the best first."""
+    best: dict[frozenset[str], Scored] = {}
+    for item in self.ranked:
+      if item.names and not item.neutral and not item.beside_force:
+        best.setdefault(item.names, item)
+    best.pop(self.extended.names, None)
+    return list(best.values())
+
+  @property
+  def confounded(self) -> list[Scored]:
+    """Hypotheses without a named effect that predict the same."""
+    alike = {id(s): s for n in self.found.names for s in n.confounded if s.names}
+    return list(alike.values())
+
+  @property
+  def joint(self) -> str:
+    """Its name."""
+    return self.subject.joint
+
+  @property
+  def known(self) -> tuple[Term, ...]:
+    """Constants and effects that were known before."""
+    return self.subject.known
+
+  @property
+  def null(self) -> Scored:
+    """The baseline."""
+    return self.subject.explainer.null

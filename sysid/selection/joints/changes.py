@@ -1,0 +1,126 @@
+"""What a joint has beyond its baseline: names by evidence that adds up, and a graded verdict.
+
+The baseline is the declared model with its tolerances, or what reference logs show: constants, and
+the effects that the machine has anyway. An effect is named where every tried hypothesis without it
+is clearly worse (`naming`), and where the reference logs are clearly worse with it than without.
+Where more remains, a name must also stand beside a force of any form.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerf2real.sysid.selection.joints.changed import CONSTANTS_OFF, Changed
+from nerf2real.sysid.selection.joints.doubts import constants_off, is_new, is_something, supported
+from nerf2real.sysid.selection.joints.leaving import leaves, may_leave, remaining
+from nerf2real.sysid.selection.joints.naming import Explanation, conclude
+from nerf2real.sysid.selection.joints.subject import Subject, following
+from nerf2real.sysid.selection.search.elaboration import elaborated
+from nerf2real.sysid.selection.search.evidence import UNREPEATED
+from nerf2real.sysid.selection.search.growth import grow
+from nerf2real.sysid.settings import SETTINGS, Settings
+
+_REST = 0.1
+"""Of the squares that all joints leave: less is left to joints that are not elaborated, chosen (5 %
+of the error)."""
+
+
+def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
+  """Explains what is new at a joint, beyond the effects of wider scope that it has.
+
+  One with play is explained by a simulation that follows the readings.
+
+  A course through play does not repeat, so that no model of it is near a whole log; what it
+  predicts from each reading on is judged where play is in the best hypothesis of whole logs.
+  """
+  whole = _explained(subject, settings)
+  done = subject.now.follows or whole.verdict in ("none", "effects")
+  if done or not whole.found.best.names & set(UNREPEATED):
+    return whole
+  near = _explained(following(subject), settings)
+  stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
+  return near if stands else whole
+
+
+def _explained(subject: Subject, settings: Settings) -> Changed:
+  now, before, usual = subject.now, subject.before, subject.usual
+  known, explainer = subject.known, subject.explainer
+  own = [t for t in known if t.names]
+  as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
+  anyway, left = remaining(subject, explainer.null)
+  if may_leave(subject, explainer.null, settings) or np.any(settings.more**2 * anyway < left):
+    ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
+  else:
+    ranked = explainer.constants_alone()
+  found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
+  named = tuple(k for k in found.named if is_something(subject, found.best, k))
+  if before is not None and usual is not None and not subject.paired:
+    named = tuple(k for k in named if is_new(before, usual, found.best, k))
+  anyway, left = remaining(subject, found.best)
+  typical, few = settings.more**2 * anyway < left
+  if named and (typical or few):
+    # That constants are off is no effect: beside it a misfit in few blocks needs no force.
+    forced = [k for k in named if typical or k != CONSTANTS_OFF]
+    named = supported(
+      explainer, found.best, named, subject.beyond, anyway=float(anyway[1]), forced=forced
+    )
+    ranked = explainer.ranked()
+  more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
+  verdict = _verdict(
+    found,
+    named,
+    any(t.wider for t in known),
+    bool(typical or few) or leaves(subject, found.best, settings),
+    more,
+  )
+  off = constants_off(subject, found.best, settings)
+  return Changed(
+    subject,
+    ranked,
+    found,
+    named,
+    "effects" if off and verdict == "none" else verdict,
+    float(np.sqrt(anyway[1])),
+    float(np.sqrt(left[1])),
+    more,
+    off,
+  )
+
+
+def elaborate(found: Sequence[Changed]) -> None:
+  """Adds fits with richer friction where more remains than names explain.
+
+  They make predictions better by what is left. Joints come in the order of that, until all others
+  together leave no more than a tenth of the squares.
+  """
+  left = sorted(found, key=lambda c: -c.left)
+  most = np.cumsum([c.left**2 for c in left])
+  before = np.append(0.0, most[:-1])
+  for item, sum_before in zip(left, before, strict=True):
+    if sum_before > (1.0 - _REST) * most[-1]:
+      break
+    if item.verdict in ("partly", "unexplained") and not item.likelihood.follows:
+      item.elaborated = elaborated(item.subject.explainer, item.found.best, item.named)
+
+
+def _verdict(
+  found: Explanation,
+  named: Sequence[str],
+  shared: bool,
+  remains: bool,
+  more: bool,
+) -> str:
+  """Returns the graded verdict of a joint.
+
+  Args:
+    found: the best hypothesis.
+    named: kinds that are certain.
+    shared: whether the joint has effects of wider scope.
+    remains: whether more is left than the machine leaves anyway, by a test or by that limit.
+    more: whether it is by the limit.
+  """
+  if not named and not shared:
+    return "unexplained" if remains or found.best.names else "none"
+  if not named and not remains:
+    return "none"
+  return "partly" if more else "effects"

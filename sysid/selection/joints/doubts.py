@@ -1,0 +1,122 @@
+"""Whether a name that is clear stands: its values are something, they are new, and it is needed
+beside a force of any form.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerf2real.suite.effects import kind_of
+from nerf2real.sysid.fit import intervals
+from nerf2real.sysid.fit.layout import CLOCKS, Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.hypotheses.constants import OWN
+from nerf2real.sysid.hypotheses.free_force import VARIABLE
+from nerf2real.sysid.selection.joints.remainder import mean_left
+from nerf2real.sysid.selection.joints.subject import Subject
+from nerf2real.sysid.selection.search import rivals
+from nerf2real.sysid.selection.search.evidence import Scored, clear, more_likely
+from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.settings import Settings
+
+_MOMENTS = ("payload",)
+"""Kinds of which a product of values shows: the product is sure where none of them is."""
+
+
+def supported(
+  explainer: Explainer,
+  best: Scored,
+  named: Sequence[str],
+  beyond: float,
+  *,
+  anyway: float,
+  forced: Sequence[str],
+) -> tuple[str, ...]:
+  """Returns the names that stand where something is left that no name is for.
+
+  What is named may then be a part of that: half of a soft stop is a spring. A kind must explain
+  more squares than remain, both of fits to all logs: left-out blocks are predicted with effects
+  that were fitted without them beside constants that were fitted to all, which is for the
+  hypothesis that lacks the effect. One that is a force over one variable stands unless a force of
+  any form over that variable does clearly better; any other where hypotheses with a force of any
+  form over both are clearly worse without it.
+
+  Args:
+    explainer: scores what has not been scored.
+    best: the best hypothesis, of which more remains than the machine leaves anyway.
+    named: kinds that are clear.
+    beyond: standard errors that count as clear.
+    anyway: mean square that the machine leaves anyway.
+    forced: kinds that are tried beside a force.
+  """
+  kept = []
+  left = _left(explainer, best)
+  for kind in named:
+    without = rivals.lacking(explainer, best, kind)
+    explained = _left(explainer, without) - left
+    if explained <= left - anyway or kind not in forced:
+      stands = explained > left - anyway
+    elif kind in VARIABLE:
+      rival = rivals.with_force(explainer, without, VARIABLE[kind])
+      stands = clear(rival, best) <= beyond
+    else:
+      beside, bare = (rivals.with_force(explainer, s) for s in (best, without))
+      stands = clear(beside, bare) > beyond
+    if stands:
+      kept.append(kind)
+  return tuple(kept)
+
+
+def _left(explainer: Explainer, item: Scored) -> float:
+  """Returns the mean square that a hypothesis leaves where it is fitted to all logs."""
+  joint = explainer.joint
+  return mean_left(joint, joint.squares(item.fit.residuals[0])[0])
+
+
+def is_something(subject: Subject, best: Scored, kind: str) -> bool:
+  """Tells whether an effect's sizes differ from those that do nothing, by their intervals.
+
+  What healthy machines have of an effect is nothing, too, where no reference shows it. A payload's
+  mass may be open where its moment is sure.
+  """
+  term = next(t for t in best.terms if t.name == kind)
+  if term.freed or not term.names or kind in _MOMENTS:
+    return True
+  alone = subject.before is None
+  sizes = {p.name: p.nominal for p in kind_of(kind).parameters if not p.shape}
+  own = OWN.get(kind, {}) if alone and subject.now.plant.hinge else {}
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=alone)
+  return any(
+    not low - own.get(n, 0.0) <= sizes[n] <= high for n, (low, high) in bounds.items() if n in sizes
+  )
+
+
+def is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str) -> bool:
+  """Tells whether the reference is less likely with an effect of these values than without."""
+  term = next(t for t in best.terms if t.name == kind)
+  if term.freed:
+    return True
+  held = term.held_at(np.array(list(best.fit.values(term).values())))
+  kept = [(t, usual.fit.values(t)) for t in usual.terms if t.kind != kind]
+  terms = (*[t for t, _ in kept], held)
+  x = np.array([v for _, values in kept for v in values.values()])
+  fitter = Fitter([before], Layout([terms]))
+  fit = fitter.leave_out(fitter.fit(x, iterations=3))
+  beside = Scored(terms, fit, before.loglik(fit.held[0]))
+  gains, prior = usual.nats - beside.nats, usual.prior - beside.prior
+  return more_likely(gains, prior, before.settings.level)
+
+
+def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
+  """Tells whether a declared constant is off by more than its tolerance, all of its interval.
+
+  Beside a reference the constants are those that it shows.
+  """
+  term = best.terms[0]
+  if subject.before is not None or term.freed:
+    return False
+  tolerance = dict(settings.tolerances)
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
+  shares = [n for n in term.names if n not in (*CLOCKS, "zero")]
+  return any(bounds[n][0] > tolerance[n] or bounds[n][1] < -tolerance[n] for n in shares)

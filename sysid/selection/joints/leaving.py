@@ -1,0 +1,50 @@
+"""What a joint leaves under a hypothesis, against what the machine leaves anyway."""
+
+import numpy as np
+
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.selection.joints.remainder import grown, mean_left, scatter, structured
+from nerf2real.sysid.selection.joints.subject import Subject
+from nerf2real.sysid.selection.search.evidence import Scored
+from nerf2real.sysid.settings import Settings
+
+Array = np.ndarray
+
+
+def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
+  """Tells whether a hypothesis leaves more than the machine does anyway.
+
+  Beside a reference with the same commands only noise may remain; beside another its blocks are the
+  measure; without one, a multiple of the readings' noise.
+  """
+  if subject.paired:
+    return structured(subject.now, item, settings)
+  if subject.usual is not None:
+    return grown(item, subject.usual, subject.beyond, settings)
+  left, noise = np.median(item.fit.held[0][0]), np.median(subject.now.noise_squares)
+  return bool(left > settings.more**2 * noise)
+
+
+def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
+  """Tells whether a hypothesis may leave more than the machine does anyway: effects are tried then,
+  and names must be clear by themselves."""
+  if subject.usual is not None and not subject.paired:
+    return grown(item, subject.usual, settings.suspected, settings)
+  return leaves(subject, item, settings)
+
+
+def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
+  """Returns what a machine leaves anyway, and what a hypothesis does: mean squares [2] of
+  the median block, and of all blocks by `mean_left`."""
+  now, before, usual = subject.now, subject.before, subject.usual
+
+  def both(joint: JointLikelihood, squares: Array) -> Array:
+    return np.array([np.median(squares), mean_left(joint, squares)])
+
+  readings = now.noise_squares * (2.0 if subject.paired else 1.0)
+  anyway = np.array([np.median(readings), readings.mean()])
+  if before is not None and usual is not None and not subject.paired:
+    anyway = both(before, usual.fit.held[0][0])
+  if now.follows:
+    anyway = np.maximum(anyway, both(now, scatter(now, item)))
+  return anyway, both(now, item.fit.held[0][0])

@@ -1,0 +1,1 @@
+"""Effects of bodies and of the whole machine, with evidence summed over joints."""
