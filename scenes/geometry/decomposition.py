@@ -36,9 +36,8 @@ class ConvexSettings:
   doubt: float = 0.3
   """Unseen space this near to seen free space counts as free too."""
   inside: float = 0.05
-  """Other unseen space counts as matter this near to seen matter: what is made up beyond it would be
-  wrong by more than the tolerance of all figures of contact geometry, 5 cm, where a thing is thin.
-  The fused band alone is as thick as the truncation already."""
+  """Other unseen space counts as matter this near to seen matter: where a thing is thin, more would
+  be wrong by more than the tolerance of all figures of contact geometry, 5 cm."""
   max_parts: int = 1000
   """Parts are merged until they are this few, those first that reach least into free space."""
   max_vertices: int = 48

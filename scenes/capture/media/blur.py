@@ -1,4 +1,4 @@
-"""Estimates the width of a picture's blur from its edges, along the direction in which it is widest.
+"""Estimates the width of a picture's blur from its edges, in the direction of the widest.
 
 The gradient of an edge with a blur of deviation s, blurred further by a, is in proportion to
 1 / sqrt(s^2 + a^2): the ratio r of two such gradients gives s^2 = (b^2 - r^2 a^2) / (r^2 - 1). It
@@ -14,7 +14,10 @@ import numpy as np
 
 from nerf2real.scenes.capture.media.video import at_standard_size
 
-_LESS, _MORE = 1.0, 2.5  # deviations of the two further blurs [pixel]; chosen: for widths of 0.5 to 7
+_LESS, _MORE = (
+  1.0,
+  2.5,
+)  # deviations of the two further blurs [pixel]; chosen: for widths of 0.5 to 7
 _DIRECTIONS = 4
 _STRONGEST = 0.03  # share of a direction's pixels that are taken for its edges
 _FEWEST = 20  # of them that say something
@@ -34,7 +37,8 @@ def blur_width(grey: np.ndarray) -> float:
   """Blur of a grey picture [H, W] at the standard size, as that of a Gaussian with its slopes.
 
   Returns:
-    Its standard deviation [pixel] along the direction in which it is widest; the shorter side of a picture without edges.
+    Its standard deviation [pixel] along the direction in which it is widest; the shorter side of a
+    picture without edges.
   """
   picture = at_standard_size(grey).astype(np.float32)
   (less, angle), (more, _) = (_gradient(picture, deviation) for deviation in (_LESS, _MORE))

@@ -137,7 +137,8 @@ class Fit:
     shown, arguments, gaussians, drawn = self._draw(camera, eye)
     error = drawn.image - truth.astype(np.float32)
     slopes = rasteriser.composite_backward(gaussians, drawn, (2 / error.size) * error)
-    gradient = projection.pull(*arguments, projection.Projected(*slopes))
+    rows, starts, spacing, _ = arguments
+    gradient = projection.pull(rows, starts, spacing, eye, projection.Projected(*slopes))
     _descend(self.rows, self._mean, self._square, self._seen, shown, gradient, rate * _RATES)
     return float(np.mean(error**2))
 

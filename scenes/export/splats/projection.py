@@ -9,10 +9,10 @@ frame, z the centre's depth, u and v the rows of the projection's Jacobian times
 place of w(q) this is the affine approximation (Zwicker et al. 2001, EWA volume splatting).
 
 Source: Moenne-Loccoz et al. 2024, 3D Gaussian Ray Tracing, section 4, for the response; the bounds
-are those of Sigg et al. 2006, GPU-based ray-casting of quadratic surfaces. What is fitted is packed,
-one row of 14 a splat, all unbounded: offset from the start in units of the spacing (3), logarithms
-of the standard deviations [m] (3), quaternion of any length (w, x, y, z), logit of the opacity,
-colour (3). Shapes: N splats.
+are those of Sigg et al. 2006, GPU-based ray-casting of quadratic surfaces. What is fitted is
+packed, one row of 14 a splat, all unbounded: offset from the start in units of the spacing (3),
+logarithms of the standard deviations [m] (3), quaternion of any length (w, x, y, z), logit of the
+opacity, colour (3). Shapes: N splats.
 """
 
 from typing import NamedTuple
@@ -274,7 +274,10 @@ def _pull(rows, starts, spacing, eye, by_centre, by_conic, by_bend, by_opacity, 
   vectors, by_vectors, out = np.empty((5, 3)), np.empty((5, 3)), np.empty(14)
   conic, bend, box = np.empty(3), np.empty(5), np.empty(4)
   for n in range(len(rows)):
-    depth, opacity = _local(rows[n], starts[n], spacing[n], eye, local), 1 / (1 + np.exp(-rows[n, 10]))
+    depth, opacity = (
+      _local(rows[n], starts[n], spacing[n], eye, local),
+      1 / (1 + np.exp(-rows[n, 10])),
+    )
     if depth == 0:
       continue
     _axes(rows[n], rotation, axes)

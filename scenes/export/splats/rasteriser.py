@@ -74,7 +74,8 @@ def assign(bounds: Bounds, *, width: int, height: int) -> Tiles:
   """Sorts splats with a positive depth by it and lists them for each tile that they reach."""
   ahead = np.flatnonzero(bounds.depths > 0)
   order = ahead[np.argsort(bounds.depths[ahead], kind="stable")]
-  return Tiles(*_assign(bounds.boxes, order, width, height), bounds.depths)
+  first, members = _assign(bounds.boxes, order, width, height)
+  return Tiles(first, members, bounds.depths)
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -154,7 +155,8 @@ def _composite(first, members, depths, centres, conics, bends, opacities, colors
 
 def composite(tiles: Tiles, gaussians: tuple[np.ndarray, ...], *, width: int, height: int) -> Drawn:
   """Draws a picture of the splats of `projection.Projected`."""
-  return Drawn(*_composite(*tiles, *gaussians, width, height))
+  inputs = (*tiles, *gaussians, width, height)
+  return Drawn(*_composite(*inputs))  # type: ignore[call-arg]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -209,5 +211,6 @@ def composite_backward(
     drawn: What it returned.
     slope: Derivative of the loss by the picture [H, W, 3].
   """
-  found: tuple[np.ndarray, ...] = _backward(*gaussians, *drawn[1:], slope)
+  inputs = (*gaussians, *drawn[1:], slope)
+  found: tuple[np.ndarray, ...] = _backward(*inputs)  # type: ignore[call-arg]
   return found

@@ -78,7 +78,9 @@ def test_projection_and_its_derivatives_are_those_of_jax():
     chosen = projection.Projected(*(slope[ahead] for slope in slopes))
     expected = np.asarray(splat_projection.pull(*exact, chosen))
   gradient = projection.pull(*arguments, slopes)
-  np.testing.assert_allclose(gradient[ahead], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+  np.testing.assert_allclose(
+    gradient[ahead], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max()
+  )
   assert not gradient[~ahead].any()
   behind = points.positions - [0, 0, 9]
   assert (projection.project(rows, behind, *arguments[2:])[1].depths == 0).all()
