@@ -184,9 +184,10 @@ def project(
     spacing: Unit of the offsets [N] [m].
     eye: Where from.
   """
-  *found, opacities, depths, boxes = _project(rows, starts, spacing, tuple(eye))
+  found = _project(rows, starts, spacing, tuple(eye))
+  centres, conics, bends, opacities, depths, boxes = found
   colors = np.ascontiguousarray(rows[:, 11:])
-  return Projected(*found, opacities, colors), Bounds(depths, boxes)
+  return Projected(centres, conics, bends, opacities, colors), Bounds(depths, boxes)
 
 
 @numba.njit(cache=True)
