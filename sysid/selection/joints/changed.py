@@ -8,7 +8,7 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.naming import Explanation
 from nerf2real.sysid.selection.joints.subject import Subject
-from nerf2real.sysid.selection.search.evidence import Scored
+from nerf2real.sysid.selection.search.evidence import Scored, clear
 
 Array = np.ndarray
 CONSTANTS_OFF = "parameter_error"
@@ -38,13 +38,20 @@ class Changed:
 
   @property
   def extended(self) -> Scored:
-    """The hypothesis to simulate with: where more remains, what predicts left-out blocks best."""
+    """The hypothesis to simulate with: where more remains, the one of fewest effects that is not
+    clearly worse than what predicts left-out blocks best. What a further effect imitates here it
+    does elsewhere, too: a zero that is shifted in the air tilts a robot on its feet."""
     if self.verdict not in ("partly", "unexplained"):
       return self.found.best
-    fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
     if self.elaborated:
       return self.elaborated[0]
-    return max(fitting, key=lambda s: s.evidence, default=self.found.best)
+    fitting = [s for s in self.ranked if not s.neutral and s.names >= set(self.named)]
+    if not fitting:
+      return self.found.best
+    top = max(fitting, key=lambda s: s.evidence)
+    worth = self.likelihood.settings.worth
+    near = [s for s in fitting if clear(top, s) < worth]
+    return min(near, key=lambda s: (len(s.names) + s.beside_force, -s.evidence))
 
   @property
   def near(self) -> list[Scored]:
