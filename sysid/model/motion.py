@@ -1,4 +1,4 @@
-"""A log's joint motion: positions smoothed and differentiated, and in more detail than readings hold.
+"""A log's joint motion: positions smoothed and differentiated, with more detail than readings hold.
 
 Where a command jumps, acceleration jumps within a step of the simulation; readings every 10 ms with
 noise show that smeared over some 40 ms. What smoothing takes away is told by the declared model:
@@ -17,12 +17,13 @@ import numpy as np
 from mujoco import rollout
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.model.drive import mean_commands
+from nerf2real.sysid.model.drive import actuator_of, mean_commands
 
 Array = np.ndarray
 
 _SMOOTHING = 0.035  # s, half width of the local polynomial that differentiates positions; chosen
 _LATEST = 0.25  # s that a machine's motion is looked for behind its commands, as late commands are
+_CLEARLY = 0.9  # of what the best lateness explains: the earliest peak is taken that does; chosen
 _LARGEST = 2.0  # times what the model says smoothing takes away; chosen
 
 
@@ -45,9 +46,7 @@ class Motion:
     def between(values: Array) -> Array:
       return np.array([np.interp(time, self.time, column) for column in values.T]).T
 
-    return Motion(
-      time, between(self.position), between(self.velocity), between(self.acceleration)
-    )
+    return Motion(time, between(self.position), between(self.velocity), between(self.acceleration))
 
 
 class Smoother:
@@ -106,48 +105,73 @@ def detailed_motion(model: mujoco.MjModel, log: Log, grid: Array) -> Motion:
     log: measured.
     grid: evenly spaced times [T], s, within which the log's stamps lie.
   """
-  measured, stamps = log.states.position, log.states.stamp
+  measured, step = log.states.position, float(grid[1] - grid[0])
   assert measured is not None
-  smoother, step = Smoother(stamps), float(grid[1] - grid[0])
+  smoother = Smoother(log.states.stamp)
   smooth = smoother.motion(measured)
-  result = smooth.at(grid)
-  acceleration = _declared_acceleration(model, log, result, step)
-  velocity = step * np.cumsum(acceleration, axis=0)
-  position = step * np.cumsum(velocity, axis=0)
-  # the state at a grid point is that before the step from there on
-  velocity = np.vstack([np.zeros_like(velocity[:1]), velocity[:-1]])
-  position = np.vstack([np.zeros_like(position[:1]), position[:-1]])
-  taken = measured - smooth.position
-  for j in range(measured.shape[1]):
-
-    def delayed(late: int, of: int = j) -> tuple[Motion, Motion, Array]:
-      keep = np.maximum(np.arange(len(grid)) - late, 0)
-      path = Motion(grid, *(v[keep][:, [of]] for v in (position, velocity, acceleration)))
-      sampled = np.interp(stamps, grid, path.position[:, 0])
-      smoothed = smoother.motion(sampled[:, None])
-      return path, smoothed, sampled - smoothed.position[:, 0]
-
-    shares, gains = [], []
-    lags = range(round(min(_LATEST, 0.5 * grid[-1]) / step) + 1)
-    for late in lags:
-      told = delayed(late)[2]
-      gains.append(float(told @ taken[:, j]) / max(float(told @ told), 1e-30))
-      shares.append(gains[-1] * float(told @ taken[:, j]))
-    best = int(np.argmax(np.array(shares) * (np.array(gains) > 0.0)))
-    gain = float(np.clip(gains[best], 0.0, _LARGEST))
-    path, smoothed, _ = delayed(lags[best])
-    smoothed = smoothed.at(grid)
-    for name in ("position", "velocity", "acceleration"):
-      detail = getattr(path, name)[:, 0] - getattr(smoothed, name)[:, 0]
-      getattr(result, name)[:, j] += gain * detail
-  return result
+  along, taken = smooth.at(grid), measured - smooth.position
+  latest = round(min(_LATEST, 0.5 * grid[-1]) / step)
+  late = np.zeros(measured.shape[1], int)
+  told = _declared(model, log, along, late)
+  for j, column in enumerate(taken.T):
+    gains = [_gain(smoother, told, j, n, column) for n in range(latest + 1)]
+    explained = np.array([gain * share for gain, share in gains])
+    peaks = explained >= np.maximum(np.append(explained[1:], 0.0), np.append(0.0, explained[:-1]))
+    late[j] = np.argmax(peaks & (explained >= _CLEARLY * explained.max()))
+  told = _declared(model, log, along, late)
+  fields = [along.position.copy(), along.velocity.copy(), along.acceleration.copy()]
+  smoothed = smoother.motion(told.at(smoother.time).position).at(grid)
+  for j, column in enumerate(taken.T):
+    gain = _gain(smoother, told, j, 0, column)[0]
+    details = (
+      told.position - smoothed.position,
+      told.velocity - smoothed.velocity,
+      told.acceleration - smoothed.acceleration,
+    )
+    for field, detail in zip(fields, details, strict=True):
+      field[:, j] += gain * detail[:, j]
+  return Motion(grid, *fields)
 
 
-def _declared_acceleration(model: mujoco.MjModel, log: Log, motion: Motion, step: float) -> Array:
-  """Returns the accelerations [T, J] of the declared model along a motion, under a log's commands.
+def _gain(
+  smoother: Smoother, told: Motion, joint: int, late: int, taken: Array
+) -> tuple[float, float]:
+  """Returns by how much what smoothing takes from a path told is what it takes from readings.
 
-  From one step of the simulation at each point of the grid, so that damping acts as there.
+  Args:
+    smoother: of the readings.
+    told: a path on the grid.
+    joint: its column.
+    late: points of the grid by which the readings are later.
+    taken: what smoothing takes from the joint's readings [N].
+
+  Returns:
+    The factor, from 0 to `_LARGEST`, and how much the two go with each other.
   """
+  step = told.time[1] - told.time[0]
+  sampled = np.interp(smoother.time - late * step, told.time, told.position[:, joint])[:, None]
+  missing = (sampled - smoother.motion(sampled).position)[:, 0]
+  share = float(missing @ taken)
+  return float(np.clip(share / max(missing @ missing, 1e-30), 0.0, _LARGEST)), share
+
+
+def _declared(model: mujoco.MjModel, log: Log, motion: Motion, late: Array) -> Motion:
+  """Returns the path that a model's accelerations along a motion make, under a log's commands.
+
+  From one step of the simulation at each point of the grid, so that damping acts as there. The
+  path drifts, as nothing holds it; what is used of it is what smoothing takes away.
+
+  Args:
+    model: restored before returning.
+    log: its commands.
+    motion: of its joints on the grid.
+    late: points of the grid by which the commands of each joint come late [J].
+  """
+  step = float(motion.time[1] - motion.time[0])
+  late_by = np.zeros(model.nu)
+  for name, points in zip(log.joints, late, strict=True):
+    if name in log.commands.joints:
+      late_by[actuator_of(model, name)] = points * step
   ids = [model.joint(name).id for name in log.joints]
   qpos, dofs = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
   own, flags = float(model.opt.timestep), int(model.opt.disableflags)
@@ -161,8 +185,14 @@ def _declared_acceleration(model: mujoco.MjModel, log: Log, motion: Motion, step
     states = np.repeat(state[None], len(motion.time), axis=0)
     states[:, 1 + qpos] = motion.position
     states[:, 1 + model.nq + dofs] = motion.velocity
-    control = mean_commands(model, log, motion.time, step)
+    control = mean_commands(model, log, motion.time, step, late_by)
     after, _ = rollout.rollout(model, data, states, control[:, None])
   finally:
     model.opt.timestep, model.opt.disableflags = own, flags
-  return (after[:, 0, 1 + model.nq + dofs] - motion.velocity) / step
+  acceleration = (after[:, 0, 1 + model.nq + dofs] - motion.velocity) / step
+  velocity = step * np.cumsum(acceleration, axis=0)
+  position = step * np.cumsum(velocity, axis=0)
+  # the state at a point is that before the step from there on
+  velocity = np.vstack([np.zeros_like(velocity[:1]), velocity[:-1]])
+  position = np.vstack([np.zeros_like(position[:1]), position[:-1]])
+  return Motion(motion.time, position, velocity, acceleration)

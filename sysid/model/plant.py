@@ -19,6 +19,7 @@ from nerf2real.sysid.model.reduction import Reduction
 
 Array = np.ndarray
 
+
 @dataclasses.dataclass(frozen=True)
 class Windows:
   """Samples at which the simulation is set to the measured state."""

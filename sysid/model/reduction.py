@@ -9,9 +9,9 @@ and c, what the other joints' velocities and accelerations demand. All of it is 
 and in gravity, so payloads and tilts are added as linear combinations without another pass.
 
 Geared servos carry most of their inertia in their own rotors, which is why one joint at a time is a
-good approximation; the figures of a report are simulated by the whole model. Where links weigh as much,
-a joint feels the others' accelerations at every jump of a command: their motion is taken in detail
-(`motion.py`), and the model is evaluated where a line between two places of it would miss that.
+good approximation; the figures of a report are simulated by the whole model. Where links weigh as
+much, a joint feels the others' accelerations at every jump of a command: their motion is taken in
+detail (`motion.py`), and the model is evaluated where a line between two places would miss that.
 
 Shapes: N samples of a log, J joints of the log, T points of the simulation's grid, M of them, the
 knots, at which the model is evaluated.
@@ -146,7 +146,7 @@ class Reduction:
     return inertia, bias, np.array(places)
 
   def _weights(self, joint: str) -> Array:
-    """Returns gravity's torque, and that a quarter turn further, per m/s^2 at the knots [2, M, 3]."""
+    """Returns gravity's torque, and a quarter turn further, at the knots per m/s^2 [2, M, 3]."""
     model, places = self.model, self._evaluated[2]
     index = model.joint(joint).id
     body = int(model.jnt_bodyid[index])
