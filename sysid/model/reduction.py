@@ -29,7 +29,7 @@ from nerf2real.sysid.model.motion import Motion, detailed_motion, smooth_motion
 
 Array = np.ndarray
 
-LONGEST_STEP = 2e-3
+LONGEST_STEP = 5e-3
 """s; chosen: a model with a longer step than this is simulated in parts of it."""
 
 _SPACING = 0.03  # s between poses at which a model is evaluated; chosen
