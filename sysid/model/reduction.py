@@ -22,10 +22,13 @@ import functools
 
 import mujoco
 import numpy as np
+from scipy.stats import norm
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model import point_mass
+from nerf2real.sysid.model.drive import actuator_of, holds_position
 from nerf2real.sysid.model.motion import Motion, detailed_motion, smooth_motion
+from nerf2real.sysid.model.simulation import simulate
 
 Array = np.ndarray
 
@@ -97,6 +100,25 @@ class Reduction:
     self._dofs = model.jnt_dofadr[ids]
     self._poses: point_mass.Poses | None = None
     self._moments: dict[int, dict[str, Array]] = {}
+
+  @functools.cached_property
+  def twin(self) -> tuple["Reduction", Array] | None:
+    """The declared machine's own recording under the same commands, reduced, and its positions
+    without the readings' noise [N, J]: what joints one by one miss there is the reduction's error.
+
+    None of one joint, and where the machine does not hold positions: its course would be another.
+    """
+    model, log = self.model, self.log
+    actuators = [actuator_of(model, name) for name in log.commands.joints]
+    if self._alone or not all(holds_position(model, u) for u in actuators):
+      return None
+    measured = log.states.position
+    assert measured is not None
+    course = simulate(model, log)
+    scatter = np.median(np.abs(measured - self.motion.position), axis=0) / norm.ppf(0.75)
+    read = course + scatter * np.random.default_rng(0).standard_normal(course.shape)
+    states = dataclasses.replace(log.states, position=read)
+    return Reduction(model, dataclasses.replace(log, states=states)), course
 
   def of_joint(self, joint: str) -> Surroundings:
     """Returns what a joint feels of the model."""
