@@ -179,6 +179,28 @@ def test_joint_among_moving_others_follows_the_whole_model(motion: str) -> None:
     assert np.sqrt(np.mean((got - want) ** 2)) < 3e-4
 
 
+def test_what_prescribing_the_others_misses_is_known_from_the_declared_machine() -> None:
+  model = mujoco.MjModel.from_xml_string(ARM)
+  # an elbow as heavy as the upper arm, without a rotor's inertia that would hide the others
+  model.dof_armature[:] = 0.0
+  model.body_mass[2], model.body_inertia[2] = 1.0, 5e-3
+  declared = log_of(ARM, "steps", rounding=0.0, duration=6.0)
+  course = evaluation.simulate(model, declared)
+  noise = 3e-4 * np.random.default_rng(1).standard_normal(course.shape)
+  states = dataclasses.replace(declared.states, position=course + noise)
+  log = dataclasses.replace(declared, states=states)
+  for column, joint in enumerate(log.joints):
+    plant = JointModel(model, joint, [log])
+    missed = plant.run(plant.declared, (), 0).position - course[:, column]
+    told = plant.reduction_error(0)
+    assert told.shape == missed.shape
+    assert np.sqrt(np.mean(told**2)) == pytest.approx(np.sqrt(np.mean(missed**2)), rel=0.5)
+    large = np.abs(missed) > 3.0 * np.sqrt(np.mean(missed**2))
+    assert np.median(told[large]) > 2.0 * np.median(told)
+  alone = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", [log_of(PENDULUM, "sweep")])
+  assert np.all(alone.reduction_error(0) == 0.0)
+
+
 def test_surroundings_of_a_payload_are_those_of_a_heavier_model() -> None:
   heavier = ARM.replace(
     '<inertial pos="0 0.01 -0.08" mass="0.3" diaginertia="8e-4 8e-4 1e-4"/>',
