@@ -17,6 +17,7 @@ Array = np.ndarray
 
 _POINTS = 1200  # a curve is thinned to this many points: a page of a few MB
 _BINS = 24
+_WIDEST = 3.0
 
 
 class Curve(NamedTuple):
@@ -117,8 +118,14 @@ def bars(
 
 
 def intervals(title: str, rows: Sequence[Interval]) -> Chart | None:
-  """Returns intervals as percentages about their values; None where all values are 0."""
-  shown = [row for row in rows if row.value]
+  """Returns intervals as percentages about their values; None where none is shown.
+
+  One that reaches farther than `_WIDEST` times its value would squeeze the others to points.
+  """
+  reach = [max(row.high - row.value, row.value - row.low) for row in rows]
+  shown = [
+    r for r, far in zip(rows, reach, strict=True) if r.value and far <= _WIDEST * abs(r.value)
+  ]
   if not shown:
     return None
   names, value, low, high = zip(*shown[::-1], strict=True)

@@ -51,7 +51,7 @@ def alternatives(found: Identified) -> list[dict[str, Any]]:
       "kinds": sorted(other.names),
       "kind": "+".join(sorted(other.names)),
       "joint": item.joint,
-      "confounded": any(other is c for c in item.confounded),
+      "confounded": bool(item.named) and any(other is c for c in item.confounded),
       "parameters": {
         k: {n: round(v, 5) for n, v in other.values(k).items()} for k in sorted(other.names)
       },

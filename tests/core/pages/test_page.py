@@ -140,6 +140,7 @@ def test_intervals_are_relative_to_their_values():
   assert trace.error_x.array == pytest.approx([50.0])
   assert trace.error_x.arrayminus == pytest.approx([10.0])
   assert charts.intervals("", [charts.Interval("zero", 0.0, -1.0, 1.0)]) is None
+  assert charts.intervals("", [charts.Interval("nothing is known of it", 1e-6, -1.0, 1.0)]) is None
 
 
 def test_bars_run_from_top_to_bottom():
