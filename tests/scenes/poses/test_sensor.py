@@ -2,13 +2,18 @@
 
 import types
 
+import cv2
 import numpy as np
 import pytest
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.poses import sensor
 from nerf2real.scenes.poses.tracks import Tracks
+from nerf2real.scenes.stages import localising
+from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from tests.scenes import furnished_room
 
 _PICTURES = Camera(width=160, height=120, fx=131.0, fy=131.0, cx=81.0, cy=59.0, k1=0.05, k2=-0.06)
@@ -91,3 +96,40 @@ def test_few_points_say_nothing(localised, beside):
   few = types.SimpleNamespace(**vars(localised))
   few.tracks = Tracks(*(column[:300] for column in localised.tracks))
   assert sensor.find_sensor(few, beside, unit=_UNIT) is None
+
+
+def _made(folder, value, made):
+  return Made(value, StageResult(folder, "key", made, 0.0, cached=False))
+
+
+def test_a_capture_gets_the_depth_that_its_camera_would_have_measured(localised, beside, tmp_path):
+  images, depth = [], []
+  for row, raw in enumerate(beside):
+    images.append(tmp_path / f"frame_{row:06d}.png")
+    depth.append(tmp_path / f"{row}.depth.png")
+    cv2.imwrite(str(images[-1]), np.zeros((120, 160, 3), np.uint8))
+    cv2.imwrite(str(depth[-1]), raw)
+  known = KnownPoses(
+    kind="rgbd",
+    camera=_PICTURES,
+    files=tuple(images),
+    world_from_camera=_POSES,
+    points=np.zeros((0, 3)),
+    point_colors=np.zeros((0, 3), np.uint8),
+    point_errors=np.zeros(0),
+    depth_files=tuple(depth),
+    depth_unit=_UNIT,
+  ).lifted()
+  ones = np.ones(len(images))
+  capture = Capture("rgbd", tmp_path, images, 160, 120, ones, ones, None, [], known)
+  localised.names = tuple(path.name for path in images)
+  cache = Stages(tmp_path / "stages", show_progress=False)
+  poses = _made(tmp_path, localised, "poses")
+  before = _made(tmp_path, capture, "keyframes")
+  after = localising.sensed(cache, before, poses)
+  assert after.stamp != before.stamp and "aligned by localised points" in after.value.warnings[0]
+  off = [
+    np.percentile(furnished_room.distance(made.value.known.points), 90) for made in (before, after)
+  ]
+  assert off[1] < 0.6 * off[0]
+  assert localising.sensed(cache, before, poses).stage.cached
