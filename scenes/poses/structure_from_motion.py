@@ -117,16 +117,16 @@ def _map(
   steps.begin("matching")
   pairs, words = features.find_pairs(database, settings.pairs, report=steps.report)
 
-  # Guided matching is several times the work: of few pictures, whose features are many, only where
-  # it is needed.
-  plain = settings.features.guided_matching and len(names) <= settings.features.few_pictures
+  guided = settings.features
+  counts = features.feature_counts(database).astype(np.float64)
+  cost = sum(counts[i] * counts[j] for i, j in pairs)
+  plain = guided.guided_matching and len(names) <= guided.few_pictures and cost > guided.guided_cost
 
   def match(chosen: list[tuple[int, int]], how: FeatureSettings, *, again: bool = False) -> int:
     return features.match_pairs(
       database, chosen, settings=how, seed=settings.seed, again=again, report=steps.report
     )
 
-  guided = settings.features
   match(pairs, dataclasses.replace(guided, guided_matching=False) if plain else guided)
   warnings = []
   width = _picture_width(database)
