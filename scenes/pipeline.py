@@ -83,6 +83,7 @@ def _run_stages(
   poses = localising.poses(cache, capture, settings.localise)
   if watcher is not None:
     watcher.poses(poses.value)
+  capture = localising.sensed(cache, capture, poses)
   if given.override.floor_points is None:
     room_check.require_room(poses.value.world_from_camera, poses.value.points)
   outlook = world_frame.outlook(

@@ -2,17 +2,22 @@
 
   python benchmarks/rooms/stills.py --work out/stills --preset tiny
   python benchmarks/rooms/stills.py --work out/stills --megapixels 12 48 --no-scene
+  python benchmarks/rooms/stills.py --work out/thing --subject thing --count 50
 
 The photographer stands along the furniture and looks across the room, two thirds of the pictures
 from eye height, the others from knee height, every third one upright; the phone sets each one's
-exposure. The files are JPEGs of a phone's size with EXIF's orientation and focal length; their
-content is as sharp as 1920x1440. Memory is the peak of a process of its own.
+exposure. Of other subjects all pictures look at one thing: a pouf from half around it, the floor
+below it; or a bookcase from before it, without any floor. The files are JPEGs of a phone's size
+with EXIF's orientation and focal length; their content is as sharp as 1920x1440. Memory is the peak
+of a process of its own.
 """
 
 import dataclasses
 import multiprocessing
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -34,6 +39,11 @@ _LENS = filming.LENS.resized(1920, 1440)
 _MILLIMETRES = round(36 * _LENS.fx / _LENS.width)  # EXIF's focal length, for film of 36 mm width
 _RING = (0.32, -0.17), (1.3, 1.2)  # centre and radii of the walk along the furniture [m]
 _HEIGHTS, _PITCHES = (1.5, 0.6), (0.38, 0.15)  # m, rad downwards
+# place looked at [m], radii of the arc [m], its first and last angle [rad], heights [m]
+_THINGS = {
+  "thing": ((-1.62, -0.66, 0.25), (1.1, 1.1), (-1.4, 1.5), (1.2, 0.8)),
+  "front": ((0.0, -1.86, 1.3), (1.4, 2.2), (0.7, 2.4), (1.5, 1.3)),
+}
 _SWAY, _TURN = 0.3, 0.03  # rad: looking left and right in turn; how crookedly a phone is held
 _STEP_ASIDE = 0.05  # standard deviation of a place [m]
 _EXPOSURE = 0.1  # standard deviation of the logarithm of the exposure
@@ -54,6 +64,8 @@ class Settings(harness.Options):
   """Photographs of the room."""
   megapixels: tuple[float, ...] = (12.0,)
   """Sizes of the files; the scene is made of the first, of others a few are read for a time."""
+  subject: Literal["room", "thing", "front"] = "room"
+  """What is photographed."""
   preset: str = "tiny"
   """Preset of the scene."""
   scene: bool = True
@@ -62,31 +74,48 @@ class Settings(harness.Options):
   """Of places and noise."""
 
 
-def places(count: int, rng: np.random.Generator) -> np.ndarray:
-  """Poses [N, 4, 4] of the upright camera in the room."""
+def _ring(count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+  """Yields places [3] along the furniture and the directions [3] across the room."""
   centre, radii = (np.array(pair) for pair in _RING)
-  poses = np.tile(np.eye(4), (count, 1, 1))
   high = round(count * 2 / 3)
-  for k, pose in enumerate(poses):
+  for k in range(count):
     ring, number, of = (0, k, high) if k < high else (1, k - high, count - high)
     angle = 2 * np.pi * number / of
     heading, pitch = angle + np.pi + _SWAY * (-1) ** k, _PITCHES[ring]
     level = np.cos(pitch)
-    axes = camera_axes(np.array([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)]))
+    place = np.array([*(centre + radii * [np.cos(angle), np.sin(angle)]), _HEIGHTS[ring]])
+    yield place, np.array([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)])
+
+
+def _arc(count: int, subject: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+  """Yields places [3] on an arc around a thing and the directions [3] to it."""
+  focus, radii, ends, heights = _THINGS[subject]
+  for k, angle in enumerate(np.linspace(*ends, count)):
+    reach = radii[0] + (radii[1] - radii[0]) * (k % 3) / 2
+    place = np.array([*reach * np.array([np.cos(angle), np.sin(angle)]), heights[k % 2]])
+    place[:2] += focus[:2]
+    yield place, (focus - place) / np.linalg.norm(focus - place)
+
+
+def places(count: int, subject: str, rng: np.random.Generator) -> np.ndarray:
+  """Poses [N, 4, 4] of the upright camera in the room."""
+  views = _ring(count) if subject == "room" else _arc(count, subject)
+  poses = np.tile(np.eye(4), (count, 1, 1))
+  for pose, (place, forward) in zip(poses, views, strict=True):
     roll = rng.normal(0, _TURN)
     turn = [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
-    pose[:3, :3] = axes @ np.array(turn)
-    pose[:2, 3] = centre + radii * [np.cos(angle), np.sin(angle)]
-    pose[2, 3] = _HEIGHTS[ring]
-    pose[:3, 3] += rng.normal(0, _STEP_ASIDE, 3)
+    pose[:3, :3] = camera_axes(forward) @ np.array(turn)
+    pose[:3, 3] = place + rng.normal(0, _STEP_ASIDE, 3)
   return poses
 
 
-def photograph(folder: Path, megapixels: float, *, count: int, seed: int) -> np.ndarray:
+def photograph(
+  folder: Path, megapixels: float, *, count: int, subject: str, seed: int
+) -> np.ndarray:
   """Writes the photographs; returns the poses [N, 4, 4] of the phone's sensor."""
   folder.mkdir(parents=True, exist_ok=True)
   rng = np.random.default_rng([seed, 9])
-  poses = places(count, rng)
+  poses = places(count, subject, rng)
   width = round(np.sqrt(1e6 * megapixels * _ASPECT) / 16) * 16
   size = (width, round(width / _ASPECT))
   with room.room_eye(seed) as eye:
@@ -185,7 +214,9 @@ def main(settings: Settings) -> None:
   for megapixels in settings.megapixels:
     folder = settings.work / f"photographs_{megapixels:g}"
     count = _READ if first else settings.count
-    poses = photograph(folder, megapixels, count=count, seed=settings.seed)
+    poses = photograph(
+      folder, megapixels, count=count, subject=settings.subject, seed=settings.seed
+    )
     figures[f"photographs_of_{megapixels:g}_megapixels"] = costs(folder, settings.work / "costs")
     first = first or (folder, poses)
   if settings.scene and first is not None:

@@ -27,7 +27,7 @@ from nerf2real.scenes.poses.localisation import (
   save,
 )
 from nerf2real.scenes.poses.matching import features
-from nerf2real.scenes.poses.matching.features import quiet
+from nerf2real.scenes.poses.matching.features import FeatureSettings, quiet
 from nerf2real.scenes.poses.matching.pairs import repair_pairs
 from nerf2real.scenes.poses.matching.parallax import parallax_share
 from nerf2real.scenes.poses.registered import check_registered
@@ -117,12 +117,17 @@ def _map(
   steps.begin("matching")
   pairs, words = features.find_pairs(database, settings.pairs, report=steps.report)
 
-  def match(chosen: list[tuple[int, int]]) -> int:
+  guided = settings.features
+  counts = features.feature_counts(database).astype(np.float64)
+  cost = sum(counts[i] * counts[j] for i, j in pairs)
+  plain = guided.guided_matching and len(names) <= guided.few_pictures and cost > guided.guided_cost
+
+  def match(chosen: list[tuple[int, int]], how: FeatureSettings, *, again: bool = False) -> int:
     return features.match_pairs(
-      database, chosen, settings=settings.features, seed=settings.seed, report=steps.report
+      database, chosen, settings=how, seed=settings.seed, again=again, report=steps.report
     )
 
-  match(pairs)
+  match(pairs, dataclasses.replace(guided, guided_matching=False) if plain else guided)
   warnings = []
   width = _picture_width(database)
   share = parallax_share(database, width=width, seed=settings.seed)
@@ -146,7 +151,9 @@ def _map(
         len(names),
         overlap=settings.pairs.overlap,
         loop_keyframes=settings.pairs.loop_keyframes,
-      )
+      ),
+      guided,
+      again=plain,
     )
     if added:
       steps.begin("mapping")

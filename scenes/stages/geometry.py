@@ -26,6 +26,7 @@ from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from nerf2real.scenes.stages.pictures import PosedPictures
 from nerf2real.scenes.stages.results import Contact, FreeFloor
 
+_SURFACE_VERSION = 2  # 2: the floor is inside of the grid
 # 2: unseen space is matter behind seen matter alone; no tolerance grows; 3: its errors apart
 _CONTACT_VERSION = 3
 
@@ -71,9 +72,11 @@ def surface(
   """Makes the coloured surface mesh of depth in the world frame."""
 
   def write(folder: Path, progress: Progress) -> None:
+    # The extent ends at the floor, which is noisy: of a grid that ends there half of it was lost.
+    below = np.array([0.0, 0.0, settings.truncation])
     grid = fusion.fuse(
       depth.value,
-      lower=world.value.extent_lower,
+      lower=world.value.extent_lower - below,
       upper=world.value.extent_upper,
       voxel=settings.voxel,
       truncation=settings.truncation,
@@ -87,7 +90,7 @@ def surface(
     mesh.save_glb(mesh.paint(found, depth.value), folder / "visual.glb")
 
   inputs = {"world": world.stamp, "depth": depth.stamp}
-  return cache.run("surface", write, settings=settings, inputs=inputs)
+  return cache.run("surface", write, settings=settings, inputs=inputs, version=_SURFACE_VERSION)
 
 
 def contact(

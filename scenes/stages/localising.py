@@ -1,19 +1,22 @@
-"""Stages from a capture to localised pictures: keyframes, poses.
+"""Stages from a capture to localised pictures: keyframes, poses, depth aligned with them.
 
 Each runs, or finds done, one stage of the cache: a function of earlier results and settings.
 """
 
+import dataclasses
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from nerf2real.core.progress import Progress
 from nerf2real.scenes.capture import keyframes as keyframe_files
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.poses import localisation, structure_from_motion
+from nerf2real.scenes.poses import localisation, sensor, structure_from_motion
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages.cache import Made, Stages
@@ -66,3 +69,43 @@ def poses(cache: Stages, capture: Made[Capture], settings: LocaliseSettings) -> 
   inputs = {"keyframes": capture.stamp}
   stage = cache.run("poses", write, settings=settings, inputs=inputs, version=_POSES_VERSION)
   return Made(localisation.load(stage.folder / "sfm"), stage)
+
+
+def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> Made[Capture]:
+  """Returns the capture with measured depth as the pictures' camera would have measured it."""
+  known, found = capture.value.known, poses.value
+  if known is None or not known.depth_files or not len(found.tracks.view):
+    return capture
+  of_name = {
+    path.name: file for path, file in zip(capture.value.images, known.depth_files, strict=True)
+  }
+
+  def write(folder: Path, progress: Progress) -> None:
+    depth = [depth_pictures.read(of_name[name]) for name in found.names]
+    own = sensor.find_sensor(found, np.stack(depth), unit=known.depth_unit)
+    for number, (name, raw) in enumerate(zip(found.names, depth, strict=True)):
+      if own is None:
+        break
+      camera = found.camera.resized(raw.shape[1], raw.shape[0])
+      aligned = own.aligned(raw * known.depth_unit, camera) / known.depth_unit
+      path = folder / f"{Path(name).stem}.png"
+      if not cv2.imwrite(str(path), np.rint(aligned).astype(np.uint16)):
+        raise OSError(f"{path} could not be written: is the disk full?")
+      progress((number + 1) / len(depth), f"depth of picture {number + 1} of {len(depth)}")
+
+  inputs = {"keyframes": capture.stamp, "poses": poses.stamp}
+  stage = cache.run("sensor", write, settings=None, inputs=inputs)
+  aligned = {path.stem: path for path in stage.folder.glob("*.png")}
+  if not aligned:
+    return capture
+  files = [aligned.get(Path(name).stem, file) for name, file in of_name.items()]
+  words = (
+    "The depth was measured by a camera beside the pictures' own, of another focal length: both "
+    "were aligned by localised points."
+  )
+  changed = dataclasses.replace(
+    capture.value,
+    known=dataclasses.replace(known, depth_files=tuple(files)).lifted(),
+    warnings=[*capture.value.warnings, words],
+  )
+  return Made(changed, stage)

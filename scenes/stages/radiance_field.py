@@ -52,6 +52,8 @@ def field(
     "train_width": pictures.width,
   }
   inputs = {"poses": pictures.poses.stamp}
+  if pictures.capture.value.known is not None and pictures.capture.value.known.depth_files:
+    inputs["keyframes"] = pictures.capture.stamp
   stage = cache.run("field", write, settings=everything, inputs=inputs, version=_FIELD_VERSION)
   return Made(TrainedField(stage.folder / "field.safetensors"), stage)
 

@@ -17,7 +17,7 @@ _SIGHTINGS = 400  # points lifted from a picture
 _INVALID = 65535  # 7-Scenes' value where no depth was measured; 0 is everybody's
 
 
-def _read(path: Path) -> np.ndarray:
+def read(path: Path) -> np.ndarray:
   """Reads a depth picture, uint16 [H, W]; what counts as not measured is 0."""
   depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
   if depth is None or depth.ndim != 2 or depth.dtype != np.uint16:
@@ -37,7 +37,7 @@ def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
   Returns:
     z-depth float32 [H, W] [m]; 0 where nothing was measured.
   """
-  depth = _read(path)
+  depth = read(path)
   row, column = (
     ((np.arange(size) + 0.5) * length / size).astype(int)
     for size, length in zip((camera.height, camera.width), depth.shape, strict=True)
@@ -47,7 +47,7 @@ def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
 
 def at_pixels(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
   """Reads z-depth float64 [A] at pixels [A, 2] of a camera; 0 where none was measured [unit]."""
-  depth = _read(path)
+  depth = read(path)
   height, width = depth.shape
   column, row = np.floor(pixels * [width / camera.width, height / camera.height]).astype(int).T
   return depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(np.float64)
@@ -69,7 +69,7 @@ def sightings(depth_files: Sequence[Path], unit: float, camera: Camera) -> np.nd
   """
   found = []
   for index, path in enumerate(depth_files):
-    depth = _read(path)
+    depth = read(path)
     height, width = depth.shape
     stride = max(1, int(np.sqrt(width * height / _SIGHTINGS)))
     row, column = (

@@ -1,7 +1,10 @@
 """Tests of localisation: a small reconstruction against the truth."""
 
+import contextlib
 import dataclasses
 import json
+import shutil
+import sqlite3
 from pathlib import Path
 
 import cv2
@@ -111,6 +114,26 @@ def test_second_run_repeats_no_feature_and_no_match(corner, monkeypatch, capfd):
   again = localise(folder / "images", folder / "out", settings=FEW)
   assert again.names == result.names
   assert capfd.readouterr() == ("", "")  # nothing of COLMAP's log
+
+
+def test_pairs_are_matched_again_with_guidance_where_asked(corner, tmp_path):
+  """Guidance finds more in the same pairs."""
+  folder, _, _, _ = corner
+  database = tmp_path / "database.db"
+  shutil.copy(folder / "out" / "work" / "database.db", database)
+
+  def inliers():
+    with contextlib.closing(sqlite3.connect(database)) as db:
+      return db.execute("SELECT COUNT(*), SUM(rows) FROM two_view_geometries").fetchone()
+
+  pairs, before = [(0, 1), (0, 5), (3, 7)], inliers()
+  plain = dataclasses.replace(FEW.features, guided_matching=False)
+  assert features.match_pairs(database, pairs, settings=plain, seed=0) == 0
+  assert inliers() == before
+  assert features.match_pairs(database, pairs, settings=plain, seed=0, again=True) == 3
+  assert inliers()[0] == before[0] and inliers()[1] < before[1]
+  assert features.match_pairs(database, pairs, settings=FEW.features, seed=0, again=True) == 3
+  assert inliers()[0] == before[0] and inliers()[1] > 0.99 * before[1]
 
 
 def test_an_interrupted_run_continues_with_one_camera(corner, tmp_path):

@@ -1,0 +1,152 @@
+"""Finds where a depth sensor sits beside the pictures' camera, and aligns its depth with them.
+
+A Kinect measures depth with a second camera, of another focal length, a few centimetres beside the
+first; a recording may hold it as measured (7-Scenes), and lifted by the pictures' camera it is off
+by 10 % of a view's width at its border. Localised points tell: seen by the sensor, each has the
+depth that the sensor measured there. Shapes: N pictures, O observations, H height, W width.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize
+
+from nerf2real.core.cameras import Camera
+from nerf2real.scenes.poses.localisation import Localisation
+
+_MOST_ERROR = 2.0  # points with a larger reprojection error are left out [pixel]
+_FEWEST_VIEWS = 3  # so are points in fewer pictures
+_FEWEST = 500  # observations for each half: fewer decide nothing
+_OUTLIER = 0.05  # relative error of the depth from which it counts no more
+_CLEARLY = 0.8  # of the error of depth that is taken as aligned; less, and a sensor of its own is
+_STEPS = (0.1, 0.03, 0.03, 0.03, 0.03)  # of the search: log of the focal length, rays' tangents, m
+_SEARCHES = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+  """A depth sensor beside the pictures' camera, that looks as it does."""
+
+  camera: Camera
+  """Of the depth pictures; without distortion."""
+  right: float
+  """Of the pictures' camera's centre [m]."""
+  below: float
+  """The pictures' camera's centre [m]."""
+
+  @property
+  def _centre(self) -> np.ndarray:
+    return np.array([self.right, self.below, 0.0])
+
+  def aligned(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """Depth as the pictures' camera would have measured it.
+
+    Args:
+      depth: z-depth [H, W] [m], 0 where nothing was measured.
+      camera: Of the pictures, with a picture of the depth's size.
+
+    Returns:
+      z-depth float32 [H, W] [m], the nearest where several meet; 0 where nothing was measured.
+    """
+    seen = depth > 0
+    points = (self.camera.rays() * depth[..., None])[seen] + self._centre
+    column, row = np.floor(camera.project(points)).astype(int).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    far_first = np.flatnonzero(inside)[np.argsort(-points[inside, 2], kind="stable")]
+    result = np.zeros((camera.height, camera.width), np.float32)
+    result[row[far_first], column[far_first]] = points[far_first, 2]
+    return result
+
+
+class _Sighted(NamedTuple):
+  """Observations of localised points and the depth pictures that go with them."""
+
+  picture: np.ndarray  # [O]
+  pixel: np.ndarray  # [O, 2] where the picture shows it, at the depth pictures' size
+  point: np.ndarray  # [O, 3] in the pictures' camera's frame [m]
+  depth: np.ndarray  # [N, H, W] z-depth in a unit, 0 where nothing was measured
+  unit: float  # [m]
+
+  def chosen(self, rows: np.ndarray) -> "_Sighted":
+    return self._replace(picture=self.picture[rows], pixel=self.pixel[rows], point=self.point[rows])
+
+  def error(self, pixel: np.ndarray, expected: np.ndarray) -> float:
+    """Mean relative error of the depth measured at pixels [O, 2], outliers cut."""
+    _, height, width = self.depth.shape
+    column, row = np.floor(pixel).astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    measured = self.unit * self.depth[self.picture[inside], row[inside], column[inside]]
+    off = np.abs(measured / expected[inside] - 1)[measured > 0]
+    return float(np.minimum(off, _OUTLIER).mean()) if len(off) >= _FEWEST else _OUTLIER
+
+  def error_of(self, sensor: Sensor) -> float:
+    """The same for a sensor of its own."""
+    beside = self.point - sensor._centre
+    return self.error(sensor.camera.project(beside), beside[:, 2])
+
+
+def _sighted(found: Localisation, depth: np.ndarray, unit: float) -> _Sighted:
+  often = found.tracks.lengths(len(found.points)) >= _FEWEST_VIEWS
+  seen = found.tracks.of_points(often & (found.point_errors < _MOST_ERROR))
+  poses = found.world_from_camera[seen.view]
+  local = np.einsum("oji,oj->oi", poses[:, :3, :3], found.points[seen.point] - poses[:, :3, 3])
+  size = np.array([depth.shape[2], depth.shape[1]]) / [found.camera.width, found.camera.height]
+  ahead = local[:, 2] > 0
+  return _Sighted(
+    seen.view[ahead],
+    (seen.pixel * size)[ahead],
+    local[ahead] / found.unit_from_source.scale,
+    depth,
+    unit,
+  )
+
+
+def find_sensor(found: Localisation, depth: np.ndarray, *, unit: float) -> Sensor | None:
+  """Finds a sensor that explains measured depth clearly better than the pictures' own camera.
+
+  Focal length, principal point and place are searched on every second picture; the others judge.
+
+  Args:
+    found: The localised pictures, with metric poses in the source's frame.
+    depth: Their depth pictures, z-depth [N, H, W] in a unit, 0 where nothing was measured.
+    unit: That unit [m].
+
+  Returns:
+    The sensor; None where the depth is aligned with the pictures, or nothing can be said.
+  """
+  sighted = _sighted(found, depth, unit)
+  halves = [sighted.chosen(np.flatnonzero(sighted.picture % 2 == k)) for k in (0, 1)]
+  if min(len(half.picture) for half in halves) < _FEWEST:
+    return None
+  _, height, width = depth.shape
+  start = found.camera.resized(width, height)
+  focal = float(0.5 * (start.fx + start.fy))
+
+  def sensor(numbers: np.ndarray) -> Sensor:
+    zoom, across, down, right, below = (float(number) for number in numbers)
+    own = focal * math.exp(zoom)
+    camera = Camera(
+      width=width,
+      height=height,
+      fx=own,
+      fy=own,
+      cx=start.cx + focal * across,
+      cy=start.cy + focal * down,
+    )
+    return Sensor(camera, right, below)
+
+  first, other = halves
+  best = np.zeros(len(_STEPS))
+  for _ in range(_SEARCHES):  # a simplex that has collapsed begins anew where it is
+    simplex = best + np.vstack([np.zeros(len(_STEPS)), np.diag(_STEPS)])
+    best = optimize.minimize(
+      lambda numbers: first.error_of(sensor(numbers)),
+      best,
+      method="Nelder-Mead",
+      options={"initial_simplex": simplex, "maxfev": 400},
+    ).x
+  chosen = sensor(best)
+  aligned = other.error(other.pixel, other.point[:, 2])
+  return chosen if other.error_of(chosen) < _CLEARLY * aligned else None
