@@ -83,14 +83,7 @@ class JointModel(JointPlant):
     return self._bases[key]
 
   def _parts(self, logs: Sequence[Sequence[Surroundings]]) -> list[Array]:
-    result = []
-    for index, parts in enumerate(logs):
-      grid, time = self._grids[index], self.logs[index].time
-      rows = [
-        [np.interp(grid, time, f) for f in (p.inertia, p.here, p.across, p.bias)] for p in parts
-      ]
-      result.append(np.array(rows))
-    return result
+    return [np.array([[p.inertia, p.here, p.across, p.bias] for p in parts]) for parts in logs]
 
   @functools.cached_property
   def law(self) -> tuple[ServoLaw, Array] | None:

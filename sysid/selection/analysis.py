@@ -13,7 +13,7 @@ from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING
-from nerf2real.sysid.model.plant import actuator_of
+from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import claims
