@@ -192,8 +192,8 @@ class Explainer:
       if term.kind in old:
         continue
       blank = np.zeros((len(term.names), *known.shape[1:]))
-      begin = [np.concatenate([x, s]) for s in term.starts]
-      begin = np.array([*begin, *_handed_over(parent, term)])
+      own = [np.concatenate([x, s]) for s in term.starts]
+      begin = np.array([*own, *_handed_over(parent, term)])
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
