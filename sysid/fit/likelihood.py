@@ -29,6 +29,7 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 Array = np.ndarray
 
 _NOTHING = np.zeros(0)
+_AT_LIMIT = 0.98  # of the largest duty: saturated
 
 
 class JointLikelihood:
@@ -74,7 +75,6 @@ class JointLikelihood:
   def _measure(self, left: Array) -> tuple[float, float]:
     """Returns scale and correlation time of what a servo's law leaves of the duty [N]."""
     assert self.law is not None and self.effort is not None
-    self._nominal = 1.0 if self.law.is_off(self.settings.duty_scale) else self.law.gain
     jump = np.concatenate(
       [command_jump(self.plant, i, 2.0 * self.plant.step) for i in range(len(self.plant.logs))]
     )
@@ -201,16 +201,20 @@ class JointLikelihood:
   def _duties(self, p: Array) -> Array:
     """Returns measured duty minus that of the law of kernel parameters [P].
 
-    A gain within what a data sheet leaves open is taken for the declared one.
+    A gain of the law within what a data sheet leaves open is taken for the declared one: of its
+    interval, as other latencies show other gains, the one that fits best.
     """
     assert self.effort is not None and self.law is not None
-    if self._nominal != 1.0:
-      p = p.copy()
-      p[INDEX["gain"]] *= self._nominal
     late = float(p[INDEX["measurement_delay"]] - p[INDEX["effort_delay"]])
     ahead = self.law.ahead - late if self.ahead is None else self.ahead
-    law = [duty_of(self.plant, p, i, ahead=ahead) for i in range(len(self.plant.logs))]
-    return np.concatenate(self.effort) - np.concatenate(law)
+    measured, logs = np.concatenate(self.effort), range(len(self.plant.logs))
+    law = np.concatenate([duty_of(self.plant, p, i, ahead=ahead) for i in logs])
+    free = self.gain[1] ** 2 * (np.abs(law) < _AT_LIMIT * np.abs(law).max())
+    factor = float(free * law @ measured) / max(float(free * law @ law), 1e-12)
+    known = self.law.gain if self.law.is_off(self.settings.duty_scale) else 1.0
+    p = p.copy()
+    p[INDEX["gain"]] *= np.clip(factor, *(np.array(self.law.interval) / known))
+    return measured - np.concatenate([duty_of(self.plant, p, i, ahead=ahead) for i in logs])
 
   def _efforts(self, along: Sequence[Simulated | None]) -> Array:
     assert self.effort is not None

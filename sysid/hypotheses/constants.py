@@ -14,8 +14,19 @@ OWN = {"backlash": {"gap": 0.0044}}
 without a reference: 0.25 degrees of play (data sheet of the XM430-W350)."""
 
 
-def constants(plant: JointModel, settings: Settings = SETTINGS) -> Term:
-  """Returns the constants of a joint that its model has, with their tolerances as prior."""
+_USUAL = 2.0
+"""Standard deviations within which a machine's own latencies are, 95 %: where no reference shows
+them, what is later is a late command or reading, not a constant."""
+
+
+def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool = False) -> Term:
+  """Returns the constants of a joint that its model has, with their tolerances as prior.
+
+  Args:
+    plant: the joint.
+    settings: tolerances.
+    healthy: whether its logs are a reference: as late as they are, the machine is.
+  """
   p, tolerance = plant.declared, dict(settings.tolerances)
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
   present = {
@@ -31,7 +42,7 @@ def constants(plant: JointModel, settings: Settings = SETTINGS) -> Term:
   names = tuple(n for n, there in present.items() if there)
   sigma = tuple(tolerance[n] for n in names)
   limit = tuple(
-    min(5.0 * s, 0.9) if n not in ("zero", "skew", "latency") else 5.0 * s
+    (5.0 if healthy else _USUAL) * s if n in ("skew", "latency") else min(5.0 * s, 0.9)
     for n, s in zip(names, sigma, strict=True)
   )
   low = tuple(0.0 if n == "latency" else -b for n, b in zip(names, limit, strict=True))

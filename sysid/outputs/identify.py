@@ -127,7 +127,7 @@ def _identify(
   near = found.near
   content: dict[str, Any] = {
     "verdict": found.verdict,
-    "effects": [] if found.verdict == "none" else found.effects,
+    "effects": [] if found.verdict == "none" else _effects_first(found.effects),
     "in_reference": found.in_reference,
     "alternatives": [*found.scopes, *alternatives(found)],
     "residual_at": residual_at(found),
@@ -145,7 +145,7 @@ def _identify(
     ],
   }
   # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
-  content["alternatives"] = [*found.nearest, *content["alternatives"]]
+  content["alternatives"] = [*_effects_first(found.nearest), *content["alternatives"]]
   if found.verdict == "unexplained":
     # What IMU, camera and floor show is explained all the same.
     claimed = [row for row in found.effects if row not in sensed.rows]
@@ -202,6 +202,11 @@ def _add(found: Identified, rows: list[dict[str, Any]], *, moves: bool = True) -
     found.effects += rows
     grade = {"none": "effects"} | ({"unexplained": "partly"} if moves else {})
     found.verdict = grade.get(found.verdict, found.verdict)
+
+
+def _effects_first(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+  """Returns entries with those of constants last: they go with what is missing."""
+  return sorted(rows, key=lambda row: row["kind"] == "parameter_error")
 
 
 def _tilt(found: Identified) -> dict[str, float] | None:

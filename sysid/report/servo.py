@@ -1,6 +1,7 @@
 """The servo's law as entries of a report: what logs of duty show by themselves."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 from nerf2real.suite.effects import Effect
@@ -23,6 +24,11 @@ def rows(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
     if law is not None:
       (claimed if item.subject.before is None else before).append(_row(item.joint, law))
   return claimed, before
+
+
+def by_law(row: Mapping[str, Any]) -> bool:
+  """Tells whether an entry is the gain of the servo's law, which the constants hold, too."""
+  return bool(row["evidence"].get("servo_law", False))
 
 
 def apart(effects: list[Effect], claimed: list[dict[str, Any]]) -> list[Effect]:

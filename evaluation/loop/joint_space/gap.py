@@ -11,6 +11,7 @@ from nerf2real.core import markdown
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL
+from nerf2real.sysid.report.servo import by_law
 
 _STEP = constants.CONTROL_TIMESTEP
 
@@ -79,10 +80,11 @@ def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:
   constants_of = json.loads(details.read_text())["calibration"]
   rows = []
   for index, name in enumerate(constants.JOINT_NAMES):
-    own = {e["kind"]: e["parameters"] for e in content["effects"] if e["joint"] == name}
+    named = [e for e in content["effects"] if e["joint"] == name]
+    own = {e["kind"]: e["parameters"] for e in named if not by_law(e)}
     share = own.pop("load_friction", {}).get("coefficient", {}).get("value")
     gain = own.pop("motor_gain", {}).get("gain", {}).get("value", 1.0)
-    gain *= constants_of[name].get("gain", 1.0)
+    gain *= constants_of[name].get("gain", 1.0)  # that of the servo's law, too
     found = "not named" if share is None else f"{share:.2f}"
     gear = f"{hidden.motors.gear_share[index]:.2f}"
     other = ", ".join(own) or "-"

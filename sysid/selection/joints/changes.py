@@ -13,7 +13,7 @@ import numpy as np
 from nerf2real.sysid.selection.joints.changed import CONSTANTS_OFF, Changed
 from nerf2real.sysid.selection.joints.doubts import constants_off, is_new, is_something, supported
 from nerf2real.sysid.selection.joints.leaving import leaves, may_leave, remaining
-from nerf2real.sysid.selection.joints.naming import Explanation, conclude
+from nerf2real.sysid.selection.joints.naming import conclude
 from nerf2real.sysid.selection.joints.subject import Subject, following
 from nerf2real.sysid.selection.search.elaboration import elaborated
 from nerf2real.sysid.selection.search.evidence import UNREPEATED
@@ -53,7 +53,8 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   else:
     ranked = explainer.constants_alone()
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
-  named = tuple(k for k in found.named if is_something(subject, found.best, k))
+  something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
+  named = tuple(k for k in found.named if k in something)
   if before is not None and usual is not None and not subject.paired:
     named = tuple(k for k in named if is_new(before, usual, found.best, k))
   anyway, left = remaining(subject, found.best)
@@ -67,7 +68,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     ranked = explainer.ranked()
   more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
-    found,
+    something,
     named,
     any(t.wider for t in known),
     bool(typical or few) or leaves(subject, found.best, settings),
@@ -104,7 +105,7 @@ def elaborate(found: Sequence[Changed]) -> None:
 
 
 def _verdict(
-  found: Explanation,
+  something: Sequence[str],
   named: Sequence[str],
   shared: bool,
   remains: bool,
@@ -113,14 +114,14 @@ def _verdict(
   """Returns the graded verdict of a joint.
 
   Args:
-    found: the best hypothesis.
+    something: kinds of the best hypothesis whose values are more than a machine's own.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
     remains: whether more is left than the machine leaves anyway, by a test or by that limit.
     more: whether it is by the limit.
   """
   if not named and not shared:
-    return "unexplained" if remains or found.best.names else "none"
+    return "unexplained" if remains or something else "none"
   if not named and not remains:
     return "none"
   return "partly" if more else "effects"

@@ -172,7 +172,7 @@ def _bare(before: JointLikelihood, settings: Settings) -> Scored:
 
   An effect of friction holds, too: it must not be judged by the difference to one that creeps.
   """
-  own = constants(before.plant, settings)
+  own = constants(before.plant, settings, healthy=True)
   return Explainer(before, own, (), settings=settings, known=[sticking(before.plant)]).null
 
 
@@ -183,7 +183,7 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
     return
   if not subject.alone and not structured(before, subject.usual, settings):
     return
-  own = constants(before.plant, settings)
+  own = constants(before.plant, settings, healthy=True)
   library = own_library(before.plant, alone=subject.alone)
   known = [sticking(before.plant)]
   first = Explainer(before, own, library, settings=settings, known=known)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerf2real.sysid.fit import rough
-from nerf2real.sysid.fit.layout import Fit, Layout
+from nerf2real.sysid.fit.layout import CONSTANTS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
@@ -27,6 +27,29 @@ def _best_of_kinds(
   for item in sorted(tried, key=lambda t: t[2].cost):
     chosen.setdefault(kinds_of(item[1]), item)
   return list(chosen.values())
+
+
+_TWINS = {
+  "command_delay": "latency",
+  "measurement_delay": "skew",
+  "encoder_offset": "zero",
+}
+"""Effects of one value that does what a constant does, and that constant."""
+
+
+def _handed_over(parent: Scored, term: Term) -> list[Array]:
+  """Returns where a parent's fit is with what a constant is off by as its twin's value, if it has
+  one: the same simulation, and a constant as it was known."""
+  constants = next((t for t in parent.terms if t.kind == CONSTANTS), None)
+  constant = _TWINS.get(term.kind)
+  if constants is None or constant not in constants.names:
+    return []
+  at = parent.fit.layout.spans[parent.fit.layout.terms.index(constants)][0]
+  at += constants.names.index(constant)
+  x = np.append(parent.fit.x, 0.0)
+  x[-1] = np.clip(x[at] - parent.fit.layout.centre[at], term.low[0], term.high[0])
+  x[at] -= x[-1]
+  return [x]
 
 
 class Explainer:
@@ -169,7 +192,8 @@ class Explainer:
       if term.kind in old:
         continue
       blank = np.zeros((len(term.names), *known.shape[1:]))
-      begin = np.array([np.concatenate([x, s]) for s in term.starts])
+      own = [np.concatenate([x, s]) for s in term.starts]
+      begin = np.array([*own, *_handed_over(parent, term)])
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 

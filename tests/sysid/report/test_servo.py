@@ -34,6 +34,7 @@ def test_a_gain_that_is_off_is_claimed_with_the_interval_of_the_duty():
   gain = row["parameters"]["gain"]
   assert gain["low"] < 0.5 < gain["high"] < 0.51
   assert row["evidence"]["clear_by_standard_errors"] > 20.0
+  assert servo.by_law(row) and not servo.by_law({"evidence": {}})
 
 
 def test_what_the_reference_shows_is_not_new_and_a_healthy_gain_is_nothing():
