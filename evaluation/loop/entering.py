@@ -14,16 +14,19 @@ from nerf2real.suite.effects import Effect
 CONSTANTS = ("parameter_error",)  # errors of declared constants: no effect, and no name
 LEARNED = "residual_force"  # a force without a name
 UNEXPLAINED = "unexplained"
+# Why an effect enters, in words.
+CLAIMED, OWN = "named", "the robot had it before"
+FITTED_BESIDE, FORCED = "constant of a named joint", "no name explains that joint"
 _BESIDE = (*CONSTANTS, "encoder_offset")  # fitted beside every hypothesis of a joint
 
 Rows = Sequence[Mapping[str, Any]]
 """Entries of the analyser's report."""
 
 
-def entering(effects: Sequence[Effect], content: Mapping[str, Any]) -> list[Effect]:
-  """Returns the effects that the simulation gets, with their intervals and samples.
+def reasons(effects: Sequence[Effect], content: Mapping[str, Any]) -> list[str]:
+  """Returns why the simulation gets an effect, for each of them; "" where it does not.
 
-  Those are what the report claims, what it finds in the reference, too (the robot has it), and the
+  It gets what the report claims, what it finds in the reference, too (the robot has it), and the
   constants of the joints at which something is claimed. Where the verdict is `unexplained` the
   joints with a learned force have all that was fitted beside it.
 
@@ -32,20 +35,29 @@ def entering(effects: Sequence[Effect], content: Mapping[str, Any]) -> list[Effe
     content: Of the report; one without entries names all effects.
   """
   if "effects" not in content:
-    return list(effects)
+    return [CLAIMED] * len(effects)
   claimed: Rows = content["effects"]
-  rows = [*claimed, *content.get("in_reference", ())]
   joints = {row["joint"] for row in claimed if row.get("joint")}
   if any(row["kind"] in CONSTANTS and not row.get("joint") for row in claimed):  # of all joints
     joints |= {effect.target for effect in effects if effect.kind in CONSTANTS}
   forced = {e.target for e in forces(effects, content)}
-  return [
-    effect
-    for effect in effects
-    if is_listed(effect, rows)
-    or (effect.kind in _BESIDE and effect.target in joints)
-    or effect.target in forced
-  ]
+
+  def reason(effect: Effect) -> str:
+    if is_listed(effect, claimed):
+      return CLAIMED
+    if is_listed(effect, content.get("in_reference", ())):
+      return OWN
+    if effect.kind in _BESIDE and effect.target in joints:
+      return FITTED_BESIDE
+    return FORCED if effect.target in forced else ""
+
+  return [reason(effect) for effect in effects]
+
+
+def entering(effects: Sequence[Effect], content: Mapping[str, Any]) -> list[Effect]:
+  """Returns the effects that the simulation gets, with their intervals and samples; `reasons`."""
+  told = reasons(effects, content)
+  return [effect for effect, reason in zip(effects, told, strict=True) if reason]
 
 
 def forces(effects: Sequence[Effect], content: Mapping[str, Any]) -> list[Effect]:

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from nerf2real.evaluation.loop import naming, telling
-from nerf2real.evaluation.loop.entering import entering, forces
+from nerf2real.evaluation.loop.entering import (
+  CLAIMED,
+  FITTED_BESIDE,
+  OWN,
+  entering,
+  forces,
+  reasons,
+)
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 
 FORCE = Effect("residual_force", "l_knee", {"weights": [0.1] * 400})
@@ -52,6 +59,17 @@ def test_names_enter_with_the_constants_of_their_joints_and_nothing_else():
   assert found[0].samples == {"gain": [0.97, 0.99]} and found[1].intervals == {"gain": (0.15, 0.17)}
 
 
+def test_why_an_effect_enters_is_said():
+  told = reasons(MODEL, _content("partly", WEAK))
+  kept = {e.kind: why for e, why in zip(MODEL, told, strict=True) if why}
+  assert kept == {
+    "parameter_error": FITTED_BESIDE,
+    "motor_gain": CLAIMED,
+    "encoder_offset": FITTED_BESIDE,
+    "imu_bias": OWN,
+  }
+
+
 def test_a_load_enters_with_the_constants_of_the_joint_that_carries_it():
   model = [*MODEL, Effect("parameter_error", "l_el", {"gain": 0.95})]
   load = _row("payload", "l_el", "l_el_link", mass=0.2)
@@ -93,4 +111,6 @@ def test_a_finding_keeps_what_enters_as_a_file_and_the_page_says_what_stays_out(
   assert named.entering_path.name == "entering.json"
   assert _places(read_effects(named.entering_path)) == _places(named.entering)
   assert len(named.entering) == 4 and len(named.left_out) == len(MODEL) - 4
-  assert "6 other effects of the extended model" in telling._entering(named)
+  assert "The 6 other effects of the analyser's extended model" in telling._entering(named)
+  left_out = telling._left_out(named)
+  assert left_out.startswith("parameter_error at r_knee; load_friction at l_knee; residual_force")
