@@ -96,6 +96,7 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
     reference = _record(settings, hidden, say)
   on_robot = [HEALTHY, BEFORE] if healthy else [BEFORE]
   walked = {name: trials.walked(settings, name, found[name], store) for name in on_robot}
+  say("identifying from the motions, and from the trials' walks")
   with stages.timed("identification"):
     named = naming.name(
       settings.out / "identified",
