@@ -186,9 +186,8 @@ def _finding(named: Named) -> Section:
 def _entering(named: Named) -> str:
   """Returns what the simulation gets and what not, in words."""
   text = (
-    "The simulation gets what is named, what the robot had before, too, and the declared constants "
-    "of joints with a name (friction, damping, gain, zero) as they were fitted beside it, each "
-    "drawn from its interval (95 %)"
+    "The simulation gets what is named, what the robot had before, too, and what was fitted beside "
+    "a name at its joint (declared constants, friction, zero), each drawn from its interval (95 %)"
   )
   if named.forces:
     joints = ", ".join(str(force.target) for force in named.forces)
