@@ -9,7 +9,7 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import JointSeries, Log
 from nerf2real.sysid.model.measured import fresh, quantum
-from nerf2real.sysid.model.reduction import smooth_motion
+from nerf2real.sysid.model.motion import smooth_motion
 
 _GAP = 3.0  # median periods without a message that count as a gap
 _DRIFT = 200e-6  # s/s between the stamps' clock and the recorder's that is worth a warning

@@ -1,10 +1,14 @@
 """Checks that a model has the joints and actuators that a measured log speaks of."""
 
 import mujoco
+import numpy as np
 
 from nerf2real.core.robot_logs.messages import COMMANDS, STATES
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.robot_logs.streaming import LogError
+
+_NEAR = 0.005  # of a joint's range from its end that counts as there; chosen
+_OFTEN = 0.01  # of the readings that may be held there; chosen
 
 
 def check_against_model(log: Log, model: mujoco.MjModel) -> None:
@@ -42,3 +46,26 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
         f"{log.name} has no {takes}s in {COMMANDS}, which the model's actuator on {name!r} takes: "
         f"record {takes}s, or give a model with the actuator that was driven."
       )
+    _check_range(log, model, name)
+
+
+def _check_range(log: Log, model: mujoco.MjModel, name: str) -> None:
+  """Raises a LogError where a joint is commanded past its declared range and stops at the end."""
+  index = model.joint(name).id
+  wanted = log.commands.position
+  if not model.jnt_limited[index] or wanted is None:
+    return
+  assert log.states.position is not None
+  low, high = model.jnt_range[index]
+  at, near = log.states.position[:, log.states.column(name)], _NEAR * (high - low)
+  column = wanted[:, log.commands.column(name)]
+  command = np.interp(log.states.stamp, log.commands.stamp, column)
+  pushed = (at > high - near) & (command > high + near)
+  pushed |= (at < low + near) & (command < low - near)
+  if np.mean(pushed) > _OFTEN:
+    raise LogError(
+      f"{log.name} commands {name!r} past the end of its declared range, {low:.3g} to {high:.3g} "
+      f"rad or m, where it stops in {np.mean(pushed):.0%} of the readings; end stops are not "
+      "simulated: record within the range, or correct the model's (in degrees, unless its compiler "
+      "says radian)."
+    )

@@ -18,8 +18,8 @@ from nerf2real.sysid.design.information import Place, beside, information, place
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.plant import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection.joints.subject import own_library
 from nerf2real.sysid.settings import Settings

@@ -62,8 +62,9 @@ class JointLikelihood:
     )
     self.mask = np.concatenate([log.valid for log in logs]).astype(float)
     self.speed = np.concatenate([log.velocity for log in logs])
-    shaky = self.stamp_noise * self.speed / self.position_noise
-    self.gain = np.array([self.mask / np.sqrt(1.0 + shaky**2), self.mask][: len(self.channels)])
+    missed = np.concatenate([plant.reduction_error(i) for i in range(len(logs))])
+    unsure = np.hypot(self.stamp_noise * self.speed, missed) / self.position_noise
+    self.gain = np.array([self.mask / np.sqrt(1.0 + unsure**2), self.mask][: len(self.channels)])
     self._cut()
     self.expectation: Expectation | None = None
     self.scale = np.maximum(self.floor, 1e-12)
@@ -116,8 +117,8 @@ class JointLikelihood:
 
   @property
   def noise_squares(self) -> Array:
-    """Mean squares of blocks [B] that the readings' noise leaves: of a joint that moves, with what
-    their stamps are off by, so that samples in motion weigh less."""
+    """Mean squares of blocks [B] that the readings' noise leaves: with what the stamps of a joint
+    that moves and its simulation among others are off by, so that such samples weigh less."""
     return self.position_noise**2 * np.add.reduceat(self.mask, self.starts) / self.counts[0]
 
   def parts_of(self, fold: int) -> list[slice]:

@@ -6,6 +6,7 @@ a sign of a wrong kind. Starts are several where the error has several valleys.
 
 import dataclasses
 
+import mujoco
 import numpy as np
 
 from nerf2real.suite.effects.registry import KINDS
@@ -242,7 +243,7 @@ def _payload(plant: JointPlant) -> Term:
       (0.1 * mass, 1.0, 1.0, 1.0),
       ((0.1 * mass, 0.0, 0.0, 0.0),),
     )
-  reach = 2.5 * size
+  reach = max(2.5 * size, 1.5 * _extent(plant.model, int(body)))
   return Term(
     "payload",
     name,
@@ -250,9 +251,16 @@ def _payload(plant: JointPlant) -> Term:
     (0.0, -reach, -reach, -reach),
     (8 * mass, reach, reach, reach),
     (0.2 * mass, 0.3 * size, 0.3 * size, 0.3 * size),
-    ((0.3 * mass, *place), (0.3 * mass, *(1.7 * place)), (0.3 * mass, *(-0.5 * place))),
+    tuple((m * mass, *(at * place)) for m in (0.3, 1.0, 3.0) for at in (1.0, 1.7, -0.5)),
     (_INF, size, size, size),
   )
+
+
+def _extent(model: mujoco.MjModel, body: int) -> float:
+  """Returns how far a body's geoms reach from the origin of its frame, m; 0 without any."""
+  geoms = np.flatnonzero(model.geom_bodyid == body)
+  away = np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
+  return float(away.max(initial=0.0))
 
 
 def _one(

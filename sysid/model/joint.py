@@ -26,6 +26,7 @@ FOLLOWED_S = 0.02
 """s in which a state that follows the readings makes up for a difference."""
 
 
+_NEAR = 0.1  # s on either side of a sample over which an error is averaged; chosen
 _KEPT = 2  # sets of loads of a log whose fields are kept: a fit's and that of a difference to it
 
 
@@ -83,19 +84,29 @@ class JointModel(JointPlant):
     return self._bases[key]
 
   def _parts(self, logs: Sequence[Sequence[Surroundings]]) -> list[Array]:
-    result = []
-    for index, parts in enumerate(logs):
-      grid, time = self._grids[index], self.logs[index].time
-      rows = [
-        [np.interp(grid, time, f) for f in (p.inertia, p.here, p.across, p.bias)] for p in parts
-      ]
-      result.append(np.array(rows))
-    return result
+    return [np.array([[p.inertia, p.here, p.across, p.bias] for p in parts]) for parts in logs]
 
   @functools.cached_property
   def law(self) -> tuple[ServoLaw, Array] | None:
     """The law of its servo and what that leaves of the duty [N], where logs hold it."""
     return servo_law(self)
+
+  def reduction_error(self, index: int) -> Array:
+    """Returns how far off a log's simulation is as its other joints are prescribed [N], rad (or m).
+
+    The root of the mean square over `_NEAR` s, of the declared machine's own recording.
+    """
+    twin = self.reductions[index].twin
+    time = self.logs[index].time
+    if twin is None:
+      return np.zeros(len(time))
+    reduction, course = twin
+    plant = JointModel(self.model, self.joint, [reduction.log], reductions=[reduction])
+    got = plant.run(plant.declared, (), 0).position
+    squares = np.square(got - course[:, reduction.log.states.column(self.joint)])
+    total = np.append(0.0, np.cumsum(squares))
+    first, last = np.searchsorted(time, time - _NEAR), np.searchsorted(time, time + _NEAR, "right")
+    return np.sqrt((total[last] - total[first]) / (last - first))
 
   def tilt_load(self, x: float, y: float) -> Load:
     """Returns what turning gravity by the rotation vector (x, y, 0) adds."""

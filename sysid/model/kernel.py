@@ -256,7 +256,7 @@ def simulate(
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + step:
         share = (reach + step - command_time[pointer + 1]) * rate_of_steps
         later = command[pointer + 1]
-      i = min(int(time * stamped), last)  # surroundings were measured: stamped time
+      i = min(int(time * stamped + 0.5), last)  # surroundings were measured: stamped time
       seen_v = motor_speed if half > 0.0 else v
       seen_q = q + encoder + on_motor * gap_offset
       before = torque  # of the last step

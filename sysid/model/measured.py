@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.model.reduction import Motion
+from nerf2real.sysid.model.motion import Motion
 
 Array = np.ndarray
 

@@ -12,13 +12,12 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model import kernel
+from nerf2real.sysid.model.drive import actuator_of, holds_position
 from nerf2real.sysid.model.measured import Measured, measured
-from nerf2real.sysid.model.reduction import Reduction, Surroundings, start_velocity
+from nerf2real.sysid.model.motion import start_velocity
+from nerf2real.sysid.model.reduction import Reduction
 
 Array = np.ndarray
-
-LONGEST_STEP = 2e-3
-"""s; ours: a model with a longer step than this is simulated in parts of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,21 +40,6 @@ class Output(NamedTuple):
   """[N] the actuator's."""
   jump: Array
   """[N] how much the torque jumps within two steps of the sample."""
-
-
-def holds_position(model: mujoco.MjModel, actuator: int) -> bool:
-  """Tells whether an actuator has a position loop, so that errors do not accumulate."""
-  return float(model.actuator_biasprm[actuator, 1]) < 0.0
-
-
-def actuator_of(model: mujoco.MjModel, joint: str) -> int:
-  """Returns the actuator that drives a joint, -1 if none does."""
-  index = model.joint(joint).id
-  for u in range(model.nu):
-    on_joint = model.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_JOINT)
-    if on_joint and model.actuator_trnid[u, 0] == index:
-      return u
-  return -1
 
 
 def declared_parameters(model: mujoco.MjModel, joint: str) -> Array:
@@ -124,9 +108,8 @@ class JointPlant:
         not hold position.
     """
     self.model, self.joint = model, joint
-    own = float(model.opt.timestep)
-    self.step = own / np.ceil(own / LONGEST_STEP)
     self.reductions = list(reductions or [Reduction(model, log) for log in logs])
+    self.step = self.reductions[0].step
     self.declared = declared_parameters(model, joint)
     self.holds = holds_position(model, actuator_of(model, joint))
     index = model.joint(joint).id
@@ -142,13 +125,13 @@ class JointPlant:
       self._windows(log, window_s, float(start_velocity(source)[source.states.column(joint)]))
       for log, source in zip(self.logs, logs, strict=True)
     ]
-    self._grids = [np.arange(0.0, log.time[-1] + 0.05, self.step) for log in self.logs]
+    self._grids = [reduction.time for reduction in self.reductions]
     self._loads = [
       np.interp(grid, log.time, _other_load(source, joint, log.time))
       for grid, log, source in zip(self._grids, self.logs, logs, strict=True)
     ]
     self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
-    self._nominal = [self._on_grid(i, s) for i, s in enumerate(self.surroundings)]
+    self._nominal = [(s.inertia, s.here, s.across, s.at, s.bias) for s in self.surroundings]
 
   def _windows(self, log: Measured, window_s: float, first_velocity: float) -> Windows:
     if self.holds:
@@ -156,11 +139,6 @@ class JointPlant:
     _, start = np.unique(np.floor((log.time - log.time[0]) / window_s), return_index=True)
     start = np.array([0, *[s for s in start[1:] if len(log.time) - s > 3]], np.int64)
     return Windows(start, log.position[start].astype(float), log.velocity[start])
-
-  def _on_grid(self, index: int, s: Surroundings) -> tuple[Array, ...]:
-    grid, time = self._grids[index], self.logs[index].time
-    fields = (s.inertia, s.here, s.across, s.at, s.bias)
-    return tuple(np.interp(grid, time, field) for field in fields)
 
   def _body(self, name: str) -> int:
     """Returns a body by its name, or by that of its joint."""

@@ -9,22 +9,34 @@ and c, what the other joints' velocities and accelerations demand. All of it is 
 and in gravity, so payloads and tilts are added as linear combinations without another pass.
 
 Geared servos carry most of their inertia in their own rotors, which is why one joint at a time is a
-good approximation; the figures of a report are simulated by the whole model.
+good approximation; the figures of a report are simulated by the whole model. Where links weigh as
+much, a joint feels the others' accelerations at every jump of a command: their motion is taken in
+detail (`motion.py`), and the model is evaluated where a line between two places would miss that.
 
-Shapes: N samples of a log, J joints of the log, T grid points.
+Shapes: N samples of a log, J joints of the log, T points of the simulation's grid, M of them, the
+knots, at which the model is evaluated.
 """
 
 import dataclasses
+import functools
 
 import mujoco
 import numpy as np
+from scipy.stats import norm
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model import point_mass
+from nerf2real.sysid.model.drive import actuator_of, holds_position
+from nerf2real.sysid.model.motion import Motion, detailed_motion, smooth_motion
+from nerf2real.sysid.model.simulation import simulate
 
 Array = np.ndarray
 
-_EVERY = 3  # samples between poses at which a model is evaluated (30 ms at 100 Hz); ours
+LONGEST_STEP = 5e-3
+"""s; chosen: a model with a longer step than this is simulated in parts of it."""
+
+_SPACING = 0.03  # s between poses at which a model is evaluated; chosen
+_MISSED = 0.05  # of an acceleration's standard deviation that a line between knots may miss; chosen
 _REACH = 0.1  # m of the places at which a mass is put to see its moments
 _UNIT = _REACH * np.eye(3)
 _MONOMIALS_AT = np.array(
@@ -33,12 +45,11 @@ _MONOMIALS_AT = np.array(
 _MONOMIALS = np.array(
   [[1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z] for x, y, z in _MONOMIALS_AT]
 )
-_SMOOTHING = 0.035  # s, half width of the local polynomial that differentiates positions; ours
 
 
 @dataclasses.dataclass(frozen=True)
 class Surroundings:
-  """What a joint feels of its model, at the samples of a log [N]."""
+  """What a joint feels of its model, on the grid of a log's simulation [T]."""
 
   inertia: Array
   """Without armature, kg m^2."""
@@ -62,117 +73,136 @@ class Surroundings:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class Motion:
-  """A log's joint motion, smoothed and differentiated."""
-
-  time: Array
-  """[N] s."""
-  position: Array
-  """[N, J]."""
-  velocity: Array
-  """[N, J]."""
-  acceleration: Array
-  """[N, J]."""
-
-
-def smooth_motion(log: Log, *, half_width: float = _SMOOTHING) -> Motion:
-  """Differentiates measured positions by local cubic fits in time (handles uneven stamps)."""
-  time, position = log.states.stamp, log.states.position
-  assert position is not None
-  spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.01
-  reach = max(2, round(half_width / max(spacing, 1e-6)))
-  count = len(time)
-  reach = min(reach, (count - 1) // 2)
-  centre = np.clip(np.arange(count), reach, count - 1 - reach)
-  index = centre[:, None] + np.arange(-reach, reach + 1)
-  offset = (time[index] - time[:, None]) / half_width  # [N, K]
-  powers = offset[..., None] ** np.arange(4)
-  weight = np.maximum(1.0 - (offset / (np.abs(offset).max(axis=1, keepdims=True) * 1.05)) ** 2, 0)
-  normal = np.einsum("nkp,nk,nkr->npr", powers, weight, powers)
-  normal += 1e-9 * np.eye(4)
-  right = np.einsum("nkp,nk,nkj->npj", powers, weight, position[index])
-  fit = np.linalg.solve(normal, right)
-  return Motion(time, fit[:, 0], fit[:, 1] / half_width, 2.0 * fit[:, 2] / half_width**2)
-
-
-def start_velocity(log: Log) -> Array:
-  """Returns the joints' velocity [J] at a log's first sample: 0 where they start from rest.
-
-  A one-sided derivative at the start of a motion is wrong by the acceleration; logs begin at rest
-  unless the first readings say otherwise.
-  """
-  position = log.states.position
-  assert position is not None
-  first = position[:4]
-  slope = (first[1] - first[0]) / max(float(log.states.stamp[1] - log.states.stamp[0]), 1e-9)
-  spread = np.ptp(position, axis=0) / max(log.duration, 1e-9)
-  moving = np.abs(slope) > 2.0 * spread
-  return np.where(moving, slope, 0.0)
-
-
 class Reduction:
   """Computes the surroundings of joints of a model along a log."""
 
-  def __init__(self, model: mujoco.MjModel, log: Log):
+  def __init__(self, model: mujoco.MjModel, log: Log, *, motion: Motion | None = None):
     """Prepares the poses.
 
     Args:
       model: compiled model; not changed for longer than a call.
       log: its joints are prescribed; joints that it lacks stay at the model's reference pose.
+      motion: of its joints on the grid, if other than this model tells in detail.
     """
     self.model, self.log = model, log
+    own = float(model.opt.timestep)
+    self.step = own / np.ceil(own / LONGEST_STEP)
+    self.time = np.arange(0.0, log.states.stamp[-1] + 0.05, self.step)
     self.motion = smooth_motion(log)
-    self._data = mujoco.MjData(model)
+    self._alone = len(log.joints) == 1 and model.nv == 1
+    if self._alone:
+      self.detailed, self._knots = self.motion.at(self.time), np.zeros(1, int)
+    else:
+      self.detailed = detailed_motion(model, log, self.time) if motion is None else motion
+      self._knots = _knots(self.detailed.acceleration, round(_SPACING / self.step))
     ids = [model.joint(name).id for name in log.joints]
     self._qpos = model.jnt_qposadr[ids]
     self._dofs = model.jnt_dofadr[ids]
     self._poses: point_mass.Poses | None = None
-    self._moments: dict[int, dict[str, list[Surroundings]]] = {}
+    self._moments: dict[int, dict[str, Array]] = {}
+
+  @functools.cached_property
+  def twin(self) -> tuple["Reduction", Array] | None:
+    """The declared machine's own recording under the same commands, reduced, and its positions
+    without the readings' noise [N, J]: what joints one by one miss there is the reduction's error.
+
+    None of one joint, and where the machine does not hold positions: its course would be another.
+    """
+    model, log = self.model, self.log
+    actuators = [actuator_of(model, name) for name in log.commands.joints]
+    if self._alone or not all(holds_position(model, u) for u in actuators):
+      return None
+    measured = log.states.position
+    assert measured is not None
+    course = simulate(model, log)
+    scatter = np.median(np.abs(measured - self.motion.position), axis=0) / norm.ppf(0.75)
+    read = course + scatter * np.random.default_rng(0).standard_normal(course.shape)
+    states = dataclasses.replace(log.states, position=read)
+    return Reduction(model, dataclasses.replace(log, states=states)), course
 
   def of_joint(self, joint: str) -> Surroundings:
-    """Returns what a joint feels of the model as it is now."""
-    model, data, motion = self.model, self._data, self.motion
-    column = self.log.states.column(joint)
-    index = model.joint(joint).id
-    dof, address = int(model.jnt_dofadr[index]), int(model.jnt_qposadr[index])
-    hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-    count = len(motion.time)
-    inertia, here, across, bias = np.zeros((4, count))
-    full = np.zeros((model.nv, model.nv))
-    alone = len(self.log.joints) == 1 and model.nv == 1
-    others = np.arange(model.nv) != dof
-    chosen = self._chosen()
-    for n in chosen[:1] if alone else chosen:
+    """Returns what a joint feels of the model."""
+    dof = int(self.model.jnt_dofadr[self.model.joint(joint).id])
+    inertia, bias, _ = self._evaluated
+    here, across = self._weights(joint) @ self.model.opt.gravity
+    return self._on_grid(joint, inertia[:, dof], here, across, bias[:, dof])
+
+  def gravity(self, joint: str) -> list[Surroundings]:
+    """Returns what gravity adds to a joint's surroundings per m/s^2 along the world's x, y, z."""
+    none = np.zeros(len(self._knots))
+    parts = np.moveaxis(self._weights(joint), -1, 0)
+    return [self._on_grid(joint, none, here, across, none) for here, across in parts]
+
+  @functools.cached_property
+  def _evaluated(self) -> tuple[Array, Array, Array]:
+    """The model at the knots.
+
+    Inertia without armature and what the others' motion demands [M, nv]; of every body's subtree,
+    its centre of mass, then axes and anchors of the joints [M, bodies + 2 joints, 3].
+    """
+    model, data, motion = self.model, mujoco.MjData(self.model), self.detailed
+    inertia, bias = np.zeros((2, len(self._knots), model.nv))
+    full, still = np.zeros((model.nv, model.nv)), np.zeros(model.nv)
+    places = []
+    for n, knot in enumerate(self._knots):
       data.qpos[:] = model.qpos0
-      data.qpos[self._qpos] = motion.position[n]
-      if alone:
-        data.qpos[address] = 0.0
+      data.qpos[self._qpos] = 0.0 if self._alone else motion.position[knot]
       data.qvel[:] = 0.0
-      mujoco.mj_fwdPosition(model, data)
+      mujoco.mj_kinematics(model, data)
+      mujoco.mj_comPos(model, data)
+      mujoco.mj_makeM(model, data)
       mujoco.mj_fullM(model, data, full)
-      inertia[n] = full[dof, dof] - model.dof_armature[dof]
+      own = full.diagonal()
+      inertia[n] = own - model.dof_armature
+      places.append(np.vstack([data.subtree_com, data.xaxis, data.xanchor]))
+      if self._alone:
+        continue
+      mujoco.mj_comVel(model, data)
+      mujoco.mj_rne(model, data, 0, still)
+      data.qvel[self._dofs] = motion.velocity[knot]
+      mujoco.mj_comVel(model, data)
+      mujoco.mj_rne(model, data, 0, bias[n])
       acceleration = np.zeros(model.nv)
-      acceleration[self._dofs] = motion.acceleration[n]
-      coupling = float(full[dof, others] @ acceleration[others])
-      mujoco.mj_fwdVelocity(model, data)
-      here[n] = data.qfrc_bias[dof]
-      if not alone:
-        data.qvel[self._dofs] = motion.velocity[n]
-        mujoco.mj_fwdVelocity(model, data)
-        bias[n] = data.qfrc_bias[dof] - here[n] + coupling
-      if hinge:
-        data.qvel[:] = 0.0
-        data.qpos[address] += np.pi / 2
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        across[n] = data.qfrc_bias[dof]
-    if alone:
-      inertia[:], here[:], across[:] = inertia[0], here[0], across[0]
-      return Surroundings(inertia, here, across, np.zeros(count), bias)
-    at = motion.position[:, column].copy()
-    fields = np.array([inertia, here, across, bias])[:, chosen]
-    return _between(chosen, at, fields, hinge=hinge)
+      acceleration[self._dofs] = motion.acceleration[knot]
+      bias[n] += full @ acceleration - own * acceleration - still
+    return inertia, bias, np.array(places)
+
+  def _weights(self, joint: str) -> Array:
+    """Returns gravity's torque, and a quarter turn further, at the knots per m/s^2 [2, M, 3]."""
+    model, places = self.model, self._evaluated[2]
+    index = model.joint(joint).id
+    body = int(model.jnt_bodyid[index])
+    centre, axis = places[:, body], places[:, model.nbody + index]
+    anchor = places[:, model.nbody + model.njnt + index]
+    mass = model.body_subtreemass[body]
+    if not self._hinge(joint):
+      return -mass * np.array([axis, np.zeros_like(axis)])
+    moved = np.cross(axis, centre - anchor)
+    return -mass * np.array([moved, np.cross(axis, moved)])
+
+  def _hinge(self, joint: str) -> bool:
+    kind = int(self.model.jnt_type[self.model.joint(joint).id])
+    return kind == int(mujoco.mjtJoint.mjJNT_HINGE)
+
+  def _on_grid(
+    self, joint: str, inertia: Array, here: Array, across: Array, bias: Array
+  ) -> Surroundings:
+    """Returns surroundings on the grid from those at the knots [M].
+
+    Gravity is interpolated as a vector that turns with a hinge.
+    """
+    at = self.detailed.position[:, self.log.states.column(joint)] * (not self._alone)
+    if self._hinge(joint):
+      cos, sin = np.cos(at), np.sin(at)
+      c, s = cos[self._knots], sin[self._knots]
+      x, y = self._between(here * c - across * s), self._between(here * s + across * c)
+      here, across = x * cos + y * sin, y * cos - x * sin
+    else:
+      here, across = self._between(here), self._between(across)
+    return Surroundings(self._between(inertia), here, across, at, self._between(bias))
+
+  def _between(self, values: Array) -> Array:
+    return np.interp(np.arange(len(self.time)), self._knots, values)
 
   def moments(self, joint: str, body: int) -> list[Surroundings]:
     """Returns what mass and its moments on a body add, per unit.
@@ -182,90 +212,46 @@ class Reduction:
     """
     if body not in self._moments:
       self._moments[body] = self._moments_of(body)
-    if joint in self._moments[body]:
-      return self._moments[body][joint]
-    zero = np.zeros(len(self.motion.time))
-    return [Surroundings(zero, zero, zero, self.of_joint(joint).at, zero)] * len(_MONOMIALS)
+    fields = self._moments[body].get(joint, np.zeros((len(_MONOMIALS), 4, len(self._knots))))
+    return [self._on_grid(joint, *part) for part in fields]
 
-  def _moments_of(self, body: int) -> dict[str, list[Surroundings]]:
-    """Returns the moments for all joints that carry a body."""
-    model, motion, chosen = self.model, self.motion, self._chosen()
-    count = len(motion.time)
-    alone = len(self.log.joints) == 1 and model.nv == 1
-    if alone:
-      chosen = chosen[:1]
-    positions = motion.position[chosen] * (not alone)
+  def _moments_of(self, body: int) -> dict[str, Array]:
+    """Returns the moments [10, 4, M] at the knots for all joints that carry a body."""
+    model, motion = self.model, self.detailed
+    positions = motion.position[self._knots] * (not self._alone)
     if self._poses is None:
       self._poses = point_mass.Poses(model, self._qpos, positions)
     carrying = point_mass.carrying(model, body)
     names = [model.joint(k).name for k in carrying]
-    velocity, acceleration = np.zeros((2, len(chosen), len(carrying)))
+    velocity, acceleration = np.zeros((2, len(self._knots), len(carrying)))
     for i, name in enumerate(names):
-      if name in self.log.joints and not alone:
+      if name in self.log.joints and not self._alone:
         column = self.log.states.column(name)
-        velocity[:, i] = motion.velocity[chosen, column]
-        acceleration[:, i] = motion.acceleration[chosen, column]
+        velocity[:, i] = motion.velocity[self._knots, column]
+        acceleration[:, i] = motion.acceleration[self._knots, column]
     values = []
     for place in _MONOMIALS_AT:
       point = self._poses.point(body, place)
       values.append(point_mass.added(self._poses, carrying, point, velocity, acceleration))
     solved = np.linalg.solve(_MONOMIALS, np.array(values).reshape(len(_MONOMIALS), -1))
-    solved = solved.reshape(len(_MONOMIALS), len(carrying), 4, len(chosen))
-    result = {}
-    for i, name in enumerate(names):
-      if name not in self.log.joints:
-        continue
-      hinge = self._poses.hinge(carrying[i])
-      at = np.zeros(count) if alone else motion.position[:, self.log.states.column(name)].copy()
-      result[name] = [_between(chosen, at, part, hinge=hinge) for part in solved[:, i]]
-    return result
-
-  def _chosen(self) -> Array:
-    """Returns the samples at which the model is evaluated."""
-    count = len(self.motion.time)
-    return np.unique(np.append(np.arange(0, count, _EVERY), count - 1))
-
-  def gravity(self, joint: str) -> list[Surroundings]:
-    """Returns what gravity adds to a joint's surroundings per m/s^2 along the world's x, y, z."""
-    model, before = self.model, self.model.opt.gravity.copy()
-    try:
-      model.opt.gravity[:] = 0.0
-      base = self.of_joint(joint)
-      parts = []
-      for axis in range(3):
-        model.opt.gravity[:] = np.eye(3)[axis]
-        part = _stack(self.of_joint(joint), base)
-        parts.append(Surroundings(part[0], part[1], part[2], base.at, part[3]))
-      return parts
-    finally:
-      model.opt.gravity[:] = before
+    solved = solved.reshape(len(_MONOMIALS), len(carrying), 4, len(self._knots))
+    return {name: solved[:, i] for i, name in enumerate(names) if name in self.log.joints}
 
 
-def _between(chosen: Array, at: Array, fields: Array, *, hinge: bool) -> Surroundings:
-  """Returns surroundings at all samples from those at the chosen ones.
-
-  Gravity is interpolated as a vector that turns with a hinge.
+def _knots(acceleration: Array, spacing: int) -> Array:
+  """Returns points [M] between which the joints' accelerations [T, J] are nearly straight.
 
   Args:
-    chosen: samples [M].
-    at: position of the joint at all samples [N].
-    fields: inertia, gravity here and across, and bias at the chosen ones [4, M].
-    hinge: whether the joint is one.
+    acceleration: on the grid.
+    spacing: points between two knots at most.
   """
-  inertia, here, across, bias = fields
-  all_of = lambda values: np.interp(np.arange(len(at)), chosen, values)  # noqa: E731
-  if hinge:
-    cos, sin = np.cos(at), np.sin(at)
-    c, s = cos[chosen], sin[chosen]
-    x, y = all_of(here * c - across * s), all_of(here * s + across * c)
-    here, across = x * cos + y * sin, y * cos - x * sin
-  else:
-    here, across = all_of(here), np.zeros(len(at))
-  return Surroundings(all_of(inertia), here, across, at, all_of(bias))
-
-
-def _stack(s: Surroundings, base: Surroundings) -> Array:
-  """Returns [4, N] differences of inertia, gravity (two) and bias."""
-  return np.array(
-    [s.inertia - base.inertia, s.here - base.here, s.across - base.across, s.bias - base.bias]
-  )
+  points = np.arange(len(acceleration))
+  knots = np.append(points[:-1:spacing], points[-1])
+  allowed = _MISSED * acceleration.std(axis=0) + 1e-12
+  while True:
+    line = np.array([np.interp(points, knots, a[knots]) for a in acceleration.T]).T
+    missed = np.flatnonzero((np.abs(acceleration - line) > allowed).any(axis=1))
+    if not len(missed):
+      return knots
+    after = np.unique(np.searchsorted(knots, missed))
+    knots = np.union1d(knots, (knots[after - 1] + knots[after]) // 2)

@@ -14,9 +14,9 @@ from mujoco import rollout
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, EffectStack
+from nerf2real.sysid.model.drive import actuator_of, holds_position, mean_commands
 from nerf2real.sysid.model.measured import fresh
-from nerf2real.sysid.model.plant import actuator_of, holds_position
-from nerf2real.sysid.model.reduction import smooth_motion, start_velocity
+from nerf2real.sysid.model.motion import smooth_motion, start_velocity
 
 Array = np.ndarray
 
@@ -86,8 +86,6 @@ def simulate(
   qpos, dofs = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
   actuators = [actuator_of(model, name) for name in log.commands.joints]
   holds = all(holds_position(model, u) for u in actuators)
-  source = log.commands.position if log.commands.position is not None else log.commands.effort
-  assert source is not None
   time = log.states.stamp
   motion = smooth_motion(log)
   starts = [0]
@@ -114,9 +112,7 @@ def simulate(
       count = int(np.ceil((time[end - 1] / (1 + rate) - first - late.min()) / step)) + 2
       data.time = first
       times = first + step * np.arange(count + 1)
-      ctrl = np.zeros((count, model.nu))
-      for column, u in enumerate(actuators):
-        ctrl[:, u] = _held(log.commands.stamp, source[:, column], times[:-1], late_by[u], step)
+      ctrl = mean_commands(model, log, times[:-1], step, late_by)
       history = np.vstack([data.qpos[qpos], _roll(stack, data, ctrl, qpos)])
       for j in range(len(ids)):
         stamps = time[start:end] / (1 + rate) - late[j]
@@ -145,23 +141,6 @@ def _roll(stack: EffectStack, data: mujoco.MjData, ctrl: Array, qpos: Array) -> 
     if on_motor is not None:
       history[n] += on_motor.observe("joint_positions", np.zeros(len(qpos)), data.time)
   return history
-
-
-def _held(stamp: Array, command: Array, times: Array, delay: float, step: float) -> Array:
-  """Returns the mean command [T] of every step, each held until the next comes, and late.
-
-  A command that comes within a step acts for the rest of it: used from the next step on it would be
-  half a step late in the mean, which a moving joint shows.
-  """
-  spans = np.diff(stamp, append=stamp[-1])
-  total = np.concatenate([[0.0], np.cumsum(command * spans)[:-1]])
-
-  def integral(at: Array) -> Array:
-    index = np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, len(stamp) - 1)
-    return total[index] + command[index] * (at - stamp[index])
-
-  begin = times - delay
-  return (integral(begin + step) - integral(begin)) / step
 
 
 def _delays(effects: Sequence[Effect], model: mujoco.MjModel) -> Array:

@@ -13,10 +13,10 @@ from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING
-from nerf2real.sysid.model.plant import actuator_of
+from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
-from nerf2real.sysid.selection import claims
+from nerf2real.sysid.selection import claims, whole_machine
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.joints import changes
 from nerf2real.sysid.selection.joints.changes import Changed
@@ -74,6 +74,7 @@ def analyse(
     _write_shared(result, effect, own_latency=not reference)
   for item in changed:
     _write_down(result, item)
+  whole_machine.discard_refuted(result, settings)
   off = [row for row in result.effects if row["kind"] == "parameter_error"]
   if len(off) > _ALL_OFF * len(joints) and len(off) > 1:
     result.effects = [row for row in result.effects if row not in off]

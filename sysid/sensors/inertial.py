@@ -23,7 +23,7 @@ from nerf2real.core import least_squares
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import kind_of
-from nerf2real.sysid.model.reduction import smooth_motion
+from nerf2real.sysid.model.motion import smooth_motion
 from nerf2real.sysid.sensors.sensed import Estimate, Estimates, Part
 
 Array = np.ndarray

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core import rotations
 from nerf2real.core.robot_logs.reading import ImuSeries, Log
-from nerf2real.sysid.model.reduction import smooth_motion
+from nerf2real.sysid.model.motion import smooth_motion
 from nerf2real.sysid.sensors import standing
 
 Array = np.ndarray

@@ -9,6 +9,7 @@ import pytest
 
 from nerf2real.core.robot_logs.reading import LogError
 from nerf2real.sysid.data.bam import UNNAMED
+from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.opening import named, read_log, read_logs
 from tests.sysid.synthetic import ARM, PENDULUM
 
@@ -31,6 +32,24 @@ def rows(start=7.0):
     lines.append(f"{start + time:.4f},{0.5 * place:.6f},,,,")
     lines.append(f"{start + time + 0.002:.4f},,{place:.6f},{2 * place:.6f},12.1,{heat}")
   return lines
+
+
+def test_a_joint_commanded_past_its_range_is_refused(tmp_path):
+  stopped = np.clip(0.5 * PATH, -0.2, 0.2)
+  lines = ["time,command_position:joint,position:joint"]
+  lines += [f"{t:.4f},{0.5 * p:.6f},{s:.6f}" for t, p, s in zip(TIME, PATH, stopped, strict=True)]
+  log = read_log(csv_of(tmp_path, lines))
+  servo = '<position name="joint" joint="joint" kp="21"/>'
+  for limits, refused in (('range="-11.46 11.46"', True), ('range="-60 60"', False)):
+    model = mujoco.MjModel.from_xml_string(
+      f'<mujoco><worldbody><body><joint name="joint" axis="0 1 0" {limits}/>'
+      f'<geom size="0.1"/></body></worldbody><actuator>{servo}</actuator></mujoco>'
+    )
+    if refused:
+      with pytest.raises(LogError, match="end of its declared range, -0.2 to 0.2"):
+        check_against_model(log, model)
+    else:
+      check_against_model(log, model)
 
 
 def test_a_csv_log(tmp_path):

@@ -40,7 +40,7 @@ def test_a_mass_adds_what_a_model_that_has_it_feels(xml, body):
     snapshot = masses.Snapshot(model)
     masses.attach_mass(model, index, added=mass, position=place)
     masses.refresh(model, mujoco.MjData(model), snapshot)
-    after = reduction.of_joint(joint)
+    after = Reduction(model, log, motion=reduction.detailed).of_joint(joint)
     snapshot.restore(model)
     for field in ("inertia", "here", "across", "bias"):
       gained = sum(f * getattr(p, field) for f, p in zip(factors, parts, strict=True))

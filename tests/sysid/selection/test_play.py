@@ -59,7 +59,7 @@ def test_play_is_named_with_its_gap() -> None:
   (row,) = found.effects
   gap = row["parameters"]["gap"]
   assert row["kind"] == "backlash" and gap["low"] < _PLAY["gap"] < gap["high"]
-  assert gap["value"] == pytest.approx(_PLAY["gap"], rel=0.1)
+  assert gap["value"] == pytest.approx(_PLAY["gap"], rel=0.15)  # courses do not repeat
 
 
 def test_what_is_no_play_is_not_judged_by_following() -> None:

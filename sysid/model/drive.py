@@ -1,0 +1,59 @@
+"""The actuators of a model's joints, and the commands of a log as they act on them.
+
+Shapes: T steps of a simulation, U actuators of the model.
+"""
+
+import mujoco
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
+
+Array = np.ndarray
+
+
+def holds_position(model: mujoco.MjModel, actuator: int) -> bool:
+  """Tells whether an actuator has a position loop, so that errors do not accumulate."""
+  return float(model.actuator_biasprm[actuator, 1]) < 0.0
+
+
+def actuator_of(model: mujoco.MjModel, joint: str) -> int:
+  """Returns the actuator that drives a joint, -1 if none does."""
+  index = model.joint(joint).id
+  for u in range(model.nu):
+    on_joint = model.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    if on_joint and model.actuator_trnid[u, 0] == index:
+      return u
+  return -1
+
+
+def mean_commands(
+  model: mujoco.MjModel, log: Log, times: Array, step: float, late_by: Array | None = None
+) -> Array:
+  """Returns the mean command [T, U] of every step, each held until the next comes, and late.
+
+  A command that comes within a step acts for the rest of it: used from the next step on it would be
+  half a step late in the mean, which a moving joint shows.
+
+  Args:
+    model: compiled model.
+    log: its commands.
+    times: at which the steps begin [T], s.
+    step: s.
+    late_by: of every actuator [U], s; none is if left out.
+  """
+  commands = log.commands
+  source = commands.position if commands.position is not None else commands.effort
+  assert source is not None
+  stamp = commands.stamp
+  spans = np.diff(stamp, append=stamp[-1])
+  result = np.zeros((len(times), model.nu))
+  for column, name in enumerate(commands.joints):
+    u, command = actuator_of(model, name), source[:, column]
+    total = np.concatenate([[0.0], np.cumsum(command * spans)[:-1]])
+    begin = times - (0.0 if late_by is None else late_by[u])
+    edges = []
+    for at in (begin, begin + step):
+      index = np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, len(stamp) - 1)
+      edges.append(total[index] + command[index] * (at - stamp[index]))
+    result[:, u] = (edges[1] - edges[0]) / step
+  return result

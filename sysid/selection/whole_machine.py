@@ -1,0 +1,72 @@
+"""What the whole machine, simulated by MuJoCo, says of what was found joint by joint.
+
+Joints are explained one at a time, among others that are prescribed as they were measured. An
+effect that helps its joint there and makes the whole machine's error on the same logs worse
+imitates what the others lack: it is not certain, and the extended model is better off without it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.model.simulation import error, is_worse
+from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.settings import Settings
+
+
+def discard_refuted(found: Identified, settings: Settings) -> None:
+  """Takes out what makes the whole machine's error worse; joints that lose a name are unexplained.
+
+  One effect or joint's constants at a time, of those that the machine is better off without the one
+  that is least certain, until all that are left help. Courses that do not repeat refute nothing:
+  joints that are judged by following stay.
+
+  Args:
+    found: of a machine of several joints; changed.
+    settings: length of windows where an actuator does not hold its position.
+  """
+  if len(found.joints) < 2:
+    return
+  kept = [j.joint for j in found.joints if j.likelihood.follows]
+
+  def left_by(effects: Sequence[Effect]) -> float:
+    return error(found.model, found.logs, effects, clocks=found.clocks, window_s=settings.window_s)
+
+  while True:
+    effects = [*found.calibration, *found.objects]
+    whole, refuted = left_by(effects), []
+    for effect in (e for e in effects if e.target not in kept):
+      without = left_by([e for e in effects if e is not effect])
+      if is_worse({"before": without, "after": whole}):
+        certain = max((_certainty(row) for row in _rows(found, effect)), default=0.0)
+        refuted.append((certain, without, effect))
+    if not refuted:
+      return
+    _take_out(found, min(refuted, key=lambda item: item[:2])[2])
+
+
+def _rows(found: Identified, effect: Effect) -> list[dict[str, Any]]:
+  """Returns the entries that claim an effect."""
+  return [
+    row
+    for row in found.effects
+    if row["kind"] == effect.kind and row.get("body", row["joint"]) == effect.target
+  ]
+
+
+def _certainty(row: dict[str, Any]) -> float:
+  return float(row["evidence"].get("clear_by_standard_errors") or 0.0)
+
+
+def _take_out(found: Identified, effect: Effect) -> None:
+  """Takes an effect out of the extended model and of what is claimed."""
+  lost = _rows(found, effect)
+  found.calibration[:] = [e for e in found.calibration if e is not effect]
+  found.objects[:] = [e for e in found.objects if e is not effect]
+  found.effects[:] = [row for row in found.effects if not any(row is other for other in lost)]
+  found.nearest += lost
+  for item in found.joints:
+    if effect.target in (item.joint, None):
+      item.elaborated = []
+    if lost and effect.target == item.joint and item.verdict in ("effects", "partly"):
+      item.verdict = "unexplained"

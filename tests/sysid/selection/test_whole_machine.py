@@ -1,0 +1,58 @@
+"""What the whole machine's error says of effects that were found joint by joint."""
+
+from types import SimpleNamespace
+
+import mujoco
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.selection.whole_machine import discard_refuted
+from nerf2real.sysid.settings import SETTINGS
+from tests.sysid.synthetic import ARM, log_of
+
+_TRUE = Effect("coulomb_friction", "shoulder", {"torque": 0.2})
+_WRONG = Effect("viscous_friction", "elbow", {"coefficient": 0.6})
+
+
+def _row(effect: Effect, clear: float) -> dict:
+  evidence = {"clear_by_standard_errors": clear}
+  return {"kind": effect.kind, "joint": effect.target, "parameters": {}, "evidence": evidence}
+
+
+def _found(*, follows: bool = False) -> Identified:
+  joints = [
+    SimpleNamespace(
+      joint=name,
+      verdict="effects",
+      elaborated=["a fit"],
+      likelihood=SimpleNamespace(follows=follows),
+    )
+    for name in ("shoulder", "elbow")
+  ]
+  model, log = mujoco.MjModel.from_xml_string(ARM), log_of(ARM, "sweep", [_TRUE], duration=4.0)
+  found = Identified(model, [log], joints, [], "effects")  # type: ignore[arg-type]
+  found.objects += [_TRUE, _WRONG]
+  found.effects += [_row(_TRUE, 8.0), _row(_WRONG, 9.0)]
+  return found
+
+
+def test_an_effect_that_makes_the_whole_machine_worse_is_taken_out() -> None:
+  found = _found()
+  discard_refuted(found, SETTINGS)
+  assert found.objects == [_TRUE]
+  assert [row["kind"] for row in found.effects] == ["coulomb_friction"]
+  assert [row["kind"] for row in found.nearest] == ["viscous_friction"]
+  assert [(j.verdict, j.elaborated) for j in found.joints] == [
+    ("effects", ["a fit"]),
+    ("unexplained", []),
+  ]
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_one_joint_and_courses_that_do_not_repeat_refute_nothing(single: bool) -> None:
+  found = _found(follows=not single)
+  if single:
+    found.joints = found.joints[:1]
+  discard_refuted(found, SETTINGS)
+  assert found.objects == [_TRUE, _WRONG] and len(found.effects) == 2
