@@ -96,6 +96,7 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
     reference = _record(settings, hidden, say)
   on_robot = [HEALTHY, BEFORE] if healthy else [BEFORE]
   walked = {name: trials.walked(settings, name, found[name], store) for name in on_robot}
+  say("identifying from the motions, and from the trials' walks")
   with stages.timed("identification"):
     named = naming.name(
       settings.out / "identified",
@@ -138,13 +139,15 @@ def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
     recording.record_floor(out / "stand", connection, None)
     return settings.reference
   age = trials.session(settings, BEFORE).seconds / 2  # between the trials: what sags, is half way
-  for folder, altered, used in ((out / "stand", hidden, age), (out / "reference", (), 0.0)):
+  recordings = ((out / "stand", hidden, age), (out / "reference", (), 0.0))
+  for noise, (folder, altered, used) in enumerate(recordings):
     if all((folder / path.name).exists() for path in wanted):
       continue
     say(f"recording the motions of the stand in {folder}")
-    with machines.virtual_robot(settings.seed, altered, films=True, age=used) as (link, robot):
+    made = functools.partial(machines.virtual_robot, settings.seed, altered, age=used, noise=noise)
+    with made(films=True) as (link, robot):
       recording.record_stand(folder, link, robot, seconds=seconds, lens=LENS)
-    with machines.virtual_robot(settings.seed, altered, age=used) as (link, robot):
+    with made() as (link, robot):
       recording.record_floor(folder, link, robot)
   return settings.reference or out / "reference"
 

@@ -22,12 +22,14 @@ from nerf2real.core.pages.blocks import (
 from nerf2real.core.pages.page import Section
 from nerf2real.core.serialization import to_plain
 from nerf2real.evaluation.episodes import OUTCOMES
+from nerf2real.evaluation.loop import entering
 from nerf2real.evaluation.loop import story as loop
 from nerf2real.evaluation.loop.comparing import Comparison, describe
 from nerf2real.evaluation.loop.naming import Named
 from nerf2real.evaluation.loop.story import Story
 from nerf2real.evaluation.loop.trials import Tally
 from nerf2real.evaluation.report import maps
+from nerf2real.suite.effects import kind_of
 from nerf2real.suite.scene import open_scene
 
 _HEIGHT = 360  # of maps [pixel]
@@ -141,15 +143,27 @@ def _paths(story: Story, floor: FloorMap, title: str, text: str, names: Sequence
 def _finding(named: Named) -> Section:
   blocks: list[Block] = []
   if named.entering:
+    reasons = entering.reasons(named.entering, named.content)
     rows = [
-      (e.kind, e.target or "all", name, value, *e.intervals.get(name, (_NOTHING, _NOTHING)))
-      for e in named.entering
+      (
+        e.kind,
+        e.target or "all",
+        name,
+        value,
+        *e.intervals.get(name, (_NOTHING, _NOTHING)),
+        kind_of(e.kind).parameter(name).unit,
+        why,
+      )
+      for e, why in zip(named.entering, reasons, strict=True)
       for name, value in e.parameters.items()
       if isinstance(value, int | float)
     ]
-    table = Table(("effect", "where", "parameter", "value", "low", "high"), rows)
+    header = ("effect", "where", "parameter", "value", "low", "high", "unit", "why")
+    table = Table(header, rows)
     blocks.append(Text(_entering(named)))
     blocks.append(table if len(rows) <= 12 else Details(f"all {len(rows)} values", [table]))
+  if named.left_out:
+    blocks.append(Details(f"what stays out: {len(named.left_out)}", [Text(_left_out(named))]))
   held = named.content["error"]["held"]
   share = _NOTHING if named.share is None else f"{100 * named.share:.0f} %"
   noise = named.content["error"]["floor"]
@@ -171,12 +185,27 @@ def _finding(named: Named) -> Section:
 
 def _entering(named: Named) -> str:
   """Returns what the simulation gets and what not, in words."""
-  text = "The simulation gets the names, with the constants beside them"
+  text = (
+    "The simulation gets what is named, what the robot had before, too, and what was fitted beside "
+    "a name at its joint (declared constants, friction, zero), each drawn from its interval (95 %)"
+  )
   if named.forces:
     joints = ", ".join(str(force.target) for force in named.forces)
-    text += f", and as no name explains the motion, learned forces at {joints}"
-  count = len(named.left_out)
-  return f"{text}. {count} other effects of the extended model, none of them named, stay out."
+    text += f"; and as no name explains the motion, learned forces at {joints}"
+  if not named.left_out:
+    return f"{text}."
+  return (
+    f"{text}. The {len(named.left_out)} other effects of the analyser's extended model stay out: "
+    "they make its errors smaller in the air, and nothing has judged them under weight."
+  )
+
+
+def _left_out(named: Named) -> str:
+  """Returns the effects that stay out, by kind."""
+  places: dict[str, list[str]] = {}
+  for effect in named.left_out:
+    places.setdefault(effect.kind, []).append(effect.target or "all")
+  return "; ".join(f"{kind} at {', '.join(listed)}" for kind, listed in places.items()) + "."
 
 
 def _training(story: Story) -> Section:

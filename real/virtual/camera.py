@@ -65,7 +65,7 @@ class VirtualCamera:
 class Sensor:
   """What the camera makes of a true picture."""
 
-  def __init__(self, settings: VirtualCamera, *, seed: int = 0):
+  def __init__(self, settings: VirtualCamera, *, seed: int | tuple[int, int] = 0):
     """Sets the sensor, with a seed for its noise."""
     self.gain, self.exposure, self.noise = settings.gain, settings.exposure, settings.noise
     self._balance = np.asarray(settings.white_balance)
@@ -137,7 +137,9 @@ class Eyes:
 class SteppedCamera:
   """The camera of a robot on a `SteppedClock`: the stream's sensor, without a network."""
 
-  def __init__(self, eyes: View, clock: Clock, settings: VirtualCamera, *, seed: int):
+  def __init__(
+    self, eyes: View, clock: Clock, settings: VirtualCamera, *, seed: int | tuple[int, int]
+  ):
     """Makes the camera; pictures are taken at multiples of the frame's duration."""
     self._eyes, self._clock, self._settings = eyes, clock, settings
     self.sensor = Sensor(settings, seed=seed)

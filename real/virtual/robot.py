@@ -36,6 +36,7 @@ class VirtualRobot:
     *,
     world: str = "floor",
     seed: int | None = None,
+    noise: int = 0,
     hidden: Hidden | None = None,
     stepped: bool = False,
     camera: VirtualCamera | None = None,
@@ -48,6 +49,7 @@ class VirtualRobot:
     Args:
       world: "floor", or "room": the built-in room.
       seed: Seed of what is hidden, of noise and of chances; None: as in the data sheets.
+      noise: Another number is another recording of the same robot: other noise, other chances.
       hidden: What is hidden, instead of a draw.
       stepped: Whether time jumps (`SteppedClock`), for rehearsals faster than real time.
       camera: The camera (needs EGL); None: a robot without.
@@ -63,7 +65,7 @@ class VirtualRobot:
     looks = camera is not None and view is None
     self.body = Body(world=world, hidden=hidden, ball=ball, furnish=furnish, looks=looks)
     self.body.time = self.clock.now()
-    devices = Devices(self.body, faults=self.faults, seed=seed or 0)
+    devices = Devices(self.body, faults=self.faults, seed=seed or 0, noise=noise)
     self._wire: Wire | Cable
     if isinstance(self.clock, SteppedClock):
       self._wire = Cable(devices, self.clock)
@@ -78,7 +80,7 @@ class VirtualRobot:
     self.stream: CameraStream | None = None
     if self.eyes is not None and camera is not None:
       if stepped:
-        self.camera = SteppedCamera(self.eyes, self.clock, camera, seed=seed or 0)
+        self.camera = SteppedCamera(self.eyes, self.clock, camera, seed=(seed or 0, noise))
       else:
         self.stream = CameraStream(self.eyes.picture, camera, release=self.eyes.close)
         self.stream.start()

@@ -4,12 +4,15 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
+
 from nerf2real.real.loading import Connection
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.real.virtual.undeclared import Undeclared
 
 DRAWN = "drawn"
+_MOMENT = 0.1  # s; chosen: more than a period of control, bus and camera
 
 
 def hidden_effects(texts: Sequence[str], seed: int) -> tuple[Undeclared, ...]:
@@ -24,7 +27,12 @@ def hidden_effects(texts: Sequence[str], seed: int) -> tuple[Undeclared, ...]:
 
 @contextlib.contextmanager
 def virtual_robot(
-  seed: int, altered: Sequence[Undeclared] = (), *, films: bool = False, age: float = 0.0
+  seed: int,
+  altered: Sequence[Undeclared] = (),
+  *,
+  films: bool = False,
+  age: float = 0.0,
+  noise: int = 0,
 ) -> Iterator[tuple[Connection, VirtualRobot]]:
   """Yields a virtual robot on stepped time and how it is reached.
 
@@ -33,8 +41,13 @@ def virtual_robot(
     altered: Undeclared effects that it has besides.
     films: Whether it has a camera, in the true room; else it stands on a bare floor.
     age: Time that its battery was in use before [s].
+    noise: Another number is another recording of the same robot: other noise of its sensors, and
+      switched on at another moment between the steps of plant, bus and camera. Without both the
+      robot repeats its motions to the bit.
   """
   build = undeclared.build(seed, altered, age=age)
   world: dict[str, Any] = {"world": "room", "camera": build.camera} if films else {}
-  with VirtualRobot(stepped=True, seed=seed, hidden=build.hidden, **world) as robot:
+  with VirtualRobot(stepped=True, seed=seed, hidden=build.hidden, noise=noise, **world) as robot:
+    moment = np.random.default_rng([seed, 8, noise]).uniform(0.0, _MOMENT)
+    robot.clock.sleep_until(robot.clock.now() + (moment if noise else 0.0))
     yield robot.connection(), robot

@@ -62,22 +62,23 @@ class Answer(NamedTuple):
 class Devices:
   """The servos and the board of one robot."""
 
-  def __init__(self, body: Body, *, faults: Faults, seed: int = 0):
+  def __init__(self, body: Body, *, faults: Faults, seed: int = 0, noise: int = 0):
     """Connects the devices to a body.
 
     Args:
       body: The plant.
       faults: What goes wrong; may change at any time.
       seed: Seed of noise and of the faults' chances.
+      noise: Which of the seed's noises; see `VirtualRobot`.
     """
     self.body, self.faults = body, faults
-    self._rng = np.random.default_rng([seed, 6])
+    self._rng = np.random.default_rng([seed, 6, noise])
     self.servos = {
       IDS[name]: Servo(IDS[name], index, body.motors)
       for index, name in enumerate(constants.JOINT_NAMES)
     }
-    noise = np.repeat([body.hidden.gyroscope_noise, body.hidden.accelerometer_noise], 3)
-    self.board = Board(noise, np.random.default_rng([seed, 7]))
+    deviations = np.repeat([body.hidden.gyroscope_noise, body.hidden.accelerometer_noise], 3)
+    self.board = Board(deviations, np.random.default_rng([seed, 7, noise]))
     self._all: dict[int, Servo | Board] = {**self.servos, self.board.device: self.board}
     self._ids = np.array([IDS[name] for name in constants.JOINT_NAMES])
     self._powered = False

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from nerf2real.evaluation.loop import naming, telling
-from nerf2real.evaluation.loop.entering import entering, forces
+from nerf2real.evaluation.loop.entering import (
+  CLAIMED,
+  FITTED_BESIDE,
+  OWN,
+  entering,
+  forces,
+  reasons,
+)
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 
 FORCE = Effect("residual_force", "l_knee", {"weights": [0.1] * 400})
@@ -41,15 +48,28 @@ def _places(effects):
   return [(effect.kind, effect.target) for effect in effects]
 
 
-def test_names_enter_with_the_constants_of_their_joints_and_nothing_else():
+def test_names_enter_with_what_was_fitted_beside_them_at_their_joint_and_nothing_else():
   found = entering(MODEL, _content("partly", WEAK))
   assert _places(found) == [
     ("parameter_error", "l_knee"),
     ("motor_gain", "l_knee"),
+    ("load_friction", "l_knee"),
     ("encoder_offset", "l_knee"),
     ("imu_bias", None),  # the reference shows it, too: the robot has it
   ]
   assert found[0].samples == {"gain": [0.97, 0.99]} and found[1].intervals == {"gain": (0.15, 0.17)}
+
+
+def test_why_an_effect_enters_is_said():
+  told = reasons(MODEL, _content("partly", WEAK))
+  kept = {e.kind: why for e, why in zip(MODEL, told, strict=True) if why}
+  assert kept == {
+    "parameter_error": FITTED_BESIDE,
+    "motor_gain": CLAIMED,
+    "load_friction": FITTED_BESIDE,
+    "encoder_offset": FITTED_BESIDE,
+    "imu_bias": OWN,
+  }
 
 
 def test_a_load_enters_with_the_constants_of_the_joint_that_carries_it():
@@ -92,5 +112,7 @@ def test_a_finding_keeps_what_enters_as_a_file_and_the_page_says_what_stays_out(
   named = naming.read(tmp_path)
   assert named.entering_path.name == "entering.json"
   assert _places(read_effects(named.entering_path)) == _places(named.entering)
-  assert len(named.entering) == 4 and len(named.left_out) == len(MODEL) - 4
-  assert "6 other effects of the extended model" in telling._entering(named)
+  assert len(named.entering) == 5 and len(named.left_out) == len(MODEL) - 5
+  assert "The 5 other effects of the analyser's extended model" in telling._entering(named)
+  left_out = telling._left_out(named)
+  assert left_out.startswith("parameter_error at r_knee; residual_force at l_knee; encoder_offset")

@@ -1,10 +1,10 @@
-"""What a robot that is turned on a floor shows of its slope."""
+"""Recordings of a virtual robot: what turning on a floor shows of its slope, and what repeats."""
 
 import numpy as np
 import pytest
 
 from nerf2real.evaluation.loop import naming
-from nerf2real.evaluation.loop.robot import machines, recording
+from nerf2real.evaluation.loop.robot import machines, motions, recording
 from nerf2real.real.virtual import undeclared
 
 
@@ -23,3 +23,15 @@ def test_a_slope_is_named_from_turning_on_it_and_none_where_there_is_none(tmp_pa
   low, high = found.intervals["y"]
   assert low <= slope <= high and high - low < 0.06
   assert np.abs(found.parameters["x"]) < 0.02
+
+
+def test_another_recording_of_the_same_robot_differs_and_the_same_one_repeats():
+  def recorded(noise):
+    actions = motions.motion("sweep", 40)
+    with machines.virtual_robot(1, noise=noise) as (connection, robot):
+      return recording.play_actions(connection, actions, robot, held=True)
+
+  first, again, other = (recorded(noise) for noise in (0, 0, 1))
+  assert np.array_equal(first, again)
+  differing = np.abs(first - other)
+  assert 0 < differing.max() < 0.01 and np.median(differing) < 0.002  # a count is 1.5 mrad
