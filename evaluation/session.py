@@ -237,9 +237,7 @@ def _run_share(
   policy = load_policy(settings, scene)
   size = policy.image_size or settings.camera_size
   size = _FILMED if settings.video and size is None else size
-  chosen = choose(
-    plants.trials(settings.protocol), settings.trials, repetition=settings.repetition
-  )
+  chosen = choose(plants.trials(settings.protocol), settings.trials, repetition=settings.repetition)
   log = None
   if settings.record and settings.plant != "sim":
     name = f"{settings.plant}_{settings.protocol}" + (f"_share{share[0]}" if share[1] > 1 else "")
