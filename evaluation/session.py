@@ -65,12 +65,27 @@ def each_plant(settings: EvaluationSettings) -> list[EvaluationSettings]:
   return [settings]
 
 
-def choose(listed: tuple[Any, ...], count: int | None) -> list[tuple[int, Any]]:
-  """Returns trials with their indices: all, or `count` spread over them."""
-  indices = range(len(listed))
-  if count is not None and count < len(listed):
-    indices = np.unique(np.linspace(0, len(listed) - 1, count).round().astype(int)).tolist()
-  return [(int(index), listed[index]) for index in indices]
+def choose(
+  listed: tuple[Any, ...], count: int | None, *, repetition: int | None = None
+) -> list[tuple[int, Any]]:
+  """Returns trials with their indices: all, or `count` spread over them.
+
+  Args:
+    listed: Groups and trials of a protocol.
+    count: How many; all if None.
+    repetition: Of the starts; all if None.
+
+  Raises:
+    ValueError: No start is repeated so often.
+  """
+  known = sorted({trial.trial for _, trial in listed})
+  if repetition is not None and repetition not in known:
+    raise ValueError(f"--repetition {repetition}: expected one of {', '.join(map(str, known))}.")
+  indices = [i for i, (_, trial) in enumerate(listed) if repetition in (None, trial.trial)]
+  if count is not None and count < len(indices):
+    spread = np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))
+    indices = [indices[place] for place in spread]
+  return [(index, listed[index]) for index in indices]
 
 
 def _line(episode: episodes.Episode, number: int, count: int) -> str:
@@ -222,7 +237,7 @@ def _run_share(
   policy = load_policy(settings, scene)
   size = policy.image_size or settings.camera_size
   size = _FILMED if settings.video and size is None else size
-  chosen = choose(plants.trials(settings.protocol), settings.trials)
+  chosen = choose(plants.trials(settings.protocol), settings.trials, repetition=settings.repetition)
   log = None
   if settings.record and settings.plant != "sim":
     name = f"{settings.plant}_{settings.protocol}" + (f"_share{share[0]}" if share[1] > 1 else "")

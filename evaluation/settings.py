@@ -33,6 +33,8 @@ class EvaluationSettings:
   """An effects.json for the simulation: what the nominal model lacks."""
   trials: int | None = None
   """Runs only the first trials of the protocol, spread over it; all if not given."""
+  repetition: int | None = None
+  """Runs only this repetition of every start, counted from 0; all if not given."""
   processes: int = 1
   """Processes that share the trials in simulation and on virtual robots; each has a plant of its
   own, so that a virtual robot's noise is another than with one."""

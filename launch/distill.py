@@ -18,7 +18,7 @@ from nerf2real.launch import command
 from nerf2real.launch.local_distributed import supervised
 
 # Arguments that are the learner's alone.
-_OF_LEARNER = ("teacher", "init_from", "relabel", "minutes")
+_OF_LEARNER = ("teacher", "init_from", "relabel", "minutes", "keep_minutes")
 _HERE = Path(__file__).resolve().parent
 SCRIPTS = training.Scripts(learner=_HERE / "distill_learner.py", actor=_HERE / "actor.py")
 
@@ -34,9 +34,9 @@ class Arguments(training.TrainingSettings):
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   preset: str | None = None
-  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push; adapt, or ball_push_on for
-  ball pushing, to train a policy on, room to train it on in another room (all with --init-from); or
-  tiny to try the machinery; "nerf_nav" if not given."""
+  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push; adapt, nerf_nav_on, or,
+  for ball pushing, ball_push_on to train a policy on, room to train it on in another room (all with
+  --init-from); or tiny to try the machinery; "nerf_nav" if not given."""
   teacher: str | None = None
   """quick, swift, steady, ball, a walker's settings as JSON, or an exported policy's folder; the
   preset's if not given."""
@@ -47,6 +47,9 @@ class Arguments(training.TrainingSettings):
   now."""
   minutes: float | None = None
   """Training time over all parts of the run [min]; 60 if not given."""
+  keep_minutes: float | None = None
+  """Training time between students that are kept in the run's policy/ beside the newest [min]; none
+  is if not given."""
 
 
 def run(arguments: Arguments, forwarded: list[str]) -> None:

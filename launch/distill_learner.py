@@ -32,8 +32,9 @@ class Arguments:
   listen: str = DEFAULT_ENDPOINT
   """Where to listen, such as tcp/0.0.0.0:7447."""
   preset: str = "nerf_nav"
-  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push; adapt, or ball_push_on for ball
-  pushing, to train a policy on, room to do so in another room; or tiny to try the machinery."""
+  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push; adapt, nerf_nav_on, or, for ball
+  pushing, ball_push_on to train a policy on, room to do so in another room; or tiny to try the
+  machinery."""
   env: str | None = None
   """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
   teacher: str | None = None
@@ -48,6 +49,8 @@ class Arguments:
   """Frames collected at most [steps]; the preset's if not given."""
   minutes: float = 60.0
   """Training time over all parts of the run [min]."""
+  keep_minutes: float | None = None
+  """Training time between students that are kept in the run's policy/ beside the newest [min]."""
   seed: int = 0
   """Seed of first weights, augmentation and sampling."""
   threads: int = 1
@@ -75,6 +78,7 @@ def settings_of(arguments: Arguments) -> Any:
     "environment": arguments.env,
     "teacher": arguments.teacher,
     "max_frames": arguments.max_env_steps,
+    "keep_minutes": arguments.keep_minutes,
   }
   if arguments.init_from is not None:
     changes["init_from"] = str(arguments.init_from)

@@ -137,6 +137,8 @@ class DistillSettings:
   """Time between students given to the collectors [s]."""
   save_period: float = 60.0
   """Time between saved states of the learner [s]."""
+  keep_minutes: float = 0.0
+  """Training time between students that are kept beside the newest [min]; 0: none is."""
   log_period: float = 15.0
   """Time between rows of metrics [s]."""
   evaluation_period: float = 480.0
@@ -148,6 +150,8 @@ class DistillSettings:
     total = sum(stage.share for stage in self.stages)
     if abs(total - 1.0) > 1e-6:
       raise ValueError(f"The stages' shares must sum to 1, found {total:g}.")
+    if self.keep_minutes < 0:
+      raise ValueError(f"keep_minutes must be 0 or more, found {self.keep_minutes:g}.")
     if self.teacher_frames < self.first_frames:
       raise ValueError(
         f"teacher_frames must be {self.first_frames} (first_frames) or more, found "
@@ -179,6 +183,21 @@ def adapt() -> DistillSettings:
     first_frames=4_000,
     learning_rate=3e-4,
     evaluation_period=3_600.0,
+  )
+
+
+def nerf_nav_on() -> DistillSettings:
+  """Navigation: the shipped student is trained on towards a faster walk, its encoder on views.
+
+  All its failures are collisions after starts at which its belief is wrong from the first picture
+  on: an episode shows one start, views show a place each.
+  """
+  return dataclasses.replace(
+    adapt(),
+    teacher="swift",
+    views=20_000,
+    # As in `ball_push_on`: views teach the encoder before there are new paths of the student's.
+    stages=(Stage(kind=ENCODER, share=0.35), Stage(kind=POLICY, share=0.65)),
   )
 
 
@@ -287,6 +306,7 @@ PRESETS: Mapping[str, Callable[[], DistillSettings]] = {
   "ball_push": ball_push,
   "ball_push_on": ball_push_on,
   "adapt": adapt,
+  "nerf_nav_on": nerf_nav_on,
   "room": room,
   "tiny": tiny,
 }

@@ -162,3 +162,8 @@ def test_trials_may_be_spread():
   chosen = session.choose(listed, 4)
   assert [index for index, _ in chosen] == [0, 18, 35, 53]
   assert len(session.choose(listed, None)) == 54 and len(session.choose(listed, 99)) == 54
+  again = session.choose(listed, None, repetition=1)
+  assert [index for index, _ in again] == list(range(1, 54, 2))
+  assert [index for index, _ in session.choose(listed, 3, repetition=1)] == [1, 27, 53]
+  with pytest.raises(ValueError, match="--repetition 2: expected one of 0, 1"):
+    session.choose(listed, None, repetition=2)

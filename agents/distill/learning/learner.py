@@ -1,8 +1,9 @@
 """The learner of a distillation: takes labelled episodes in, trains and serves the student.
 
 What a run leaves in its folder: `data/` (episodes), `checkpoints/` (the learner's state),
-`settings.json`, `policy/newest` (the exported student) and `metrics.jsonl`. Files are written
-whole; a killed run goes on from its last state with all its episodes.
+`settings.json`, `policy/newest` (the exported student), `policy/kept_NNN` (where students are kept,
+the first of every such period) and `metrics.jsonl`. Files are written whole; a killed run goes on
+from its last state with all its episodes.
 """
 
 import dataclasses
@@ -307,8 +308,16 @@ class Learner:
     if not self._is_fit:
       return
     self._publish()
+    self._export(self._run / POLICY)
+    if self._settings.keep_minutes > 0:
+      period = int(self._counters.elapsed / 60 / self._settings.keep_minutes)
+      kept = self._run / POLICY.parent / f"kept_{period:03d}"
+      if not kept.exists():
+        self._export(kept)
+
+  def _export(self, folder: Path) -> None:
     export_policy(
-      self._run / POLICY,
+      folder,
       self._trainer.served_parameters(),
       layout=self._layout,
       environment=self._settings.environment,

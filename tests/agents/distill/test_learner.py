@@ -76,6 +76,27 @@ def test_a_policy_stage_that_ends_before_it_settled_gives_its_student(kind, stop
   assert learner._counters.begun == (12 if given else None)
 
 
+def test_a_student_is_kept_once_a_period(tmp_path, monkeypatch):
+  learner, written = object.__new__(Learner), []
+  learner._settings = dataclasses.replace(TINY, keep_minutes=2.0)
+  learner._run, learner._is_fit = tmp_path, True
+  learner._trainer = SimpleNamespace(state=None)
+  learner._publish = lambda: None
+
+  def export(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    written.append(folder.name)
+
+  learner._export = export
+  monkeypatch.setattr("nerf2real.agents.distill.learning.learner.save_state", lambda *_: None)
+  for minutes in (0.5, 1.5, 2.5, 3.9, 6.1):
+    learner._counters = checkpoint.Counters(elapsed=60 * minutes)
+    learner._save()
+  assert written == ["newest", "kept_000", "newest", "newest", "kept_001"] + ["newest"] * 2 + [
+    "kept_003"
+  ]
+
+
 def _start(run, *extra):
   command = [sys.executable, str(SCRIPT), "--run", str(run), "--preset", "tiny", *extra]
   environment = os.environ | {"PYTHONPATH": str(SCRIPT.parents[1])}
