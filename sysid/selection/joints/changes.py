@@ -16,7 +16,7 @@ from nerf2real.sysid.selection.joints.leaving import leaves, may_leave, remainin
 from nerf2real.sysid.selection.joints.naming import conclude
 from nerf2real.sysid.selection.joints.subject import Subject, following
 from nerf2real.sysid.selection.search.elaboration import elaborated
-from nerf2real.sysid.selection.search.evidence import UNREPEATED
+from nerf2real.sysid.selection.search.evidence import UNREPEATED, clear
 from nerf2real.sysid.selection.search.growth import grow
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -48,11 +48,14 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   own = [t for t in known if t.names]
   as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
   anyway, left = remaining(subject, explainer.null)
-  if may_leave(subject, explainer.null, settings) or np.any(settings.more**2 * anyway < left):
+  more_at_first = bool(np.any(settings.more**2 * anyway < left))
+  if may_leave(subject, explainer.null, settings) or more_at_first:
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
   found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
+  lacking = more_at_first or leaves(subject, explainer.null, settings)
+  lacking |= clear(found.best, explainer.null) > subject.beyond
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
   named = tuple(k for k in found.named if k in something)
   if before is not None and usual is not None and not subject.paired:
@@ -68,7 +71,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     ranked = explainer.ranked()
   more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
-    something,
+    bool(something) and lacking,
     named,
     any(t.wider for t in known),
     bool(typical or few) or leaves(subject, found.best, settings),
@@ -105,7 +108,7 @@ def elaborate(found: Sequence[Changed]) -> None:
 
 
 def _verdict(
-  something: Sequence[str],
+  lacking: bool,
   named: Sequence[str],
   shared: bool,
   remains: bool,
@@ -114,14 +117,16 @@ def _verdict(
   """Returns the graded verdict of a joint.
 
   Args:
-    something: kinds of the best hypothesis whose values are more than a machine's own.
+    lacking: whether the best hypothesis has a kind whose values are more than a machine's own, and
+      the baseline leaves more than the machine does anyway, or is clearly worse. Names are tried
+      from less on: what is not certain then is nothing.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
     remains: whether more is left than the machine leaves anyway, by a test or by that limit.
     more: whether it is by the limit.
   """
   if not named and not shared:
-    return "unexplained" if remains or something else "none"
+    return "unexplained" if remains or lacking else "none"
   if not named and not remains:
     return "none"
   return "partly" if more else "effects"
