@@ -129,11 +129,14 @@ def _read_stills(
       f"{source}: {' '.join(found.warnings)} At least {settings.min_images} different pictures of "
       "one camera are needed."
     )
-  size = min(settings.max_size, found.long_side)
+  size = found.size(settings.max_size)
 
   def read(index: int) -> np.ndarray:
-    image = limit_size(stills.read_still(found.files[index], least=size), size)
-    return stills.quarter_turned(image) if found.turned[index] else image
+    image = stills.read_still(found.files[index], least=max(size))
+    if found.turned[index]:
+      image = stills.quarter_turned(image)
+    same = image.shape[1::-1] == size
+    return image if same else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
   frames = _sharpest_pictures(len(found.files), read, settings, progress)
   capture = _write("images", frames, folder, settings, found.warnings)

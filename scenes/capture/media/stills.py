@@ -27,6 +27,7 @@ _REDUCED = (
   (4, cv2.IMREAD_REDUCED_COLOR_4),
   (2, cv2.IMREAD_REDUCED_COLOR_2),
 )
+_ENOUGH = 1600  # long side at which features are sought: smaller pictures lose some [pixel]
 _TURNED = (5, 6, 7, 8)  # EXIF orientations with width and height exchanged
 # Camera axes of the upright picture in those of the one that was turned counter-clockwise.
 _TURNED_FROM_UPRIGHT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -60,15 +61,15 @@ class Look(NamedTuple):
     """Of the picture [pixel]."""
     return max(self.width, self.height)
 
-  @property
-  def shape(self) -> float:
-    """Long side over short side, to a hundredth: binning and scaling round a picture's size."""
-    return round(self.long_side / min(self.width, self.height), 2)
+  def short_side(self, long_side: int) -> int:
+    """Of the picture when its long side is this [pixel]."""
+    return round(min(self.width, self.height) * long_side / self.long_side)
 
   def shares_camera(self, other: "Look") -> bool:
     """Whether both may be of one camera, turned or reduced; a missing lens may be any."""
     lenses = {self.focal, other.focal} - {None}
-    return self.shape == other.shape and len(lenses) < 2
+    size = min(self.long_side, other.long_side)  # binning and scaling round a picture's size
+    return abs(self.short_side(size) - other.short_side(size)) <= 1 and len(lenses) < 2
 
 
 class Stills(NamedTuple):
@@ -76,8 +77,16 @@ class Stills(NamedTuple):
 
   files: list[Path]
   turned: np.ndarray  # bool [N]: is to be turned by a quarter to lie as the others
-  long_side: int  # of the most common size; larger ones are reduced to it [pixel]
+  look: Look  # of most of them
+  long_side: int  # of the smallest; the others are reduced to it [pixel]
   warnings: list[str]
+
+  def size(self, limit: int) -> tuple[int, int]:
+    """Width and height that all get, with a long side of at most a limit [pixel]."""
+    long_side = min(limit, self.long_side)
+    short_side = self.look.short_side(long_side)
+    wide = self.look.width >= self.look.height
+    return (long_side, short_side) if wide else (short_side, long_side)
 
 
 def look_of(path: Path) -> Look:
@@ -111,16 +120,31 @@ def _without_copies(files: Sequence[Path]) -> list[Path]:
   return list(first.values())
 
 
+def _most_common(looks: Sequence[Look]) -> Look:
+  """The most common look of the camera that most pictures may be of."""
+  told = [look for look in looks if look.focal is not None]
+  # Of a shape that some files tell the lens of, the others may be of any lens.
+  lenses = [k for k in looks if k.focal or not any(k.shares_camera(other) for other in told)]
+  counts = {lens: sum(map(lens.shares_camera, looks)) for lens in dict.fromkeys(lenses)}
+  lens = max(counts, key=lambda look: counts[look])
+  sizes = collections.Counter(k[:2] for k in looks if lens.shares_camera(k))
+  return Look(*sizes.most_common(1)[0][0], lens.focal)
+
+
 def of_one_camera(files: Sequence[Path]) -> Stills:
   """Keeps the pictures of the most common camera, each once.
+
+  Pictures in several sizes, as messengers make them, are all kept while the smallest shows as many
+  features as the others.
 
   Raises:
     CaptureError: One is no picture.
   """
   once = _without_copies(files)
   looks = [look_of(path) for path in once]
-  common = collections.Counter(looks).most_common(1)[0][0]
-  alike = [look.shares_camera(common) and look.long_side >= common.long_side for look in looks]
+  common = _most_common(looks)
+  least = min(common.long_side, _ENOUGH)
+  alike = [look.shares_camera(common) and look.long_side >= least for look in looks]
   wide = common.width >= common.height
   kept = [path for path, same in zip(once, alike, strict=True) if same]
   across = [
@@ -133,10 +157,11 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   if others:
     rest = ", ".join(f"{count} of {look}" for look, count in others.most_common(3))
     warnings.append(
-      f"Only {len(kept)} of {len(once)} pictures are {common} or larger; left out are {rest}: "
-      "expected one camera and one zoom."
+      f"Only {len(kept)} of {len(once)} pictures are {common} or of its camera and at least "
+      f"{least} pixels long; left out are {rest}: expected one camera and one zoom."
     )
-  return Stills(kept, np.array(across), common.long_side, warnings)
+  smallest = min(look.long_side for look, same in zip(looks, alike, strict=True) if same)
+  return Stills(kept, np.array(across), common, smallest, warnings)
 
 
 def read_still(path: Path, *, least: int | None = None) -> np.ndarray:

@@ -60,6 +60,28 @@ def test_most_stills_are_kept_and_the_rest_is_named(tmp_path):
     read_capture(tmp_path, tmp_path / "out", settings=CaptureSettings(min_images=10))
 
 
+def test_smaller_stills_are_kept_where_they_show_enough(tmp_path):
+  sizes = [(2016, 1512)] * 4 + [(1600, 1200)] * 3 + [(1200, 1600), (1400, 1050), (1920, 1080)]
+  sizes += [(1600, 1201)]  # rounded otherwise
+  for number, size in enumerate(sizes):
+    _still(tmp_path / f"{number:02d}.jpg", size, focal=26 if number < 4 else None, seed=number)
+  found = stills.of_one_camera(sorted(tmp_path.iterdir()))
+  assert [int(path.stem) for path in found.files] == [0, 1, 2, 3, 4, 5, 6, 7, 10]
+  assert found.size(1920) == (1600, 1200) and found.size(800) == (800, 600)
+  assert "1 of 1400x1050" in found.warnings[0] and "1 of 1920x1080" in found.warnings[0]
+  capture = read_capture(tmp_path, tmp_path / "out")
+  assert len(capture.images) == 9 and (capture.width, capture.height) == (1600, 1200)
+
+
+def test_the_lens_that_most_files_tell_is_kept(tmp_path):
+  focals = [None] * 5 + [26] * 3 + [13] * 2
+  for number, focal in enumerate(focals):
+    _still(tmp_path / f"{number:02d}.jpg", (40, 30), focal=focal, seed=number)
+  found = stills.of_one_camera(sorted(tmp_path.iterdir()))
+  assert len(found.files) == 8 and found.look.focal == 26
+  assert "2 of 40x30 with a lens of 13 mm" in found.warnings[0]
+
+
 def test_stills_of_one_look_are_all_kept_but_copies(tmp_path):
   for number in range(3):
     _still(tmp_path / f"{number}.png", (40, 30), seed=number)
