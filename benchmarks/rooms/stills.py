@@ -162,7 +162,8 @@ def _features(folder: Path, database: Path) -> tuple[float, float]:
   """Seconds of processor time a picture for features, and peak memory [MB] of this process."""
   names = sorted(path.name for path in folder.glob("*.jpg"))[:_READ]
   began = time.process_time()
-  features.extract_features(database, folder, names, settings=features.FeatureSettings())
+  settings = features.FeatureSettings()
+  features.extract_features(database, folder, names, settings=settings, guided=False)
   spent = (time.process_time() - began) / len(names)
   return spent, _peak_memory()
 

@@ -137,15 +137,16 @@ def _robot_scores(
   return scores
 
 
-def _moved(parts: Sequence[convex.Part], transform: Similarity) -> list[convex.Part]:
-  moved = []
+def moved(parts: Sequence[convex.Part], transform: Similarity) -> list[convex.Part]:
+  """Returns convex parts in another frame of the same scale."""
+  found = []
   for part in parts:
     vertices = transform.apply(part.vertices)
     planes = part.planes.copy()
     planes[:, :3] = part.planes[:, :3] @ transform.rotation.T
     planes[:, 3] = part.planes[:, 3] - planes[:, :3] @ transform.translation
-    moved.append(part._replace(vertices=vertices, planes=planes))
-  return moved
+    found.append(part._replace(vertices=vertices, planes=planes))
+  return found
 
 
 def _box(result: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +179,7 @@ def _contact_figures(result: Reconstruction, rigid: Similarity) -> dict[str, flo
   """Distances between the convex parts and the true surfaces, in the truth's frame."""
   lower, upper = _box(result)
   error = collision_error.collision_error(
-    _moved(result.parts, rigid),
+    moved(result.parts, rigid),
     room.sample_surface(_SURFACE_POINTS)[0],
     eyes=rigid.apply(result.depth.positions),
     lower=lower,

@@ -106,11 +106,13 @@ def _map(
 ) -> Mapped:
   """Features, pairs, matches, a model, repairs, refinement."""
   steps.begin("features")
+  photographs = not film and known is None
   features.extract_features(
     database,
     images_folder,
     names,
     settings=settings.features,
+    guided=not photographs,
     report=steps.report,
     camera=None if known is None else to_colmap(known.camera),
   )
@@ -120,7 +122,7 @@ def _map(
   guided = settings.features
   counts = features.feature_counts(database).astype(np.float64)
   cost = sum(counts[i] * counts[j] for i, j in pairs)
-  plain = guided.guided_matching and len(names) <= guided.few_pictures and cost > guided.guided_cost
+  plain = guided.guided_matching and photographs and cost > guided.guided_cost
 
   def match(chosen: list[tuple[int, int]], how: FeatureSettings, *, again: bool = False) -> int:
     return features.match_pairs(
