@@ -68,6 +68,10 @@ def assemble(
     )
   if judged is not None and judged.unfit is not None:
     warnings.append(judged.unfit)
+  floor = map_server.read(out / "free_space.yaml")
+  figures["free_area_apart_m2"] = floor.area_apart
+  if not floor.reachable.any():
+    warnings.append(f"{floor.why_full} The scene can be looked at and exported, not trained in.")
   goals = results.contact.value.floor.goals
   path = alignment.world_from_unit.apply(poses.world_from_camera[:, :3, 3])
   report.write(
@@ -89,7 +93,7 @@ def assemble(
       visual=mesh.load_glb(out / "visual.glb"),
       collision=[trimesh.Trimesh(part.vertices, part.faces) for part in parts],
       floor=floor_picture.draw(
-        map_server.read(out / "free_space.yaml"),
+        floor,
         (alignment.extent_lower, alignment.extent_upper),
         height=_MAP_HEIGHT,
       ),

@@ -124,16 +124,25 @@ class FreeSpaceMap(FreeSpace):
   @functools.cached_property
   def reachable(self) -> np.ndarray:
     """Cells where the robot's centre can be, bool [H, W]: the largest connected piece."""
-    wide = self.clearance >= self.radius
-    labels, count = ndimage.label(wide)
+    labels, count = ndimage.label(self._roomy)
     if count == 0:
-      return wide
+      return self._roomy
     return labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
+
+  @property
+  def _roomy(self) -> np.ndarray:
+    """Cells that have room for the robot, bool [H, W]."""
+    return self.clearance >= self.radius
 
   @property
   def area(self) -> float:
     """Reachable area [m^2]."""
     return float(self.reachable.sum() * self.resolution**2)
+
+  @property
+  def area_apart(self) -> float:
+    """Area where the robot fits, too, but that it cannot reach from there [m^2]."""
+    return float(self._roomy.sum() * self.resolution**2) - self.area
 
   def cell_of(self, points: np.ndarray) -> np.ndarray:
     """Row and column [..., 2] of world points [..., >= 2]; may lie outside the map."""
@@ -151,7 +160,7 @@ class FreeSpaceMap(FreeSpace):
     """Poses x, y, yaw [count, 3], uniform over the reachable area and all directions [m, rad]."""
     places = np.argwhere(self.reachable)
     if len(places) == 0:
-      raise FreeSpaceError(self._full())
+      raise FreeSpaceError(self.why_full)
     chosen = places[rng.integers(0, len(places), count)][:, ::-1] + rng.random((count, 2))
     yaw = rng.uniform(-np.pi, np.pi, count)
     return np.column_stack([self.origin + self.resolution * chosen, yaw])
@@ -163,7 +172,7 @@ class FreeSpaceMap(FreeSpace):
       FreeSpaceError: There is no place to stand.
     """
     if not self.reachable.any():
-      raise FreeSpaceError(self._full())
+      raise FreeSpaceError(self.why_full)
     space = np.where(self.reachable, self.clearance, -1)
     row, column = np.unravel_index(np.argmax(space), space.shape)
     return np.array([*(self.origin + self.resolution * (np.array([column, row]) + 0.5)), 0.0])
@@ -176,7 +185,7 @@ class FreeSpaceMap(FreeSpace):
     """
     reachable = self.reachable
     if not reachable.any():
-      raise FreeSpaceError(self._full())
+      raise FreeSpaceError(self.why_full)
     space = np.where(reachable, self.clearance, 0)
     wide = space >= min(self.radius + clearance, np.quantile(space[reachable], 0.7))
     cost = np.where(reachable, 1.0, np.inf)
@@ -188,7 +197,9 @@ class FreeSpaceMap(FreeSpace):
       goals.append(tuple(int(i) for i in np.unravel_index(np.argmax(distance), distance.shape)))
     return self.origin + self.resolution * (np.array(goals)[:, ::-1] + 0.5)
 
-  def _full(self) -> str:
+  @property
+  def why_full(self) -> str:
+    """What to say where there is no place to stand."""
     share = (self.cells == FREE).mean()
     return (
       f"Found no place where a robot of radius {self.radius:g} m fits: {100 * share:.0f} % of the "

@@ -127,7 +127,10 @@ FIGURES: Mapping[str, Meaning] = {
   "points_missed_by_truth": Meaning(
     "", "the same share of points, judged on the true surface: the judge's own error", "near 0"
   ),
-  "free_area_m2": Meaning("m^2", "floor area that the robot can stand on"),
+  "free_area_m2": Meaning("m^2", "largest piece of floor that the robot can walk about on"),
+  "free_area_apart_m2": Meaning(
+    "m^2", "floor where it fits, too, behind passages that are too narrow for it", "near 0"
+  ),
   "baseline_psnr_db": Meaning("dB", "PSNR of the COLMAP Poisson mesh on the same held-out views"),
 }
 
@@ -266,7 +269,7 @@ def _free_space(data: ReportData) -> Section:
   return Section(
     "Free space",
     "Seen from above: white is floor that the robot's centre may stand on, light grey is too near "
-    "to something, grey was never seen, dark grey is occupied. Crosses are the goals, the line is "
-    "the camera.",
+    "to something or cut off, grey was never seen, dark grey is occupied. Crosses are the goals, "
+    "the line is the camera.",
     [Grid([Picture(floor.scale_bar().picture)], 2)],
   )

@@ -123,7 +123,11 @@ def contact(
       settings=floor_settings,
     )
     map_server.write(space, folder / "free_space.pgm")
-    goals = space.default_goals(count=floor_settings.goals, clearance=floor_settings.goal_clearance)
+    goals = np.zeros((0, 2))
+    if space.reachable.any():
+      goals = space.default_goals(
+        count=floor_settings.goals, clearance=floor_settings.goal_clearance
+      )
     write_json(folder / "contact.json", FreeFloor(goals, space.area))
 
   everything = [collision_settings, floor_settings]

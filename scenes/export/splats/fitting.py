@@ -171,9 +171,6 @@ def fit(
     bundle: The scene.
     settings: How.
     progress: Called with the fraction done and a text.
-
-  Raises:
-    FreeSpaceError: The scene has no free floor to look from.
   """
   settings = settings or FitSettings()
   rng = np.random.default_rng(settings.seed)
@@ -186,6 +183,8 @@ def fit(
   )
 
   def poses(count: int) -> np.ndarray:
+    if not bundle.free_space.reachable.any():  # a thing that was filmed by itself
+      return capture[rng.integers(0, len(capture), count)]
     return robot_poses(bundle, count, eye_height=settings.eye_height, rng=rng)
 
   half = settings.seed_views // 2

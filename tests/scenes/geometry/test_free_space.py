@@ -1,5 +1,7 @@
 """The free-space map of hand-made parts, its files, its samples and goals."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -127,6 +129,15 @@ def test_room_around_places_and_the_nearest_place(ground):
   np.testing.assert_array_equal(ground.nearest_reachable(np.array([0.0, 0.0]), others), [0.0, 0.0])
   with pytest.raises(free_space.FreeSpaceError, match="among 1 around"):
     ground.nearest_reachable(np.array([1.0, 0.6]), others[:1])
+
+
+def test_floor_behind_a_narrow_passage_is_apart():
+  walls = [box([0.0, y, 0.5], [0.1, 0.425, 0.5]) for y in (-0.575, 0.575)]  # 0.3 m between
+  ground = floor_plan.floor_plan(walls, lower=[-2.0, -1.0, 0.0], upper=[1.0, 1.0, 1.0])
+  assert ground.area_apart == pytest.approx((0.9 - 0.36) * (2 - 0.36), rel=0.2)  # into the gap, too
+  assert ground.area == pytest.approx((1.9 - 0.36) * (2 - 0.36), rel=0.2)  # into the gap, too
+  wide = dataclasses.replace(ground, radius=0.1)
+  assert wide.area_apart == 0 and wide.area > ground.area + ground.area_apart
 
 
 def test_no_place_to_stand_is_said():

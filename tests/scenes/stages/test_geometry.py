@@ -6,7 +6,7 @@ import types
 import numpy as np
 
 from nerf2real.core import cameras
-from nerf2real.scenes.geometry import mesh
+from nerf2real.scenes.geometry import collision, floor_plan, mesh
 from nerf2real.scenes.stages import geometry
 from nerf2real.scenes.stages.cache import Made, Stages
 from tests.scenes import furnished_room
@@ -35,3 +35,18 @@ def test_the_surface_holds_the_floor(tmp_path):
   level = (centres[:, 2] < 0.05) & (found.face_normals[:, 2] > 0.7)
   covered = found.area_faces[open_floor & level].sum()
   assert 0.8 < covered / (3.0 * 1.2) < 1.1
+
+
+def test_a_thing_without_floor_to_walk_on_is_a_scene(tmp_path):
+  views = furnished_room.depth_views(furnished_room.walk(8), _CAMERA)
+  lower, upper = _EXTENT
+  place = types.SimpleNamespace(extent_lower=lower, extent_upper=upper, floor_threshold=0.04)
+  earlier = types.SimpleNamespace(made="earlier")
+  made = geometry.contact(
+    Stages(tmp_path, show_progress=False),
+    Made(place, earlier),
+    Made(views, earlier),
+    collision.CollisionSettings(voxel=0.15, truncation=0.3),
+    floor_plan.FreeSpaceSettings(radius=5.0),
+  )
+  assert made.value.parts and made.value.floor.area_m2 == 0 and not len(made.value.floor.goals)
