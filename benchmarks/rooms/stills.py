@@ -3,6 +3,7 @@
   python benchmarks/rooms/stills.py --work out/stills --preset tiny
   python benchmarks/rooms/stills.py --work out/stills --megapixels 12 48 --no-scene
   python benchmarks/rooms/stills.py --work out/thing --subject thing --count 50
+  python benchmarks/rooms/stills.py --work out/mixed --mixed
 
 The photographer stands along the furniture and looks across the room, two thirds of the pictures
 from eye height, the others from knee height, every third one upright; the phone sets each one's
@@ -10,10 +11,15 @@ exposure. Of other subjects all pictures look at one thing: a pouf from half aro
 below it; or a bookcase from before it, without any floor. The files are JPEGs of a phone's size
 with EXIF's orientation and focal length; their content is as sharp as 1920x1440. Memory is the peak
 of a process of its own.
+
+`--mixed` makes of the same photographs a folder as people send it: some as PNG without EXIF, some
+reduced by a messenger, some of a second lens, some blurred by the hand, one of another room, one a
+copy, exposures that differ more.
 """
 
 import dataclasses
 import multiprocessing
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,12 +52,18 @@ _THINGS = {
 }
 _SWAY, _TURN = 0.3, 0.03  # rad: looking left and right in turn; how crookedly a phone is held
 _STEP_ASIDE = 0.05  # standard deviation of a place [m]
-_EXPOSURE = 0.1  # standard deviation of the logarithm of the exposure
+_EXPOSURE = 0.1, 0.3  # standard deviation of the logarithm of the exposure; in a mixed folder
 # of a phone held upright: the sensor's x is down, its y is left
 _UPRIGHT_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _QUALITY = 92  # of the JPEG files
 _ASPECT = 4 / 3
 _READ = 8  # files that are read for a time
+# In a mixed folder, picture k of every ten: what became of it.
+_FATES = {1: "png", 3: "reduced", 5: "blurred", 8: "second lens"}
+_STRANGER = 12  # picture of another room
+_REDUCED = 1600  # long side that a messenger leaves [pixel]
+_BLUR = 24  # pixels that the hand moves in a blurred picture of 1920
+_SECOND_LENS = 1.3  # focal length, times the first one's
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,6 +78,8 @@ class Settings(harness.Options):
   """Sizes of the files; the scene is made of the first, of others a few are read for a time."""
   subject: Literal["room", "thing", "front"] = "room"
   """What is photographed."""
+  mixed: bool = False
+  """Whether the folder is one as people send it."""
   preset: str = "tiny"
   """Preset of the scene."""
   scene: bool = True
@@ -110,7 +124,7 @@ def places(count: int, subject: str, rng: np.random.Generator) -> np.ndarray:
 
 
 def photograph(
-  folder: Path, megapixels: float, *, count: int, subject: str, seed: int
+  folder: Path, megapixels: float, *, count: int, subject: str, seed: int, mixed: bool = False
 ) -> np.ndarray:
   """Writes the photographs; returns the poses [N, 4, 4] of the phone's sensor."""
   folder.mkdir(parents=True, exist_ok=True)
@@ -120,17 +134,36 @@ def photograph(
   size = (width, round(width / _ASPECT))
   with room.room_eye(seed) as eye:
     for k, pose in enumerate(poses):
-      upright, exif = k % 3 == 2, PIL.Image.Exif()
-      exif[PIL.ExifTags.Base.Orientation] = 6 if upright else 1
-      exif.get_ifd(PIL.ExifTags.IFD.Exif)[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = _MILLIMETRES
+      upright, fate = k % 3 == 2, _FATES.get(k % 10, "") if mixed else ""
       if upright:
         pose[:3, :3] = pose[:3, :3] @ _UPRIGHT_FROM_SENSOR
-      gain = np.exp(rng.normal(0, _EXPOSURE))
-      picture = eye.render(_LENS, pose, supersample=1)[0].astype(np.float32)
+      longer = _SECOND_LENS if fate == "second lens" else 1.0
+      lens = dataclasses.replace(_LENS, fx=longer * _LENS.fx, fy=longer * _LENS.fy)
+      if mixed and k == _STRANGER:
+        with room.room_eye(seed + 1) as other:
+          picture = other.render(lens, pose, supersample=1)[0].astype(np.float32)
+      else:
+        picture = eye.render(lens, pose, supersample=1)[0].astype(np.float32)
+      if fate == "blurred":
+        picture = cv2.blur(picture, (_BLUR, 1))
       picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
-      picture = gain * picture + 2 * rng.standard_normal(picture.shape, np.float32)
+      picture = np.exp(rng.normal(0, _EXPOSURE[mixed])) * picture
+      picture += 2 * rng.standard_normal(picture.shape, np.float32)
       image = PIL.Image.fromarray(np.clip(np.rint(picture), 0, 255).astype(np.uint8))
-      image.save(folder / f"IMG_{k:04d}.jpg", quality=_QUALITY, exif=exif)
+      path = folder / f"IMG_{k:04d}.jpg"
+      if fate in ("png", "reduced"):  # upright by its pixels, without EXIF
+        image = image.transpose(PIL.Image.Transpose.ROTATE_270) if upright else image
+        if fate == "reduced":
+          image.thumbnail((_REDUCED, _REDUCED))
+        image.save(path.with_suffix(".png" if fate == "png" else ".jpg"), quality=_QUALITY)
+        continue
+      exif = PIL.Image.Exif()
+      exif[PIL.ExifTags.Base.Orientation] = 6 if upright else 1
+      detail = exif.get_ifd(PIL.ExifTags.IFD.Exif)
+      detail[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = round(longer * _MILLIMETRES)
+      image.save(path, quality=_QUALITY, exif=exif)
+  if mixed:
+    shutil.copy(folder / "IMG_0000.jpg", folder / "IMG_0000 (1).jpg")
   return poses
 
 
@@ -189,11 +222,23 @@ def costs(folder: Path, work: Path) -> dict[str, harness.Value]:
   return found
 
 
+def _number(path: Path) -> int:
+  """A photograph's number, of its name."""
+  return int(path.stem.split("_")[1][:4])
+
+
 def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str, harness.Value]:
   """Makes a scene of the photographs and measures it against the truth."""
 
+  # Keyframes count the files that are of one camera.
+  numbers = [_number(path) for path in stills.of_one_camera(stills.list_images(folder)).files]
+
   def measure(result: Reconstruction) -> TruthFigures:
-    rows = [int(name.removesuffix(".jpg").split("_")[-1]) for name in result.localisation.names]
+    rows = [
+      numbers[int(name.removesuffix(".jpg").split("_")[-1])] for name in result.localisation.names
+    ]
+    if settings.mixed and _STRANGER in rows:
+      print("the picture of another room was placed")
     return ground_truth.compare(result, poses[rows])
 
   used = dataclasses.replace(preset(settings.preset), marker_side=ground_truth.MARKER_SIDE)
@@ -216,7 +261,12 @@ def main(settings: Settings) -> None:
     folder = settings.work / f"photographs_{megapixels:g}"
     count = _READ if first else settings.count
     poses = photograph(
-      folder, megapixels, count=count, subject=settings.subject, seed=settings.seed
+      folder,
+      megapixels,
+      count=count,
+      subject=settings.subject,
+      seed=settings.seed,
+      mixed=settings.mixed,
     )
     figures[f"photographs_of_{megapixels:g}_megapixels"] = costs(folder, settings.work / "costs")
     first = first or (folder, poses)
