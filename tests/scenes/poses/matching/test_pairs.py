@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.matching.pairs import (
   PairSettings,
   choose_pairs,
@@ -73,6 +74,19 @@ def test_the_bound_is_the_cost_not_the_number():
     np.full(150, 3000), PairSettings(), score=lambda k: np.zeros((len(k), len(k)), int)
   )
   assert many[1].startswith("sequential")
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_features_shrink_smoothly_with_the_number_of_pictures(guided):
+  settings = FeatureSettings()
+  counts = np.array([settings.of_each(number, guided=guided) for number in range(1, 400)])
+  assert counts[0] == settings.few_num_features and counts[-1] == settings.max_num_features
+  change = counts[1:] / counts[:-1]
+  assert change.max() <= 1 and change.min() > 0.9  # no number from which much is lost
+  limit = settings.guided_cost if guided else settings.plain_cost
+  number = np.arange(1, 400)
+  cost = number * (number - 1) / 2 * counts.astype(float) ** 2
+  assert cost[counts > settings.max_num_features].max() <= limit
 
 
 def test_sequential_pairs_by_hand():
