@@ -16,6 +16,10 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 _RIGID = 1e-2  # of R R^T to the identity: written with few digits a rotation is one still
 _OPPOSITE = 1e-12  # 1 + cosine under which two directions count as opposite
 
+# How a hand holds a camera; chosen, and two rooms' floors change by half a degree with half of it.
+_ROLL, _PITCH = np.radians([5.0, 30.0])  # standard deviations from level
+_MOST_ROLLED = 0.5  # sine of the roll of a camera that is held so
+
 
 def is_rigid(pose: np.ndarray) -> bool:
   """Whether the 3x3 part of a pose [>= 3, >= 3] is a rotation, as far as its digits say."""
@@ -105,6 +109,28 @@ def camera_axes(forward: np.ndarray) -> np.ndarray:
   right = np.cross(forward, [0.0, 0.0, 1.0])
   right /= np.linalg.norm(right, axis=-1, keepdims=True)
   return np.stack([right, np.cross(forward, right), forward], axis=-1)
+
+
+def level_up(world_from_camera: np.ndarray, rough: np.ndarray) -> np.ndarray:
+  """Up direction [3] of cameras [N, 4, 4] that are held level but may all look down.
+
+  It is as perpendicular as can be to the cameras' right axes, which a hand keeps level, and, for
+  what these leave open, to the directions in which they look: the least eigenvector of
+  sum r r^T / roll^2 + f f^T / pitch^2. The mean of the cameras' own up directions leans to where
+  they look from above.
+
+  Args:
+    world_from_camera: Poses, OpenCV axes.
+    rough: Mean up direction; cameras that are rolled against it take no part, and of two opposite
+      results the nearer one is taken.
+  """
+  right, forward = world_from_camera[:, :3, 0], world_from_camera[:, :3, 2]
+  held = np.abs(right @ rough) < _MOST_ROLLED * np.linalg.norm(rough)
+  if not held.any():
+    return rough / np.linalg.norm(rough)
+  right, forward = right[held] / _ROLL, forward[held] / _PITCH
+  up: np.ndarray = np.linalg.eigh(right.T @ right + forward.T @ forward)[1][:, 0]
+  return up if up @ rough > 0 else -up
 
 
 def pose_of_mujoco_camera(position: np.ndarray, world_from_mujoco: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ class Evidence(NamedTuple):
   surface_normals: np.ndarray | None = None  # theirs [Q, 3]
   marker: MarkerScale | None = None
   sensor_scale: float | None = None  # metres per unit, where a depth sensor measured
-  up: np.ndarray | None = None  # roughly [3]; None: the cameras' mean up direction
+  up: np.ndarray | None = None  # roughly [3]; None: the cameras' up direction
 
   @property
   def positions(self) -> np.ndarray:

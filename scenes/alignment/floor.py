@@ -1,4 +1,4 @@
-"""Detects the floor plane: the lowest large plane across the cameras' mean up direction.
+"""Detects the floor plane: the lowest large plane across the cameras' up direction.
 
 The plane with the most points can be a table top, and the lowest plane a reflection or a few stray
 points. So planes are measured by the ground they cover, not by their points, and of those that
@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerf2real.core import rotations
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.alignment.planes import across, best_plane, fit_plane
@@ -25,7 +26,7 @@ class FloorSettings:
   """Settings of the search for the floor; lengths relative to the median distance of the points."""
 
   max_tilt_deg: float = 20.0
-  """Between the floor's normal and the cameras' mean up direction."""
+  """Between the floor's normal and the cameras' up direction."""
   tolerance: float = 0.012
   """a point this near belongs to a plane: about 2.5 cm in a room."""
   cell: float = 0.05
@@ -48,7 +49,7 @@ class Floor(NamedTuple):
   points: int  # that lie in it
   cover: float  # ground that its points cover [unit^2]
   residual: float  # root mean square distance of its points [unit]
-  tilt_from_cameras_deg: float  # angle to the cameras' mean up direction
+  tilt_from_cameras_deg: float  # angle to the cameras' up direction
 
   def heights(self, points: np.ndarray) -> np.ndarray:
     """Signed heights [...] of points [..., 3] above the floor."""
@@ -56,7 +57,7 @@ class Floor(NamedTuple):
 
 
 def mean_up(frame_from_camera: np.ndarray) -> np.ndarray:
-  """The cameras' mean up direction [3]; a phone is held upright on average."""
+  """The cameras' up direction [3]: a phone is held upright, see `rotations.level_up`."""
   up = -frame_from_camera[:, :3, 1].mean(0)
   length = np.linalg.norm(up)
   if length < 0.2:
@@ -64,7 +65,7 @@ def mean_up(frame_from_camera: np.ndarray) -> np.ndarray:
       f"The cameras' up directions cancel (mean length {length:.2f}): the pictures are rolled all "
       'ways. Give "up" or "floor_points" in the override file.'
     )
-  return up / length
+  return rotations.level_up(frame_from_camera, up)
 
 
 def _cover(points: np.ndarray, normal: np.ndarray, cell: float) -> float:
@@ -168,7 +169,7 @@ class FoundFloor(NamedTuple):
 
 
 def rough_up(evidence: Evidence, override: Overrides) -> np.ndarray:
-  """The cameras' mean up direction [3]; the unit frame's where only the override has one."""
+  """The cameras' up direction [3]; the unit frame's where only the override has one."""
   if evidence.up is not None:
     return evidence.up
   try:

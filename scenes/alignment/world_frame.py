@@ -24,7 +24,7 @@ from nerf2real.scenes.alignment.scale import Scale, choose_scale
 from nerf2real.scenes.alignment.yaw import choose_yaw
 
 _ABOVE_FLOOR = 0.1  # m: points above belong to the room, not to its floor
-_MAX_TILT_DEG = 15.0  # of the floor against the cameras' mean up direction, without a warning
+_MAX_TILT_DEG = 15.0  # of the floor against the cameras' up direction, without a warning
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ class Alignment:
   floor_points: int
   """Points that carry the floor."""
   floor_tilt_from_cameras_deg: float
-  """floor's normal against the cameras' mean up direction."""
+  """floor's normal against the cameras' up direction."""
   floor_threshold: float
   """m."""
   yaw_source: str
@@ -159,7 +159,7 @@ def align(
   warnings = found.warnings + scale.warnings + rotation.warnings + extent.warnings
   if tilt > _MAX_TILT_DEG:
     warnings += (
-      f"The floor tilts {tilt:.0f} degrees against the cameras' mean up direction: check it in the "
+      f"The floor tilts {tilt:.0f} degrees against the cameras' up direction: check it in the "
       "report, and give floor_points in the override file if it is wrong.",
     )
   return Alignment(

@@ -20,18 +20,18 @@ _UPRIGHT = 0.1  # length of the mean up vector below which up is unknown
 
 
 def mean_up(world_from_camera: np.ndarray) -> np.ndarray:
-  """Mean up direction of cameras [N, 4, 4]: a unit vector [3], against the cameras' y axes.
+  """Up direction of cameras [N, 4, 4]: a unit vector [3], see `rotations.level_up`.
 
-  A camera carried by hand is level on average. Where the ups cancel (a camera that rolls over),
-  the direction in which the positions spread least is up.
+  Where the cameras' ups cancel (a camera that rolls over), the direction in which the positions
+  spread least is up.
   """
   poses = np.asarray(world_from_camera, np.float64)
   up = -poses[:, :3, 1].mean(axis=0)
   if np.linalg.norm(up) < _UPRIGHT:
     centred = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
     least = np.linalg.svd(centred, full_matrices=False)[2][-1]
-    up = least if least @ up >= 0 else -least
-  return up / np.linalg.norm(up)
+    return least if least @ up >= 0 else -least
+  return rotations.level_up(poses, up)
 
 
 def _heading(rotation: np.ndarray, pose: np.ndarray) -> float:
@@ -69,7 +69,7 @@ def _yaw_of_smallest_box(points: np.ndarray, heading: float) -> np.ndarray:
 def unit_from_source(world_from_camera: np.ndarray, points: np.ndarray) -> Similarity:
   """Chooses the unit frame.
 
-  Up is the mean up direction of the cameras, yaw makes the room's box small (walls along the axes),
+  Up is as the cameras are held, yaw makes the room's box small (walls along the axes),
   with the first camera's right axis near +x, the origin is the middle of that box, and the unit is
   such that 98 % of the points and all cameras lie in [-1, 1]^3. All of it follows from the capture:
   the frame that poses and points are given in does not matter.

@@ -96,7 +96,7 @@ FIGURES: Mapping[str, Meaning] = {
     "deg", "angle between the floor found and the true vertical's floor", "near 0"
   ),
   "floor_tilt_from_cameras_deg": Meaning(
-    "deg", "angle between the floor's normal and the cameras' mean up direction"
+    "deg", "angle between the floor's normal and the cameras' up direction"
   ),
   "floor_height_error_m": Meaning("m", "height of the floor found against the truth", "near 0"),
   "scale_source": Meaning("", "where the metric scale comes from"),

@@ -23,7 +23,8 @@ from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Source
 
 _PICTURES_VERSION = 2  # 2: stills turned and without copies; depth checked with the pictures
-_POSES_VERSION = 3  # 2: the unit frame's yaw; 3: the rolling shutter is taken out
+# 2: the unit frame's yaw; 3: the rolling shutter is taken out; 4: up by level right axes
+_POSES_VERSION = 4
 
 
 def keyframes(cache: Stages, source: Source, settings: CaptureSettings) -> Made[Capture]:

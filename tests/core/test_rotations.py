@@ -104,3 +104,21 @@ def test_pose_of_a_mujoco_camera():
   np.testing.assert_allclose(pose[:3, 3], [1, 2, 3])
   np.testing.assert_allclose(pose[:3, :3] @ [0, 0, 1], [0, 0, -1])  # forward
   np.testing.assert_allclose(pose[:3, :3] @ [0, 1, 0], [0, -1, 0])  # down in the picture
+
+
+def test_level_up_of_cameras_that_all_look_down():
+  rng = np.random.default_rng(0)
+  turn = Rotation.random(random_state=0).as_matrix()
+  for arc, most in ((2 * np.pi, 1.0), (np.pi, 2.0), (np.pi / 2, 5.0)):
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    for pose, heading in zip(poses, np.linspace(0, arc, 40, endpoint=False), strict=True):
+      level = np.cos(np.radians(35))
+      forward = np.array(
+        [level * np.cos(heading), level * np.sin(heading), -np.sin(np.radians(35))]
+      )
+      roll = Rotation.from_rotvec([0, 0, rng.normal(0, np.radians(3))]).as_matrix()
+      pose[:3, :3] = turn @ rotations.camera_axes(forward) @ roll
+    poses[::10, :3, :3] = poses[::10, :3, :3] @ [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # held upright
+    found = rotations.level_up(poses, -poses[:, :3, 1].mean(0))
+    assert np.degrees(np.arccos(found @ turn[:, 2])) < most
+    assert np.linalg.norm(found) == pytest.approx(1)
