@@ -157,8 +157,8 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   if others:
     rest = ", ".join(f"{count} of {look}" for look, count in others.most_common(3))
     warnings.append(
-      f"Only {len(kept)} of {len(once)} pictures are of one camera, {common}, and {least} pixels or "
-      f"longer; left out are {rest}: expected one camera and one zoom."
+      f"Only {len(kept)} of {len(once)} pictures are of one camera, {common}, and {least} pixels "
+      f"or longer; left out are {rest}: expected one camera and one zoom."
     )
   smallest = min(look.long_side for look, same in zip(looks, alike, strict=True) if same)
   return Stills(kept, np.array(across), common, smallest, warnings)
