@@ -25,7 +25,7 @@ class Counters:
   elapsed: float = 0.0
   """s of training, over all parts of the run."""
   begun: int | None = None
-  """Frames at which the first student was published."""
+  """Frames at which the run's first own student was published."""
 
 
 def save_state(path: Path, state: TrainingState, counters: Counters) -> None:
