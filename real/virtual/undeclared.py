@@ -74,8 +74,8 @@ def _command_delay(build: Build, target: str | None, values: tuple[float, ...]) 
 
 
 def _camera_latency(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
-  latency = build.camera.latency + values[0]
-  return build._replace(camera=dataclasses.replace(build.camera, latency=latency))
+  latency = build.camera.undeclared_latency + values[0]
+  return build._replace(camera=dataclasses.replace(build.camera, undeclared_latency=latency))
 
 
 def _camera_focal(build: Build, target: str | None, values: tuple[float, ...]) -> Build:

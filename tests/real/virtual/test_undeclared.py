@@ -187,18 +187,22 @@ def test_friction_grows_at_rest_and_goes_with_motion():
   assert friction[0] > 0.3  # the others still rest
 
 
-def test_a_late_camera_shows_the_past():
+def test_a_late_camera_shows_the_past_and_its_driver_does_not_know():
+  seen, ages = {}, {}
+
   class Eyes:
     def picture(self, time):
-      return np.full((2, 2, 3), round(1000 * time) % 256, np.uint8)
+      seen[name] = time
+      return np.zeros((2, 2, 3), np.uint8)
 
   clock = SteppedClock()
   clock.advance(clock.now() + 2.0)
-  ages = {}
   for name in ("nothing", "other_camera"):
     settings = _build(name).camera
     ages[name] = SteppedCamera(Eyes(), clock, settings, seed=0).read()[1]
-  assert ages["other_camera"] - ages["nothing"] == pytest.approx(0.12, abs=1 / 30)
+  assert seen["nothing"] - seen["other_camera"] == pytest.approx(0.12, abs=1 / 30)
+  assert clock.now() - seen["nothing"] == pytest.approx(ages["nothing"])
+  assert clock.now() - seen["other_camera"] == pytest.approx(ages["other_camera"] + 0.12)
   lens = _build("other_camera").camera.lens
   assert (lens.fx, lens.fy) == pytest.approx((1.12 * LENS.fx, 1.12 * LENS.fy))
   assert (lens.cx, lens.k1) == (LENS.cx, LENS.k1)
