@@ -55,6 +55,23 @@ def test_trials_start_where_the_simulations_tasks_have_them(scene, simulated):
     assert place == pytest.approx(ball.task.ball_start)
 
 
+def test_other_scenes_effects_and_times_are_other_conditions(tmp_path):
+  """The same command with another scene or effects runs its own trials in the same folder."""
+  assert plants.conditions_of(EvaluationSettings()) == ""
+  assert plants.conditions_of(EvaluationSettings(seed=3, trials=2, processes=2)) == ""
+  found = set()
+  for number in range(2):
+    room, effects = tmp_path / f"{number}" / "room", tmp_path / f"{number}.json"
+    room.mkdir(parents=True)
+    (room / "scene.json").write_text(f"{number}")
+    effects.write_text(f"[{number}]")
+    found.add(plants.conditions_of(EvaluationSettings(scene=room)))
+    found.add(plants.conditions_of(EvaluationSettings(effects=effects)))
+  assert len(found) == 4 and all("room" in text or "effects" in text for text in found)
+  changed = EvaluationSettings(plant="virtual", time_limit=20, stochastic=True, placing=(0.0, 0.0))
+  assert plants.conditions_of(changed) == "at most 20 s, drawn actions, placed within 0 m, 0 rad"
+
+
 def test_repetitions_are_put_down_beside_their_pose():
   """The first stands on its mark, the second within the errors, on every robot the same."""
   pose, errors = Pose(1.0, -2.0, 0.5), (0.03, 0.05)
