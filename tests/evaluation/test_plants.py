@@ -257,3 +257,22 @@ def test_a_dry_run_moves_nothing_and_asks_for_no_verdict(scene):
   assert len(asked) == 1 and "Place the robot" in asked[0]
   assert found.outcome == "stopped" and found.detail.startswith("dry run; ")
   assert "observation to goal" in found.detail  # what it would have taken
+
+
+def test_a_robot_that_is_not_there_leaves_terminal_and_folder_as_they_were(
+  scene, monkeypatch, tmp_path
+):
+  """The terminal was put into another mode for the stop key, and the recording was open."""
+  given_back = []
+
+  class Terminal:
+    ask = None
+
+    def close(self):
+      given_back.append(self)
+
+  monkeypatch.setattr(operated, "Terminal", Terminal)
+  settings = EvaluationSettings(plant="robot", robot=str(tmp_path / "none"))
+  with pytest.raises(OSError, match="cannot be opened"):
+    operated.OperatedPlant(scene, settings, image_size=None, record=tmp_path / "log.mcap")
+  assert len(given_back) == 1 and list(tmp_path.iterdir()) == []

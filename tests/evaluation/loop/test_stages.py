@@ -36,6 +36,25 @@ def test_a_folder_belongs_to_one_loop(tmp_path):
   )  # nothing tells before the end
 
 
+@pytest.mark.parametrize(
+  ("changes", "message"),
+  [
+    ({"trials": 0}, "--trials 0: expected at least 1"),
+    ({"simulated": -1}, "--simulated -1: expected at least 1"),
+    ({"processes": 0}, "--processes 0: expected at least 1"),
+    ({"actors": 0}, "--actors 0: expected at least 1"),
+    ({"preset": "best"}, "Unknown preset 'best'"),
+    ({"teacher": "nobody"}, "Unknown teacher 'nobody'"),
+  ],
+)
+def test_what_a_later_stage_would_refuse_is_refused_at_once(tmp_path, changes, message):
+  with pytest.raises(ValueError, match=message):
+    claim(_settings(tmp_path / "out", **changes))
+  with pytest.raises(ValueError, match=r"lacks .*none/sweep.mcap, "):
+    claim(_settings(tmp_path / "out", reference=tmp_path / "none"))
+  assert not (tmp_path / "out").exists()
+
+
 def test_a_policy_that_is_not_there_is_one_line(tmp_path):
   assert policy_folder(_settings(tmp_path)) is None
   assert (policy_folder(_settings(tmp_path, policy="shipped")) / "policy.json").exists()
