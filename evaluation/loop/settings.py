@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
+from nerf2real.suite.scene import open_scene
 
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"
@@ -121,11 +122,11 @@ def _check(settings: LoopSettings) -> None:
     missing = [str(log) for log in logs if not log.is_file()]
     if missing:
       raise ValueError(f"--reference {settings.reference} lacks {', '.join(missing)}.")
+  scene = open_scene(settings.scene)
   if settings.policy:
     from nerf2real.agents.distill.settings import preset
     from nerf2real.agents.distill.teacher import make_teacher
-    from nerf2real.suite.scene import open_scene
 
     preset(settings.preset)
     if settings.teacher != AUTO:
-      make_teacher(settings.teacher, open_scene(settings.scene))
+      make_teacher(settings.teacher, scene)

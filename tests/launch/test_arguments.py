@@ -4,6 +4,8 @@ import socket
 
 import pytest
 
+from nerf2real.agents.supervision.statuses import NOT_SAVED
+from nerf2real.core.files import disk_full
 from tests.launch.test_identify import _log
 
 
@@ -49,3 +51,24 @@ def test_the_link_of_a_robot_that_was_killed_is_taken_over(run, tmp_path):
   link.symlink_to(tmp_path / "gone")
   ended = run("virtual_robot", "--link", link, "--seconds", 0.1, "--no-camera", "--world", "floor")
   assert ended.status == 0 and not link.is_symlink(), ended
+
+
+def test_a_distillation_that_cannot_be_saved_says_so(run, tmp_path, monkeypatch):
+  """The status tells the supervisor that a new start would fail as well."""
+
+  class Full:
+    def __init__(self, *_, **__):
+      pass
+
+    def run(self):
+      raise disk_full("state.npz")
+
+    def close(self):
+      pass
+
+  monkeypatch.setattr("nerf2real.agents.distill.learning.learner.Learner", Full)
+  ended = run("distill_learner", "--run", tmp_path / "run", "--preset", "tiny")
+  assert ended.status == NOT_SAVED, ended
+  assert ended.err.splitlines()[-1] == (
+    "error: Could not write state.npz: the disk is full. Free some space and try again."
+  )
