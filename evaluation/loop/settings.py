@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
-from nerf2real.suite.scene import open_scene
 
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"
@@ -113,6 +112,8 @@ def claim(settings: LoopSettings) -> None:
 
 def _check(settings: LoopSettings) -> None:
   """Raises ValueError for what a stage would refuse, hours later."""
+  from nerf2real.suite.scene import open_scene
+
   for name in ("trials", "simulated", "processes", "actors"):
     count = getattr(settings, name)
     if count is not None and count < 1:

@@ -163,7 +163,9 @@ def test_training_draws_the_effects_of_the_finding(tmp_path):
   write_effects(path, [Effect("motor_gain", "l_knee", {"gain": 0.6}, {"gain": (0.5, 0.7)})])
   name = training.environment_name(_settings(tmp_path), None, path)
   assert name.startswith("suite:nerf_nav?image_size=12x16&time_limit=1&effects=")
-  (tmp_path / "policy.json").write_text(json.dumps({"environment": "suite:nerf_nav?lens=l.yaml"}))
+  record = {key: {} for key in ("layout", "settings", "info", "sha256")} | {"format_version": 1}
+  record["environment"] = "suite:nerf_nav?lens=l.yaml"
+  (tmp_path / "policy.json").write_text(json.dumps(record))
   of_policy = training.environment_name(_settings(tmp_path), tmp_path, path)
   assert of_policy == f"suite:nerf_nav?lens=l.yaml&effects={path}&draw_effects=true"
   environment = make_environment(name + "&pushes=false", seed=0)
