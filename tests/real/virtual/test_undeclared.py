@@ -60,6 +60,8 @@ def test_a_file_holds_an_effect_a_line(tmp_path):
     ("command_delay@l_knee:0.1", "expected no target"),
     ("motor_gain@l_kne:0.1", "expected one of head_pan"),
     ("payload:0.2", "Found the target None of payload"),
+    ("command_delay:-1", "Found -1 for delay of command_delay, expected 0 or more"),
+    ("floor_slope:0,nan", "Found nan for y of floor_slope, expected a finite number"),
   ],
 )
 def test_what_is_no_effect_is_one_clear_line(text, said):
