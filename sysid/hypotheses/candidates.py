@@ -174,6 +174,8 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   if limited and term.kind == "motor_gain" and plant.declared[INDEX["damping"]] > 0:
     # A weak motor: its back-EMF, part of the joint's damping, falls with its torque.
     forms.append(dataclasses.replace(term, fixed=(*forms[-1].fixed, ("scales_damping", 1.0))))
+  if term.kind == "motor_gain" and plant.declared[INDEX["velocity"]] != 0:
+    forms.append(dataclasses.replace(term, fixed=(*term.fixed, ("position_alone", 1.0))))
   return forms
 
 
