@@ -160,7 +160,9 @@ class SupplySag(Operator):
 
 def _choice(name: str, doc: str) -> Parameter:
   """Returns a parameter that chooses between models: 0 or 1."""
-  return Parameter(name, "1", 0.0, 0.0, 1.0, doc, minimum=0.0, maximum=1.0, shape=True, fitted=False)
+  return Parameter(
+    name, "1", 0.0, 0.0, 1.0, doc, minimum=0.0, maximum=1.0, shape=True, fitted=False
+  )
 
 
 _SCALES_LIMIT = _choice("scales_limit", "1 if the actuator's limits weaken with it, 0 if they stay")
