@@ -34,6 +34,9 @@ class Setting:
   """"none", or what was disturbed."""
   control: str = "none"
   """Or what of the observations was falsified, one of `controls.CONTROLS`."""
+  conditions: str = ""
+  """What else is not as in the paper's evaluation in the built-in room, such as another scene;
+  see `plants.plant.conditions_of`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

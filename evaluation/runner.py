@@ -30,6 +30,7 @@ def setting_of(plant: Plant, policy: EvaluatedPolicy) -> Setting:
     protocol=plant.protocol,
     perturbation=plant.perturbation,
     control=policy.control,
+    conditions=plant.conditions,
   )
 
 

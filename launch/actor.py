@@ -64,8 +64,10 @@ def run(arguments: Arguments) -> None:
   name = f"{role}-{arguments.index}-{uuid.uuid4().hex[:8]}"
   logging.basicConfig(level=logging.INFO, format=f"%(asctime)s {name}: %(message)s", force=True)
   process: JoinedProcess | None = None
+  stopped = threading.Event()  # an exit that is raised during an import may be swallowed
 
   def stop(*_: object) -> None:
+    stopped.set()
     if process is None:
       sys.exit(0)
     process.stop()
@@ -75,7 +77,11 @@ def run(arguments: Arguments) -> None:
   try:
     session = sessions.connect(arguments.connect, arguments.link, timeout=arguments.wait)
     link = ActorLink(session, arguments.link, actor=name, role=role)
-    process = _process(link, arguments)
+    process = _process(link, arguments, stopped)
+    if stopped.is_set():
+      process.stop()
+  except InterruptedError:
+    return
   except (sessions.LinkError, MessageError, ValueError) as error:
     raise command.CommandError(error, status=REFUSED) from error
   try:
@@ -86,13 +92,17 @@ def run(arguments: Arguments) -> None:
     link.close()
 
 
-def _process(link: "ActorLink", arguments: Arguments) -> "JoinedProcess":
-  """Returns what the learner's run needs: its description names the kind of run."""
+def _process(link: "ActorLink", arguments: Arguments, stopped: threading.Event) -> "JoinedProcess":
+  """Returns what the learner's run needs: its description names the kind of run.
+
+  Raises:
+    InterruptedError: `stopped` was set while the learner did not answer.
+  """
   from nerf2real.agents.distill.settings import KIND
   from nerf2real.agents.processes.joining import wait_for
 
   seed, index = arguments.seed, arguments.index
-  description = wait_for(link.status, threading.Event())["description"]
+  description = wait_for(link.status, stopped)["description"]
   if description.get("kind") == KIND:
     from nerf2real.agents.distill.collecting.collector import Collector
     from nerf2real.agents.distill.collecting.evaluator import Evaluator

@@ -5,14 +5,17 @@ function, so that `--help` answers at once and the environment is set before MuJ
 """
 
 import contextlib
+import dataclasses
+import math
 import os
 import shlex
 import signal
+import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import tyro
 
@@ -25,6 +28,34 @@ _PATIENCE = 20.0  # s for a learner whose supervisor was killed to save what it 
 _LAST_PORT = 65535
 _IMPORT_PERIOD = 0.05  # s between interruptions of an import
 _SIGNALLED = 128  # plus the signal's number: the shell's convention
+
+
+class _Range(NamedTuple):
+  """Which numbers an argument may have."""
+
+  low: float
+  high: float
+  words: str
+  open: bool = False  # whether `low` itself is none of them
+
+  def holds(self, value: float) -> bool:
+    above = value > self.low if self.open else value >= self.low
+    return above and value <= self.high
+
+
+_TIME = _Range(0, math.inf, "more than 0", open=True)
+_SEED = _Range(0, 2**32 - 1, f"0 to {2**32 - 1}")  # of NumPy's RandomState
+_RANGES = {
+  "port": _Range(0, _LAST_PORT, f"0 (a free one) to {_LAST_PORT}, such as 8080"),
+  "seed": _SEED,
+  "robot_seed": _SEED,
+  "seconds": _TIME,
+  "splat_seconds": _TIME,
+  "minutes": _TIME,
+  "time_limit": _TIME,
+}
+"""By the name of an argument, the same in all commands: a wrong one would be noticed late or never,
+or end in words that do not name it."""
 
 DRAWING = {"MUJOCO_GL": "egl"}
 """Environment of commands that draw through MuJoCo, also without a screen."""
@@ -90,13 +121,13 @@ def main(
     return _SIGNALLED + signal.SIGPIPE
   received = [signal.SIGINT]
   try:
-    _check_port(getattr(values[0], "port", None))
+    _check(values[0])
     with _terminated_as_interrupted(received):
       return function(*values) or 0
   except CommandError as error:
     message, status = str(error), error.status
   except errors as error:
-    message, status = str(error), FAILED
+    message, status = _words(error), FAILED
   except KeyboardInterrupt:
     for number in (signal.SIGINT, signal.SIGTERM):  # a second one would only add a trace
       signal.signal(number, signal.SIG_IGN)
@@ -117,10 +148,43 @@ def _hide_interrupt(kind: type[BaseException], error: BaseException, trace: Any)
 sys.excepthook = _hide_interrupt
 
 
-def _check_port(port: int | None) -> None:
-  """Raises RefusedError for a number that is no port's; servers would wait for ever."""
-  if port is not None and not 0 <= port <= _LAST_PORT:
-    raise RefusedError(f"--port {port}: expected 0 (a free one) to {_LAST_PORT}, such as 8080.")
+def _check(arguments: Any) -> None:
+  """Raises RefusedError for numbers that their arguments cannot have, and for a foreign address."""
+  for name, value in vars(arguments).items():
+    if dataclasses.is_dataclass(value):
+      _check(value)
+    option = f"--{name.replace('_', '-')}"
+    for number in value if isinstance(value, tuple) else (value,):
+      if isinstance(number, float) and math.isnan(number):
+        raise RefusedError(f"{option} nan: expected a number.")
+      allowed = _RANGES.get(name)
+      if allowed and isinstance(number, int | float) and not allowed.holds(number):
+        raise RefusedError(f"{option} {number:g}: expected {allowed.words}.")
+  host = getattr(arguments, "host", None)
+  if host is not None:
+    _check_host(host)
+
+
+def _check_host(host: str) -> None:
+  """Raises RefusedError for what is no address of this machine; viser would wait for ever."""
+  try:
+    family = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0][0]
+    with socket.socket(family) as probe:
+      probe.bind((host, 0))
+  except OSError as error:
+    raise RefusedError(
+      f"--host {host}: no address of this machine ({error.strerror}); expected such as 127.0.0.1, "
+      "or 0.0.0.0 for all of them."
+    ) from error
+
+
+def _words(error: Exception) -> str:
+  """Returns what an error says; of the system's errors the file first, without their number."""
+  text = str(error)
+  if isinstance(error, OSError) and text.startswith("[Errno") and error.strerror:
+    about = error.filename2 or error.filename
+    return f"{about}: {error.strerror.lower()}." if about else f"{error.strerror}."
+  return text
 
 
 def _say(text: str) -> None:

@@ -16,6 +16,8 @@ from typing import Any
 import tyro
 
 from nerf2real.agents.link import sessions
+from nerf2real.agents.supervision.statuses import NOT_SAVED
+from nerf2real.core.files import is_disk_full
 from nerf2real.core.serialization import read_json
 from nerf2real.launch import command
 from nerf2real.launch.learner import DEFAULT_ENDPOINT, set_threads
@@ -91,7 +93,8 @@ def run(arguments: Arguments) -> None:
   """Distils until the minutes are over or it is stopped.
 
   Raises:
-    CommandError: It cannot start with these arguments, or episodes can no longer be taken in.
+    CommandError: It cannot start with these arguments, episodes can no longer be taken in, or what
+      was learned cannot be saved.
   """
   logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s", force=True)
   set_threads(arguments.threads)
@@ -125,6 +128,9 @@ def _distil(arguments: Arguments) -> None:
     learner.run()
   except RuntimeError as error:
     raise command.CommandError(error) from error
+  except OSError as error:  # of a state or a policy: on a full disk a new start fails as well
+    status = NOT_SAVED if is_disk_full(error) else command.FAILED
+    raise command.CommandError(error, status=status) from error
   finally:
     learner.close()
 

@@ -4,10 +4,10 @@ Every run adds its episodes to a folder, from which one report is made: run it w
 and `--plant virtual` into the same folder for tables with both side by side. A run that was cut
 short goes on where it stopped.
 
-  python launch/evaluate.py --policy gait --plant sim --protocol navigation --out out/evaluation
+  python launch/evaluate.py --policy walker --plant sim --protocol navigation --out out/evaluation
   python launch/evaluate.py --policy runs/nav/policy/best --plant both --robot-seed 1 2 3
   python launch/evaluate.py --policy runs/nav/policy/best --plant sim --control black
-  python launch/evaluate.py --policy gait --plant robot --robot /dev/ttyUSB0 --camera 0 --dry-run
+  python launch/evaluate.py --policy walker --plant robot --robot /dev/ttyUSB0 --camera 0 --dry-run
 """
 
 import dataclasses

@@ -43,6 +43,8 @@ def run(arguments: Arguments) -> None:
   from nerf2real.core.files import write_atomically
   from nerf2real.evaluation.report.belief_pictures import draw_episode
 
+  if not cv2.haveImageWriter(str(arguments.out)):
+    raise ValueError(f"{arguments.out} is no name of a picture: expected one such as belief.png.")
   drawn = draw_episode(
     arguments.policy,
     environment=arguments.env,
@@ -51,9 +53,7 @@ def run(arguments: Arguments) -> None:
     max_steps=arguments.max_steps,
   )
   arguments.out.parent.mkdir(parents=True, exist_ok=True)
-  done, data = cv2.imencode(arguments.out.suffix, drawn.picture[..., ::-1])
-  if not done:
-    raise ValueError(f"{arguments.out} cannot be written: expected a name such as belief.png.")
+  _, data = cv2.imencode(arguments.out.suffix, drawn.picture[..., ::-1])
   write_atomically(arguments.out, data.tobytes())
   print(
     f"{len(drawn.errors)} steps, mean distance of the belief from the truth "

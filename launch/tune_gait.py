@@ -51,9 +51,9 @@ def run(arguments: Arguments) -> None:
   if arguments.start is not None:
     try:
       known = json.loads(arguments.start.read_text())["settings"]
-    except (ValueError, KeyError) as error:
+      kept = {name: float(known[name]) for name in tuning.BOUNDS if name in known}
+    except (ValueError, KeyError, TypeError) as error:
       raise ValueError(f"{arguments.start} is no result of an earlier search: {error}.") from error
-    kept = {name: known[name] for name in tuning.BOUNDS if name in known}
     settings = dataclasses.replace(settings, **kept)
   names = ("generations", "population", "seconds", "worlds", "turning", "spread", "seed")
   begin = time.monotonic()

@@ -88,6 +88,8 @@ def _linked(link: Path | None, port: str) -> Iterator[None]:
   if link is None:
     yield
     return
+  if link.is_symlink() and not link.exists():  # of a robot that was killed
+    link.unlink()
   link.symlink_to(port)
   try:
     yield

@@ -9,6 +9,8 @@ from nerf2real.agents.distill.settings import DistillSettings, MixtureSettings
 
 _FINAL_RATE = 0.02  # of the learning rate, at a stage's end
 _NO_PUSH = 1e-6  # N
+BORROWED = 1
+"""Version of the student that a run begins with; one of the run's own has 1 + its updates."""
 
 
 def stage_at(settings: DistillSettings, progress: float) -> tuple[int, float]:
@@ -33,16 +35,19 @@ class Mixture(NamedTuple):
   belief: float  # of the episodes whose teacher is given the student's belief
 
 
-def mixture_at(settings: MixtureSettings, frames: int, *, begun: int | None) -> Mixture:
+def mixture_at(
+  settings: MixtureSettings, frames: int, *, begun: int | None, is_borrowed: bool = False
+) -> Mixture:
   """Returns the mixture after a number of frames.
 
   Args:
     settings: of the mixture.
     frames: of the run so far.
-    begun: frames at which the first student was there; None before it.
+    begun: frames at which the run's first own student was there; None before it.
+    is_borrowed: whether before it the student that the run begins with drives beside the teacher.
   """
   if begun is None:
-    return Mixture(1.0, 0.0)
+    return Mixture(settings.first_share if is_borrowed else 1.0, 0.0)
   progress = float(np.clip((frames - begun) / max(settings.anneal_frames, 1), 0.0, 1.0))
   teacher = settings.first_share + progress * (settings.last_share - settings.first_share)
   return Mixture(teacher, progress * settings.belief_share)
@@ -54,7 +59,7 @@ def may_collect(settings: DistillSettings, frames: int, *, begun: int | None) ->
   Args:
     settings: of the distillation.
     frames: of the run so far.
-    begun: frames at which the first student was there; None before it.
+    begun: frames at which the run's first own student was there; None before it.
   """
   limit = settings.max_frames
   return frames < (min(limit, settings.teacher_frames) if begun is None else limit)

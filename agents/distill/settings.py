@@ -35,7 +35,8 @@ class MixtureSettings:
   """Who drives while data are collected: DAgger's mixture (Ross et al. 2011), in segments."""
 
   first_share: float = 1.0
-  """The teacher's share of the segments when the first student is there."""
+  """The teacher's share of the segments until the run's first own student is there, where one from
+  elsewhere drives beside it, and then."""
   last_share: float = 0.15
   """And in the end; not 0, so that the data keep showing how it should be done."""
   anneal_frames: int = 60_000
@@ -92,8 +93,9 @@ class DistillSettings:
   max_frames: int = 400_000
   """Frames collected at most [steps]: 5 kB each in memory."""
   teacher_frames: int = 200_000
-  """Frames collected at most before the first student is there [steps]: a fast collector would fill
-  the data set with the teacher's own paths, and none would show how a student errs."""
+  """Frames collected at most before the run's first own student is there [steps]: a fast collector
+  would fill the data set with the teacher's own paths, or with those of the student that the run
+  begins with, and none would show how its own errs."""
   holdout: int = 10
   """Every episode of that number is held out for validation."""
   learning_rate: float = 1e-3
@@ -245,8 +247,11 @@ def ball_push_on() -> DistillSettings:
     ball_push(),
     mixture=MixtureSettings(first_share=0.5, anneal_frames=20_000),
     # Views teach the encoder before there are new paths of the student's: once is enough.
-    stages=(Stage(kind=ENCODER, share=0.35), Stage(kind=POLICY, share=0.65)),
+    stages=(Stage(kind=ENCODER, share=0.25), Stage(kind=POLICY, share=0.75)),
     first_frames=4_000,
+    # Until the encoder has learned, the student that the run begins with is lost where more is
+    # drawn than it knows.
+    teacher_frames=40_000,
     evaluation_period=3_600.0,
   )
 

@@ -94,7 +94,7 @@ def _open_router(endpoint: str, settings: LinkSettings, *, learner_joins: bool) 
     )
   config = _common(settings)
   _insert(config, "mode", "router")
-  _insert(config, "listen/endpoints", [endpoint])
+  _insert_endpoint(config, "listen/endpoints", endpoint)
   _insert(config, "listen/exit_on_failure", True)
   if security.users is not None:
     users = read_users(security.users)
@@ -126,7 +126,7 @@ def connect(endpoint: str, settings: LinkSettings, *, timeout: float) -> zenoh.S
   security = settings.security
   config = _common(settings)
   _insert(config, "mode", "client")
-  _insert(config, "connect/endpoints", [endpoint])
+  _insert_endpoint(config, "connect/endpoints", endpoint)
   _insert(config, "connect/timeout_ms", _ATTEMPT_MS)
   _insert(config, "connect/exit_on_failure", True)
   _insert(config, "connect/retry", _RETRY)
@@ -167,6 +167,15 @@ def is_loopback(endpoint: str) -> bool:
     return ipaddress.ip_address(host).is_loopback
   except ValueError:
     return False
+
+
+def _insert_endpoint(config: zenoh.Config, key: str, endpoint: str) -> None:
+  try:
+    _insert(config, key, [endpoint])
+  except zenoh.ZError as error:
+    raise LinkError(
+      f"{endpoint!r} is no endpoint: expected such as tcp/127.0.0.1:7447 or tls/head:7447."
+    ) from error
 
 
 def _common(settings: LinkSettings) -> zenoh.Config:

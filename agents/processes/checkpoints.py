@@ -150,7 +150,14 @@ def read_info(run: Path) -> dict[str, Any] | None:
 
 def _read_record(checkpoint: Path) -> dict[str, Any] | None:
   path = checkpoint / "info" / "metadata"
-  return json.loads(path.read_text()) if path.exists() else None
+  if not path.exists():
+    return None
+  try:
+    return json.loads(path.read_text())
+  except ValueError as error:
+    raise CheckpointError(
+      f"{path} is damaged ({error}): remove {checkpoint} to go on from an older one."
+    ) from error
 
 
 def _shapes(state: TrainingState) -> list[Any]:

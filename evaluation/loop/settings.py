@@ -10,6 +10,8 @@ from nerf2real.core import files
 
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"
+TRAIN, HELD = ("sweep", "slow", "steps"), ("mixed",)  # motions of the stand
+AUTO = "auto"  # the teacher is chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,7 +52,7 @@ class LoopSettings:
   """Time to train the policy on [min]."""
   preset: str = "adapt"
   """Settings of that distillation."""
-  teacher: str = "auto"
+  teacher: str = AUTO
   """quick, swift, steady, a walker's settings as JSON, the folder of a policy, or auto: the walker
   that succeeds most often with the effects in the simulation, fitted to them if all fail."""
   actors: int = 1
@@ -78,10 +80,11 @@ def claim(settings: LoopSettings) -> None:
   What is hidden is written as a digest alone until the end.
 
   Raises:
-    ValueError: It is another loop's.
+    ValueError: It is another loop's, or a stage would refuse the settings.
   """
   from nerf2real.agents.dmpo.policy.export import read_record
 
+  _check(settings)
   folder = policy_folder(settings) if settings.policy else None
   digest = "" if folder is None else read_record(folder)["sha256"]
   own: dict[str, Any] = {
@@ -105,3 +108,26 @@ def claim(settings: LoopSettings) -> None:
       f"{settings.out} holds a loop with another {', '.join(other)}: take another folder with "
       "--out, or the arguments that it began with."
     )
+
+
+def _check(settings: LoopSettings) -> None:
+  """Raises ValueError for what a stage would refuse, hours later."""
+  from nerf2real.suite.scene import open_scene
+
+  for name in ("trials", "simulated", "processes", "actors"):
+    count = getattr(settings, name)
+    if count is not None and count < 1:
+      raise ValueError(f"--{name} {count}: expected at least 1.")
+  if settings.reference is not None:
+    logs = [settings.reference / f"{name}.mcap" for name in TRAIN]
+    missing = [str(log) for log in logs if not log.is_file()]
+    if missing:
+      raise ValueError(f"--reference {settings.reference} lacks {', '.join(missing)}.")
+  scene = open_scene(settings.scene)
+  if settings.policy:
+    from nerf2real.agents.distill.settings import preset
+    from nerf2real.agents.distill.teacher import make_teacher
+
+    preset(settings.preset)
+    if settings.teacher != AUTO:
+      make_teacher(settings.teacher, scene)

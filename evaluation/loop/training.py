@@ -11,7 +11,7 @@ from nerf2real.agents.distill import settings as distillation
 from nerf2real.agents.distill.learning.checkpoint import STATE, load_counters
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.supervision import training
-from nerf2real.evaluation.loop.settings import LoopSettings
+from nerf2real.evaluation.loop.settings import AUTO, LoopSettings
 from nerf2real.evaluation.loop.teachers import choose_teacher
 
 POLICY = Path("policy") / "newest"
@@ -65,7 +65,7 @@ def train(
   run = settings.out / "training"
   run.mkdir(parents=True, exist_ok=True)
   teacher, teachers, count = settings.teacher, dict[str, int](), 0
-  if teacher == "auto":
+  if teacher == AUTO:
     teacher, teachers, count = choose_teacher(
       run, effects, scene, seed=settings.seed, time_limit=settings.time_limit
     )

@@ -119,7 +119,7 @@ def run(
   for _ in range(MOST_COOLED + 1):
     done = len(found())
     with contextlib.closing(_make_plant(settings, condition, scene, policy, on_robot)) as plant:
-      plant.plant_id = label
+      plant.plant_id, plant.conditions = label, ""  # the folder is of one scene and time limit
       report = _reporter(plant, condition, on_robot, say)
       run_all = functools.partial(runner.run_all, plant, policy, chosen, store=store, report=report)
       hot = until_hot(plant, run_all)

@@ -71,15 +71,21 @@ class OperatedPlant(RobotPlant):
       connection = dataclasses.replace(connection, operator=terminal)
       ask = terminal.ask
     self._observer, self._ask, self._say = observer, ask, say
-    self._environment = real.load(
-      TASKS[self.protocol],
-      robot=connection,
-      scene=scene,
-      image_size=image_size,
-      time_limit=settings.time_limit,
-      settings=RobotSettings(dry_run=settings.dry_run),
-      recorder=self._recorder,
-    )
+    try:
+      self._environment = real.load(
+        TASKS[self.protocol],
+        robot=connection,
+        scene=scene,
+        image_size=image_size,
+        time_limit=settings.time_limit,
+        settings=RobotSettings(dry_run=settings.dry_run),
+        recorder=self._recorder,
+      )
+    except BaseException:
+      if connection.operator is not None:  # a terminal that was taken is given back
+        connection.operator.close()
+      self._abandon_recording()
+      raise
     if isinstance(self._environment.bus.clock, RealClock):
       prefer_this_thread(acting=True)
     self._dry_run = settings.dry_run

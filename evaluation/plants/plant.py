@@ -1,12 +1,13 @@
 """The protocol of plants in an evaluation: set a trial up, step it, observe the robot."""
 
 import abc
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import dm_env
 import numpy as np
 
-from nerf2real.core import errors
+from nerf2real.core import errors, files
 from nerf2real.evaluation.plants import perturbations
 from nerf2real.evaluation.settings import EvaluationSettings
 from nerf2real.suite import protocols
@@ -44,6 +45,7 @@ class Plant(abc.ABC):
       settings: The evaluation's protocol and perturbation, and what the kind of plant reads.
     """
     self.scene, self.protocol, self.perturbation = scene, settings.protocol, settings.perturb
+    self.conditions = conditions_of(settings)
 
   @property
   @abc.abstractmethod
@@ -99,6 +101,31 @@ class Plant(abc.ABC):
     """Raises OSError, after `close`, if what was to be recorded is not whole."""
     if self._recorder is not None:
       self._recorder.raise_failure()
+
+
+def conditions_of(settings: EvaluationSettings) -> str:
+  """Returns what the settings change besides policy, plant, protocol and what is disturbed.
+
+  Episodes under other conditions are others, also where they share a folder.
+
+  Returns:
+    Scene, effects, length of an episode, drawn actions and errors of placing, in words with digests
+    of the files; empty for what the paper evaluates, in the built-in room.
+  """
+  found = []
+  if settings.scene is not None:
+    folder = Path(settings.scene)
+    digest = files.hash_path(folder / "scene.json")
+    found.append(f"scene {folder.resolve().name} ({digest[:8]})")
+  if settings.effects is not None and settings.plant == "sim":
+    found.append(f"effects {files.hash_path(settings.effects)[:8]}")
+  if settings.time_limit is not None:
+    found.append(f"at most {settings.time_limit:g} s")
+  if settings.stochastic:
+    found.append("drawn actions")
+  if settings.plant == "virtual" and settings.placing != EvaluationSettings.placing:
+    found.append("placed within {:g} m, {:g} rad".format(*settings.placing))
+  return ", ".join(found)
 
 
 def trials(protocol: str) -> tuple[tuple[str, Trial], ...]:

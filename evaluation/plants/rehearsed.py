@@ -119,6 +119,7 @@ class RehearsedPlant(RobotPlant):
       self._environment = self._connect(image_size, settings.time_limit)
     except BaseException:
       self.robot.close()
+      self._abandon_recording()
       raise
 
   def _connect(self, image_size: tuple[int, int] | None, time_limit: float | None) -> Any:

@@ -34,6 +34,12 @@ class RobotPlant(Plant):
     self._workspace = find_workspace(scene) if self.protocol == BALL else None
     self._recorder = None if record is None else Recorder(record)
 
+  def _abandon_recording(self) -> None:
+    """Ends the recording of a robot that was not reached: it holds nothing."""
+    if self._recorder is not None:
+      self._recorder.close()
+      self._recorder.path.unlink(missing_ok=True)
+
   @property
   def environment(self) -> dm_env.Environment:
     return self._environment

@@ -40,16 +40,15 @@ class SimulatedPlant(Plant):
       draw_effects: Whether every episode draws the effects' values from their intervals.
     """
     super().__init__(scene, settings)
-    effects, seed, swap = settings.effects, settings.seed, settings.swap
-    self.plant_id = f"seed {seed}" + ("" if effects is None else ", effects")
-    self.plant_id += swaps.told("the robot's", swap)
+    seed, swap = settings.seed, settings.swap
+    self.plant_id = f"seed {seed}" + swaps.told("the robot's", swap)
     self._room = swaps.TrueRoom(scene) if swaps.PICTURE in swap and image_size else None
     self._seed = seed
     self._intruder = make_intruder(self, protocols.scene_starts(scene))
     self._environment = suite.load(
       TASKS[self.protocol],
       scene=scene,
-      effects=effects,
+      effects=settings.effects,
       draw_effects=draw_effects,
       image_size=image_size,
       camera=swaps.camera_in_simulation(camera or CameraSettings(), swap),

@@ -3,11 +3,12 @@
 from pathlib import Path
 
 from nerf2real import agents
+from nerf2real.agents.dmpo.policy.export import RECORD, read_record
+from nerf2real.suite.tasks import catalogue
 from nerf2real.suite.views.drivers import WALKER
 
 SHIPPED = "shipped"
 WALKERS = (WALKER, "gait")  # the second is its name in records
-_RECORD = "policy.json"
 _IN_A_RUN = ("policy/best", "policy/newest")
 
 
@@ -22,23 +23,34 @@ def policy_folder(name: str, *, task: str) -> Path:
   Args:
     name: "shipped", a run's folder (its best policy, or else its newest one is taken), or an
       exported policy's folder.
-    task: The task, for the shipped one.
+    task: The task that it is to act in.
 
   Raises:
-    ValueError: There is no such policy; the message is one line.
+    ValueError: There is no such policy, or it was trained on another of the suite's tasks.
   """
+  folder = _find(name, task=task)
+  trained_on = str(read_record(folder)["environment"]).partition("?")[0].removeprefix("suite:")
+  if trained_on in catalogue.ALL_TASKS and trained_on != task:
+    raise ValueError(
+      f"The policy {folder} was trained on {trained_on}, found the task {task}: take one of that "
+      "task."
+    )
+  return folder
+
+
+def _find(name: str, *, task: str) -> Path:
   if name == SHIPPED:
     folder = shipped_folder(task)
-    if not (folder / _RECORD).is_file():
+    if not (folder / RECORD).is_file():
       raise ValueError(
         f"No policy for {task} is shipped with this version (expected one in {folder}): use "
         f"--policy {WALKER}, or the folder of a run."
       )
     return folder
   for folder in (Path(name), *(Path(name) / inner for inner in _IN_A_RUN)):
-    if (folder / _RECORD).is_file():
+    if (folder / RECORD).is_file():
       return folder
   raise ValueError(
-    f"Unknown policy {name!r}: expected {WALKER}, {SHIPPED}, or a folder that holds {_RECORD} (of "
+    f"Unknown policy {name!r}: expected {WALKER}, {SHIPPED}, or a folder that holds {RECORD} (of "
     f"an exported policy) or {_IN_A_RUN[0]} (of a run)."
   )

@@ -82,8 +82,10 @@ def draw_episode(
     max_steps: Longest episode [steps].
 
   Raises:
-    ValueError: The folder holds no policy, or one without a belief.
+    ValueError: The folder holds no policy, or one without a belief; no moment, or no step.
   """
+  if moments < 1 or max_steps < 1:
+    raise ValueError(f"Found {moments} moments of {max_steps} steps, expected 1 or more of both.")
   loaded = load_policy(folder)
   made = make_environment(environment or loaded.environment, seed=seed, history=loaded.history)
   frames, errors = run_episode(loaded, made, moments=moments, max_steps=max_steps)

@@ -191,10 +191,10 @@ def gain_table(found: Sequence[Episode]) -> Table:
 
 
 def changes(setting: kept.Setting) -> str:
-  """Says what was disturbed or falsified, after a comma; empty if nothing was."""
+  """Says what was disturbed, falsified or changed, after a comma; empty if nothing was."""
   control = "" if setting.control == "none" else f"control {setting.control}"
   disturbed = "" if setting.perturbation == "none" else setting.perturbation
-  return "".join(f", {change}" for change in (disturbed, control) if change)
+  return "".join(f", {change}" for change in (disturbed, control, setting.conditions) if change)
 
 
 def exact_rate(successes: int, count: int) -> str:
@@ -233,15 +233,21 @@ def outcome_table(found: Sequence[Episode]) -> Table:
   return Table("How the episodes ended", header, tuple(rows))
 
 
+_MAKERS = {"navigation": navigation_table, "ball": ball_table, "gain": gain_table}
+
+
 def paper_tables(found: Sequence[Episode]) -> list[Table]:
-  """Returns the paper's tables for which there are undisturbed episodes."""
+  """Returns the paper's tables for which there are undisturbed episodes, apart by conditions."""
   plain = select(found, perturbation="none", control="none")
-  makers = {"navigation": navigation_table, "ball": ball_table, "gain": gain_table}
-  return [
-    make(select(plain, protocol=protocol))
-    for protocol, make in makers.items()
-    if select(plain, protocol=protocol)
-  ]
+  made = []
+  for conditions in dict.fromkeys(episode.setting.conditions for episode in plain):
+    for protocol, make in _MAKERS.items():
+      chosen = select(plain, protocol=protocol, conditions=conditions)
+      if chosen:
+        table = make(chosen)
+        title = f"{table.title}; {conditions}" if conditions else table.title
+        made.append(table._replace(title=title))
+  return made
 
 
 def as_text(table: Table) -> str:

@@ -6,7 +6,11 @@ from nerf2real.real.recorder import replay
 
 
 def make_server(shown: replay.Replay, *, host: str, port: int) -> ThreadingHTTPServer:
-  """Returns a server of the page and its pictures; call its serve_forever."""
+  """Returns a server of the page and its pictures; call its serve_forever.
+
+  Raises:
+    ValueError: It cannot listen there, such as at a port that is taken.
+  """
   page = replay.page(shown, embed=False).encode()
 
   class Handler(BaseHTTPRequestHandler):
@@ -32,4 +36,10 @@ def make_server(shown: replay.Replay, *, host: str, port: int) -> ThreadingHTTPS
     def log_message(self, format: str, *args: object) -> None:
       """Keeps the console quiet."""
 
-  return ThreadingHTTPServer((host, port), Handler)
+  try:
+    return ThreadingHTTPServer((host, port), Handler)
+  except OSError as error:
+    raise ValueError(
+      f"Cannot serve at {host}:{port} ({error.strerror}): another port is given with --port, 0 for "
+      "a free one."
+    ) from error

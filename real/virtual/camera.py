@@ -45,7 +45,9 @@ class VirtualCamera:
   rate: float = 30.0
   """Pictures a second."""
   latency: float = 0.04
-  """s from the light to the arrival of a picture."""
+  """s from the light to the arrival of a picture, as the driver has it."""
+  undeclared_latency: float = 0.0
+  """s more, of which the driver knows nothing: it takes pictures for younger than they are."""
   gain: float = 1.0
   """Factor on the signal; 1 is neutral."""
   exposure: float = 1.0
@@ -58,8 +60,9 @@ class VirtualCamera:
   def __post_init__(self) -> None:
     if not self.rate > 0:
       raise ValueError(f"The camera's rate must be positive [Hz], found {self.rate}.")
-    if not self.latency >= 0:
-      raise ValueError(f"The camera's latency must be 0 s or more, found {self.latency}.")
+    if not (self.latency >= 0 and self.undeclared_latency >= 0):
+      found = f"{self.latency} and {self.undeclared_latency}"
+      raise ValueError(f"The camera's latencies must be 0 s or more, found {found}.")
 
 
 class Sensor:
@@ -147,13 +150,14 @@ class SteppedCamera:
     self.frozen = False  # no new pictures come
 
   def read(self) -> tuple[np.ndarray, float]:
-    """Returns the newest picture that has arrived, uint8 [H, W, 3], and its age [s]."""
-    now, rate = self._clock.now(), self._settings.rate
-    frame = int(np.floor((now - self._settings.latency) * rate + 1e-6))
+    """Returns the newest picture that has arrived, uint8 [H, W, 3], and its age as declared [s]."""
+    settings, rate = self._settings, self._settings.rate
+    seen = self._clock.now() - settings.undeclared_latency
+    frame = int(np.floor((seen - settings.latency) * rate + 1e-6))
     if frame != self._frame and not (self.frozen and self._frame >= 0):
       self._frame = frame
       self._picture = self.sensor.develop(self._eyes.picture(frame / rate))
-    return self._picture, now - self._frame / rate
+    return self._picture, seen - self._frame / rate
 
   def close(self) -> None:
     """Has nothing to free: the picture belongs to the robot."""

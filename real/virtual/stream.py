@@ -50,7 +50,8 @@ class CameraStream:
     """
     settings = settings or VirtualCamera()
     self._render, self._release = render, release
-    self._period, self._latency = 1.0 / settings.rate, settings.latency
+    self._period = 1.0 / settings.rate
+    self._latency = settings.latency + settings.undeclared_latency
     self.sensor = Sensor(settings, seed=seed)
     self._blocked = False
     self._frozen = False

@@ -5,6 +5,7 @@ its units and its meaning; the others are outside that library. CASES are sets o
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -61,6 +62,7 @@ class Kind(NamedTuple):
   defaults: tuple[float, ...] = ()  # of the last parameters
   none: float = 0.0  # value of a size at which there is no effect
   sizes: tuple[int, ...] = (0,)  # which parameters are sizes
+  signed: bool = False  # whether sizes may be negative
   in_library: bool = True  # whether `suite.effects` has it, by this name
 
 
@@ -74,8 +76,8 @@ def _command_delay(build: Build, target: str | None, values: tuple[float, ...]) 
 
 
 def _camera_latency(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
-  latency = build.camera.latency + values[0]
-  return build._replace(camera=dataclasses.replace(build.camera, latency=latency))
+  latency = build.camera.undeclared_latency + values[0]
+  return build._replace(camera=dataclasses.replace(build.camera, undeclared_latency=latency))
 
 
 def _camera_focal(build: Build, target: str | None, values: tuple[float, ...]) -> Build:
@@ -135,7 +137,8 @@ KINDS: Mapping[str, Kind] = {
   "payload": Kind(  # kg, m in the link
     ("mass", "x", "y", "z"), _payload, targets=_LINKS, defaults=(0.0, 0.0, 0.0)
   ),
-  "floor_slope": Kind(("x", "y"), _floor_slope, sizes=(0, 1)),  # rad about the world's axes
+  # rad about the world's axes
+  "floor_slope": Kind(("x", "y"), _floor_slope, sizes=(0, 1), signed=True),
   # V, V, s: the battery's voltage falls by so much from its first value within so long.
   "supply_course": Kind(
     ("fall", "full", "seconds"), _supply_course, defaults=(12.5, _SESSION), in_library=False
@@ -172,7 +175,8 @@ def parse(text: str) -> list[Undeclared]:
   name, _, numbers = text.partition(":")
   kind, _, target = name.partition("@")
   if kind not in KINDS:
-    raise ValueError(errors.unknown_name("undeclared effect", kind, [*CASES, *KINDS]))
+    known = [*dict.fromkeys((*CASES, *KINDS))]
+    raise ValueError(errors.unknown_name("undeclared effect", kind, known))
   return [Undeclared(kind, _target(kind, target or None), _values(kind, numbers))]
 
 
@@ -193,7 +197,13 @@ def _values(kind: str, numbers: str) -> tuple[float, ...]:
   missing = len(wanted) - len(found)
   if not found or not 0 <= missing <= len(defaults):
     raise ValueError(f"Found {numbers!r} for {kind}, expected the numbers {', '.join(wanted)}.")
-  return (*found, *defaults[len(defaults) - missing :]) if missing else found
+  values = (*found, *defaults[len(defaults) - missing :]) if missing else found
+  for index, (name, value) in enumerate(zip(wanted, values, strict=True)):
+    negative = value < 0 and index in KINDS[kind].sizes and not KINDS[kind].signed
+    if negative or not math.isfinite(value):
+      expected = "a finite number" if not negative else "0 or more"
+      raise ValueError(f"Found {value:g} for {name} of {kind}, expected {expected}.")
+  return values
 
 
 def parse_all(texts: Iterable[str]) -> tuple[Undeclared, ...]:

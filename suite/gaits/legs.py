@@ -9,8 +9,6 @@ import numpy as np
 
 from nerf2real.suite.op3 import constants
 
-HIP_OFFSET = 0.035  # m from the middle to a hip, sideways (links.csv, hip_yaw_link)
-HIP_DROP = 0.0285  # m from the torso's origin down to the hips' centre (links.csv, hip_roll_link)
 THIGH, SHANK = 0.11015, 0.11  # m (links.csv, knee_link and ank_pitch_link)
 SIDES = (1.0, -1.0)  # left, right: sign of y
 _JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ank_pitch", "ank_roll")

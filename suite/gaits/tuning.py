@@ -12,6 +12,7 @@ import numpy as np
 
 from nerf2real import suite
 from nerf2real.suite.effects import Effect
+from nerf2real.suite.environment import Environment
 from nerf2real.suite.gaits import walk
 from nerf2real.suite.gaits.evolution import Evolution
 from nerf2real.suite.gaits.floor import EmptyFloor
@@ -56,11 +57,12 @@ WORLDS: tuple[tuple[Effect, ...], ...] = (
     Effect("parameter_error", None, {"damping": 0.85}),
   ),
 )
+_MIN_POPULATION = 2  # the better half of it moves the search
 _TARGET_SPEED = 0.15  # m/s: walking faster than this earns nothing more
 _TARGET_TURN = 0.3  # rad/s at full turn
 
 
-def make_environments(count: int, seconds: float) -> list[suite.environment.Environment]:
+def make_environments(count: int, seconds: float) -> list[Environment]:
   """Returns one environment without pictures for each world."""
   settings = RandomisationSettings(pushes=False)
   environments = [
@@ -182,7 +184,15 @@ def search(
     start: The first candidate, and the centre of the first round.
     spread: Width of the first round, as a share of the bounds.
     seed: Of the search.
+
+  Raises:
+    ValueError: Too few candidates, or none or more worlds than there are.
   """
+  if population < _MIN_POPULATION or not 1 <= worlds <= len(WORLDS):
+    raise ValueError(
+      f"Found a population of {population} in {worlds} worlds, expected {_MIN_POPULATION} or more "
+      f"in 1 to {len(WORLDS)}."
+    )
   environments = make_environments(worlds, seconds)
   evolution = Evolution(vector_of(start), spread, population, seed)
   best, best_vector, walks = -np.inf, evolution.mean, list[dict[str, Any]]()

@@ -96,6 +96,7 @@ def episode(outcome="success", *, index=0, group="navigation", **changes):
     "protocol": "navigation",
     "perturbation": "none",
     "control": "none",
+    "conditions": "",
   }
   fields = {"time": 10.0 if outcome == "success" else None, "duration": 12.0}
   for name, value in changes.items():

@@ -55,6 +55,23 @@ def test_trials_start_where_the_simulations_tasks_have_them(scene, simulated):
     assert place == pytest.approx(ball.task.ball_start)
 
 
+def test_other_scenes_effects_and_times_are_other_conditions(tmp_path):
+  """The same command with another scene or effects runs its own trials in the same folder."""
+  assert plants.conditions_of(EvaluationSettings()) == ""
+  assert plants.conditions_of(EvaluationSettings(seed=3, trials=2, processes=2)) == ""
+  found = set()
+  for number in range(2):
+    room, effects = tmp_path / f"{number}" / "room", tmp_path / f"{number}.json"
+    room.mkdir(parents=True)
+    (room / "scene.json").write_text(f"{number}")
+    effects.write_text(f"[{number}]")
+    found.add(plants.conditions_of(EvaluationSettings(scene=room)))
+    found.add(plants.conditions_of(EvaluationSettings(effects=effects)))
+  assert len(found) == 4 and all("room" in text or "effects" in text for text in found)
+  changed = EvaluationSettings(plant="virtual", time_limit=20, stochastic=True, placing=(0.0, 0.0))
+  assert plants.conditions_of(changed) == "at most 20 s, drawn actions, placed within 0 m, 0 rad"
+
+
 def test_repetitions_are_put_down_beside_their_pose():
   """The first stands on its mark, the second within the errors, on every robot the same."""
   pose, errors = Pose(1.0, -2.0, 0.5), (0.03, 0.05)
@@ -240,3 +257,22 @@ def test_a_dry_run_moves_nothing_and_asks_for_no_verdict(scene):
   assert len(asked) == 1 and "Place the robot" in asked[0]
   assert found.outcome == "stopped" and found.detail.startswith("dry run; ")
   assert "observation to goal" in found.detail  # what it would have taken
+
+
+def test_a_robot_that_is_not_there_leaves_terminal_and_folder_as_they_were(
+  scene, monkeypatch, tmp_path
+):
+  """The terminal was put into another mode for the stop key, and the recording was open."""
+  given_back = []
+
+  class Terminal:
+    ask = None
+
+    def close(self):
+      given_back.append(self)
+
+  monkeypatch.setattr(operated, "Terminal", Terminal)
+  settings = EvaluationSettings(plant="robot", robot=str(tmp_path / "none"))
+  with pytest.raises(OSError, match="cannot be opened"):
+    operated.OperatedPlant(scene, settings, image_size=None, record=tmp_path / "log.mcap")
+  assert len(given_back) == 1 and list(tmp_path.iterdir()) == []

@@ -1,5 +1,7 @@
 """Policies are found by name, wherever they lie; what is missing is said in one line."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -8,10 +10,22 @@ from nerf2real.evaluation.policies.driving import choose_driver
 from nerf2real.suite.views import drivers
 
 
-def _put(folder):
+def _put(folder, environment="suite:nerf_nav?camera_rate=15"):
   folder.mkdir(parents=True)
-  (folder / "policy.json").write_text("{}")
+  record = {name: {} for name in ("layout", "settings", "info", "sha256")}
+  record |= {"format_version": 1, "environment": environment}
+  (folder / "policy.json").write_text(json.dumps(record))
   return folder
+
+
+def test_a_policy_of_another_task_is_refused(tmp_path):
+  """Both tasks have the same observations: it would act, and fail without a word."""
+  pushing = _put(tmp_path / "push", "suite:ball_push?light=true")
+  assert policy_names.policy_folder(str(pushing), task="ball_push") == pushing
+  with pytest.raises(ValueError, match="was trained on ball_push, found the task nerf_nav"):
+    policy_names.policy_folder(str(pushing), task="nerf_nav")
+  own = _put(tmp_path / "own", "suite:a_registered_one")
+  assert policy_names.policy_folder(str(own), task="nerf_nav") == own
 
 
 def test_folders_of_runs_and_policies(tmp_path):

@@ -75,6 +75,8 @@ def test_only_missing_trials_are_run(tmp_path):
   other = ScriptedPlant([FAR] * 4)
   other.plant_id = "another"
   assert runner.run_all(other, StillPolicy(), chosen, store=again) == 5
+  other.conditions = "scene office (1a2b3c4d)"
+  assert runner.run_all(other, StillPolicy(), chosen, store=again) == 5
 
 
 def test_operator_may_repeat_an_episode(tmp_path):

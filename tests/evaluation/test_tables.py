@@ -106,6 +106,14 @@ def test_disturbed_episodes_stay_out_of_the_papers_tables():
   assert "person" in outcomes.rows[1].name
 
 
+def test_other_conditions_have_a_table_of_their_own():
+  found = [*_many(4, 4), *_many(1, 4, conditions="scene office (1a2b3c4d)")]
+  built_in, office = tables.paper_tables(found)
+  assert built_in.rows[0].cells[0] == "100±0% (n=4)" and office.rows[0].cells[0] == "25±25% (n=4)"
+  assert office.title.endswith("; scene office (1a2b3c4d)")
+  assert "scene office" in tables.outcome_table(found).rows[1].name
+
+
 def test_store_goes_on_where_a_run_was_cut_off(tmp_path):
   store = episodes.Store(tmp_path)
   moment = episodes.Moment(

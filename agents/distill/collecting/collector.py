@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from nerf2real.agents.distill.collecting.episodes import EpisodeRunner
-from nerf2real.agents.distill.schedule import may_collect, mixture_at, push_level, pushed
+from nerf2real.agents.distill.schedule import BORROWED, may_collect, mixture_at, push_level, pushed
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import make_teacher
 from nerf2real.agents.dmpo.policy.acting import task_of
@@ -77,7 +77,8 @@ class Collector(JoinedProcess):
         answer = self.link.parameters()
         if answer is not None:
           self._policy = Policy.of_network(answer[1], self._settings.agent.network)
-          self._begun = grant["steps"] if self._begun is None else self._begun
+          if self._begun is None and answer[0] > BORROWED:
+            self._begun = int(grant["steps"])
       if may_collect(self._settings, int(grant["steps"]), begun=self._begun):
         return int(grant["steps"])
       self.link.flush()
@@ -89,7 +90,9 @@ class Collector(JoinedProcess):
     if self._runner is None or level != self._level:
       self._runner, self._level = self._make_runner(level), level
     begin = time.perf_counter()
-    mixture = mixture_at(self._settings.mixture, frames, begun=self._begun)
+    mixture = mixture_at(
+      self._settings.mixture, frames, begun=self._begun, is_borrowed=self._policy is not None
+    )
     arrays, figures = self._runner.run(self._policy, mixture)
     steps = len(arrays["state"])
     self.link.send(arrays, steps=steps)

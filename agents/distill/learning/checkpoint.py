@@ -1,9 +1,14 @@
 """The learner's saved state: one file, written whole."""
 
+import contextlib
 import dataclasses
 import io
 import json
+import zipfile
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +30,7 @@ class Counters:
   elapsed: float = 0.0
   """s of training, over all parts of the run."""
   begun: int | None = None
-  """Frames at which the first student was published."""
+  """Frames at which the run's first own student was published."""
 
 
 def save_state(path: Path, state: TrainingState, counters: Counters) -> None:
@@ -46,9 +51,9 @@ def load_state(path: Path, *, like: TrainingState) -> tuple[TrainingState, Count
     like: a state of the same settings.
 
   Raises:
-    ValueError: it is of other settings.
+    ValueError: it is damaged, or of other settings.
   """
-  with np.load(path, allow_pickle=False) as stored:
+  with _opened(path) as stored:
     found = [stored[name] for name in sorted(n for n in stored.files if n.startswith("leaf"))]
   expected, structure = jax.tree.flatten(like)
   if [x.shape for x in found] != [x.shape for x in expected]:
@@ -57,6 +62,18 @@ def load_state(path: Path, *, like: TrainingState) -> tuple[TrainingState, Count
 
 
 def load_counters(path: Path) -> Counters:
-  """Reads the counters of what `save_state` wrote."""
-  with np.load(path, allow_pickle=False) as stored:
+  """Reads the counters of what `save_state` wrote; raises ValueError where it is damaged."""
+  with _opened(path) as stored:
     return from_plain(json.loads(stored["counters"].tobytes()), Counters)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+  """Opens a saved state; a file that was cut off or is another one is one clear error."""
+  try:
+    with np.load(path, allow_pickle=False) as stored:
+      yield stored
+  except (zipfile.BadZipFile, zlib.error, EOFError, KeyError) as error:
+    raise ValueError(
+      f"{path} is damaged ({error}): put a copy of it there, or begin anew in another folder."
+    ) from error

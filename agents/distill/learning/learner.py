@@ -22,7 +22,7 @@ from nerf2real.agents.distill.dataset import Dataset
 from nerf2real.agents.distill.learning.beginning import begin_with
 from nerf2real.agents.distill.learning.checkpoint import STATE, Counters, load_state, save_state
 from nerf2real.agents.distill.learning.training import Trainer
-from nerf2real.agents.distill.schedule import stage_at
+from nerf2real.agents.distill.schedule import BORROWED, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
 from nerf2real.agents.distill.views import kept_views
 from nerf2real.agents.dmpo.policy.acting import task_of
@@ -93,10 +93,9 @@ class Learner:
     self._times = StageTimes()
     self._trainer = Trainer(settings, self._layout, self._data, seed=seed, times=self._times)
     self._counters = Counters()
-    if settings.init_from:  # its student drives from the first frame on
-      arrays = load_arrays(Path(settings.init_from))
-      self._trainer.state = begin_with(self._trainer.state, arrays)
-      self._counters = Counters(begun=0)
+    borrowed = load_arrays(Path(settings.init_from)) if settings.init_from else None
+    if borrowed is not None:
+      self._trainer.state = begin_with(self._trainer.state, borrowed)
     if resume:
       self._trainer.state, self._counters = load_state(run / STATE, like=self._trainer.state)
     write_json(run / SETTINGS, settings)
@@ -135,12 +134,14 @@ class Learner:
       },
     )
     self._set_status()
-    if settings.init_from and not resume:
-      self._publish()
+    if borrowed is not None and self._counters.begun is None:  # drives from the first frame on
+      self._link.publish_parameters(borrowed, version=self._version)
     elif (run / POLICY).exists():
-      self._link.publish_parameters(
-        load_arrays(run / POLICY), version=max(1, self._counters.updates)
-      )
+      self._link.publish_parameters(load_arrays(run / POLICY), version=self._version)
+
+  @property
+  def _version(self) -> int:
+    return BORROWED if self._counters.begun is None else BORROWED + self._counters.updates
 
   @property
   def _progress(self) -> float:
@@ -238,7 +239,7 @@ class Learner:
     self._save()
 
   def _begin_serving(self) -> None:
-    """Serves the first student."""
+    """Serves the run's first own student."""
     if self._counters.begun is None:
       self._counters = dataclasses.replace(self._counters, begun=self._data.frames)
       self._publish()
@@ -299,9 +300,7 @@ class Learner:
     self._link.set_status(status | self._rates.measure(frames, updates))
 
   def _publish(self) -> None:
-    # Version 0 stands for no student in the link.
-    arrays = self._trainer.served_parameters()
-    self._link.publish_parameters(arrays, version=max(1, self._counters.updates))
+    self._link.publish_parameters(self._trainer.served_parameters(), version=self._version)
 
   def _save(self) -> None:
     save_state(self._run / STATE, self._trainer.state, self._counters)

@@ -21,6 +21,7 @@ from nerf2real.core.serialization import from_plain, to_plain
 
 FORMAT_VERSION = 1
 _ARRAYS, RECORD = "policy.npz", "policy.json"
+_ENTRIES = ("environment", "layout", "settings", "info", "sha256")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,13 +82,18 @@ def load_policy(folder: Path | str) -> ExportedPolicy:
     ValueError: if the folder holds none, one of another format, or files that do not match.
   """
   record, parameters = _read(Path(folder))
-  network = record["settings"]["network"]
-  policy = Policy(parameters, init_stddev=network["init_stddev"], min_stddev=network["min_stddev"])
+  try:
+    network, history = record["settings"]["network"], record["settings"]["history"]
+    spreads = {name: network[name] for name in ("init_stddev", "min_stddev")}
+  except (KeyError, TypeError) as error:
+    raise ValueError(
+      f"{folder} has other settings than an agent's ({error}): export it again."
+    ) from error
   return ExportedPolicy(
-    policy=policy,
-    layout=from_plain(record["layout"], Layout),
+    policy=Policy(parameters, **spreads),
+    layout=from_plain(record["layout"], Layout, source=Path(folder) / RECORD),
     environment=record["environment"],
-    history=record["settings"]["history"],
+    history=history,
     info=record["info"],
   )
 
@@ -101,20 +107,29 @@ def read_record(folder: Path) -> dict[str, Any]:
   """Returns what is known of an exported policy besides its arrays, as `export_policy` wrote it.
 
   Raises:
-    ValueError: the folder holds no policy.
+    ValueError: the folder holds no policy, a damaged one, or one of another format.
   """
-  if not (folder / RECORD).is_file():
+  path = folder / RECORD
+  if not path.is_file():
     raise ValueError(f"{folder} holds no {RECORD}: give the folder of an exported policy.")
-  return json.loads((folder / RECORD).read_text())
+  try:
+    record = json.loads(path.read_text())
+  except ValueError as error:
+    raise ValueError(f"{path} is damaged ({error}): export the policy again.") from error
+  version = record.get("format_version") if isinstance(record, dict) else None
+  if version != FORMAT_VERSION:
+    raise ValueError(
+      f"{folder} is of format {version}, expected {FORMAT_VERSION}: export it again with this "
+      "version."
+    )
+  missing = [name for name in _ENTRIES if name not in record]
+  if missing:
+    raise ValueError(f"{path} lacks {', '.join(missing)}: export the policy again.")
+  return record
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
   record = read_record(folder)
-  if record.get("format_version") != FORMAT_VERSION:
-    raise ValueError(
-      f"{folder} is of format {record.get('format_version')}, expected {FORMAT_VERSION}: export it "
-      "again with this version."
-    )
   data = (folder / _ARRAYS).read_bytes()
   if hashlib.sha256(data).hexdigest() != record["sha256"]:
     raise ValueError(f"{folder}: the arrays are not those of {RECORD}; export it again.")

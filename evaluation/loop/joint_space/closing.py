@@ -37,7 +37,7 @@ def close_loop(settings: LoopSettings) -> Closed:
     with machines.virtual_robot(settings.seed, altered) as (connection, virtual):
       _record(out, connection, virtual, seconds)
   else:
-    _record(out, Connection(port=settings.robot), None, seconds)
+    _record(out, Connection(port=settings.robot, offsets=settings.offsets), None, seconds)
   standing = np.load(out / "standing.npz")
   named = naming.name(out / "identified", out, settings.reference)
   before = gap.suite_motion(None, standing["actions"])

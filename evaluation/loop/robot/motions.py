@@ -6,11 +6,10 @@ Shapes: T control steps, 20 joints.
 import mujoco
 import numpy as np
 
+from nerf2real.evaluation.loop.settings import HELD, TRAIN
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.op3.op3 import OP3
 
-TRAIN = ("sweep", "slow", "steps")
-HELD = ("mixed",)
 STANDING = "sway"
 _KINDS = (*TRAIN, *HELD, STANDING)
 _STEP = constants.CONTROL_TIMESTEP

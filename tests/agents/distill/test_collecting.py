@@ -21,6 +21,9 @@ def test_the_teacher_gives_way_to_the_student():
   mixture = MixtureSettings(first_share=1.0, last_share=0.2, anneal_frames=100, belief_share=0.5)
   assert schedule.mixture_at(mixture, 5_000, begun=None) == (1.0, 0.0)
   assert schedule.mixture_at(mixture, 5_000, begun=5_000) == (1.0, 0.0)
+  shared = dataclasses.replace(mixture, first_share=0.6)
+  assert schedule.mixture_at(shared, 5_000, begun=None) == (1.0, 0.0)
+  assert schedule.mixture_at(shared, 5_000, begun=None, is_borrowed=True) == (0.6, 0.0)
   assert schedule.mixture_at(mixture, 5_050, begun=5_000) == pytest.approx((0.6, 0.25))
   assert schedule.mixture_at(mixture, 9_999, begun=5_000) == pytest.approx((0.2, 0.5))
 

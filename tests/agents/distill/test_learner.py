@@ -55,6 +55,17 @@ def test_a_state_is_read_as_it_was_written(tmp_path):
     checkpoint.load_state(tmp_path / "state.npz", like=other)
 
 
+@pytest.mark.parametrize("size", [0, 10, 2000])
+def test_a_saved_state_that_was_cut_off_is_one_line(tmp_path, size):
+  state, path = {"a": np.arange(1000.0)}, tmp_path / "state.npz"
+  checkpoint.save_state(path, state, checkpoint.Counters())
+  path.write_bytes(path.read_bytes()[:size])
+  for read in (checkpoint.load_counters, lambda path: checkpoint.load_state(path, like=state)):
+    with pytest.raises(ValueError, match=r"state.npz is damaged \(") as found:
+      read(path)
+    assert "\n" not in str(found.value)
+
+
 @pytest.mark.parametrize(
   ("kind", "stopped", "given"),
   [("policy", False, True), ("policy", True, False), ("encoder", False, False)],

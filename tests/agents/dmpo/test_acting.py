@@ -1,5 +1,6 @@
 """Trajectories, environments by name, export and loading."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -110,6 +111,29 @@ def test_damaged_or_missing_policy_is_refused(tmp_path):
     stream.seek(200)
     stream.write(b"xxxx")
   with pytest.raises(ValueError, match="arrays are not those"):
+    export.load_policy(tmp_path)
+
+
+@pytest.mark.parametrize(
+  ("content", "message"),
+  [
+    ("{", "policy.json is damaged"),
+    ("[]", "is of format None, expected 1"),
+    ('{"format_version": 0}', "is of format 0, expected 1"),
+    ('{"format_version": 1}', "lacks environment, layout, settings, info, sha256"),
+  ],
+)
+def test_a_record_that_is_none_is_refused(tmp_path, content, message):
+  (tmp_path / "policy.json").write_text(content)
+  with pytest.raises(ValueError, match=message):
+    export.load_policy(tmp_path)
+
+
+def test_settings_of_another_agent_are_refused(tmp_path):
+  _exported(tmp_path)
+  record = export.read_record(tmp_path) | {"settings": {"nothing": 1}}
+  (tmp_path / "policy.json").write_text(json.dumps(record))
+  with pytest.raises(ValueError, match="other settings than an agent's \\('network'\\)"):
     export.load_policy(tmp_path)
 
 

@@ -4,6 +4,7 @@ The learner is a process without networks (`mini_learner.py`), so that each case
 same cases with the whole agent are in `tests/agents/processes/test_runs.py`.
 """
 
+import functools
 import os
 import signal
 import subprocess
@@ -314,6 +315,9 @@ def test_beyond_this_machine_only_with_users():
     sessions.listen("tcp/0.0.0.0:0", sessions.LinkSettings())
   with pytest.raises(sessions.LinkError, match="certificate"):
     sessions.listen("tls/127.0.0.1:0", sessions.LinkSettings())
+  for kind in (sessions.listen, functools.partial(sessions.connect, timeout=0.0)):
+    with pytest.raises(sessions.LinkError, match="'127.0.0.1' is no endpoint"):
+      kind("127.0.0.1", sessions.LinkSettings(security=sessions.Security(allow_anonymous=True)))
   assert sessions.is_loopback("tcp/127.0.0.1:7447") and sessions.is_loopback("tcp/[::1]:7447")
   assert not sessions.is_loopback("tcp/[::]:7447") and not sessions.is_loopback("tcp/10.0.0.1:1")
 

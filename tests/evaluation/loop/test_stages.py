@@ -36,6 +36,25 @@ def test_a_folder_belongs_to_one_loop(tmp_path):
   )  # nothing tells before the end
 
 
+@pytest.mark.parametrize(
+  ("changes", "message"),
+  [
+    ({"trials": 0}, "--trials 0: expected at least 1"),
+    ({"simulated": -1}, "--simulated -1: expected at least 1"),
+    ({"processes": 0}, "--processes 0: expected at least 1"),
+    ({"actors": 0}, "--actors 0: expected at least 1"),
+    ({"preset": "best"}, "Unknown preset 'best'"),
+    ({"teacher": "nobody"}, "Unknown teacher 'nobody'"),
+  ],
+)
+def test_what_a_later_stage_would_refuse_is_refused_at_once(tmp_path, changes, message):
+  with pytest.raises(ValueError, match=message):
+    claim(_settings(tmp_path / "out", **changes))
+  with pytest.raises(ValueError, match=r"lacks .*none/sweep.mcap, "):
+    claim(_settings(tmp_path / "out", reference=tmp_path / "none"))
+  assert not (tmp_path / "out").exists()
+
+
 def test_a_policy_that_is_not_there_is_one_line(tmp_path):
   assert policy_folder(_settings(tmp_path)) is None
   assert (policy_folder(_settings(tmp_path, policy="shipped")) / "policy.json").exists()
@@ -144,7 +163,9 @@ def test_training_draws_the_effects_of_the_finding(tmp_path):
   write_effects(path, [Effect("motor_gain", "l_knee", {"gain": 0.6}, {"gain": (0.5, 0.7)})])
   name = training.environment_name(_settings(tmp_path), None, path)
   assert name.startswith("suite:nerf_nav?image_size=12x16&time_limit=1&effects=")
-  (tmp_path / "policy.json").write_text(json.dumps({"environment": "suite:nerf_nav?lens=l.yaml"}))
+  record = {key: {} for key in ("layout", "settings", "info", "sha256")} | {"format_version": 1}
+  record["environment"] = "suite:nerf_nav?lens=l.yaml"
+  (tmp_path / "policy.json").write_text(json.dumps(record))
   of_policy = training.environment_name(_settings(tmp_path), tmp_path, path)
   assert of_policy == f"suite:nerf_nav?lens=l.yaml&effects={path}&draw_effects=true"
   environment = make_environment(name + "&pushes=false", seed=0)

@@ -60,6 +60,8 @@ def test_a_file_holds_an_effect_a_line(tmp_path):
     ("command_delay@l_knee:0.1", "expected no target"),
     ("motor_gain@l_kne:0.1", "expected one of head_pan"),
     ("payload:0.2", "Found the target None of payload"),
+    ("command_delay:-1", "Found -1 for delay of command_delay, expected 0 or more"),
+    ("floor_slope:0,nan", "Found nan for y of floor_slope, expected a finite number"),
   ],
 )
 def test_what_is_no_effect_is_one_clear_line(text, said):
@@ -187,18 +189,22 @@ def test_friction_grows_at_rest_and_goes_with_motion():
   assert friction[0] > 0.3  # the others still rest
 
 
-def test_a_late_camera_shows_the_past():
+def test_a_late_camera_shows_the_past_and_its_driver_does_not_know():
+  seen, ages = {}, {}
+
   class Eyes:
     def picture(self, time):
-      return np.full((2, 2, 3), round(1000 * time) % 256, np.uint8)
+      seen[name] = time
+      return np.zeros((2, 2, 3), np.uint8)
 
   clock = SteppedClock()
   clock.advance(clock.now() + 2.0)
-  ages = {}
   for name in ("nothing", "other_camera"):
     settings = _build(name).camera
     ages[name] = SteppedCamera(Eyes(), clock, settings, seed=0).read()[1]
-  assert ages["other_camera"] - ages["nothing"] == pytest.approx(0.12, abs=1 / 30)
+  assert seen["nothing"] - seen["other_camera"] == pytest.approx(0.12, abs=1 / 30)
+  assert clock.now() - seen["nothing"] == pytest.approx(ages["nothing"])
+  assert clock.now() - seen["other_camera"] == pytest.approx(ages["other_camera"] + 0.12)
   lens = _build("other_camera").camera.lens
   assert (lens.fx, lens.fy) == pytest.approx((1.12 * LENS.fx, 1.12 * LENS.fy))
   assert (lens.cx, lens.k1) == (LENS.cx, LENS.k1)

@@ -13,6 +13,9 @@ from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL, RandomisationSettings
 
+HIP_OFFSET = 0.035  # m from the middle to a hip, sideways (links.csv, hip_yaw_link)
+HIP_DROP = 0.0285  # m from the torso's origin down to the hips' centre (links.csv, hip_roll_link)
+
 
 @pytest.fixture(scope="module")
 def posed_robot():
@@ -41,7 +44,7 @@ def test_legs_put_feet_where_told(posed_robot):
       place = world_from_torso.T @ (physics.bind(foot).xpos - torso.xpos)
       turn = world_from_torso.T @ physics.bind(foot).xmat.reshape(3, 3)
       centre = place + turn @ [0.0241, 0, 0]  # links.csv: from the foot's frame to the ankle
-      hip = np.array([0.0, side * legs.HIP_OFFSET, -legs.HIP_DROP])
+      hip = np.array([0.0, side * HIP_OFFSET, -HIP_DROP])
       assert centre - hip == pytest.approx(ankle, abs=2e-4)  # the table's own 0.1 mm
       expected = np.zeros(9)
       quaternions = np.zeros(4), np.zeros(4), np.zeros(4)
