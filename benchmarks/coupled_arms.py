@@ -31,7 +31,8 @@ PAYLOAD = '<geom pos="0.18 0 0" size="0.02" mass="0.25" contype="0" conaffinity=
 LATE = 0.024  # s
 RUBS = 0.2  # N m more at the elbow
 STRETCHED, REST = 3.0, 0.2  # N m/rad and rad of a spring at the elbow
-HIDDEN = ("nothing", "payload", "late commands", "friction", "spring")
+SOFTER = 0.75  # of the shoulder's gain for position; its servo's own damping stays
+HIDDEN = ("nothing", "payload", "late commands", "friction", "spring", "position gain")
 
 _STEP, _COMMAND, _READING = 0.002, 10, 5  # s, and steps between commands and readings
 _SECONDS, _SETTLING = 14.0, 3.0
@@ -139,6 +140,8 @@ def make(folder: Path, hidden: str, seed: int) -> None:
   }
   shoulder, elbow = true["friction"]
   changed = true | ({"friction": (shoulder, elbow + RUBS)} if hidden == "friction" else {})
+  if hidden == "position gain":
+    changed["stiffness"] = (SOFTER * true["stiffness"][0], true["stiffness"][1])
   xml = arm(changed, PAYLOAD if hidden == "payload" else "")
   late = LATE if hidden == "late commands" else 0.0
   force = _spring if hidden == "spring" else None
@@ -193,7 +196,7 @@ def main(settings: Settings) -> None:
       figures[name] = identified(folder, references=references)
   words = (
     "Hidden: 0.25 kg at 0.18 m on the forearm; commands 24 ms late; 0.2 N m of friction and a "
-    "spring of 3 N m/rad about 0.2 rad at the elbow."
+    "spring of 3 N m/rad about 0.2 rad at the elbow; the shoulder's gain for position at 0.75."
   )
   harness.finish("coupled_arms", figures, settings, seed=settings.seed, words=words)
 

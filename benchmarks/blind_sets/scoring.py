@@ -56,8 +56,8 @@ class Score:
   """Effects of one joint: the first finding is at that joint."""
   all_right: bool | None
   """Pairs: both kinds were named."""
-  none_wrong: bool | None
-  """No kind was named that is not there."""
+  none_wrong: bool
+  """No kind was named that is not there, at another joint not even one that is."""
   unexplained: bool | None
   """Outside the library: the verdict is unexplained."""
   accused: bool | None
@@ -84,13 +84,13 @@ def score(truth: Entry, report: Entry) -> Score:
   verdict = report.get("verdict", "failed")
   below = bool(truth.get("below_floor"))
   first = sought[0] if sought else None
-  right_first = right_joint = all_right = none_wrong = unexplained = accused = None
+  right_first = right_joint = all_right = unexplained = accused = None
+  none_wrong = all(any(_is(e, effect) for effect in effects) for e in accusations)
   if mix == "single":
     right_first = first is not None and first["kind"] == effects[0]["kind"]
   if mix == "pair":
     all_right = kinds <= {e["kind"] for e in named}
   if mix in ("single", "pair", "outside"):
-    none_wrong = all(e["kind"] in kinds for e in accusations)
     right_joint = _right_joint(effects, first, report)
   if mix == "outside":
     unexplained = verdict == "unexplained"
@@ -130,6 +130,12 @@ def _words(effects: list[Entry]) -> str:
 def _places(effect: Entry) -> set[str]:
   """Returns the names of joint and body of an effect's target."""
   return {str(effect[key]) for key in ("joint", "body", "target") if effect.get(key)}
+
+
+def _is(said: Entry, effect: Entry) -> bool:
+  """Returns whether an entry of a report is of an effect's kind, and not at another place."""
+  places, found = _places(effect), _places(said)
+  return said["kind"] == effect["kind"] and not (places and found and not places & found)
 
 
 def _right_joint(truth: list[Entry], first: Entry | None, report: Entry) -> bool | None:
@@ -206,6 +212,7 @@ def table(scores: list[Score]) -> list[Row]:
   seen = [s for s in scores if not s.below_floor]
   rows = [
     _share("single: right name first", [s.right_first for s in seen], 0.95),
+    _share("single: none wrong", [s.none_wrong for s in seen if s.mix == "single"], 0.95),
     _share("right joint", [s.right_joint for s in seen], 0.98),
     _share("healthy: accused", [s.accused for s in seen], 1 / 60, most=True),
     _share("pair: both right", [s.all_right for s in seen], 0.8),
@@ -216,6 +223,9 @@ def table(scores: list[Score]) -> list[Row]:
       [not s.none_wrong if s.mix == "outside" else None for s in seen],
       0.05,
       most=True,
+    ),
+    _share(
+      "all sets: a name that is not there", [not s.none_wrong for s in scores], 0.05, most=True
     ),
   ]
   errors = [e for s in seen for e in s.size_errors]

@@ -60,6 +60,7 @@ class MotorGain(Operator):
 
   A motor whose torque is less than its current's should give slows down less by its own back-EMF,
   too, which servos' models have in the joint's damping: `scales_damping` says that it follows.
+  A servo whose gain for position alone differs keeps its own damping: `position_alone`.
   """
 
   def bind(self, binding: Binding) -> None:
@@ -68,7 +69,8 @@ class MotorGain(Operator):
     limit = np.where(parameters["scales_limit"] > 0, gain, 1.0)
     binding.model.actuator_forcerange *= limit[:, None]
     binding.model.actuator_gainprm[:, 0] *= gain
-    binding.model.actuator_biasprm[:, :3] *= gain[:, None]
+    binding.model.actuator_biasprm[:, :2] *= gain[:, None]
+    binding.model.actuator_biasprm[:, 2] *= np.where(parameters["position_alone"] > 0, 1.0, gain)
     driven = binding.actuator_joint >= 0
     dofs = np.arange(binding.model.nv)[binding.dofs][binding.actuator_joint[driven]]
     damping = np.where(parameters["scales_damping"] > 0, gain, 1.0)
@@ -156,19 +158,14 @@ class SupplySag(Operator):
       binding.limit *= strength
 
 
-def _scales_limit() -> Parameter:
+def _choice(name: str, doc: str) -> Parameter:
+  """Returns a parameter that chooses between models: 0 or 1."""
   return Parameter(
-    "scales_limit",
-    "1",
-    0.0,
-    0.0,
-    1.0,
-    "1 if the actuator's limits weaken with it, 0 if they stay",
-    minimum=0.0,
-    maximum=1.0,
-    shape=True,
-    fitted=False,
+    name, "1", 0.0, 0.0, 1.0, doc, minimum=0.0, maximum=1.0, shape=True, fitted=False
   )
+
+
+_SCALES_LIMIT = _choice("scales_limit", "1 if the actuator's limits weaken with it, 0 if they stay")
 
 
 KINDS = (
@@ -187,16 +184,13 @@ KINDS = (
     "model",
     (
       Parameter("gain", "1", 1.0, 0.1, 1.6, "true over declared force", minimum=0.0),
-      _scales_limit(),
-      Parameter(
+      _SCALES_LIMIT,
+      _choice(
         "scales_damping",
-        "1",
-        0.0,
-        0.0,
-        1.0,
         "1 if the joint's damping (a motor's back-EMF) falls with it, 0 if it stays",
-        minimum=0.0,
-        maximum=1.0,
+      ),
+      _choice(
+        "position_alone", "1 if the actuator's own damping stays, 0 if it is scaled with its gain"
       ),
     ),
     MotorGain,
@@ -226,7 +220,7 @@ KINDS = (
       Parameter("heating", "K/(s N^2 m^2)", 0.0, 0.0, 5.0, "heating by torque", minimum=0.0),
       Parameter("time_constant", "s", 300.0, 20.0, 1000.0, "of cooling", minimum=1e-3, shape=True),
       Parameter("derating", "1/K", 0.004, 0.001, 0.02, "loss per kelvin", minimum=0.0, shape=True),
-      _scales_limit(),
+      _SCALES_LIMIT,
     ),
     ThermalDerating,
   ),
@@ -238,7 +232,7 @@ KINDS = (
     (
       Parameter("droop", "1/(N m)", 0.0, 0.0, 0.1, "loss per total torque", minimum=0.0),
       Parameter("fade", "1/s", 0.0, 0.0, 0.01, "loss per second", minimum=0.0),
-      _scales_limit(),
+      _SCALES_LIMIT,
     ),
     SupplySag,
   ),

@@ -18,7 +18,12 @@ class Expectation:
   """A reference's residuals as functions of time since the commands."""
 
   def __init__(
-    self, logs: Sequence[Measured], likes: Sequence[tuple[Array, Array]], baseline: Array
+    self,
+    logs: Sequence[Measured],
+    likes: Sequence[tuple[Array, Array]],
+    baseline: Array,
+    *,
+    apart: float = 0.0,
   ):
     """Takes the reference.
 
@@ -26,7 +31,9 @@ class Expectation:
       logs: of which something is expected.
       likes: stamps [S] and residuals [C, S] of the reference's log that is like each.
       baseline: kernel parameters [P] under which the reference leaves that.
+      apart: s by which one recording's latency may differ from the others'.
     """
+    self.apart = apart
     self._times = [log.time for log in logs]
     self._likes = [(_since_command(stamps, baseline), rows) for (stamps, rows) in likes]
     self._last: tuple[tuple[float, ...], Array] | None = None

@@ -9,12 +9,14 @@ zero. Shapes: n values, k values of a term.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from nerf2real.sysid.fit.layout import Fit
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.hypotheses.candidates import typical_speed
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.model.kernel import INDEX
 
@@ -23,7 +25,8 @@ Array = np.ndarray
 SYSTEMATIC = 2.0  # factor on standard deviations; ours, set on blind sets to cover 95 %
 RELATIVE = 0.009  # of a value; what no model of a joint holds: elastic gears, uneven teeth; ours
 BESIDE_PLAY = 0.025  # the same where a course does not repeat; ours
-PEAK = 0.08  # of friction at rest, which yields over a way no rigid model has; ours
+PEAK = 0.08
+"""Of all dry friction: it is larger at rest, over a way no rigid model has; ours."""
 LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; ours
 OWN_LATENCY = 0.004  # s; what a healthy machine may have of a delay: two of latency's tolerances
 RUBS = 0.2  # of the declared dry friction; servos of one batch differ by that much; ours
@@ -51,19 +54,49 @@ def intervals(
     fit.x[slice(*span)],
     *reaches(fit, spread(fit, [joint]), span),
     own_latency=own_latency,
-    friction=float(joint.plant.declared[INDEX["friction"]]),
+    usual=usual_of(joint, fit),
     relative=BESIDE_PLAY if any(t.kind == "backlash" for t in fit.layout.terms) else RELATIVE,
   )
 
 
+class Usual(NamedTuple):
+  """What every machine of a kind has of some effects, beside its declared constants."""
+
+  friction: float = 0.0
+  """Declared dry friction, N m or N."""
+  dry: float = 0.0
+  """The same with what a fit adds to it."""
+  bend: float = 0.0
+  """Drag, N m s^2/rad^2 or N s^2/m^2, by which the declared damping bends over the speeds of the
+  logs where it is off at the top by as much as the constant may be."""
+
+
+_NOTHING = Usual()
+
+
+def usual_of(joint: JointLikelihood, fit: Fit) -> Usual:
+  """Returns what machines of a joint's kind have."""
+  p = joint.plant.declared
+  rubs = float(p[INDEX["friction"]])
+  dry = rubs
+  for term in fit.layout.terms:
+    if term.kind in ("coulomb_friction", "asymmetric_friction") and term.names:
+      dry += float(np.mean(list(fit.values(term).values())))
+  share = dict(joint.settings.tolerances)["damping"]
+  return Usual(rubs, dry, share * float(p[INDEX["damping"]]) / typical_speed(joint.plant))
+
+
 def unmodelled(
-  term: Term, name: str, value: float, *, friction: float = 0.0, relative: float = RELATIVE
+  term: Term, name: str, value: float, *, usual: Usual = _NOTHING, relative: float = RELATIVE
 ) -> float:
   """Returns the standard deviation of a value by what no model of the joint holds; see `around`."""
   own = 1.0 + value if term.kind == "calibration" else value  # a factor is told
+  if name == "breakaway":
+    return PEAK * (usual.dry + value)
   known = LATE if name == "delay" else 0.0
-  known = RUBS * friction if name in _DRY and term.kind != "calibration" else known
-  return float(np.hypot((PEAK if name == "breakaway" else relative) * own, known))
+  known = RUBS * usual.friction if name in _DRY and term.kind != "calibration" else known
+  known = usual.bend if term.kind == "quadratic_drag" else known
+  return float(np.hypot(relative * own, known))
 
 
 def draws(joint: JointLikelihood, fit: Fit, count: int, random: np.random.Generator) -> Array:
@@ -74,13 +107,13 @@ def draws(joint: JointLikelihood, fit: Fit, count: int, random: np.random.Genera
   put on it.
   """
   layout, own = fit.layout, np.zeros(len(fit.x))
-  friction = float(joint.plant.declared[INDEX["friction"]])
+  usual = usual_of(joint, fit)
   for term, (a, b) in zip(layout.terms, layout.spans, strict=True):
     if term.kind == FREE:
       continue
     for at, name in zip(range(a, b), term.names, strict=True):
       share = 0.0 if name in ("zero", "skew", "latency") else RELATIVE
-      own[at] = unmodelled(term, name, fit.x[at], friction=friction, relative=share)
+      own[at] = unmodelled(term, name, fit.x[at], usual=usual, relative=share)
   wide = spread(fit, [joint]) + np.diag(own**2)
   result = random.multivariate_normal(fit.x, wide, count, check_valid="ignore", method="eigh")
   for _ in range(_AGAIN):
@@ -191,7 +224,7 @@ def around(
   up: Array,
   *,
   own_latency: bool = False,
-  friction: float = 0.0,
+  usual: Usual = _NOTHING,
   relative: float = RELATIVE,
 ) -> dict[str, tuple[float, float]]:
   """Returns 95 % intervals about values of a term.
@@ -203,12 +236,12 @@ def around(
     up: the same above.
     own_latency: whether nothing tells what latency the machine had before: then a delay is all
       that it has now, and its interval reaches down by what healthy machines have.
-    friction: the declared dry friction, N m or N.
+    usual: what every machine of the kind has of some effects.
     relative: share of a value that no model of the joint holds.
   """
   result = {}
   for name, value, less, more, lowest in zip(term.names, x, down, up, term.low, strict=True):
-    model = _Z * unmodelled(term, name, value, friction=friction, relative=relative)
+    model = _Z * unmodelled(term, name, value, usual=usual, relative=relative)
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     low = max(value - float(np.hypot(less, model)) - below, lowest)
     high = value + float(np.hypot(more, model))

@@ -14,6 +14,7 @@ in units of what remains. Shapes: N samples of all logs, B blocks, C channels, n
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import t as student
 
 from nerf2real.sysid.fit.expectation import Expectation
 from nerf2real.sysid.fit.noise import effort_noise, timing
@@ -30,6 +31,7 @@ Array = np.ndarray
 
 _NOTHING = np.zeros(0)
 _AT_LIMIT = 0.98  # of the largest duty: saturated
+_RARE = 0.025  # share of recordings whose latency is later than what is allowed, as many earlier
 
 
 class JointLikelihood:
@@ -50,9 +52,9 @@ class JointLikelihood:
     logs = plant.logs
     self.effort: list[Array] | None = None
     self.law = None if plant.law is None else plant.law[0]
-    self.ahead: float | None = None
-    """s that positions were ahead of duties in a reference: what is more now is a late reading.
-    Without one the law's own holds both."""
+    self.ahead: tuple[float, float] | None = None
+    """Interval of the s that positions were ahead of duties in a reference: what is more now is a
+    late reading. Without one the law's own holds both."""
     if self.law is not None:
       self.effort = [log.duty for log in logs]  # type: ignore[misc]
     elif all(log.effort is not None for log in logs) and plant.holds:
@@ -90,7 +92,7 @@ class JointLikelihood:
   def _cut(self) -> None:
     starts, folds, offset = [], [], 0
     alone = len(self.plant.logs) == 1
-    log_of = []
+    log_of, log_at = [], []
     for index, log in enumerate(self.plant.logs):
       label = np.floor((log.time - log.time[0]) / self.settings.block_s).astype(int)
       first = np.unique(label, return_index=True)[1]
@@ -100,9 +102,10 @@ class JointLikelihood:
       half = np.arange(len(first)) // 2 % self.settings.folds
       folds.append(half if alone else np.full(len(first), index))
       log_of.append(np.full(len(first), index))
+      log_at.append(np.full(len(label), index))
       offset += len(label)
     self.starts, self.fold = np.concatenate(starts), np.concatenate(folds)
-    self.log_of = np.concatenate(log_of)
+    self.log_of, self.log_at = np.concatenate(log_of), np.concatenate(log_at)
     self.size = offset
     self.counts = np.maximum(np.add.reduceat(self.gain**2, self.starts, axis=1), 1.0)
     lengths = np.diff(np.append(self.starts, offset))
@@ -164,7 +167,15 @@ class JointLikelihood:
     if self.expectation is not None:
       for row, x in zip(result, np.atleast_2d(xs), strict=True):
         row -= self.expectation.under(compose(self.plant, terms, x)[0])
+        late, most = self._late(row[0]), self.expectation.apart
+        row[0] -= np.clip(late - late.mean(), -most, most)[self.log_at] * self.speed
     return result * self.gain
+
+  def _late(self, residual: Array) -> Array:
+    """Returns the s by which each log [L] is earlier than simulated, by a residual course [N]."""
+    weights = self.gain[0] ** 2 * self.speed
+    moved, turned = (np.bincount(self.log_at, weights * row) for row in (residual, self.speed))
+    return moved / np.maximum(turned, 1e-12)
 
   def expect(
     self,
@@ -174,6 +185,10 @@ class JointLikelihood:
     x: Array = _NOTHING,
   ) -> bool:
     """Takes what a reference leaves for expected, where it was driven by the very same commands.
+
+    By as much as its recordings are early or late among each other any other may be: cycles of a
+    bus and of a loop begin anew with every recording. It is no more than what machines of one kind
+    differ by.
 
     Args:
       reference: logs of the machine before.
@@ -195,26 +210,42 @@ class JointLikelihood:
       other, keep = reference.plant.logs[like], reference.mask[starts[like] : ends[like]] > 0
       likes.append((other.time[keep], residuals[:, starts[like] : ends[like]][:, keep]))
     baseline = compose(reference.plant, terms, x)[0]
-    self.expectation = Expectation(self.plant.logs, likes, baseline)
+    late, apart = reference._late(residuals[0]), 0.0
+    if len(late) > 1 and not self.follows:
+      spread = float(np.sqrt(2.0) * late.std(ddof=1))  # of a difference of two recordings
+      most = dict(self.settings.tolerances)["latency"]
+      apart = min(spread * float(student.isf(_RARE, len(late) - 1)), most)
+    self.expectation = Expectation(self.plant.logs, likes, baseline, apart=apart)
     return True
 
   def _duties(self, p: Array) -> Array:
     """Returns measured duty minus that of the law of kernel parameters [P].
 
     A gain of the law within what a data sheet leaves open is taken for the declared one: of its
-    interval, as other latencies show other gains, the one that fits best.
+    interval, as other latencies show other gains, the one that fits best. So it is with what
+    positions were ahead of duties in a reference.
     """
     assert self.effort is not None and self.law is not None
     late = float(p[INDEX["measurement_delay"]] - p[INDEX["effort_delay"]])
-    ahead = self.law.ahead - late if self.ahead is None else self.ahead
+    ahead = self.law.ahead - late if self.ahead is None else float(np.mean(self.ahead))
     measured, logs = np.concatenate(self.effort), range(len(self.plant.logs))
-    law = np.concatenate([duty_of(self.plant, p, i, ahead=ahead) for i in logs])
+
+    def duties(ahead: float) -> Array:
+      return np.concatenate([duty_of(self.plant, p, i, ahead=ahead) for i in logs])
+
+    law = duties(ahead)
     free = self.gain[1] ** 2 * (np.abs(law) < _AT_LIMIT * np.abs(law).max())
     factor = float(free * law @ measured) / max(float(free * law @ law), 1e-12)
     known = self.law.gain if self.law.is_off(self.settings.duty_scale) else 1.0
     p = p.copy()
     p[INDEX["gain"]] *= np.clip(factor, *(np.array(self.law.interval) / known))
-    return measured - np.concatenate([duty_of(self.plant, p, i, ahead=ahead) for i in logs])
+    law = duties(ahead)
+    if self.ahead is not None and self.ahead[1] > self.ahead[0]:
+      reach = 0.5 * (self.ahead[1] - self.ahead[0])
+      further = (duties(ahead + reach) - law) / reach
+      by = float(free * further @ (measured - law)) / max(float(free * further @ further), 1e-12)
+      law = duties(ahead + float(np.clip(by, -reach, reach)))
+    return measured - law
 
   def _efforts(self, along: Sequence[Simulated | None]) -> Array:
     assert self.effort is not None

@@ -37,7 +37,7 @@ def library(plant: JointPlant) -> list[Term]:
   top = plant.declared[INDEX["highest"]]
   reach = _reach(plant)
   torque = typical_torque(plant)
-  speed = _typical_speed(plant)
+  speed = typical_speed(plant)
   terms = [
     _one("command_delay", joint, "delay", 0.0, 0.25, 0.01, (0.006, 0.03, 0.08, 0.16)),
     _one("clock_drift", None, "rate", -0.05, 0.05, 0.003, (0.003, -0.003)),
@@ -174,6 +174,8 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   if limited and term.kind == "motor_gain" and plant.declared[INDEX["damping"]] > 0:
     # A weak motor: its back-EMF, part of the joint's damping, falls with its torque.
     forms.append(dataclasses.replace(term, fixed=(*forms[-1].fixed, ("scales_damping", 1.0))))
+  if term.kind == "motor_gain" and plant.declared[INDEX["velocity"]] != 0:
+    forms.append(dataclasses.replace(term, fixed=(*term.fixed, ("position_alone", 1.0))))
   return forms
 
 
@@ -279,7 +281,7 @@ def _reach(plant: JointPlant) -> float:
   return max(float(np.ptp(np.concatenate([log.position for log in plant.logs]))) / 2, 1e-6)
 
 
-def _typical_speed(plant: JointPlant) -> float:
+def typical_speed(plant: JointPlant) -> float:
   speeds = np.concatenate([np.abs(log.velocity) for log in plant.logs])
   return max(float(np.quantile(speeds, 0.98)), 1e-6)
 

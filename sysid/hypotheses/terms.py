@@ -188,7 +188,10 @@ def _spring(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
 
 def _gain(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   scales_limit = v.get("scales_limit", 0.0) > 0
-  for name in ("gain", "lowest", "highest", "strength") if scales_limit else ("gain",):
+  names: tuple[str, ...] = ("gain", "lowest", "highest", "strength") if scales_limit else ("gain",)
+  if v.get("position_alone", 0.0) > 0:  # the servo's own damping stays
+    names = ("input", "constant", "position")
+  for name in names:
     p[I[name]] *= v["gain"]
   if v.get("scales_damping", 0.0) > 0:  # back-EMF
     p[I["damping"]] *= v["gain"]

@@ -156,7 +156,10 @@ def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float
       joint.damping = _first_plus(joint.damping, value["coefficient"], 1)
     case "motor_gain":
       for actuator in actuators:
+        damping = actuator.biasprm[2]
         _scale(actuator, value["gain"])
+        if value.get("position_alone"):
+          actuator.biasprm[2] = damping
         if value.get("scales_limit"):
           actuator.forcerange = np.array(actuator.forcerange) * value["gain"]
       if value.get("scales_damping"):

@@ -48,6 +48,8 @@ class ServoLaw:
   """s between a command and the duty."""
   ahead: float
   """s by which the positions that the duty is of are later than those that are logged with it."""
+  ahead_deviation: float
+  """Of that."""
   dead_band: float
   """rad (m) of position error."""
   integral: float
@@ -115,19 +117,23 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
     [_integral(columns[log_of == i, 0], log.time) for i, log in enumerate(logs)]
   )
   wound, wide = _regressed(np.column_stack([total, columns])[kept], duty[kept], block[kept])
-  apart = [
-    np.linalg.lstsq(columns[m], duty[m], rcond=None)[0][0]
-    for m in (kept & (log_of == i) for i in range(len(logs)))
-    if m.sum() > _FEWEST
-  ]
-  between = float(np.std(apart, ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else 0.0
+  apart = np.array(
+    [
+      np.linalg.lstsq(columns[m], duty[m], rcond=None)[0][:2]
+      for m in (kept & (log_of == i) for i in range(len(logs)))
+      if m.sum() > _FEWEST
+    ]
+  )
+  between = apart.std(axis=0, ddof=1) / np.sqrt(len(apart)) if len(apart) > 1 else np.zeros(2)
+  gain_deviation, speed_deviation = np.maximum(spread[:2], between)
   left = duty - np.clip(columns[:, :2] @ beta[:2], -top, top)
   is_clear = abs(wound[0]) > _CLEAR * wide[0]
   law = ServoLaw(
     gain=float(beta[0]),
-    gain_deviation=max(float(spread[0]), between),
+    gain_deviation=float(gain_deviation),
     delay=delay,
     ahead=float(-beta[1] / (beta[0] * slope)),
+    ahead_deviation=float(abs(speed_deviation / (beta[0] * slope))),
     dead_band=band,
     integral=float(wound[0]),
     integral_deviation=float(wide[0]),

@@ -121,9 +121,25 @@ def _reopened(
   if len(changed) < 2:
     return shared, changed
   known = {s.term.kind for s in shared} | set(refuted)
-  further = scopes.found_beside(model, changed, settings, known=known)
-  if further is None:
-    return shared, changed
+  for instead in (None, *sorted(scopes.open_scopes(changed) - known)):
+    further = scopes.found_beside(model, changed, settings, known=known, instead=instead)
+    if further is not None:
+      again = _beside(shared, further, changed, settings, simpler=instead is not None)
+      if again is not None:
+        return [*shared, further], again
+  return shared, changed
+
+
+def _beside(
+  shared: list[Shared],
+  further: Shared,
+  changed: list[Changed],
+  settings: Settings,
+  *,
+  simpler: bool,
+) -> list[Changed] | None:
+  """Returns joints' explanations beside one more shared effect, None where they are not better; for
+  one that stands for several joints' own, where they are worse."""
   before = [c.subject.state for c in changed]
   for member in further.members:
     member.take(further.held)
@@ -132,11 +148,12 @@ def _reopened(
   after = [c.subject.state for c in changed]
   for item, state in zip(changed, before, strict=True):
     item.subject.state = state
-  if not stands or not scopes.better(again, changed):
-    return shared, changed
+  worth = not scopes.better(changed, again) if simpler else scopes.better(again, changed)
+  if not stands or not worth:
+    return None
   for item, state in zip(changed, after, strict=True):
     item.subject.state = state
-  return [*shared, further], again
+  return again
 
 
 def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> None:

@@ -17,9 +17,9 @@ from nerf2real.sysid.settings import Settings
 def discard_refuted(found: Identified, settings: Settings) -> None:
   """Takes out what makes the whole machine's error worse; joints that lose a name are unexplained.
 
-  One effect or joint's constants at a time, of those that the machine is better off without the one
-  that is least certain, until all that are left help. Courses that do not repeat refute nothing:
-  joints that are judged by following stay.
+  One part at a time, of those that the machine is better off without the one that is least certain,
+  until all that are left help. A part is an effect that is claimed, or all else that a joint's fit
+  brings along. Courses that do not repeat refute nothing: joints that are judged by following stay.
 
   Args:
     found: of a machine of several joints; changed.
@@ -27,22 +27,32 @@ def discard_refuted(found: Identified, settings: Settings) -> None:
   """
   if len(found.joints) < 2:
     return
-  kept = [j.joint for j in found.joints if j.likelihood.follows]
 
   def left_by(effects: Sequence[Effect]) -> float:
     return error(found.model, found.logs, effects, clocks=found.clocks, window_s=settings.window_s)
 
   while True:
-    effects = [*found.calibration, *found.objects]
-    whole, refuted = left_by(effects), []
-    for effect in (e for e in effects if e.target not in kept):
-      without = left_by([e for e in effects if e is not effect])
+    whole, refuted = left_by([*found.calibration, *found.objects]), []
+    for part in _parts(found):
+      kept = [e for e in (*found.calibration, *found.objects) if not any(e is p for p in part)]
+      without = left_by(kept)
       if is_worse({"before": without, "after": whole}):
-        certain = max((_certainty(row) for row in _rows(found, effect)), default=0.0)
-        refuted.append((certain, without, effect))
+        certain = max((_certainty(row) for e in part for row in _rows(found, e)), default=0.0)
+        refuted.append((certain, without, part))
     if not refuted:
       return
-    _take_out(found, min(refuted, key=lambda item: item[:2])[2])
+    for effect in min(refuted, key=lambda item: item[:2])[2]:
+      _take_out(found, effect)
+
+
+def _parts(found: Identified) -> list[list[Effect]]:
+  """Returns the effects that may be taken out: every claimed one, and each joint's others."""
+  stay = [j.joint for j in found.joints if j.likelihood.follows]
+  parts: dict[object, list[Effect]] = {}
+  for effect in (*found.calibration, *found.objects):
+    if effect.target not in stay:
+      parts.setdefault(id(effect) if _rows(found, effect) else effect.target, []).append(effect)
+  return list(parts.values())
 
 
 def _rows(found: Identified, effect: Effect) -> list[dict[str, Any]]:

@@ -50,7 +50,7 @@ def test_a_right_name():
   ("report", "first", "joint", "clean"),
   [
     (_report(_effect("measurement_delay")), False, True, False),
-    (_report(_effect("command_delay", "wrist", delay=0.03)), True, False, True),
+    (_report(_effect("command_delay", "wrist", delay=0.03)), True, False, False),
     (_report(CONSTANTS, _effect("command_delay", delay=0.03)), True, True, True),
     (_report(CONSTANTS), False, False, True),
     (_report(verdict="unexplained", residual_at={"joint": "elbow"}), False, True, True),

@@ -57,9 +57,9 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   lacking = more_at_first or leaves(subject, explainer.null, settings)
   lacking |= clear(found.best, explainer.null) > subject.beyond
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
-  named = tuple(k for k in found.named if k in something)
   if before is not None and usual is not None and not subject.paired:
-    named = tuple(k for k in named if is_new(before, usual, found.best, k))
+    something = [k for k in something if is_new(before, usual, found.best, k)]
+  named = tuple(k for k in found.named if k in something)
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
   if named and (typical or few):
@@ -118,8 +118,9 @@ def _verdict(
 
   Args:
     lacking: whether the best hypothesis has a kind whose values are more than a machine's own, and
-      the baseline leaves more than the machine does anyway, or is clearly worse. Names are tried
-      from less on: what is not certain then is nothing.
+      that references do not have as well, and the baseline leaves more than the machine does
+      anyway, or is clearly worse. Names are tried from less on: what is not certain then is
+      nothing.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
     remains: whether more is left than the machine leaves anyway, by a test or by that limit.

@@ -14,8 +14,11 @@ Array = np.ndarray
 
 def structured(joint: JointLikelihood, item: Scored, settings: Settings) -> bool:
   """Tells whether neighbouring readings' residuals go together in more than one block, which may
-  hold a knock, by more than rounding makes them where a joint is slow."""
+  hold a knock, by more than rounding makes them where a joint is slow. A log's first block is not
+  judged: its course begins at one reading, which is rounded."""
   certain, size = _together(joint, item.fit.residuals[0][0])
+  later = np.append(False, np.diff(joint.log_of) == 0)
+  certain, size = certain[later], size[later]
   # Two of B blocks exceed z by chance with a probability of (B p)^2 / 2 at most.
   rare = float(norm.isf(np.sqrt(2.0 * settings.level) / len(certain)))
   step = min(quantum(log.position) for log in joint.plant.logs)

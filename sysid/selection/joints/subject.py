@@ -20,6 +20,7 @@ from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.servo_law import ServoLaw
 from nerf2real.sysid.selection.joints.baseline import (
   changed_constants,
   freed_constants,
@@ -158,13 +159,20 @@ def _subject(
     freed = widened(own)
     explainer = _explainer(now, None, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
-  now.ahead = None if before.law is None else before.law.ahead
+  now.ahead = None if before.law is None else _ahead(before.law, settings)
   usual = _bare(before, settings)
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   freed = freed_constants(known[0])
   explainer = _explainer(now, before, known, library, freed)
   return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
+
+
+def _ahead(law: ServoLaw, settings: Settings) -> tuple[float, float]:
+  """Returns the interval of what positions are ahead of duties in another recording than the law's:
+  by the law's own deviation, and by what readings differ between two recordings."""
+  reach = 1.96 * float(np.hypot(law.ahead_deviation, dict(settings.repeat)["skew"]))
+  return law.ahead - reach, law.ahead + reach
 
 
 def _bare(before: JointLikelihood, settings: Settings) -> Scored:

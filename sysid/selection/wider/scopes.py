@@ -98,6 +98,7 @@ def found_beside(
   settings: Settings,
   *,
   known: Collection[str],
+  instead: str | None = None,
 ) -> Shared | None:
   """Returns one more effect of wider scope, beside what joints have of their own, if there is one.
 
@@ -108,6 +109,7 @@ def found_beside(
     changed: the joints' explanations; they stay.
     settings: effort.
     known: kinds that are not tried.
+    instead: a kind that joints have of their own, to be shared in place of that; None for any.
   """
   if not any(c.named for c in changed):
     return None
@@ -115,10 +117,11 @@ def found_beside(
   before = [s.state for s in subjects]
   for item in changed:
     explainer, certain = item.subject.explainer, item.found.best
-    for kind in sorted(certain.names - set(item.named)):
+    for kind in sorted(certain.names - (set(item.named) - {instead})):
       certain = rivals.lacking(explainer, certain, kind)
     explainer.null = certain
-  best = _next(model, subjects, settings, known)
+  certain_kinds = () if instead is None else (instead,)
+  best = _next(model, subjects, settings, known, certain_kinds, only=certain_kinds)
   for subject, state in zip(subjects, before, strict=True):
     subject.state = state
   return best
@@ -130,14 +133,17 @@ def _next(
   settings: Settings,
   known: Collection[str],
   certain: Collection[str] = (),
+  *,
+  only: Collection[str] = (),
 ) -> Shared | None:
   """Returns the best effect of a body or of the machine, if it is clear, where a joint leaves more
-  than the machine does anyway; joints' scales may have changed after."""
+  than the machine does anyway; joints' scales may have changed after. Only some kinds, if given."""
   leaving = [s for s in subjects if leaves(s, s.explainer.null, settings)]
   tried = [
     wide.screened(term, members)
     for term, members in (wide.hypotheses(model, subjects) if leaving else ())
-    if term.kind not in known and any(m in leaving for m in members)
+    if term.kind not in known and (not only or term.kind in only)
+    if any(m in leaving for m in members)
   ]
   return _best(tried, certain, own_latency=subjects[0].before is None)
 

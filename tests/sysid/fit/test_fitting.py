@@ -29,6 +29,26 @@ def _fitted(effect: Effect) -> tuple[Explainer, Scored]:
   )
 
 
+def test_what_every_machine_has_widens_the_values_of_some_effects() -> None:
+  _, joint = joint_of(("sweep",))
+  usual = intervals.Usual(friction=0.1, dry=1.0, bend=0.02)
+  terms = {t.kind: t for t in candidates.library(joint.plant)}
+
+  def deviation(kind: str, name: str, value: float) -> float:
+    return intervals.unmodelled(terms[kind], name, value, usual=usual)
+
+  assert deviation("stribeck_friction", "breakaway", 0.5) == pytest.approx(1.5 * intervals.PEAK)
+  assert deviation("quadratic_drag", "coefficient", 0.0) == pytest.approx(0.02)
+  assert deviation("coulomb_friction", "torque", 0.0) == pytest.approx(0.1 * intervals.RUBS)
+  assert deviation("viscous_friction", "coefficient", 1.0) == pytest.approx(intervals.RELATIVE)
+  explainer = Explainer(joint, constants(joint.plant), ())
+  fastest = candidates.typical_speed(joint.plant)
+  share = dict(SETTINGS.tolerances)["damping"]
+  of_joint = intervals.usual_of(joint, explainer.null.fit)
+  assert of_joint.bend == pytest.approx(share * 1.0 / fastest)  # damping of 1 N m s/rad
+  assert of_joint.dry == of_joint.friction == pytest.approx(0.03)
+
+
 def _intervals(explainer: Explainer, item: Scored, kind: str) -> dict:
   term = next(t for t in item.terms if t.kind == kind)
   return intervals.intervals(explainer.joint, item.fit, term, own_latency=True)

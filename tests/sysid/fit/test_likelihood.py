@@ -42,6 +42,22 @@ def test_nats_of_a_block_are_those_of_the_formula(viscous):
   assert np.all(np.delete(nats, 2) == 0.0)
 
 
+def test_a_recording_may_be_as_late_as_references_are_among_each_other():
+  made = [log_of(PENDULUM, kind, duration=5.0, seed=i) for i, kind in enumerate(("sweep", "slow"))]
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  reference, now = (JointLikelihood(JointModel(model, "joint", made)) for _ in range(2))
+  late = np.array([0.001, -0.001])
+  left = np.zeros((1, reference.size))
+  left[0] = late[reference.log_at] * reference.speed
+  assert now.expect(reference, left * reference.gain)
+  terms, none = (), np.zeros((1, 0))
+  expected = now.residuals(terms, none)[0, 0]
+  now.expectation.apart = 0.0
+  other = now.residuals(terms, none)[0, 0]
+  assert np.sqrt(np.mean(expected**2)) < 0.7 * np.sqrt(np.mean(other**2))
+  assert now.expect(reference, np.zeros_like(left)) and now.expectation.apart == 0.0
+
+
 def test_logs_are_folds_and_blocks_are_a_second(viscous):
   _, joint = viscous
   assert set(joint.fold) == {0, 1}

@@ -77,6 +77,16 @@ def test_native_effects_move_as_the_suites(effect, commands, share, tmp_path):
   assert rms(natives(path, commands) - want) < share * changed
 
 
+def test_a_gain_of_position_alone_is_written_with_the_servos_own_damping(tmp_path):
+  damped = PENDULUM.replace('kp="21"', 'kp="21" kv="0.8"')
+  gain = Effect("motor_gain", "joint", {"gain": 0.6, "position_alone": 1.0})
+  path, left = written(tmp_path, damped, [gain])
+  assert left == []
+  assert rms(natives(path, SWEEP) - suites(damped, [gain], SWEEP)) < 1e-9
+  whole = Effect("motor_gain", "joint", {"gain": 0.6})
+  assert rms(natives(path, SWEEP) - suites(damped, [whole], SWEEP)) > 1e-3
+
+
 def test_late_readings_are_late_sensors(tmp_path):
   effect = Effect("measurement_delay", "joint", {"delay": 0.0234})
   path, left = written(tmp_path, PENDULUM, [effect])

@@ -88,6 +88,19 @@ def test_kind_moves_the_joint_as_mujoco_does(kind: str, values: dict, tolerance:
 _COMMON = ("supply_sag", "gravity_tilt", "clock_drift")
 
 
+def test_a_gain_of_position_alone_keeps_the_servos_own_damping() -> None:
+  damped = PENDULUM.replace('kp="21"', 'kp="21" kv="0.8"')
+  model = mujoco.MjModel.from_xml_string(damped)
+  log = log_of(damped, "steps", rounding=0.0, duration=4.0)
+  plant = JointModel(model, "joint", [log])
+  forms = [t for t in candidates.library(plant) if t.kind == "motor_gain"]
+  alone = next(t for t in forms if dict(t.fixed).get("position_alone"))
+  gain = Effect("motor_gain", "joint", {"gain": 0.6, "position_alone": 1.0})
+  want = evaluation.simulate(model, log, [gain])[:, 0]
+  assert np.sqrt(np.mean((_position(plant, [alone], [0.6]) - want) ** 2)) < 1e-4
+  assert np.sqrt(np.mean((_position(plant, [forms[0]], [0.6]) - want) ** 2)) > 1e-3
+
+
 def test_a_gear_is_loaded_by_what_a_scaled_back_emf_leaves() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "sweep", rounding=0.0, duration=4.0)

@@ -49,6 +49,15 @@ def test_an_effect_that_makes_the_whole_machine_worse_is_taken_out() -> None:
   ]
 
 
+def test_what_is_not_claimed_of_a_joint_is_taken_out_together() -> None:
+  found = _found()
+  other = Effect("encoder_offset", "elbow", {"offset": 0.0})
+  found.effects, found.objects = found.effects[:1], [_TRUE, other, _WRONG]
+  discard_refuted(found, SETTINGS)
+  assert found.objects == [_TRUE]
+  assert [j.verdict for j in found.joints] == ["effects", "effects"]
+
+
 @pytest.mark.parametrize("single", [True, False])
 def test_one_joint_and_courses_that_do_not_repeat_refute_nothing(single: bool) -> None:
   found = _found(follows=not single)

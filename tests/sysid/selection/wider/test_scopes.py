@@ -100,6 +100,13 @@ def test_an_effect_of_the_machine_is_looked_for_beside_what_joints_have(model, m
   }
 
 
+def test_what_joints_each_have_is_one_effect_of_the_machine(model, monkeypatch):
+  monkeypatch.setattr(scopes, "shared_effects", lambda *_, **__: [])  # hidden at first
+  found = analysis.analyse(model, _logs([LATE]))
+  assert [(e["kind"], e["joint"]) for e in found.effects] == [("command_delay", None)]
+  assert found.verdict == "effects"
+
+
 @pytest.mark.parametrize(("square", "stands"), [(0.1, True), (1.0, False), (9.0, False)])
 def test_explanations_beside_a_further_effect_must_be_better(square, stands):
   def explained(left):
