@@ -34,7 +34,7 @@ _DRY = ("torque", "positive", "negative")  # dry friction that is added to the d
 _PLAY = {"gap": (0.85, 1.35), "stiffness": (0.4, 2.5), "damping": (0.4, 2.5)}
 """Times a value of play, the least of an interval: gears that give way take a part of the gap, and
 costs are too rough for derivatives to say how sure values are. Ours, on blind sets."""
-_Z = 1.96
+SIGMAS = 1.96  # standard deviations from a value to the ends of its interval
 _RESOLVED = 1e-4
 """Of a curvature scaled to 1 for each value: twins whose derivatives agree to a hundredth have
 less."""
@@ -137,7 +137,7 @@ def reaches(fit: Fit, covariance: Array, span: tuple[int, int]) -> tuple[Array, 
     span: which ones.
   """
   own = slice(*span)
-  half = _Z * np.sqrt(np.maximum(np.diag(covariance)[own], 0.0))
+  half = SIGMAS * np.sqrt(np.maximum(np.diag(covariance)[own], 0.0))
   random = np.random.default_rng(0)
   draws = random.multivariate_normal(fit.x, covariance, _DRAWS, check_valid="ignore", method="eigh")
   others = np.ones(len(fit.x), bool)
@@ -241,7 +241,7 @@ def around(
   """
   result = {}
   for name, value, less, more, lowest in zip(term.names, x, down, up, term.low, strict=True):
-    model = _Z * unmodelled(term, name, value, usual=usual, relative=relative)
+    model = SIGMAS * unmodelled(term, name, value, usual=usual, relative=relative)
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     low = max(value - float(np.hypot(less, model)) - below, lowest)
     high = value + float(np.hypot(more, model))

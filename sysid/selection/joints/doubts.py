@@ -109,14 +109,21 @@ def is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str) -> b
 
 
 def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
-  """Tells whether a declared constant is off by more than its tolerance, all of its interval.
+  """Tells whether a declared constant is off by clearly more than machines of one kind differ by.
 
-  Beside a reference the constants are those that it shows.
+  Tolerances are standard deviations, so that some constant of a healthy machine is outside its own:
+  the value is compared with what tolerance and interval make together. Beside a reference the
+  constants are those that it shows.
   """
   term = best.terms[0]
   if subject.before is not None or term.freed:
     return False
-  tolerance = dict(settings.tolerances)
+  tolerance, values = dict(settings.tolerances), best.fit.values(term)
   bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
+
+  def pull(name: str) -> float:
+    low, high = bounds[name]
+    return abs(values[name]) / np.hypot(tolerance[name], (high - low) / (2 * intervals.SIGMAS))
+
   shares = [n for n in term.names if n not in (*CLOCKS, "zero")]
-  return any(bounds[n][0] > tolerance[n] or bounds[n][1] < -tolerance[n] for n in shares)
+  return any(pull(name) > subject.beyond for name in shares)
