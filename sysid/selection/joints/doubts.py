@@ -24,6 +24,9 @@ _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
 
 
+_SCATTER = ("friction",)  # constants that no drawing or data sheet holds
+
+
 def supported(
   explainer: Explainer,
   best: Scored,
@@ -109,11 +112,11 @@ def is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str) -> b
 
 
 def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
-  """Tells whether a declared constant is off by clearly more than machines of one kind differ by.
+  """Tells whether a declared constant is off by more than its tolerance, all of its interval.
 
-  Tolerances are standard deviations, so that some constant of a healthy machine is outside its own:
-  the value is compared with what tolerance and interval make together. Beside a reference the
-  constants are those that it shows.
+  Dry friction scatters from copy to copy by its tolerance, so that some healthy machine is outside:
+  it is off where it is clearly more than tolerance and interval make together. Beside a reference
+  the constants are those that it shows.
   """
   term = best.terms[0]
   if subject.before is not None or term.freed:
@@ -121,9 +124,11 @@ def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
   tolerance, values = dict(settings.tolerances), best.fit.values(term)
   bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
 
-  def pull(name: str) -> float:
+  def off(name: str) -> bool:
     low, high = bounds[name]
-    return abs(values[name]) / np.hypot(tolerance[name], (high - low) / (2 * intervals.SIGMAS))
+    if name not in _SCATTER:
+      return bool(low > tolerance[name] or high < -tolerance[name])
+    sure = (high - low) / (2 * intervals.SIGMAS)
+    return bool(abs(values[name]) > subject.beyond * np.hypot(tolerance[name], sure))
 
-  shares = [n for n in term.names if n not in (*CLOCKS, "zero")]
-  return any(pull(name) > subject.beyond for name in shares)
+  return any(off(name) for name in term.names if name not in (*CLOCKS, "zero"))

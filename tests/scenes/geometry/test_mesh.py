@@ -126,8 +126,9 @@ def test_the_visual_mesh_lies_within_the_bundles_extent():
   scene = bundle.Bundle.load()
   found = mesh.load_glb(scene.visual_path)
   lower, upper = scene.extent
-  voxel = scene.scene["settings"]["mesh"]["voxel"]
-  assert (found.bounds[0] > lower - voxel).all() and (found.bounds[1] < upper + voxel).all()
+  settings = scene.scene["settings"]["mesh"]
+  voxel, below = settings["voxel"], np.array([0.0, 0.0, settings["truncation"]])
+  assert (found.bounds[0] > lower - below - voxel).all() and (found.bounds[1] < upper + voxel).all()
   assert (np.ptp(found.bounds, axis=0) > 0.8 * (upper - lower)).all()
 
 

@@ -296,18 +296,20 @@ def test_values_stay_within_what_is_plausible_for_the_machine(limit, amplitude):
 
 
 @pytest.mark.parametrize(
-  "friction, half, off",
+  "name, value, half, off",
   [
-    (0.33, 0.13, False),  # a healthy copy of a kind whose dry friction differs by a fifth
-    (0.9, 0.13, True),
-    (0.9, 0.6, False),  # by an interval that holds what copies differ by
+    ("friction", 0.33, 0.13, False),  # a healthy copy of a kind whose dry friction differs so
+    ("friction", 0.9, 0.13, True),
+    ("friction", 0.9, 0.6, False),
+    ("damping", 0.12, 0.03, True),
+    ("damping", 0.12, 0.07, False),
   ],
 )
-def test_a_constant_is_off_by_more_than_copies_differ_by(monkeypatch, friction, half, off):
-  term = SimpleNamespace(names=("friction", "zero"), freed=False)
-  values = {"friction": friction, "zero": 0.5}
+def test_a_constant_is_off_by_more_than_copies_differ_by(monkeypatch, name, value, half, off):
+  term = SimpleNamespace(names=(name, "zero"), freed=False)
+  values = {name: value, "zero": 0.5}
   best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
-  bounds = {"friction": (friction - half, friction + half), "zero": (0.4, 0.6)}
+  bounds = {name: (value - half, value + half), "zero": (0.4, 0.6)}
   monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
   judged = SimpleNamespace(before=None, now=None, beyond=3.2)
   assert doubts.constants_off(judged, best, SETTINGS) == off
