@@ -33,6 +33,8 @@ class Settings:
     ("latency", 0.002),
   )
   """Standard deviations of nominal constants: shares, rad (m), s."""
+  servo: float = 0.2
+  """Of gain and damping where a reference shows the machine: a model guesses servos, not masses."""
   repeat: tuple[tuple[str, float], ...] = (
     ("damping", 0.015),
     ("armature", 0.01),

@@ -1,5 +1,8 @@
 """Nominal constants of a joint with tolerances: what every hypothesis may vary."""
 
+import dataclasses
+from collections.abc import Mapping
+
 import numpy as np
 
 from nerf2real.sysid.hypotheses.terms import SERVO_GAIN, STICKING, Term
@@ -19,15 +22,21 @@ _USUAL = 2.0
 them, what is later is a late command or reading, not a constant."""
 
 
+_SCALES = ("damping", "armature", "gain", "mass")
+_FAR = 0.6  # share that a healthy machine's may be off; chosen
+
+
 def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool = False) -> Term:
   """Returns the constants of a joint that its model has, with their tolerances as prior.
 
   Args:
     plant: the joint.
     settings: tolerances.
-    healthy: whether its logs are a reference: as late as they are, the machine is.
+    healthy: whether its logs are a reference: as late and as strong as they are, the machine is.
   """
   p, tolerance = plant.declared, dict(settings.tolerances)
+  if healthy:
+    tolerance |= {name: settings.servo for name in ("gain", "damping")}
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
   present = {
     "damping": p[INDEX["damping"]] > 0,
@@ -42,7 +51,9 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
   names = tuple(n for n, there in present.items() if there)
   sigma = tuple(tolerance[n] for n in names)
   limit = tuple(
-    (5.0 if healthy else _USUAL) * s if n in ("skew", "latency") else min(5.0 * s, 0.9)
+    (5.0 if healthy else _USUAL) * s
+    if n in ("skew", "latency")
+    else (_FAR if healthy and n in _SCALES else min(5.0 * s, 0.9))
     for n, s in zip(names, sigma, strict=True)
   )
   low = tuple(0.0 if n == "latency" else -b for n, b in zip(names, limit, strict=True))
@@ -55,6 +66,25 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
     if plant.law[0].is_off(settings.duty_scale):
       fixed = (*fixed, (SERVO_GAIN, plant.law[0].gain))
   return Term(NAME, plant.joint, names, low, limit, scale, (zeros,), sigma, zeros, fixed)
+
+
+def tolerant(own: Term, values: Mapping[str, float]) -> Term:
+  """Returns constants of which some may be far off, as the last values show, at a price that grows
+  with the distance and not with its square (Huber 1964, by weights).
+
+  All torques larger by one factor make the same motion. So tells a prior alone which of gain,
+  masses, damping and armature are off, and a normal one spreads it over all of them: with this one
+  most of them stay where they are declared.
+
+  Args:
+    own: as `constants` gives them.
+    values: of a fit.
+  """
+  prior = tuple(
+    float(np.sqrt(s * max(s, abs(values[n])))) if n in _SCALES else s
+    for n, s in zip(own.names, own.prior, strict=True)
+  )
+  return dataclasses.replace(own, prior=prior)
 
 
 def sticking(plant: JointModel) -> Term:

@@ -15,7 +15,7 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
-from nerf2real.sysid.hypotheses.constants import constants, sticking
+from nerf2real.sysid.hypotheses.constants import constants, sticking, tolerant
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
@@ -36,6 +36,9 @@ from nerf2real.sysid.settings import Settings
 
 WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
 """Kinds that have no target: they concern all joints of a machine or none."""
+
+_WEIGHTED = 4  # fits of a reference's constants under weights of their priors, at most
+_SETTLED = 0.1  # share by which these weights differ at the end
 
 
 @dataclasses.dataclass
@@ -160,7 +163,7 @@ def _subject(
     explainer = _explainer(now, None, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
   now.ahead = None if before.law is None else _ahead(before.law, settings)
-  usual = _bare(before, settings)
+  usual = reference_constants(before, settings)
   known = known_terms(usual, settings)
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   freed = freed_constants(known[0])
@@ -175,13 +178,20 @@ def _ahead(law: ServoLaw, settings: Settings) -> tuple[float, float]:
   return law.ahead - reach, law.ahead + reach
 
 
-def _bare(before: JointLikelihood, settings: Settings) -> Scored:
+def reference_constants(before: JointLikelihood, settings: Settings) -> Scored:
   """Returns the constants that a reference shows, with a dry friction that holds at rest.
 
   An effect of friction holds, too: it must not be judged by the difference to one that creeps.
   """
   own = constants(before.plant, settings, healthy=True)
-  return Explainer(before, own, (), settings=settings, known=[sticking(before.plant)]).null
+  known = [sticking(before.plant)]
+  found = Explainer(before, own, (), settings=settings, known=known).null
+  for _ in range(_WEIGHTED):
+    wider = tolerant(own, found.fit.values(found.terms[0]))
+    if np.allclose(wider.prior, found.terms[0].prior, rtol=_SETTLED):
+      break
+    found = Explainer(before, wider, (), settings=settings, known=known, start=found.fit.x).null
+  return found
 
 
 def explain_reference(subject: Subject, settings: Settings) -> None:
@@ -191,7 +201,7 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
     return
   if not subject.alone and not structured(before, subject.usual, settings):
     return
-  own = constants(before.plant, settings, healthy=True)
+  own = subject.usual.terms[0]
   library = own_library(before.plant, alone=subject.alone)
   known = [sticking(before.plant)]
   first = Explainer(before, own, library, settings=settings, known=known)

@@ -1,10 +1,14 @@
-"""Constants that are off where no reference shows them."""
+"""Constants that are off, where no reference shows them and where one does."""
 
 import mujoco
+import pytest
 
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.selection.joints import subject
 from nerf2real.sysid.selection.joints.baseline import widened
+from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
 
@@ -14,3 +18,17 @@ def test_all_torques_are_not_larger_by_a_factor_that_no_motion_shows():
   tight, freed = (dict(zip(own.names, t.prior, strict=True)) for t in (own, widened(own)))
   assert freed["gain"] == tight["gain"]
   assert freed["damping"] > 2.0 * tight["damping"]
+
+
+@pytest.mark.parametrize("strength, mass", [(1.3, 1.0), (1.0, 1.3)])
+def test_a_reference_tells_a_stronger_servo_from_a_heavier_arm(strength, mass):
+  """Gain and damping are larger by one factor, or the mass is: the others are as declared."""
+  machine = PENDULUM.replace('kp="21"', f'kp="{21 * strength}"')
+  machine = machine.replace('damping="1.0"', f'damping="{strength}"')
+  machine = machine.replace('mass="0.5"', f'mass="{0.5 * mass}"')
+  logs = [log_of(machine, kind, duration=6.0) for kind in ("sweep", "slow", "steps")]
+  plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
+  usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
+  values = usual.fit.values(usual.terms[0])
+  assert 1.0 + values["gain"] == pytest.approx(strength, rel=0.05)
+  assert 1.0 + values["mass"] == pytest.approx(mass, rel=0.05)
