@@ -200,6 +200,8 @@ def nerf_nav_on() -> DistillSettings:
     views=20_000,
     # As in `ball_push_on`: views teach the encoder before there are new paths of the student's.
     stages=(Stage(kind=ENCODER, share=0.35), Stage(kind=POLICY, share=0.65)),
+    # The encoder has the views: time is better spent on its updates than on more of the old paths.
+    teacher_frames=60_000,
   )
 
 
