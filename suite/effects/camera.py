@@ -42,7 +42,8 @@ class CameraLatency(Operator):
 class CameraFocal(Operator):
   """The focal length is `scale` times the declared one: the picture is magnified about its centre.
 
-  Resampled bilinearly; where a smaller focal length would see more, the border is repeated.
+  For given pictures, resampled bilinearly; where a smaller focal length would see more, the border
+  is repeated. The suite's tasks render through the other lens instead.
   """
 
   def bind(self, binding: Binding) -> None:

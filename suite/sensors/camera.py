@@ -234,12 +234,13 @@ class RobotCamera:
       world_from_unit: Maps the field's frame to the world [m].
       settings: How the sensor responds and how geoms are composited.
     """
-    self.camera = camera
+    self.camera = self._declared = camera
     self.settings = settings or CameraSettings()
     self._renderer = renderer
     self._unit_from_world = world_from_unit.inverse()
     self._meters_per_unit = world_from_unit.scale
     self._response = self.settings.response()
+    self._model: mujoco.MjModel | None = None
     self.caster: GeomCaster | None = None
     self.camera_id = -1
 
@@ -259,8 +260,18 @@ class RobotCamera:
       raise RuntimeError("The camera has no model yet: call bind(model, camera_id) first.")
     self.caster.light = light
 
+  def set_focal_scale(self, scale: float) -> None:
+    """Makes the focal length a multiple of the declared one, from the next picture on."""
+    fx, fy = scale * self._declared.fx, scale * self._declared.fy
+    if (fx, fy) == (self.camera.fx, self.camera.fy):
+      return
+    self.camera = dataclasses.replace(self._declared, fx=fx, fy=fy)
+    if self._model is not None:
+      self.bind(self._model, self.camera_id)
+
   def bind(self, model: mujoco.MjModel, camera_id: int) -> None:
     """Takes the geoms and the mounting from a compiled model."""
+    self._model = model
     self.caster = GeomCaster(model, self.camera)
     self.camera_id = camera_id
 

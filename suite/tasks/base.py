@@ -191,6 +191,10 @@ class RobotTask(composer.Task):
       else as_gravity(effect)
       for effect in declared
     ]
+    if self.robot_camera is not None:  # a longer lens shows more detail: rendered, not magnified
+      scales = [e.parameters.get("scale", 1.0) for e in effects if e.kind == "camera_focal"]
+      self.robot_camera.set_focal_scale(float(np.prod(scales)))
+      effects = [effect for effect in effects if effect.kind != "camera_focal"]
     joints = [prefix + name for name in constants.JOINT_NAMES]
     stack = EffectStack(effects).bind(self._model, joints=joints)
     self._proprioception.observe = stack.observe if effects else None

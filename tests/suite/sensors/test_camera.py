@@ -1,5 +1,7 @@
 """The robot's camera: compositing, lens, response, against OpenCV and MuJoCo's GL."""
 
+import dataclasses
+
 import cv2
 import mujoco
 import numpy as np
@@ -212,3 +214,14 @@ def test_default_lens_is_the_robots():
   assert (lens.height, lens.width) == (30, 40)
   assert 2 * np.arctan(15 / lens.fy) == pytest.approx(np.deg2rad(43.3))
   assert CameraSettings(lens=LENS).camera((30, 40)).fx == pytest.approx(620 / 16)
+
+
+def test_a_longer_lens_is_rendered_and_taken_back(world):
+  """The picture is that of a camera which has this lens: no magnified picture of the other."""
+  model, data = world
+  camera, declared = _camera(model), _camera(model).render(data)
+  camera.set_focal_scale(2.0)
+  longer = dataclasses.replace(LENS, fx=2 * LENS.fx, fy=2 * LENS.fy)
+  np.testing.assert_array_equal(camera.render(data), _camera(model, lens=longer).render(data))
+  camera.set_focal_scale(1.0)
+  np.testing.assert_array_equal(camera.render(data), declared)
