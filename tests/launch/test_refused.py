@@ -1,11 +1,13 @@
 """What cannot succeed is refused at once, in one line, and leaves nothing."""
 
 import os
+import shutil
 
 import pytest
 
 from nerf2real.real.safety.operator import Terminal
 from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.scenes.bundle import BUILT_IN
 from tests.launch.test_identify import _log
 
 
@@ -51,6 +53,23 @@ def test_refused_at_once(run, tmp_path, script, arguments, status, words):
   (line,) = ended.err.splitlines()
   assert line.startswith("error: ") and words.format(out=out) in line, line
   assert sorted(path.name for path in tmp_path.iterdir()) == ["log.mcap"]
+
+
+@pytest.mark.parametrize(
+  ("script", "arguments"),
+  [("export_scene", ("--to", "glb", "--out", "{out}.glb")), ("view", ("--port", "0"))],
+)
+def test_a_field_that_was_cut_off_is_one_line(run, tmp_path, script, arguments):
+  """As a download that ended early leaves it."""
+  room = tmp_path / "room"
+  shutil.copytree(BUILT_IN, room)
+  field = room / "field.safetensors"
+  os.truncate(field, field.stat().st_size // 2)
+  ended = run(script, room, *(text.format(out=tmp_path / "out") for text in arguments))
+  assert ended.status == 1, ended
+  line = ended.err.strip().splitlines()[-1]
+  assert line.startswith(f"error: {field} is damaged: found "), ended.err
+  assert "Traceback" not in ended.err and sorted(tmp_path.iterdir()) == [room]
 
 
 def test_a_dry_run_needs_no_terminal_and_asks_for_nothing(run, monkeypatch, capsys):
