@@ -109,6 +109,7 @@ def _distil(arguments: Arguments) -> None:
 
   try:
     settings = settings_of(arguments)
+    sessions.check_listening(arguments.listen, arguments.link)
     if arguments.relabel is not None and not (arguments.run / STATE).exists():
       relabel_for(settings, arguments.relabel, arguments.run / "data", seed=arguments.seed)
     learner = Learner(

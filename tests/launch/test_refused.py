@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import socket
 
 import pytest
 
@@ -53,6 +54,37 @@ def test_refused_at_once(run, tmp_path, script, arguments, status, words):
   (line,) = ended.err.splitlines()
   assert line.startswith("error: ") and words.format(out=out) in line, line
   assert sorted(path.name for path in tmp_path.iterdir()) == ["log.mcap"]
+
+
+@pytest.mark.parametrize(
+  ("script", "arguments", "late"),
+  [
+    (
+      "learner",
+      ("--env", "dm_control:cartpole:swingup", "--preset", "state"),
+      "nerf2real.agents.processes.learner.Learner",
+    ),
+    (
+      "distill_learner",
+      ("--preset", "tiny", "--relabel", "{out}"),
+      "nerf2real.agents.distill.relabelling.relabel_for",
+    ),
+  ],
+)
+def test_a_taken_endpoint_is_refused_before_anything_is_prepared(
+  run, tmp_path, monkeypatch, script, arguments, late
+):
+  """Compiling the updates or labelling episodes anew takes minutes."""
+  began = []
+  monkeypatch.setattr(late, lambda *_, **__: began.append(late))
+  out = tmp_path / "run"
+  with socket.create_server(("127.0.0.1", 0)) as other:
+    endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+    found = (text.format(out=out) for text in arguments)
+    ended = run(script, "--run", out, "--listen", endpoint, *found)
+  assert ended.status == 2 and not began, ended
+  assert ended.err.strip().splitlines()[-1].startswith(f"error: Cannot listen on {endpoint}: ")
+  assert not out.exists()
 
 
 @pytest.mark.parametrize(
