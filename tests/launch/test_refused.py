@@ -3,10 +3,12 @@
 import os
 import shutil
 import socket
+import threading
 
 import pytest
 
 from nerf2real.real.safety.operator import Terminal
+from nerf2real.real.virtual.body import Body
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.scenes.bundle import BUILT_IN
 from tests.launch.test_identify import _log
@@ -112,6 +114,23 @@ def test_a_dry_run_needs_no_terminal_and_asks_for_nothing(run, monkeypatch, caps
     ended = run("check_robot", "--robot", "virtual", "--dry-run", "--seconds", "0.5")
   assert ended.status == 0 and ended.out.strip().endswith("passed"), ended
   assert "HOLD" not in ended.out
+
+
+def test_a_virtual_robot_whose_physics_ends_says_so(run, monkeypatch, tmp_path):
+  advance, link = Body.advance, tmp_path / "op3"
+
+  def fail(self, until):
+    if threading.current_thread().name == "virtual wire":
+      raise FloatingPointError("unstable physics")
+    return advance(self, until)
+
+  monkeypatch.setattr(Body, "advance", fail)
+  options = ("--world", "floor", "--no-camera", "--link", link, "--seconds", "100")
+  ended = run("virtual_robot", *options)
+  assert ended.status == 1, ended
+  (line,) = ended.err.splitlines()
+  assert line.startswith("error: The virtual robot ended (FloatingPointError: unstable physics)")
+  assert not link.is_symlink()
 
 
 class _Opened:
