@@ -4,6 +4,7 @@ import os
 import shutil
 import socket
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -131,6 +132,18 @@ def test_a_virtual_robot_whose_physics_ends_says_so(run, monkeypatch, tmp_path):
   (line,) = ended.err.splitlines()
   assert line.startswith("error: The virtual robot ended (FloatingPointError: unstable physics)")
   assert not link.is_symlink()
+
+
+@pytest.mark.parametrize(("asked", "says"), [(8080, True), (8081, False), (0, False)])
+def test_a_page_on_another_port_than_was_asked_for_is_told(run, monkeypatch, asked, says):
+  server = SimpleNamespace(get_port=lambda: 8081, stop=lambda: None)
+  monkeypatch.setattr("nerf2real.scenes.viewing.bundle_viewer.view_bundle", lambda *_, **__: server)
+  event = SimpleNamespace(wait=lambda: None)
+  monkeypatch.setattr("nerf2real.launch.view.threading", SimpleNamespace(Event=lambda: event))
+  ended = run("view", "--port", asked)
+  assert ended.status == 0 and "open http://127.0.0.1:8081 " in ended.out
+  told = "port 8080 is taken by another program: the page is on port 8081\n"
+  assert ended.err == (told if says else "")
 
 
 class _Opened:
