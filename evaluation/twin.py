@@ -37,9 +37,41 @@ class Agreement(NamedTuple):
   difference: Interval  # mean of simulated minus virtual success rate
 
 
+class _Kind(NamedTuple):
+  """What the episodes of both plants must have in common to be compared."""
+
+  protocol: str
+  conditions: str
+
+  def __str__(self) -> str:
+    return f"{self.protocol}, {self.conditions or 'as in the paper'}"
+
+
+def _kinds(plain: Sequence[Episode], plant: str) -> list[_Kind]:
+  settings = [episode.setting for episode in select(plain, plant=plant)]
+  return list(dict.fromkeys(_Kind(setting.protocol, setting.conditions) for setting in settings))
+
+
 def pairs_of(found: Sequence[Episode]) -> list[Pair]:
-  """Counts the undisturbed episodes of every policy that has some on both plants."""
+  """Counts the undisturbed episodes of every policy that has some on both plants.
+
+  Protocol and conditions (scene, effects, ...) are the same for all: those that both plants have.
+
+  Raises:
+    ValueError: The plants have no conditions in common, or several.
+  """
   plain = select(found, perturbation="none", control="none")
+  simulated, virtual = (_kinds(plain, plant) for plant in ("sim", "virtual"))
+  shared = [kind for kind in simulated if kind in virtual]
+  if not simulated or not virtual:
+    return []
+  if len(shared) != 1:
+    raise ValueError(
+      f"Found simulations of ({'; '.join(map(str, simulated))}) and virtual robots of "
+      f"({'; '.join(map(str, virtual))}), expected one protocol and conditions that both have: "
+      "evaluate each into a folder of its own."
+    )
+  plain = select(plain, **shared[0]._asdict())
   pairs = []
   for name, digest in dict.fromkeys((e.setting.policy, e.setting.policy_id) for e in plain):
     counts = []

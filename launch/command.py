@@ -250,6 +250,12 @@ def learner_folder(run: Path) -> Iterator[None]:
     yield
 
 
+def tell_port(asked: int, found: int) -> None:
+  """Says that a page is not where it was asked to be: viser takes the next port of a taken one."""
+  if asked and found != asked:
+    _say(f"port {asked} is taken by another program: the page is on port {found}")
+
+
 def command_line() -> str:
   """Returns the command that was given, as a shell takes it."""
   program = ["python", sys.argv[0]] if sys.argv[0].endswith(".py") else sys.argv[0].split()

@@ -46,7 +46,8 @@ class Arguments:
   """Folder of an exported policy that the student begins with; its networks are taken along."""
   relabel: Path | None = None
   """Folder `data` of an earlier run in such an environment: a new run begins with its episodes,
-  labelled by the teacher of now."""
+  labelled by the teacher of now. They count among the frames, but the teacher's share falls over
+  those that come after the run's own first student."""
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   minutes: float = 60.0
@@ -109,6 +110,7 @@ def _distil(arguments: Arguments) -> None:
 
   try:
     settings = settings_of(arguments)
+    sessions.check_listening(arguments.listen, arguments.link)
     if arguments.relabel is not None and not (arguments.run / STATE).exists():
       relabel_for(settings, arguments.relabel, arguments.run / "data", seed=arguments.seed)
     learner = Learner(

@@ -155,6 +155,8 @@ def _learn(arguments: Arguments) -> None:
 
   try:
     environment, config = agent_settings(arguments)
+    if arguments.connect is None:
+      sessions.check_listening(arguments.listen, arguments.link)
     names = {field.name for field in dataclasses.fields(RunSettings)} - {"environment"}
     settings = RunSettings(
       environment=environment, **{name: getattr(arguments, name) for name in names}

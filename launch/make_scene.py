@@ -120,6 +120,7 @@ def _watched(arguments: Arguments) -> Iterator["Watcher | None"]:
   from nerf2real.scenes.viewing.training_viewer import TrainingViewer
 
   viewer = TrainingViewer(host=arguments.host, port=arguments.port)
+  command.tell_port(arguments.port, viewer.port)
   print(f"watch it grow: {viewer.address}")
   try:
     yield viewer

@@ -36,7 +36,8 @@ class Arguments:
   host: str = "127.0.0.1"
   """Address to serve on; 0.0.0.0 lets other machines connect."""
   port: int = 8080
-  """Port to serve on."""
+  """Port to serve on; 0 takes a free one. Where it is taken the next one is, and the command says
+  so."""
 
 
 def run(arguments: Arguments) -> None:
@@ -66,6 +67,7 @@ def run(arguments: Arguments) -> None:
 
     splats = None if arguments.splats is None else Splats.load_ply(arguments.splats)
     server = view_bundle(Bundle.load(arguments.bundle), host=host, port=port, splats=splats)
+  command.tell_port(port, server.get_port())
   print(f"open http://{host}:{server.get_port()} (Ctrl-C ends)", flush=True)
   with contextlib.suppress(KeyboardInterrupt):
     wait()

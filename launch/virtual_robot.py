@@ -102,6 +102,7 @@ def _wait(robot: "VirtualRobot", seconds: float | None) -> None:
   report = time.monotonic() + _REPORT_INTERVAL
   keys = [sys.stdin] if sys.stdin.isatty() else []
   while time.monotonic() < end:
+    robot.check()
     ready, _, _ = select.select(keys, (), (), min(0.5, max(0.0, end - time.monotonic())))
     if ready:
       key = sys.stdin.readline().strip()

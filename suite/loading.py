@@ -107,15 +107,7 @@ def _effects(effects: Any) -> tuple[Effect, ...]:
 
 def load_renderer(bundle: Any) -> "Renderer":
   """Returns a renderer of a bundle's field on this machine's CPU."""
-  import safetensors
-
   from nerf2real.scenes.field.field import Field
   from nerf2real.scenes.field.render.renderer import Renderer
 
-  try:
-    field = Field.load(bundle.field_path)
-  except (safetensors.SafetensorError, KeyError, ValueError) as error:
-    raise ValueError(
-      f"{bundle.field_path} is damaged or of another version ({error}): make the bundle again."
-    ) from error
-  return Renderer(field)
+  return Renderer(Field.load(bundle.field_path))

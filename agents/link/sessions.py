@@ -72,6 +72,15 @@ def listen(endpoint: str, settings: LinkSettings) -> zenoh.Session:
   return _open_router(endpoint, settings, learner_joins=False)
 
 
+def check_listening(endpoint: str, settings: LinkSettings) -> None:
+  """Checks that `listen` can be called: what takes minutes to prepare must not end in a taken port.
+
+  Raises:
+    LinkError: as `listen`.
+  """
+  close(listen(endpoint, settings))
+
+
 def route(endpoint: str, settings: LinkSettings) -> zenoh.Session:
   """Opens a router that the learner joins as well: its address stays while the learner moves.
 

@@ -26,7 +26,7 @@ class Settings(harness.Options):
   """What to compare."""
 
   policies: tuple[str, ...]
-  """Folders of exported policies, "gait" for the scripted walker; three or more."""
+  """Folders of exported policies, "walker" for the scripted one; three or more."""
   trials: int = 18
   """Trials of the navigation protocol on each plant, spread over it."""
   robots: tuple[int, ...] = (1, 2, 3)

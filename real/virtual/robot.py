@@ -96,6 +96,15 @@ class VirtualRobot:
     clock = self.clock if isinstance(self.clock, SteppedClock) else None
     return Connection(port=self.port, camera=source, operator=self.operator, clock=clock)
 
+  def check(self) -> None:
+    """Raises RuntimeError, in one line, where the robot in real time answers no more."""
+    error = self._wire.error if isinstance(self._wire, Wire) else None
+    if error is not None:
+      raise RuntimeError(
+        f"The virtual robot ended ({type(error).__name__}: {error}): its port answers no more; "
+        "start it again."
+      ) from error
+
   # ---- what a person in the room does and sees ----
 
   def place(self, x: float, y: float, yaw: float) -> None:
@@ -124,6 +133,7 @@ class VirtualRobot:
 
   def truth(self) -> Truth:
     """Returns the observer's present view of the robot."""
+    self.check()
     with self.body.lock:
       self.body.advance(self.clock.now())
       return self.body.truth()

@@ -20,6 +20,7 @@ from nerf2real.scenes.field import encoding
 from nerf2real.scenes.field.contraction import grid_coordinates
 
 FORMAT_VERSION = 1
+_METADATA = ("format_version", "settings", "training_pixel_angle")
 _LAYER_NORM_EPSILON = 1e-5
 Params = Mapping[str, jax.Array | np.ndarray]
 
@@ -204,28 +205,45 @@ class Field:
 
   @classmethod
   def load(cls, path: str | Path) -> "Field":
-    """Reads what `save` wrote; parameters become float32."""
-    with safetensors.safe_open(path, "numpy") as file:
-      metadata = file.metadata() or {}
-      if metadata.get("format") != "radiance field":
-        raise ValueError(
-          f"{path} holds no radiance field (metadata {metadata}); expected a file that Field.save "
-          "wrote."
-        )
-      if int(metadata["format_version"]) > FORMAT_VERSION:
-        raise ValueError(
-          f"{path} has format version {metadata['format_version']}, this program reads up to "
-          f"{FORMAT_VERSION}; update the program."
-        )
-      values = json.loads(metadata["settings"])
-      rule = values.pop("footprint_rule", "additive")  # written until there was one rule only
-      if rule != "additive":
-        raise ValueError(
-          f"{path} was trained with footprint_rule={rule!r}, which this program no longer renders; "
-          "expected 'additive': train the field again."
-        )
-      settings = from_plain(values, FieldSettings, source=path)
-      params = {name: file.get_tensor(name).astype(np.float32) for name in file.keys()}  # noqa: SIM118
+    """Reads what `save` wrote; parameters become float32.
+
+    Raises:
+      ValueError: The file is cut off, damaged or no field of this version; the message is one line.
+    """
+    try:
+      with safetensors.safe_open(path, "numpy") as file:
+        metadata = file.metadata() or {}
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except safetensors.SafetensorError as error:
+      raise ValueError(
+        f"{path} is damaged: found {Path(path).stat().st_size:,} bytes that are no whole "
+        f"safetensors file ({error}), expected a radiance field. Copy it again from where it came, "
+        "or make the bundle again."
+      ) from error
+    if metadata.get("format") != "radiance field":
+      raise ValueError(
+        f"{path} holds no radiance field (metadata {metadata}); expected a file that Field.save "
+        "wrote."
+      )
+    lacking = [name for name in _METADATA if name not in metadata]
+    if lacking:
+      raise ValueError(
+        f"{path} is damaged: its metadata lacks {', '.join(lacking)}; make the bundle again."
+      )
+    if int(metadata["format_version"]) > FORMAT_VERSION:
+      raise ValueError(
+        f"{path} has format version {metadata['format_version']}, this program reads up to "
+        f"{FORMAT_VERSION}; update the program."
+      )
+    values = json.loads(metadata["settings"])
+    rule = values.pop("footprint_rule", "additive")  # written until there was one rule only
+    if rule != "additive":
+      raise ValueError(
+        f"{path} was trained with footprint_rule={rule!r}, which this program no longer renders; "
+        "expected 'additive': train the field again."
+      )
+    settings = from_plain(values, FieldSettings, source=path)
+    params = {name: array.astype(np.float32) for name, array in arrays.items()}
     for name, shape in settings.shapes.items():
       if name not in params or params[name].shape != shape:
         found = params[name].shape if name in params else "nothing"

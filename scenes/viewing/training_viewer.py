@@ -57,7 +57,12 @@ class TrainingViewer:
   @property
   def address(self) -> str:
     """Where a browser finds the page."""
-    return f"http://{self._server.get_host()}:{self._server.get_port()}"
+    return f"http://{self._server.get_host()}:{self.port}"
+
+  @property
+  def port(self) -> int:
+    """The page's port: a later one than was asked for where that was taken."""
+    return self._server.get_port()
 
   @property
   def text(self) -> str:

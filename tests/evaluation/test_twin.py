@@ -61,3 +61,19 @@ def test_episodes_are_counted_by_policy_and_plant():
     episode(index=0, policy_id="d2"),
   ]
   assert twin.pairs_of(found) == [Pair("p (d1)", (1, 2), (1, 2))]
+  # Of other conditions that one plant alone has, nothing is counted.
+  others = [episode("fall", conditions="effects 0a"), episode("fall", protocol="ball")]
+  assert twin.pairs_of(found + others) == twin.pairs_of(found)
+  assert twin.pairs_of(others) == twin.pairs_of([]) == []
+
+
+def test_conditions_are_not_pooled():
+  there = [episode(plant=plant) for plant in ("sim", "virtual")]
+  other = [episode("lost", plant=plant, conditions="scene x (0a)") for plant in ("sim", "virtual")]
+  assert twin.pairs_of(other) == [Pair("p (d1)", (0, 1), (0, 1))]
+  for found in (there + other, [there[0], other[1]]):
+    with pytest.raises(
+      ValueError, match=r"navigation, scene x \(0a\).*folder of its own"
+    ) as caught:
+      twin.pairs_of(found)
+    assert "navigation, as in the paper" in str(caught.value) and "\n" not in str(caught.value)

@@ -1,11 +1,17 @@
 """What cannot succeed is refused at once, in one line, and leaves nothing."""
 
 import os
+import shutil
+import socket
+import threading
+from types import SimpleNamespace
 
 import pytest
 
 from nerf2real.real.safety.operator import Terminal
+from nerf2real.real.virtual.body import Body
 from nerf2real.real.virtual.robot import VirtualRobot
+from nerf2real.scenes.bundle import BUILT_IN
 from tests.launch.test_identify import _log
 
 
@@ -53,6 +59,54 @@ def test_refused_at_once(run, tmp_path, script, arguments, status, words):
   assert sorted(path.name for path in tmp_path.iterdir()) == ["log.mcap"]
 
 
+@pytest.mark.parametrize(
+  ("script", "arguments", "late"),
+  [
+    (
+      "learner",
+      ("--env", "dm_control:cartpole:swingup", "--preset", "state"),
+      "nerf2real.agents.processes.learner.Learner",
+    ),
+    (
+      "distill_learner",
+      ("--preset", "tiny", "--relabel", "{out}"),
+      "nerf2real.agents.distill.relabelling.relabel_for",
+    ),
+  ],
+)
+def test_a_taken_endpoint_is_refused_before_anything_is_prepared(
+  run, tmp_path, monkeypatch, script, arguments, late
+):
+  """Compiling the updates or labelling episodes anew takes minutes."""
+  began = []
+  monkeypatch.setattr(late, lambda *_, **__: began.append(late))
+  out = tmp_path / "run"
+  with socket.create_server(("127.0.0.1", 0)) as other:
+    endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+    found = (text.format(out=out) for text in arguments)
+    ended = run(script, "--run", out, "--listen", endpoint, *found)
+  assert ended.status == 2 and not began, ended
+  assert ended.err.strip().splitlines()[-1].startswith(f"error: Cannot listen on {endpoint}: ")
+  assert not out.exists()
+
+
+@pytest.mark.parametrize(
+  ("script", "arguments"),
+  [("export_scene", ("--to", "glb", "--out", "{out}.glb")), ("view", ("--port", "0"))],
+)
+def test_a_field_that_was_cut_off_is_one_line(run, tmp_path, script, arguments):
+  """As a download that ended early leaves it."""
+  room = tmp_path / "room"
+  shutil.copytree(BUILT_IN, room)
+  field = room / "field.safetensors"
+  os.truncate(field, field.stat().st_size // 2)
+  ended = run(script, room, *(text.format(out=tmp_path / "out") for text in arguments))
+  assert ended.status == 1, ended
+  line = ended.err.strip().splitlines()[-1]
+  assert line.startswith(f"error: {field} is damaged: found "), ended.err
+  assert "Traceback" not in ended.err and sorted(tmp_path.iterdir()) == [room]
+
+
 def test_a_dry_run_needs_no_terminal_and_asks_for_nothing(run, monkeypatch, capsys):
   """Nothing moves, so nobody must hold the robot."""
   with open(os.devnull) as nowhere, VirtualRobot(stepped=True) as robot:
@@ -61,6 +115,35 @@ def test_a_dry_run_needs_no_terminal_and_asks_for_nothing(run, monkeypatch, caps
     ended = run("check_robot", "--robot", "virtual", "--dry-run", "--seconds", "0.5")
   assert ended.status == 0 and ended.out.strip().endswith("passed"), ended
   assert "HOLD" not in ended.out
+
+
+def test_a_virtual_robot_whose_physics_ends_says_so(run, monkeypatch, tmp_path):
+  advance, link = Body.advance, tmp_path / "op3"
+
+  def fail(self, until):
+    if threading.current_thread().name == "virtual wire":
+      raise FloatingPointError("unstable physics")
+    return advance(self, until)
+
+  monkeypatch.setattr(Body, "advance", fail)
+  options = ("--world", "floor", "--no-camera", "--link", link, "--seconds", "100")
+  ended = run("virtual_robot", *options)
+  assert ended.status == 1, ended
+  (line,) = ended.err.splitlines()
+  assert line.startswith("error: The virtual robot ended (FloatingPointError: unstable physics)")
+  assert not link.is_symlink()
+
+
+@pytest.mark.parametrize(("asked", "says"), [(8080, True), (8081, False), (0, False)])
+def test_a_page_on_another_port_than_was_asked_for_is_told(run, monkeypatch, asked, says):
+  server = SimpleNamespace(get_port=lambda: 8081, stop=lambda: None)
+  monkeypatch.setattr("nerf2real.scenes.viewing.bundle_viewer.view_bundle", lambda *_, **__: server)
+  event = SimpleNamespace(wait=lambda: None)
+  monkeypatch.setattr("nerf2real.launch.view.threading", SimpleNamespace(Event=lambda: event))
+  ended = run("view", "--port", asked)
+  assert ended.status == 0 and "open http://127.0.0.1:8081 " in ended.out
+  told = "port 8080 is taken by another program: the page is on port 8081\n"
+  assert ended.err == (told if says else "")
 
 
 class _Opened:

@@ -34,7 +34,8 @@ def close_loop(settings: LoopSettings) -> Closed:
   claim(settings)
   out, seconds = settings.out, settings.seconds
   if settings.robot == recording.VIRTUAL:
-    with machines.virtual_robot(settings.seed, altered) as (connection, virtual):
+    noise = machines.noise_beside(settings.reference)
+    with machines.virtual_robot(settings.seed, altered, noise=noise) as (connection, virtual):
       _record(out, connection, virtual, seconds)
   else:
     _record(out, Connection(port=settings.robot, offsets=settings.offsets), None, seconds)

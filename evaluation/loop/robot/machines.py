@@ -2,10 +2,13 @@
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from nerf2real.core import files
+from nerf2real.evaluation.loop.robot.motions import TRAIN
 from nerf2real.real.loading import Connection
 from nerf2real.real.virtual import undeclared
 from nerf2real.real.virtual.robot import VirtualRobot
@@ -23,6 +26,19 @@ def hidden_effects(texts: Sequence[str], seed: int) -> tuple[Undeclared, ...]:
   """
   drawn = [effect for text in texts if text == DRAWN for effect in undeclared.draw(seed)]
   return (*drawn, *undeclared.parse_all(text for text in texts if text != DRAWN))
+
+
+def noise_beside(reference: Path | None) -> int:
+  """Returns the noise of a recording beside a reference's, for `virtual_robot`; 0 without one.
+
+  The number is of the reference's first log, so that the same command records the same again, and
+  not the number that the reference was recorded with: beside a robot that repeats its noise to the
+  bit, nothing but what is hidden would differ.
+
+  Args:
+    reference: Folder of its logs.
+  """
+  return 0 if reference is None else int(files.hash_path(reference / f"{TRAIN[0]}.mcap")[:8], 16)
 
 
 @contextlib.contextmanager

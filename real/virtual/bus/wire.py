@@ -38,6 +38,7 @@ class Wire:
     """Path of the serial port."""
     self._line = Line(devices, clock)
     self._stop = threading.Event()
+    self.error: Exception | None = None  # what ended the answering, if anything did
     self._thread: threading.Thread | None = None
     if isinstance(clock, SteppedClock):
       os.set_blocking(self._master, False)
@@ -58,6 +59,12 @@ class Wire:
         os.close(end)
 
   def _run(self) -> None:
+    try:
+      self._answer_until_stopped()
+    except Exception as error:  # whatever physics or port raise: the robot's user is told of it
+      self.error = error
+
+  def _answer_until_stopped(self) -> None:
     clock = self._clock
     prefer_this_thread()  # servos do not wait for the host's programs
     while not self._stop.is_set():

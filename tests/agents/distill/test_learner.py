@@ -87,6 +87,18 @@ def test_a_policy_stage_that_ends_before_it_settled_gives_its_student(kind, stop
   assert learner._counters.begun == (12 if given else None)
 
 
+def test_frames_that_were_labelled_anew_leave_the_student_its_beginning():
+  """--relabel fills the data set before the run's own student is there: its share begins then."""
+  learner = object.__new__(Learner)
+  learner._settings, learner._counters = settings.preset("nerf_nav"), checkpoint.Counters()
+  learner._data, learner._publish = SimpleNamespace(frames=150_000), lambda: None
+  learner._begin_serving()
+  begun, mixture = learner._counters.begun, learner._settings.mixture
+  assert schedule.mixture_at(mixture, 150_000, begun=begun).teacher == mixture.first_share == 1.0
+  half = schedule.mixture_at(mixture, 150_000 + mixture.anneal_frames // 2, begun=begun).teacher
+  assert half == pytest.approx((mixture.first_share + mixture.last_share) / 2)
+
+
 def test_a_student_is_kept_once_a_period(tmp_path, monkeypatch):
   learner, written = object.__new__(Learner), []
   learner._settings = dataclasses.replace(TINY, keep_minutes=2.0)

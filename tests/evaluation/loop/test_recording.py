@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from nerf2real.evaluation.loop import naming
+from nerf2real.evaluation.loop.joint_space import closing
 from nerf2real.evaluation.loop.robot import machines, motions, recording
+from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.real.virtual import undeclared
 
 
@@ -23,6 +25,32 @@ def test_a_slope_is_named_from_turning_on_it_and_none_where_there_is_none(tmp_pa
   low, high = found.intervals["y"]
   assert low <= slope <= high and high - low < 0.06
   assert np.abs(found.parameters["x"]) < 0.02
+
+
+def test_a_recording_beside_a_reference_has_a_noise_of_its_own(tmp_path, monkeypatch):
+  """The joint-position loop had recorded the robot with what is hidden, to the bit, else."""
+  reference = tmp_path / "reference"
+  reference.mkdir()
+  (reference / f"{motions.TRAIN[0]}.mcap").write_bytes(b"a log")
+  assert machines.noise_beside(None) == 0
+  noise = machines.noise_beside(reference)
+  assert noise not in (0, 1) and machines.noise_beside(reference) == noise
+  (reference / f"{motions.TRAIN[0]}.mcap").write_bytes(b"another")
+  assert machines.noise_beside(reference) != noise
+
+  class Recorded(Exception):
+    pass
+
+  def virtual_robot(seed, altered, *, noise=0):
+    raise Recorded(noise)
+
+  monkeypatch.setattr(machines, "virtual_robot", virtual_robot)
+  for name in motions.TRAIN[1:]:
+    (reference / f"{name}.mcap").touch()
+  for given, expected in ((None, 0), (reference, machines.noise_beside(reference))):
+    settings = LoopSettings(out=tmp_path / str(expected), reference=given)
+    with pytest.raises(Recorded, match=str(expected)):
+      closing.close_loop(settings)
 
 
 def test_another_recording_of_the_same_robot_differs_and_the_same_one_repeats():

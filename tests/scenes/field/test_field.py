@@ -69,6 +69,18 @@ def test_file_of_another_kind_is_refused(tmp_path):
     Field.load(tmp_path / "a.safetensors")
 
 
+@pytest.mark.parametrize("share", [0.0, 0.0001, 0.6, 0.999])
+def test_a_file_that_was_cut_off_is_one_line(tmp_path, share):
+  path = tmp_path / "field.safetensors"
+  Field(SETTINGS, init_params(jax.random.PRNGKey(0), SETTINGS), 0.002).save(path)
+  whole = path.read_bytes()
+  path.write_bytes(whole[: int(share * len(whole))])
+  with pytest.raises(ValueError, match=r"field\.safetensors is damaged: found .* bytes") as caught:
+    Field.load(path)
+  assert "expected a radiance field" in str(caught.value)
+  assert "make the bundle again" in str(caught.value) and "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("rule", ["additive", "paper"])
 def test_files_with_the_former_footprint_rule(tmp_path, monkeypatch, rule):
   path = tmp_path / "field.safetensors"
