@@ -70,6 +70,8 @@ def assemble(
     warnings.append(judged.unfit)
   floor = map_server.read(out / "free_space.yaml")
   figures["free_area_apart_m2"] = floor.area_apart
+  if floor.passage_lacks is not None:
+    figures["passage_lacks_m"] = floor.passage_lacks
   if not floor.reachable.any():
     warnings.append(f"{floor.why_full} The scene can be looked at and exported, not trained in.")
   goals = results.contact.value.floor.goals

@@ -7,7 +7,7 @@ metres is the scale. Shapes: K detections of one marker.
 
 import collections
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -17,13 +17,15 @@ from scipy import optimize
 from nerf2real.core import cameras, least_squares
 from nerf2real.core.progress import Progress, no_progress
 
-# Groups are tried in this order until one is read; the time grows with the number of codes:
-# 30, 55 and 105 ms a picture of 640x480. The large sets contain the small ones.
+# Groups are tried in this order until one is read: the large sets contain the small ones. The time
+# grows with the picture's size and with the number of codes.
 DICTIONARIES = (
   ("4X4_50", "5X5_50", "6X6_50", "7X7_50"),
   ("APRILTAG_36h11", "APRILTAG_25h9", "APRILTAG_16h5", "ARUCO_MIP_36h12"),
   ("ARUCO_ORIGINAL", "4X4_1000", "5X5_250", "6X6_250", "7X7_250"),
 )
+_LOOKS = 60  # pictures in which all codes are tried; of a film's usual 150 no three in a row
+# are without one
 _MIN_VIEWS = 3  # a code read in fewer pictures is taken for an accident
 _MIN_PARALLAX_DEG = 3.0  # between rays to the marker; less leaves its distance open
 _MAX_ERROR_PX = 3.0  # of a detection against the fitted square
@@ -85,22 +87,25 @@ def detect(
 ) -> list[Detection]:
   """Finds markers in pictures (paths, or uint8 arrays [H, W] or [H, W, 3]).
 
-  Groups of dictionaries are tried in turn; the search ends with the first group of which one code
-  is read in at least three pictures. Returns what that group, or else all of them, found.
+  Which dictionaries there are is looked up in at most `_LOOKS` pictures, spread evenly. Those that
+  were read there are then searched for in all pictures, a group at a time; the search ends with the
+  first group of which one code is read in at least three pictures. Returns what that group, or else
+  all of them, found.
   """
+  looks = np.linspace(0, len(images) - 1, min(len(images), _LOOKS)).round().astype(int)
+  everywhere = [name for group in dictionaries for name in group]
+
+  def part_of(begin: float, end: float) -> Callable[[float], None]:
+    return lambda done: progress(begin + done * (end - begin), "looking for markers")
+
+  first = _search(images, looks, everywhere, part_of(0.0, 0.5))
+  there = {d.dictionary for d in first}
+  groups = [[name for name in group if name in there] for group in dictionaries]
+  groups = [names for names in groups if names]
+  ends = np.linspace(0.5, 1.0, len(groups) + 1)
   everything: list[Detection] = []
-  for number, names in enumerate(dictionaries):
-    detector = _detector(names)
-    found = []
-    for view, image in enumerate(images):
-      corners, ids, _, which = detector.detectMarkersMultiDict(_read(image))
-      if ids is not None:
-        for quad, marker, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
-          quad = np.asarray(quad, np.float64).reshape(4, 2) + cameras.PIXEL_CENTRE
-          if np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=-1).min() >= _MIN_SIDE_PX:
-            found.append(Detection(names[int(index)], int(marker), view, quad))
-      done = (number + (view + 1) / len(images)) / len(dictionaries)
-      progress(done, f"looking for markers {names[0]}, ...")
+  for names, begin, end in zip(groups, ends[:-1], ends[1:], strict=True):
+    found = _search(images, np.arange(len(images)), names, part_of(begin, end))
     everything += found
     views = collections.defaultdict(set)
     for d in found:
@@ -108,6 +113,26 @@ def detect(
     if any(len(seen) >= _MIN_VIEWS for seen in views.values()):
       return found
   return everything
+
+
+def _search(
+  images: Sequence[pathlib.Path | np.ndarray],
+  views: np.ndarray,
+  names: Sequence[str],
+  say: Callable[[float], None],
+) -> list[Detection]:
+  """Finds the markers of dictionaries in some of the pictures."""
+  found: list[Detection] = []
+  detector = _detector(names)
+  for count, view in enumerate(views.tolist()):
+    corners, ids, _, which = detector.detectMarkersMultiDict(_read(images[view]))
+    if ids is not None:
+      for quad, marker, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
+        quad = np.asarray(quad, np.float64).reshape(4, 2) + cameras.PIXEL_CENTRE
+        if np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=-1).min() >= _MIN_SIDE_PX:
+          found.append(Detection(names[int(index)], int(marker), view, quad))
+    say((count + 1) / len(views))
+  return found
 
 
 def triangulate(rays: np.ndarray, origins: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ Shapes: H rows along y, W columns along x (row 0 is the smallest y in memory); X
 """
 
 import abc
+import bisect
 import dataclasses
 import functools
 
@@ -143,6 +144,29 @@ class FreeSpaceMap(FreeSpace):
   def area_apart(self) -> float:
     """Area where the robot fits, too, but that it cannot reach from there [m^2]."""
     return float(self._roomy.sum() * self.resolution**2) - self.area
+
+  @property
+  def passage_lacks(self) -> float | None:
+    """Width that the widest way to the largest piece apart lacks for the robot [m].
+
+    None where there is no piece apart, or no way to it at all.
+    """
+    labels, count = ndimage.label(self._roomy)
+    if count < 2:
+      return None
+    first, second = np.argsort(np.bincount(labels.ravel())[1:])[::-1][:2] + 1
+    here, there = (tuple(np.argwhere(labels == piece)[0]) for piece in (first, second))
+    widths = np.unique(self.clearance[(self.clearance > 0) & (self.clearance < self.radius)])
+
+    def joined(width: float) -> bool:
+      found, _ = ndimage.label(self.clearance >= width)
+      return bool(found[here] == found[there])
+
+    if not len(widths) or not joined(widths[0]):
+      return None
+    # The widest at which both are one: joined at all smaller ones.
+    last = bisect.bisect_left(widths, True, key=lambda width: not joined(width)) - 1
+    return float(2 * (self.radius - widths[last]))
 
   def cell_of(self, points: np.ndarray) -> np.ndarray:
     """Row and column [..., 2] of world points [..., >= 2]; may lie outside the map."""

@@ -131,6 +131,9 @@ FIGURES: Mapping[str, Meaning] = {
   "free_area_apart_m2": Meaning(
     "m^2", "floor where it fits, too, behind passages that are too narrow for it", "near 0"
   ),
+  "passage_lacks_m": Meaning(
+    "m", "width that the widest way to the largest such piece lacks for the robot"
+  ),
   "baseline_psnr_db": Meaning("dB", "PSNR of the COLMAP Poisson mesh on the same held-out views"),
 }
 

@@ -78,6 +78,26 @@ def test_wrong_poses_and_misread_codes_are_dropped(scene):
   assert scale.metres_per_unit == pytest.approx(1 / UNIT, rel=0.005)
 
 
+def test_without_a_marker_a_bounded_number_of_pictures_is_searched(monkeypatch):
+  """All codes in every picture had taken minutes where no marker is in sight."""
+  reads, read = [], markers._read
+  monkeypatch.setattr(markers, "_read", lambda image: reads.append(1) or read(image))
+  blank = np.full((90, 160), 128, np.uint8)
+  for count, looks in ((5, 5), (150, 60), (1000, 60)):
+    reads.clear()
+    assert markers.detect([blank] * count) == [] and len(reads) == looks
+
+
+@pytest.mark.parametrize("first", [0, 70, 101, 147])
+def test_a_marker_in_three_pictures_in_a_row_is_found(scene, first):
+  _, pictures = scene
+  shown = [np.full((90, 160), 128, np.uint8)] * 150
+  shown[first : first + 3] = pictures[:3]
+  found = markers.detect(shown)
+  assert {(d.dictionary, d.marker) for d in found} == {("APRILTAG_36h11", 7)}
+  assert [d.view for d in found] == [first, first + 1, first + 2]
+
+
 def test_nothing_found_is_none_and_mistakes_are_named(scene):
   poses, pictures = scene
   found = markers.detect(pictures[:2])

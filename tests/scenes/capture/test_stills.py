@@ -22,6 +22,7 @@ from nerf2real.scenes.poses.unit_frame import mean_up
 from tests.scenes import synthetic_capture as synthetic
 
 HEIC = Path(__file__).with_name("wide.heic")  # 64x48, a lens of 26 mm, redder to the right
+UPRIGHT = HEIC.with_name("upright.heic")  # the phone turned: 64x48 with EXIF's 6, blue at its right
 
 
 def _still(path, size, *, focal=None, orientation=None, seed=0):
@@ -136,6 +137,14 @@ def test_apples_pictures_are_read(tmp_path):
   (tmp_path / "IMG_0002.HEIC").write_bytes(b"ftypheic")
   with pytest.raises(CaptureError, match=r"IMG_0002\.HEIC cannot be read as a picture"):
     stills.of_one_camera(sorted(tmp_path.iterdir()))
+
+
+def test_an_apple_picture_of_a_turned_phone_is_upright():
+  assert stills.look_of(UPRIGHT) == (48, 64, 26.0)
+  image = stills.read_still(UPRIGHT)
+  assert image.shape == (64, 48, 3)
+  assert image[30, 40, 0] > 150 > 60 > image[30, 8, 0]  # BGR: the file's upper half is at the right
+  assert image[60, 24, 2] > 200 > 60 > image[4, 24, 2]  # and its right half below
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,15 @@ def test_floor_behind_a_narrow_passage_is_apart():
   ground = floor_plan.floor_plan(walls, lower=[-2.0, -1.0, 0.0], upper=[1.0, 1.0, 1.0])
   assert ground.area_apart == pytest.approx((0.9 - 0.36) * (2 - 0.36), rel=0.2)  # into the gap, too
   assert ground.area == pytest.approx((1.9 - 0.36) * (2 - 0.36), rel=0.2)  # into the gap, too
+  assert ground.passage_lacks == pytest.approx(2 * 0.18 - 0.3, abs=0.021)  # to a cell a side
   wide = dataclasses.replace(ground, radius=0.1)
+  assert wide.passage_lacks is None
+  closed = floor_plan.floor_plan(
+    [*walls, box([0.0, 0.0, 0.5], [0.1, 0.2, 0.5])],
+    lower=[-2.0, -1.0, 0.0],
+    upper=[1.0, 1.0, 1.0],
+  )
+  assert closed.area_apart > 0 and closed.passage_lacks is None
   assert wide.area_apart == 0 and wide.area > ground.area + ground.area_apart
 
 
