@@ -56,7 +56,7 @@ def library(plant: JointPlant) -> list[Term]:
       joint,
       ("breakaway", "velocity"),
       (0.0, 0.002 * speed),
-      (0.5 * torque, 0.5 * speed),
+      (strongest(plant), 0.5 * speed),  # a larger one would hold the joint throughout
       (0.05 * torque, 0.03 * speed),
       ((0.05 * torque, 0.02 * speed), (0.05 * torque, 0.15 * speed)),
     ),

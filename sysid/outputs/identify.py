@@ -129,7 +129,7 @@ def _identify(
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else _effects_first(found.effects),
     "in_reference": found.in_reference,
-    "alternatives": [*found.scopes, *alternatives(found)],
+    "alternatives": [*found.scopes, *found.twins, *alternatives(found)],
     "residual_at": residual_at(found),
     "error": {
       "train": errors(found, logs, near, settings),

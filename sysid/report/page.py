@@ -112,7 +112,7 @@ def _place(effect: dict[str, Any]) -> str:
 def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
   rows, bounds = _parameters(content["effects"])
   notes = [
-    f"As good an explanation of {a['joint']}: {a['kind']}."
+    f"As good an explanation of {a['joint'] or 'all joints'}: {a['kind']}."
     for a in content["alternatives"]
     if a.get("confounded")
   ]

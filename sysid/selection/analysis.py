@@ -172,6 +172,7 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   result.effects.append(row)
   if shared.or_alone is not None:
     result.scopes.append(claims.alone(shared.term, shared.origin.joint, *shared.or_alone))
+  result.twins += [claims.alike(term, x) for term, x in shared.alike]
 
 
 def machine_verdict(verdicts: Sequence[str], *, claimed: bool) -> str:

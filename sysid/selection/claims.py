@@ -80,14 +80,30 @@ def alone(term: Term, joint: str, behind: float, x: Array) -> dict[str, Any]:
     behind: standard errors by which that is less likely.
     x: its values there [n].
   """
+  evidence = {"behind_by_standard_errors": round(behind, 2)}
+  return _alternative(term, x) | {"joint": joint, "evidence": evidence}
+
+
+def alike(term: Term, x: Array) -> dict[str, Any]:
+  """Returns the entry of an alternative: an effect of several joints that predicts the same as a
+  claimed one.
+
+  Args:
+    term: the effect.
+    x: its values [n].
+  """
+  return _alternative(term, x) | {"confounded": True}
+
+
+def _alternative(term: Term, x: Array) -> dict[str, Any]:
   values = {n: round(float(v), 5) for n, v in zip(term.names, x, strict=True)}
   return {
     "kinds": [term.kind],
     "kind": term.kind,
-    "joint": joint,
+    "joint": None,
     "confounded": False,
     "parameters": {term.kind: values},
-    "evidence": {"behind_by_standard_errors": round(behind, 2)},
+    "evidence": {},
   }
 
 

@@ -63,6 +63,8 @@ class Identified:
 
   scopes: list[dict[str, Any]] = dataclasses.field(default_factory=list)
   """Entries of alternatives: an effect of several joints at one of them alone."""
+  twins: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+  """Entries of alternatives: effects of several joints that predict the same as a claimed one."""
 
   @property
   def near(self) -> list[Member]:

@@ -51,6 +51,8 @@ class Shared:
   or_alone: tuple[float, Array] | None = None
   """Where the same at `origin` alone, whose own it may be, is not clearly worse: standard errors
   that it is behind, and its values there [n]."""
+  alike: tuple[tuple[Term, Array], ...] = ()
+  """Other effects of wider scope that predict the same motion, and their values [n]."""
 
   @property
   def held(self) -> Term:
@@ -194,7 +196,8 @@ def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool)
     return None
   origin = best.members[most]
   or_alone = (behind, single[most][1]) if behind < beyond else None
-  return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total, or_alone)
+  twins = tuple((w.term, w.x) for w in alike if w is not best)
+  return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total, or_alone, twins)
 
 
 def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency: bool) -> bool:

@@ -84,6 +84,25 @@ def test_effects_change_how_the_suite_moves(tmp_path):
   assert 1e-4 < np.abs(changed - nominal)[:, knee].max() < 0.2
 
 
+def test_strength_holds_the_gain_of_the_servos_law_once(tmp_path):
+  """Constants hold the law's gain; a weak motor is named beside them."""
+  by_duty = {"kind": "motor_gain", "evidence": {"servo_law": True}}
+  by_duty |= {"parameters": {"gain": {"value": 0.9}}}
+  weak = {"kind": "motor_gain", "joint": "r_knee", "evidence": {}}
+  weak |= {"parameters": {"gain": {"value": 0.5}}}
+  rows = [{**by_duty, "joint": joint} for joint in ("l_knee", "r_knee")]
+  held = {joint: {"gain": 1.0} for joint in constants.JOINT_NAMES}
+  held |= {joint: {"gain": 0.9 * 1.2} for joint in ("l_knee", "r_knee")}
+  (tmp_path / "details.json").write_text(json.dumps({"calibration": held}))
+  for effects in ([*rows, weak], [weak, *rows]):
+    table = gap.hidden_table(1, {"effects": effects}, tmp_path / "details.json")
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    found = {row[0]: row[4] for row in cells if row and row[0] in constants.JOINT_NAMES}
+    assert found["l_knee"] == "1.08"
+    assert found["r_knee"] == "0.54"
+    assert found["head_pan"] == "1.00"
+
+
 def test_an_unreachable_robot_is_one_line(monkeypatch, capsys, tmp_path):
   monkeypatch.setattr(
     sys, "argv", ["close_loop.py", "--robot", str(tmp_path / "tty"), "--out", str(tmp_path / "o")]

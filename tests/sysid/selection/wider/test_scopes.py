@@ -1,5 +1,6 @@
 """Effects of a body and of the machine: evidence summed over joints."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import mujoco
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.joints import subject
@@ -117,6 +119,24 @@ def test_explanations_beside_a_further_effect_must_be_better(square, stands):
     return SimpleNamespace(joint="elbow", subject=subject, found=SimpleNamespace(best=best))
 
   assert scopes.better([explained(square)], [explained(1.0)]) == stands
+
+
+def test_what_predicts_the_same_as_a_shared_effect_is_said_beside_it():
+  term = Term("command_delay", None, ("delay",), (0.0,), (0.1,), (0.01,), ((0.0,),))
+  twin = dataclasses.replace(term, kind="measurement_delay")
+  joints = tuple(SimpleNamespace(joint=name) for name in ("shoulder", "elbow"))
+  near = np.array([0.001])
+  shared = scopes.Shared(
+    *(term, np.array([0.0153]), (near, near), joints[1], joints, 4.2, 150.0),
+    alike=((twin, np.array([0.0154])),),
+  )
+  found = SimpleNamespace(objects=[], effects=[], scopes=[], twins=[])
+  analysis._write_shared(found, shared, own_latency=False)
+  assert [(e["kind"], e["joint"]) for e in found.effects] == [("command_delay", None)]
+  (other,) = found.twins
+  assert (other["kind"], other["joint"], other["confounded"]) == ("measurement_delay", None, True)
+  assert other["parameters"] == {"measurement_delay": {"delay": 0.0154}}
+  assert found.scopes == []
 
 
 def test_two_healthy_joints_have_nothing(model):
