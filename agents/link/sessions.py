@@ -8,6 +8,8 @@ import dataclasses
 import ipaddress
 import json
 import logging
+import re
+import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ _WAIT_BEFORE_CLOSE_MICROSECONDS = 120_000_000
 _SHARED_MEMORY_BYTES = 64 << 20  # pool of a process; 16 MiB holds too few trajectories
 _OPEN_TIMEOUT_MS = 3000
 _ATTEMPT_MS = 1500  # of one attempt to join; `connect` tries again until its own timeout
+_TCP = ("tcp", "tls", "ws", "wss")  # kinds of endpoints that a port of TCP stands behind
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
@@ -75,10 +78,25 @@ def listen(endpoint: str, settings: LinkSettings) -> zenoh.Session:
 def check_listening(endpoint: str, settings: LinkSettings) -> None:
   """Checks that `listen` can be called: what takes minutes to prepare must not end in a taken port.
 
+  The port is bound and left at once, without a session: no actor may join what is gone again.
+
   Raises:
     LinkError: as `listen`.
   """
-  close(listen(endpoint, settings))
+  _router_config(endpoint, settings, learner_joins=False)
+  kind, _, place = re.split("[?#]", endpoint, maxsplit=1)[0].partition("/")
+  host, _, port = place.rpartition(":")
+  if kind not in _TCP or not port.isdecimal():
+    return
+  try:
+    family, _, _, _, address = socket.getaddrinfo(
+      host.strip("[]"), int(port), type=socket.SOCK_STREAM
+    )[0]
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+      probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as zenoh: not for ended links
+      probe.bind(address)
+  except OSError as error:
+    raise LinkError(f"Cannot listen on {endpoint}: {error.strerror}.") from error
 
 
 def route(endpoint: str, settings: LinkSettings) -> zenoh.Session:
@@ -95,6 +113,14 @@ def route(endpoint: str, settings: LinkSettings) -> zenoh.Session:
 
 
 def _open_router(endpoint: str, settings: LinkSettings, *, learner_joins: bool) -> zenoh.Session:
+  config = _router_config(endpoint, settings, learner_joins=learner_joins)
+  try:
+    return zenoh.open(config)
+  except zenoh.ZError as error:
+    raise LinkError(f"Cannot listen on {endpoint}: {_first_line(error)}") from error
+
+
+def _router_config(endpoint: str, settings: LinkSettings, *, learner_joins: bool) -> zenoh.Config:
   security = settings.security
   if not is_loopback(endpoint) and security.users is None and not security.allow_anonymous:
     raise LinkError(
@@ -118,10 +144,7 @@ def _open_router(endpoint: str, settings: LinkSettings, *, learner_joins: bool) 
       raise LinkError(f"{endpoint} needs a certificate and its key (--tls-certificate, --tls-key).")
     _insert(config, "transport/link/tls/listen_certificate", str(security.tls_certificate))
     _insert(config, "transport/link/tls/listen_private_key", str(security.tls_key))
-  try:
-    return zenoh.open(config)
-  except zenoh.ZError as error:
-    raise LinkError(f"Cannot listen on {endpoint}: {_first_line(error)}") from error
+  return config
 
 
 def connect(endpoint: str, settings: LinkSettings, *, timeout: float) -> zenoh.Session:
