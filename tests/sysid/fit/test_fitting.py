@@ -49,6 +49,15 @@ def test_what_every_machine_has_widens_the_values_of_some_effects() -> None:
   assert of_joint.dry == of_joint.friction == pytest.approx(0.03)
 
 
+def test_friction_at_rest_is_looked_for_up_to_what_the_actuator_does() -> None:
+  """One that is beyond half of a typical torque moves all the same, at the largest."""
+  _, joint = joint_of(("sweep",))
+  (term,) = [t for t in candidates.library(joint.plant) if t.kind == "stribeck_friction"]
+  most = dict(zip(term.names, term.high, strict=True))["breakaway"]
+  assert most == joint.plant.declared_torque().max()
+  assert most > 0.5 * candidates.typical_torque(joint.plant)
+
+
 def _intervals(explainer: Explainer, item: Scored, kind: str) -> dict:
   term = next(t for t in item.terms if t.kind == kind)
   return intervals.intervals(explainer.joint, item.fit, term, own_latency=True)
