@@ -198,7 +198,8 @@ def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]
   """Raises KeyboardInterrupt at Ctrl-C and SIGTERM, and appends the signal to `received`.
 
   Where it comes during an import, it is raised until it is heeded: libraries that import others on
-  trial (trimesh for one) take every exception there for a missing library, and go on.
+  trial (trimesh for one) take every exception there for a missing library, and go on. Where
+  it comes in a destructor, whose exceptions Python drops, it is raised again after it.
   """
 
   def interrupt(number: int, frame: FrameType | None) -> None:
@@ -211,6 +212,14 @@ def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]
     if not isinstance(sys.exc_info()[1], KeyboardInterrupt):  # else it is being handled
       raise KeyboardInterrupt
 
+  def dropped(unraisable: Any) -> None:
+    if isinstance(unraisable.exc_value, KeyboardInterrupt):
+      period = signal.getitimer(signal.ITIMER_REAL)[1]  # that of an import, or none
+      signal.setitimer(signal.ITIMER_REAL, _IMPORT_PERIOD, period)
+    else:
+      hook(unraisable)
+
+  hook, sys.unraisablehook = sys.unraisablehook, dropped
   numbers = [signal.SIGTERM]
   if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell may have it ignored
     numbers.append(signal.SIGINT)
@@ -220,6 +229,7 @@ def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]
     yield
   finally:
     signal.setitimer(signal.ITIMER_REAL, 0.0)
+    sys.unraisablehook = hook
     for number, handler in before.items():
       signal.signal(number, handler)
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import av
 import pytest
 
+from nerf2real.launch import command
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -55,6 +57,22 @@ def test_an_interrupted_rollout_leaves_a_video_that_plays(tmp_path):
   with av.open(str(video)) as container:
     assert sum(1 for _ in container.decode(video=0)) >= 1
   assert [path.name for path in tmp_path.iterdir()] == ["out.mp4"]
+
+
+def test_a_signal_that_comes_in_a_destructor_is_not_lost():
+  """Python drops what a destructor raises."""
+
+  class Signals:
+    def __del__(self):
+      signal.raise_signal(signal.SIGTERM)
+
+  received: list[signal.Signals] = []
+  with pytest.raises(KeyboardInterrupt), command._terminated_as_interrupted(received):
+    thing = Signals()
+    del thing
+    assert received == [signal.SIGTERM]
+    time.sleep(10.0)
+  assert received == [signal.SIGTERM]
 
 
 @pytest.mark.slow
