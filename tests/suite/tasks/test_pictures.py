@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
+from nerf2real.suite.effects import Effect
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL
 from nerf2real.suite.sensors.camera import CameraSettings, world_from_camera
@@ -61,6 +62,23 @@ def test_picture_is_late_by_the_camera_latency(room):
   for step in range(3, 9):  # 50 ms are two control steps
     np.testing.assert_array_equal(poses[0.05][step], poses[0.0][step - 2])
   assert not np.array_equal(poses[0.0][8], poses[0.0][6])
+
+
+def test_an_undeclared_lens_is_the_cameras_own_and_magnifies_nothing(room, nav):
+  effects = [Effect("camera_focal", None, {"scale": 1.5})]
+  environment = suite.load(
+    "nerf_nav",
+    scene=room,
+    renderer=FlatRenderer(),
+    random=0,
+    randomisation=NOMINAL,
+    camera=CameraSettings(latency=0.0),
+    effects=effects,
+  )
+  seen = environment.reset().observation["camera"]
+  camera = environment.task.robot_camera
+  assert camera.camera.fx == pytest.approx(1.5 * nav.task.robot_camera.camera.fx)
+  np.testing.assert_array_equal(seen, camera.render(environment.physics.data.ptr))
 
 
 @pytest.mark.parametrize("rate", [10.0, 15.0, 30.0, 40.0])
