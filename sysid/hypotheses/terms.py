@@ -244,6 +244,8 @@ def _backlash(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
 
 def _late(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
   p[I["measurement_delay"]] += v["delay"]
+  if v.get("of_all", 0.0) > 0:
+    p[I["surroundings_delay"]] += v["delay"]
 
 
 def _sticking(plant: JointPlant, p: Array, v: dict[str, float]) -> None:

@@ -55,6 +55,8 @@ NAMES = (
   *("sag_scales_limit", "sag_tells"),
   # torque at a duty over the declared: nothing here needs it, what is told of the duty does
   "strength",
+  # s by which the other joints' readings, which prescribe the surroundings, are late
+  "surroundings_delay",
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 
@@ -194,6 +196,7 @@ def simulate(
   tooth_stiffness, tooth_damping, friction_on_link = p[40], p[41], p[42]
   follow, follow_speed = p[43], p[44]
   sag_limits, sag_tells = p[45] > 0.5, p[46] > 0.5
+  others_late = p[48]
   learned = weights.size > 0
   samples = sample_time.size
   windows = window_start.size
@@ -256,7 +259,8 @@ def simulate(
       if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + step:
         share = (reach + step - command_time[pointer + 1]) * rate_of_steps
         later = command[pointer + 1]
-      i = min(int(time * stamped + 0.5), last)  # surroundings were measured: stamped time
+      # The surroundings were measured: stamped time, late where all readings are.
+      i = min(int((time + others_late) * stamped + 0.5), last)
       seen_v = motor_speed if half > 0.0 else v
       seen_q = q + encoder + on_motor * gap_offset
       before = torque  # of the last step

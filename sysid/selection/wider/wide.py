@@ -27,6 +27,9 @@ Array = np.ndarray
 
 _LATE = ("command_delay", "measurement_delay")
 """Kinds that are a joint's or the bus's."""
+_OF_ALL = {"measurement_delay": (("of_all", 1.0),)}
+"""What is fixed of a kind where it is the machine's: the motion that the other joints' readings
+prescribe is late, too."""
 _ENOUGH = 20  # steps of a fit, which ends by itself: a bound on time
 
 
@@ -100,7 +103,11 @@ def hypotheses(
   for subject in subjects:
     plant = subject.now.plant
     terms = [plausible(t, plant) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
-    late = [dataclasses.replace(t, target=None) for t in subject.library if t.kind in _LATE]
+    late = [
+      dataclasses.replace(t, target=None, fixed=(*t.fixed, *_OF_ALL.get(t.kind, ())))
+      for t in subject.library
+      if t.kind in _LATE
+    ]
     for term in (*terms, *late):
       known = machine.get((term.kind, term.fixed))
       if known is None or term.scale < known.scale:  # of the joint that bears most
@@ -192,7 +199,9 @@ def alone(item: Wide, at: int) -> tuple[Evidence, Array]:
   """Returns the evidence of the same effect at one of its joints, fitted there alone, and its
   values [n]."""
   member = item.members[at]
-  fitter = Fitter([member.now], Layout([(*member.explainer.null.terms, item.term)]))
+  others = _OF_ALL.get(item.term.kind, ())
+  term = dataclasses.replace(item.term, fixed=tuple(f for f in item.term.fixed if f not in others))
+  fitter = Fitter([member.now], Layout([(*member.explainer.null.terms, term)]))
   fit = fitter.fit(np.concatenate([item.own(at), item.x]), iterations=_ENOUGH)
   return _evidence([member], fitter.leave_out(fit)), fit.x[-len(item.x) :]
 

@@ -192,6 +192,20 @@ def test_joint_among_moving_others_follows_the_whole_model(motion: str) -> None:
     assert np.sqrt(np.mean((got - want) ** 2)) < 3e-4
 
 
+def test_where_all_readings_are_late_the_others_motion_is_prescribed_late_too() -> None:
+  model = mujoco.MjModel.from_xml_string(ARM)
+  late = Effect("measurement_delay", None, {"delay": 0.03})
+  log = log_of(ARM, "sweep", [late], rounding=0.0, duration=5.0)
+  left = []
+  for of_all in (0.0, 1.0):
+    term = Term(
+      "measurement_delay", None, (), (), (), (), ((),), fixed=(("delay", 0.03), ("of_all", of_all))
+    )
+    course = _position(JointModel(model, "shoulder", [log]), [term])
+    left.append(np.sqrt(np.mean((log.states.position[:, 0] - course) ** 2)))
+  assert left[1] < 0.2 * left[0]
+
+
 def test_what_prescribing_the_others_misses_is_known_from_the_declared_machine() -> None:
   model = mujoco.MjModel.from_xml_string(ARM)
   # an elbow as heavy as the upper arm, without a rotor's inertia that would hide the others
