@@ -24,6 +24,10 @@ number."""
 _WIND_UP = 0.004
 """rad; ours: about what a gear of metal gives way under the torque that it works at."""
 
+_DELAYS = tuple(0.004 * 1.35**k for k in range(14))
+"""s, to 0.2: close enough for one to be in the valley of the least error; ours, each a third later,
+where the first are nearest."""
+
 _TEETH = 0.5
 """Share that the stiffness of teeth differs from what is usual; a gap and soft teeth are alike."""
 
@@ -39,9 +43,11 @@ def library(plant: JointPlant) -> list[Term]:
   torque = typical_torque(plant)
   speed = typical_speed(plant)
   terms = [
-    _one("command_delay", joint, "delay", 0.0, 0.25, 0.01, (0.006, 0.03, 0.08, 0.16)),
+    _one("command_delay", joint, "delay", 0.0, 0.25, 0.01, _DELAYS),
     _one("clock_drift", None, "rate", -0.05, 0.05, 0.003, (0.003, -0.003)),
-    _one("coulomb_friction", joint, "torque", 0.0, torque, 0.1 * torque, (0.05 * torque,)),
+    _one(
+      "coulomb_friction", joint, "torque", 0.0, strongest(plant), 0.1 * torque, (0.05 * torque,)
+    ),
     _one(
       "viscous_friction",
       joint,
@@ -72,7 +78,7 @@ def library(plant: JointPlant) -> list[Term]:
       joint,
       ("positive", "negative"),
       (0.0, 0.0),
-      (torque, torque),
+      (strongest(plant), strongest(plant)),
       (0.1 * torque, 0.1 * torque),
       ((0.06 * torque, 0.01 * torque), (0.01 * torque, 0.06 * torque)),
     ),
@@ -123,7 +129,7 @@ def library(plant: JointPlant) -> list[Term]:
   weaker = {"motor_gain", "supply_sag", "thermal_derating"}
   terms = [v for t in terms for v in (_weakenings(plant, t) if t.kind in weaker else [t])]
   if plant.holds:
-    terms.append(_one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, (0.006, 0.03, 0.08)))
+    terms.append(_one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, _DELAYS[:-1]))
     terms.append(_play(plant, encoder_on_motor=True))
   if plant.holds or plant.hinge:  # a slide without a servo has no place that its zero could show
     terms.append(_one("encoder_offset", joint, "offset", -0.4, 0.4, 0.03, (0.03, -0.03)))

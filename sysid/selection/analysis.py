@@ -102,6 +102,7 @@ def _explained(
     fresh = scopes.open_scopes(changed) - certain - refuted
     if not needless and not fresh:
       shared, changed = _reopened(model, shared, changed, settings, refuted)
+      shared = scopes.with_twins(shared, changed)
       changes.elaborate(changed)
       return shared, changed
     refuted |= {s.term.kind for s in needless}

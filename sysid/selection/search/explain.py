@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import rough
 from nerf2real.sysid.fit.layout import CONSTANTS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
@@ -22,9 +23,9 @@ _SETTLED = 0.5  # nats that a fit under a new scale gains at which both have set
 def _best_of_kinds(
   tried: Sequence[tuple[Fitter, tuple[Term, ...], Fit]],
 ) -> list[tuple[Fitter, tuple[Term, ...], Fit]]:
-  """Returns the best form of every set of kinds, the best first."""
+  """Returns the best form of every set of kinds by what its next step promises, the best first."""
   chosen: dict[frozenset[str], tuple[Fitter, tuple[Term, ...], Fit]] = {}
-  for item in sorted(tried, key=lambda t: t[2].cost):
+  for item in sorted(tried, key=lambda t: t[2].cost - t[0].promised(t[2])):
     chosen.setdefault(kinds_of(item[1]), item)
   return list(chosen.values())
 
@@ -50,6 +51,24 @@ def _handed_over(parent: Scored, term: Term) -> list[Array]:
   x[-1] = np.clip(x[at] - parent.fit.layout.centre[at], term.low[0], term.high[0])
   x[at] -= x[-1]
   return [x]
+
+
+def _scaled(parent: Scored, term: Term) -> list[Array]:
+  """Returns where a parent's fit is with all torques of its effects larger by each start of a gain:
+  that makes about the same motion, and single steps do not lead from one to the other."""
+  if term.kind != "motor_gain":
+    return []
+  torques = np.array(
+    [
+      t.kind != CONSTANTS and kind_of(t.kind).parameter(n).unit.startswith("N m")
+      for t in parent.terms
+      for n in t.names
+    ]
+  )
+  if not torques.any():
+    return []
+  factors = np.array([s[0] for s in term.starts])[:, None]
+  return list(np.hstack([parent.fit.x * np.where(torques, factors, 1.0), factors]))
 
 
 class Explainer:
@@ -193,7 +212,7 @@ class Explainer:
         continue
       blank = np.zeros((len(term.names), *known.shape[1:]))
       own = [np.concatenate([x, s]) for s in term.starts]
-      begin = np.array([*own, *_handed_over(parent, term)])
+      begin = np.array([*own, *_handed_over(parent, term), *_scaled(parent, term)])
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 

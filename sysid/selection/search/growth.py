@@ -1,10 +1,12 @@
-"""Grows sets of effects forward until one more is not clear, and scores their rivals."""
+"""Grows sets of effects until one more is not clear, exchanges them, and scores their rivals."""
 
 from collections.abc import Callable
 
 from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size
 from nerf2real.sysid.selection.search.explain import Explainer
-from nerf2real.sysid.selection.search.rivals import beside_force, neutralise
+from nerf2real.sysid.selection.search.rivals import beside_force, lacking, neutralise
+
+_EXCHANGES = 3  # rounds at most in which an effect is exchanged for another
 
 
 def grow(
@@ -40,6 +42,7 @@ def grow(
       break
     best = grown[0]
     parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
+  best = _exchanged(explainer, best)
   for size in {len(item.names) for item in explainer.scored.values()}:
     same = of_size(explainer.scored.values(), size)
     if same:
@@ -47,3 +50,21 @@ def grow(
   if leaves(best):
     beside_force(explainer, best)
   return explainer.ranked()
+
+
+def _exchanged(explainer: Explainer, best: Scored) -> Scored:
+  """Returns a set of as many effects that is better, one of them in another's place, or the same.
+
+  Effects that were added one by one were chosen where the others were missing yet (floating search,
+  Pudil, Novovicova and Kittler 1994).
+  """
+  for _ in range(_EXCHANGES if len(best.names) > 1 else 0):
+    begun = best
+    for kind in sorted(begun.names):
+      grown = explainer.extend(lacking(explainer, begun, kind), explainer.settings.kept)
+      top = max(grown, key=lambda g: g.evidence, default=best)
+      if top.evidence > best.evidence:
+        best = explainer.adopt(top)
+    if best is begun:
+      break
+  return best

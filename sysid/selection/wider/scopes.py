@@ -249,6 +249,21 @@ def better(these: Sequence[Changed], others: Sequence[Changed]) -> bool:
   return Evidence(rows, prior).clear > max(c.subject.beyond for c in others)
 
 
+def with_twins(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
+  """Returns the shared effects with those that predict the same beside what joints have of their
+  own: what is missing yet hides that late commands and late readings do."""
+  result = []
+  for shared in found:
+    if shared.term.kind in wide.LATE and not shared.alike:
+      term = wide.twin(shared.term)
+      other = dataclasses.replace(term.held_at(shared.x), known=True)
+      concerned = [(c.subject, c.found.best) for c in changed if c.subject in shared.members]
+      if all(wide.with_twin(subject, best, shared.held, other) for subject, best in concerned):
+        shared = dataclasses.replace(shared, alike=((term, shared.x),))
+    result.append(shared)
+  return result
+
+
 def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared]:
   """Returns the shared effects without which the joints' explanations do about as well.
 

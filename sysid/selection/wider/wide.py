@@ -25,7 +25,7 @@ from nerf2real.sysid.selection.search.evidence import Scored, clearness
 
 Array = np.ndarray
 
-_LATE = ("command_delay", "measurement_delay")
+LATE = ("command_delay", "measurement_delay")
 """Kinds that are a joint's or the bus's."""
 _OF_ALL = {"measurement_delay": (("of_all", 1.0),)}
 """What is fixed of a kind where it is the machine's: the motion that the other joints' readings
@@ -103,11 +103,9 @@ def hypotheses(
   for subject in subjects:
     plant = subject.now.plant
     terms = [plausible(t, plant) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
-    late = [
-      dataclasses.replace(t, target=None, fixed=(*t.fixed, *_OF_ALL.get(t.kind, ())))
-      for t in subject.library
-      if t.kind in _LATE
-    ]
+    late = [_of_machine(t) for t in subject.library if t.kind in LATE]
+    if len(late) == 1:  # a joint alone that holds no position does not tell these apart
+      late.append(twin(late[0]))
     for term in (*terms, *late):
       known = machine.get((term.kind, term.fixed))
       if known is None or term.scale < known.scale:  # of the joint that bears most
@@ -124,6 +122,18 @@ def hypotheses(
 def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
   """Returns the joints that carry a body, the nearest first."""
   return [model.joint(k).name for k in reversed(carrying(model, body))]
+
+
+def _of_machine(term: Term) -> Term:
+  """Returns a late command or reading of a joint as one of all joints."""
+  return dataclasses.replace(term, target=None, fixed=(*term.fixed, *_OF_ALL.get(term.kind, ())))
+
+
+def twin(term: Term) -> Term:
+  """Returns late readings of a machine for its late commands, and the reverse."""
+  (other,) = (k for k in LATE if k != term.kind)
+  fixed = tuple(f for f in term.fixed if f not in _OF_ALL.get(term.kind, ()))
+  return dataclasses.replace(term, kind=other, fixed=(*fixed, *_OF_ALL.get(other, ())))
 
 
 def screened(term: Term, members: Sequence[Subject]) -> Wide:
@@ -222,6 +232,14 @@ def without(member: Subject, item: Scored, held: Term) -> Scored:
   fitter = Fitter([member.now], Layout([terms]))
   fit = fitter.leave_out(fitter.fit(item.fit.x, iterations=4))
   return Scored(terms, fit, member.now.loglik(fit.held[0]))
+
+
+def with_twin(member: Subject, item: Scored, held: Term, other: Term) -> bool:
+  """Tells whether a joint's hypothesis with another effect of wider scope in the place of one
+  predicts the same motion, but for a part of what remains."""
+  terms = tuple(other if t == held else t for t in item.terms)
+  fit = Fitter([member.now], Layout([terms])).fit(item.fit.x, iterations=4)
+  return _alike(member.now, fit.residuals[0] - item.fit.residuals[0])
 
 
 def same(one: Wide, other: Wide) -> bool:
