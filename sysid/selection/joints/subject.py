@@ -111,9 +111,9 @@ def prepare(
 ) -> Subject:
   """Returns a joint with its constants fitted.
 
-  Its courses are compared with those simulated from the commands alone, unless what these leave
-  of a reference's goes together for longer than a block: then with what is predicted from each
-  reading on.
+  Its courses are compared with those simulated from the commands alone, unless no actuator holds
+  its position, so that errors of torque add up, or what they leave of a reference's goes together
+  for longer than a block: then with what is predicted from each reading on.
 
   Args:
     model: the declared one.
@@ -129,7 +129,8 @@ def prepare(
   library = own_library(now.plant, alone=tried == 1)
   beyond = threshold(len({t.kind for t in library} | set(WHOLE)) * tried, settings)
   found = _subject(now, before, library, beyond, alone=tried == 1)
-  return found if found.paired or before is None or _tells(before) else following(found)
+  apart = not (found.paired or before is None or _tells(before))
+  return following(found) if apart or not now.plant.holds else found
 
 
 def following(subject: Subject) -> Subject:

@@ -17,7 +17,7 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.selection.joints.changes import Changed, leaves
+from nerf2real.sysid.selection.joints.changes import Changed, may_leave
 from nerf2real.sysid.selection.joints.naming import USUAL
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search import rivals
@@ -70,7 +70,7 @@ def shared_effects(
 ) -> list[Shared]:
   """Finds effects of bodies and of the machine, puts them into their joints' hypotheses.
 
-  Looks for them as long as a joint leaves more than the machine does anyway.
+  Looks for them as long as a joint may leave more than the machine does anyway.
 
   Args:
     model: the declared one.
@@ -138,9 +138,10 @@ def _next(
   *,
   only: Collection[str] = (),
 ) -> Shared | None:
-  """Returns the best effect of a body or of the machine, if it is clear, where a joint leaves more
-  than the machine does anyway; joints' scales may have changed after. Only some kinds, if given."""
-  leaving = [s for s in subjects if leaves(s, s.explainer.null, settings)]
+  """Returns the best effect of a body or of the machine, if it is clear, where a joint may leave
+  more than the machine does anyway; joints' scales may have changed after. Only some kinds, if
+  given."""
+  leaving = [s for s in subjects if may_leave(s, s.explainer.null, settings)]
   tried = [
     wide.screened(term, members)
     for term, members in (wide.hypotheses(model, subjects) if leaving else ())
