@@ -269,6 +269,12 @@ class JointLikelihood:
     """Returns mean squares of blocks [..., C, B]."""
     return np.add.reduceat(residuals**2, self.starts, axis=-1) / self.counts
 
+  def alike(self, apart: Array) -> bool:
+    """Tells whether courses that are so far apart [C, N] are the same but for a part of what
+    remains."""
+    mean = np.median(self.squares(apart), axis=1)
+    return bool(np.all(mean < self.settings.alike**2 * self.scale**2))
+
   def loglik(self, squares: Array) -> Array:
     """Returns nats of blocks [..., B], channels added."""
     n = self.independent[:, None] * self.counts

@@ -9,8 +9,9 @@ from nerf2real.sysid.fit.posterior import FINE, Fitter
 
 _SHIFTS = tuple(0.0005 * k for k in (-8, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 8))
 """s by which latencies are shifted to look about."""
-_WORTH = 0.5  # nats that other latencies must be better by, chosen
+_WORTH = 0.5  # nats that other latencies, or values drawn, must be better by, chosen
 _GENERATIONS, _DRAWN, _ELITE = 12, 120, 20  # of values that are drawn where costs are rough, chosen
+_IDLE = 3  # generations in a row without a better one after which no more are drawn, chosen
 _SHAKEN, _LEAST_SHAKEN = 0.3, 0.01  # scales that they spread over, at first and at least, chosen
 _FAR = 3.0  # the same of the values of effects alone, at first
 
@@ -49,11 +50,15 @@ def draw(fitter: Fitter, fit: Fit) -> Fit:
   best, least = fit.x, fit.cost
   for moving, shaken in ((layout.is_effect, _FAR), (np.ones(len(fit.x), bool), _SHAKEN)):
     mean, spread = best.copy(), shaken * layout.scale * moving
+    since = 0  # generations that brought nothing
     for _ in range(_GENERATIONS):
+      if since == _IDLE:
+        break
       tried = random.normal(mean, spread, (_DRAWN, len(mean)))
       tried = np.clip(np.vstack([best, tried]), layout.low, layout.high)
       costs = fitter.costs(tried)
       elite = tried[np.argsort(costs)[:_ELITE]]
+      since = 0 if costs.min() < least - _WORTH else since + 1
       best, least = elite[0], float(costs.min())
       narrow = _LEAST_SHAKEN * layout.scale * moving
       mean, spread = elite.mean(axis=0), np.maximum(elite.std(axis=0), narrow)

@@ -23,7 +23,7 @@ from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.joints.naming import Name
 from nerf2real.sysid.selection.joints.subject import WHOLE, Subject, explain_reference, prepare
 from nerf2real.sysid.selection.search.evidence import clear
-from nerf2real.sysid.selection.wider import scopes, wide
+from nerf2real.sysid.selection.wider import scopes, wide, zeros
 from nerf2real.sysid.selection.wider.scopes import Shared
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -103,6 +103,7 @@ def _explained(
     if not needless and not fresh:
       shared, changed = _reopened(model, shared, changed, settings, refuted)
       shared = scopes.with_twins(shared, changed)
+      changed = zeros.reread(model, changed, settings)
       changes.elaborate(changed)
       return shared, changed
     refuted |= {s.term.kind for s in needless}

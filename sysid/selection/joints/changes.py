@@ -58,7 +58,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   lacking |= clear(found.best, explainer.null) > subject.beyond
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
   if before is not None and usual is not None and not subject.paired:
-    something = [k for k in something if is_new(before, usual, found.best, k)]
+    something = [k for k in something if is_new(subject, found.best, k)]
   named = tuple(k for k in found.named if k in something)
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left

@@ -2,6 +2,7 @@
 beside a force of any form.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,12 +14,15 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.remainder import mean_left
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.search.evidence import Scored, clear, more_likely
 from nerf2real.sysid.selection.search.explain import Explainer
 from nerf2real.sysid.settings import Settings
+
+Array = np.ndarray
 
 _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
@@ -95,20 +99,37 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   )
 
 
-def is_new(before: JointLikelihood, usual: Scored, best: Scored, kind: str) -> bool:
-  """Tells whether the reference is less likely with an effect of these values than without."""
+def is_new(subject: Subject, best: Scored, kind: str) -> bool:
+  """Tells whether logs and reference are less likely where both have an effect of these values than
+  where the logs alone have it.
+
+  Declared constants that are far off may do in the reference what undoes the effect; the logs have
+  the same constants, but for what recordings of one machine differ by.
+  """
+  before, usual = subject.before, subject.usual
+  assert before is not None and usual is not None
   term = next(t for t in best.terms if t.name == kind)
   if term.freed:
     return True
   held = term.held_at(np.array(list(best.fit.values(term).values())))
   kept = [(t, usual.fit.values(t)) for t in usual.terms if t.kind != kind]
-  terms = (*[t for t, _ in kept], held)
   x = np.array([v for _, values in kept for v in values.values()])
-  fitter = Fitter([before], Layout([terms]))
-  fit = fitter.leave_out(fitter.fit(x, iterations=3))
-  beside = Scored(terms, fit, before.loglik(fit.held[0]))
-  gains, prior = usual.nats - beside.nats, usual.prior - beside.prior
+  theirs = _fitted(before, (*[t for t, _ in kept], held), x)
+  constants = tuple(theirs.fit.values(theirs.terms[0]).values())
+  instead = dataclasses.replace(best.terms[0], centre=constants, starts=(constants,))
+  terms = (instead, *[held if t is term else t for t in best.terms[1:]])
+  values = [v for t in terms[1:] if t is not held for v in best.fit.values(t).values()]
+  ours = _fitted(subject.now, terms, np.array([*constants, *values]))
+  gains = np.concatenate([usual.nats - theirs.nats, best.nats - ours.nats])
+  prior = usual.prior - theirs.prior + best.prior - ours.prior
   return more_likely(gains, prior, before.settings.level)
+
+
+def _fitted(joint: JointLikelihood, terms: tuple[Term, ...], x: Array) -> Scored:
+  """Returns a hypothesis fitted on from values [n], with its predictions of left-out blocks."""
+  fitter = Fitter([joint], Layout([terms]))
+  fit = fitter.leave_out(fitter.fit(x, iterations=3))
+  return Scored(terms, fit, joint.loglik(fit.held[0]))
 
 
 def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:

@@ -37,7 +37,8 @@ class Name:
   certain: bool
   """Whether that is beyond the threshold."""
   confounded: tuple[Scored, ...]
-  """Hypotheses without it that predict the same."""
+  """Hypotheses with another effect in its place that predict the same; one without any says that it
+  is needless."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _name(
   rivals = [s for s in ranked if kind not in s.names and not s.beside_force]
   behind = [(clear(best, s), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
-  alike = tuple(s for s in near if _same(joint, best, s))
+  alike = tuple(s for s in near if not s.names < best.names and _same(joint, best, s))
   told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
@@ -140,10 +141,7 @@ def carries_over(joint: JointLikelihood, item: Scored, plain: Scored) -> bool:
 
 
 def _same(joint: JointLikelihood, one: Scored, other: Scored) -> bool:
-  """Tells whether two hypotheses predict the same but for a part of what remains."""
-  apart = one.fit.residuals[0] - other.fit.residuals[0]
-  mean = np.median(joint.squares(apart), axis=1)
-  return bool(np.all(mean < joint.settings.alike**2 * joint.scale**2))
+  return joint.alike(one.fit.residuals[0] - other.fit.residuals[0])
 
 
 def _share(with_it: Array, without: Array, draws: int = 400) -> tuple[float, float]:

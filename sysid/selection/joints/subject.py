@@ -143,6 +143,22 @@ def following(subject: Subject) -> Subject:
   return _subject(now, before, subject.library, subject.beyond, alone=subject.alone)
 
 
+def beside(subject: Subject, reductions: Sequence[Reduction]) -> Subject:
+  """Returns a joint of the same logs beside another motion of the other joints, its constants
+  fitted anew."""
+  now = _likelihood(
+    subject.now.plant.model,
+    subject.joint,
+    [r.log for r in reductions],
+    reductions,
+    subject.now.settings,
+    follows=subject.now.follows,
+  )
+  now.ahead, now.expectation = subject.now.ahead, subject.now.expectation
+  explainer = _explainer(now, subject.before, subject.known, subject.library, subject.freed)
+  return dataclasses.replace(subject, now=now, explainer=explainer)
+
+
 def _tells(joint: JointLikelihood) -> bool:
   """Tells whether what a course leaves in a block is worth an observation: where a joint that stops
   stays a little off, the residual goes together for longer."""
@@ -220,9 +236,11 @@ def _likelihood(
   logs: Sequence[Log],
   reductions: Sequence[Reduction],
   settings: Settings,
+  *,
+  follows: bool = False,
 ) -> JointLikelihood:
   plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)
-  return JointLikelihood(plant, settings=settings)
+  return JointLikelihood(plant, settings=settings, follows=follows)
 
 
 def _explainer(

@@ -14,7 +14,6 @@ import numpy as np
 
 from nerf2real.sysid.fit import rough
 from nerf2real.sysid.fit.layout import CLOCKS, Fit, Layout
-from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
@@ -239,7 +238,7 @@ def with_twin(member: Subject, item: Scored, held: Term, other: Term) -> bool:
   predicts the same motion, but for a part of what remains."""
   terms = tuple(other if t == held else t for t in item.terms)
   fit = Fitter([member.now], Layout([terms])).fit(item.fit.x, iterations=4)
-  return _alike(member.now, fit.residuals[0] - item.fit.residuals[0])
+  return member.now.alike(fit.residuals[0] - item.fit.residuals[0])
 
 
 def same(one: Wide, other: Wide) -> bool:
@@ -247,11 +246,6 @@ def same(one: Wide, other: Wide) -> bool:
   if [m.joint for m in one.members] != [m.joint for m in other.members]:
     return False
   return all(
-    _alike(m.now, a - b)
+    m.now.alike(a - b)
     for m, a, b in zip(one.members, one.fit.residuals, other.fit.residuals, strict=True)
   )
-
-
-def _alike(joint: JointLikelihood, apart: Array) -> bool:
-  mean = np.median(joint.squares(apart), axis=1)
-  return bool(np.all(mean < joint.settings.alike**2 * joint.scale**2))
