@@ -166,6 +166,13 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
     "held_out_gain_nats": round(shared.nats, 2),
     "joints": [m.joint for m in shared.members],
   }
+  zero = shared.term.kind == "gravity_tilt" and zeros.of_tilt(result.model, shared.x, bounds)
+  if zero:
+    joint, offset, interval = zero
+    result.zeros[joint] = offset
+    result.effects.append(claims.zero(joint, offset, interval, evidence))
+    result.twins.append(claims.alike(shared.term, shared.x))
+    return
   effect, row = claims.shared(shared.term, shared.x, bounds, evidence)
   if shared.term.kind == "payload":
     body = result.model.body(str(shared.term.target)).id
@@ -195,7 +202,7 @@ def _write_down(result: Identified, item: Changed) -> None:
   best = item.extended
   terms = sorted(best.terms, key=lambda t: t.kind == STICKING)  # a friction of its own holds, too
   names = {n.kind: n for n in item.found.names}
-  offset = 0.0
+  offset = result.zeros.get(item.joint, 0.0)
   for term in terms:
     values = best.fit.values(term)
     if term.kind == CONSTANTS:

@@ -71,6 +71,27 @@ def shared(
   }
 
 
+def zero(
+  joint: str, offset: float, interval: tuple[float, float], evidence: dict[str, Any]
+) -> dict[str, Any]:
+  """Returns the entry of a joint's shifted zero that the others' motion shows, too.
+
+  Args:
+    joint: which joint.
+    offset: of its readings, rad.
+    interval: of that.
+    evidence: for the report.
+  """
+  low, high = interval
+  parameters = {"offset": {"value": offset, "low": low, "high": high, "unit": "rad"}}
+  return {
+    "kind": "encoder_offset",
+    "joint": joint,
+    "parameters": parameters,
+    "evidence": evidence,
+  }
+
+
 def alone(term: Term, joint: str, behind: float, x: Array) -> dict[str, Any]:
   """Returns the entry of an alternative: an effect of several joints that may be of one alone.
 

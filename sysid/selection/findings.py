@@ -18,9 +18,10 @@ from nerf2real.sysid.selection.search.evidence import Scored
 _MOST = 8  # fits near the best that are simulated, chosen
 
 
-def effects_of(joint: str, item: Scored) -> tuple[list[Effect], Clocks]:
-  """Returns the effects of a joint's hypothesis that are its own, and its latencies."""
-  effects, clocks, offset = [], Clocks(), 0.0
+def effects_of(joint: str, item: Scored, *, offset: float = 0.0) -> tuple[list[Effect], Clocks]:
+  """Returns the effects of a joint's hypothesis that are its own, and its latencies; its zero is
+  shifted by an offset, rad, beside what the hypothesis says."""
+  effects, clocks = [], Clocks()
   for term in item.terms:
     values = item.fit.values(term)
     x = np.array(list(values.values()))
@@ -58,6 +59,8 @@ class Identified:
   calibration: list[Effect] = dataclasses.field(default_factory=list)
   """Declared constants corrected, one effect a joint."""
   clocks: dict[str, Clocks] = dataclasses.field(default_factory=dict)
+  zeros: dict[str, float] = dataclasses.field(default_factory=dict)
+  """Offsets of joints' zeros that were found over all joints, rad, beside those found at one."""
   in_reference: list[dict[str, Any]] = dataclasses.field(default_factory=list)
   """Entries of effects that reference logs show, too: the model lacks them, nothing has changed."""
 
@@ -78,8 +81,10 @@ class Identified:
     effects, clocks = list(own.effects), dict(own.clocks)
     for item in (j for j in self.joints if len(j.near) > 1):
       theirs = {(e.kind, e.target) for e in effects_of(item.joint, item.near[0])[0]}
+      theirs.add(("encoder_offset", item.joint))
       effects = [e for e in effects if (e.kind, e.target) not in theirs]
-      other, clocks[item.joint] = effects_of(item.joint, item.near[at % len(item.near)])
+      near, zero = item.near[at % len(item.near)], self.zeros.get(item.joint, 0.0)
+      other, clocks[item.joint] = effects_of(item.joint, near, offset=zero)
       effects += other
     return Member(effects, clocks)
 

@@ -2,13 +2,15 @@
 
 A joint is judged beside the measured motion of the others. Where the zero of one is shifted, that
 motion was misread: a link beyond it hangs elsewhere, which at the other joints looks like a zero, a
-load or a tilt of their own.
+load or a tilt of their own. Where the zero of the joint is shifted that carries all others, the
+machine moves as one that is tilted about that joint's axis, and no log tells the two apart.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
+import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model.reduction import Reduction
@@ -18,7 +20,10 @@ from nerf2real.sysid.selection.joints.subject import beside
 from nerf2real.sysid.selection.wider.scopes import better
 from nerf2real.sysid.settings import Settings
 
+Array = np.ndarray
+
 KIND = "encoder_offset"
+_LEVEL = 0.9  # cosine of how far an axis may be from level; about an upright one nothing is tilted
 
 
 def reread(model: mujoco.MjModel, changed: Sequence[Changed], settings: Settings) -> list[Changed]:
@@ -46,6 +51,34 @@ def reread(model: mujoco.MjModel, changed: Sequence[Changed], settings: Settings
         reductions.append(kept[id(old)])
       result[other.joint] = _again(other, reductions, settings)
   return [result[c.joint] for c in changed]
+
+
+def of_tilt(
+  model: mujoco.MjModel, x: Array, bounds: Mapping[str, tuple[float, float]]
+) -> tuple[str, float, tuple[float, float]] | None:
+  """Returns the joint that carries all others, the offset of its zero that predicts what a tilt
+  does, rad, and its interval; None where the tilt is not about that joint's axis.
+
+  Args:
+    model: the declared one.
+    x: the tilt [2]: a rotation vector's part in the plane, rad.
+    bounds: its interval by name.
+  """
+  first, carriers = 0, model.body_rootid[model.jnt_bodyid]
+  if model.njnt == 0 or model.jnt_type[first] != mujoco.mjtJoint.mjJNT_HINGE:
+    return None
+  if np.any(carriers != carriers[first]) or model.body_jntnum[model.jnt_bodyid[first]] != 1:
+    return None
+  data = mujoco.MjData(model)
+  mujoco.mj_kinematics(model, data)
+  axis = data.xaxis[first]
+  along = axis[:2]
+  half = np.array([0.5 * np.ptp(bounds[name]) for name in ("x", "y")])
+  across = np.array([-along[1], along[0]])
+  if abs(x @ across) > np.abs(across) @ half or float(along @ along) < _LEVEL**2:
+    return None
+  offset, reach = float(x @ along / (along @ along)), float(np.abs(along) @ half / (along @ along))
+  return model.joint(first).name, offset, (offset - reach, offset + reach)
 
 
 def _without(log: Log, joint: str, offset: float) -> Log:

@@ -14,7 +14,7 @@ from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
-from nerf2real.sysid.selection.joints import doubts, naming, remainder, subject
+from nerf2real.sysid.selection.joints import doubts, leaving, naming, remainder, subject
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.search.evidence import Scored, clearness, more_likely, standardised
 from nerf2real.sysid.settings import SETTINGS
@@ -45,6 +45,10 @@ class _Joint:
   def squares(residuals):
     return residuals.reshape(1, -1, 10).var(axis=2)
 
+  @classmethod
+  def alike(cls, apart):
+    return JointLikelihood.alike(cls, apart)
+
 
 def _scored(kinds, nats, prediction=0.0):
   layout = Layout([()])
@@ -73,6 +77,33 @@ def test_a_rival_that_predicts_the_same_is_said_beside_the_name():
   (name,) = naming.conclude(_Joint, [null, right, twin], 3.0).names
   assert name.certain
   assert [sorted(s.names) for s in name.confounded] == [["b"]]
+
+
+def test_an_effect_without_which_the_same_is_predicted_is_needless():
+  null = _scored((), np.linspace(-4, -3, 30))
+  both = _scored(("a", "b"), np.linspace(0, 0.1, 30))
+  plain = _scored(("a",), np.linspace(0, 0.1, 30) - 0.05 * (-1.0) ** np.arange(30))
+  (a, b) = naming.conclude(_Joint, [null, both], 3.0).names  # without its rival it would stand
+  assert (a.certain, b.certain) == (True, True)
+  names = {
+    n.kind: n for n in (naming._name(_Joint, both, k, [null, both, plain], 3.0) for k in "ab")
+  }
+  assert names["a"].certain and not names["b"].certain
+  assert names["b"].confounded == ()
+
+
+def test_constants_that_are_strained_may_hide_an_effect():
+  def item(prior):
+    return SimpleNamespace(prior=prior, fit=SimpleNamespace(layout=SimpleNamespace(count=7)))
+
+  def left(*_):
+    return False
+
+  judged = SimpleNamespace(usual=None, paired=False)
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(leaving, "leaves", left)
+    assert not leaving.may_leave(judged, item(5.0), SETTINGS)
+    assert leaving.may_leave(judged, item(9.0), SETTINGS)  # 5 % of chi square with 7 degrees: 7.03
 
 
 def test_a_name_that_makes_one_motion_clearly_worse_does_not_stand():

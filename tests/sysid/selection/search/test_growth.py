@@ -1,0 +1,75 @@
+"""Sets of effects that are found one by one, and what single steps do not lead to."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.layout import Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.hypotheses import candidates
+from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.selection.search import explain, growth
+from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.settings import SETTINGS
+from tests.sysid.synthetic import PENDULUM, log_of
+
+KINDS = ("command_delay", "coulomb_friction", "motor_gain", "viscous_friction")
+
+
+@pytest.fixture(scope="module")
+def explainer():
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  hidden = [
+    Effect("coulomb_friction", "joint", {"torque": 0.3}),
+    Effect("motor_gain", "joint", {"gain": 1.3, "scales_limit": 1.0}),
+  ]
+  logs = [log_of(PENDULUM, kind, hidden, duration=5.0) for kind in ("sweep", "slow")]
+  plant = JointModel(model, "joint", logs)
+  library = [t for t in candidates.library(plant) if t.kind in KINDS]
+  return Explainer(JointLikelihood(plant, settings=SETTINGS), constants(plant), library)
+
+
+def _of(explainer, *kinds):
+  """Returns the hypothesis of some kinds, each in its first form from its first start."""
+  terms = [next(t for t in explainer.library if t.kind == kind) for kind in kinds]
+  chosen = (*explainer.base, *terms)
+  x = np.concatenate([explainer.null.fit.x, *[t.starts[0] for t in terms]])
+  return explainer.score(chosen, Fitter([explainer.joint], Layout([chosen])).fit(x, iterations=6))
+
+
+def test_a_gain_begins_with_the_other_torques_larger_by_as_much(explainer):
+  parent = _of(explainer, "command_delay", "coulomb_friction")
+  gain = next(t for t in explainer.library if t.kind == "motor_gain")
+  begun = explain._scaled(parent, gain)
+  assert [row[-1] for row in begun] == [s[0] for s in gain.starts]
+  before = parent.fit.x
+  for row in begun:
+    assert row[-2] == pytest.approx(before[-1] * row[-1])  # friction
+    assert row[:-2] == pytest.approx(before[:-1])  # constants and a delay
+  assert explain._scaled(parent, next(t for t in explainer.library if t.kind != "motor_gain")) == []
+  assert explain._scaled(explainer.null, gain) == []  # nothing to scale
+
+
+def test_an_effect_that_was_chosen_too_early_is_exchanged(explainer):
+  begun = _of(explainer, "coulomb_friction", "viscous_friction")
+  found = growth._exchanged(explainer, begun)
+  assert found.names == {"coulomb_friction", "motor_gain"}
+  left = [np.sqrt(np.median(s.fit.held[0][0])) for s in (found, begun)]
+  assert left[0] < 0.5 * left[1]
+  assert found.values("motor_gain")["gain"] == pytest.approx(1.3, rel=0.05)
+  assert found.values("coulomb_friction")["torque"] == pytest.approx(0.3, rel=0.1)
+
+
+def test_one_effect_is_exchanged_for_none(explainer):
+  single = _of(explainer, "viscous_friction")
+  assert growth._exchanged(explainer, single) is single
+
+
+def test_a_late_command_is_near_one_of_the_starts(explainer):
+  (starts,) = {t.starts for t in explainer.library if t.kind == "command_delay"}
+  values = np.array(starts)[:, 0]
+  assert values[0] < 0.005 and values[-1] > 0.15
+  assert np.all(values[1:] / values[:-1] < 1.4)
