@@ -39,6 +39,8 @@ def test_every_text_is_escaped(tmp_path):
     blocks.Text(EVIL),
     blocks.Heading(EVIL),
     blocks.Warnings([EVIL]),
+    blocks.Notes([EVIL]),
+    blocks.Answers([blocks.Answer(EVIL, EVIL, [EVIL], bars={EVIL: 1.0})]),
     Picture(IMAGE, EVIL),
     Table([EVIL], [[EVIL]]),
     Figures([Figure(EVIL, EVIL, EVIL, EVIL, EVIL)]),
@@ -50,7 +52,7 @@ def test_every_text_is_escaped(tmp_path):
     warnings=[EVIL],
     origin=Origin(EVIL, EVIL, EVIL),
   )
-  assert "alert('a')" not in text and text.count("alert(&#39;a&#39;)") == 21
+  assert "alert('a')" not in text and text.count("alert(&#39;a&#39;)") == 26
   (figure,) = figures_in(text)
   assert figure["data"][0]["name"] == figure["layout"]["title"]["text"] == EVIL
 
@@ -108,7 +110,7 @@ def test_own_templates_have_the_look_and_must_be_given_their_names(tmp_path):
   data = Figure("</script>", np.float32(0.5), good=None)
   text = page.render(tmp_path / "own.html", plots=False, name="a<b", data=data)
   assert "<p>a&lt;b</p>" in text and "--accent" in text
-  assert '"value":0.5' in text and "good" not in text and text.count("</script>") == 1
+  assert '"value":0.5' in text and '"good"' not in text and text.count("</script>") == 1
   with pytest.raises(jinja2.UndefinedError, match="name"):
     page.render(tmp_path / "own.html", plots=False, data=data)
 
