@@ -97,12 +97,18 @@ def open_film(path: Path) -> Iterator[Sink]:
 
   Raises:
     DiskFullError: The disk or the quota is exhausted.
+    OSError: The file cannot be written.
     ValueError: Another suffix.
   """
   check_film(path)
   path.parent.mkdir(parents=True, exist_ok=True)
   interrupt: KeyboardInterrupt | None = None
   with files.atomic_path(path) as partial:
+    try:
+      partial.touch()  # the libraries open it late, when all has been rendered
+      partial.unlink()
+    except OSError as error:
+      raise OSError(error.errno, error.strerror, str(path)) from error
     sink: Sink = Video(partial) if path.suffix == ".mp4" else Animation(partial)
     try:
       yield sink
