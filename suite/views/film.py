@@ -102,13 +102,9 @@ def open_film(path: Path) -> Iterator[Sink]:
   """
   check_film(path)
   path.parent.mkdir(parents=True, exist_ok=True)
+  files.check_writable(path)  # the libraries open it late, when all has been rendered
   interrupt: KeyboardInterrupt | None = None
   with files.atomic_path(path) as partial:
-    try:
-      partial.touch()  # the libraries open it late, when all has been rendered
-      partial.unlink()
-    except OSError as error:
-      raise OSError(error.errno, error.strerror, str(path)) from error
     sink: Sink = Video(partial) if path.suffix == ".mp4" else Animation(partial)
     try:
       yield sink
