@@ -33,6 +33,22 @@ def is_disk_full(error: BaseException) -> bool:
   return isinstance(error, OSError) and error.errno in _REASONS
 
 
+def check_writable(path: str | Path) -> None:
+  """Raises OSError, naming `path`, where nothing can be made there: before hours of work for it.
+
+  The folder that it will be in must exist; what is there under its name is untouched.
+  """
+  path = Path(path)
+  probe = path.with_name(f".{path.name}.{os.getpid()}.probe")
+  try:
+    probe.touch()
+    probe.unlink()
+  except OSError as error:
+    if error.errno in _REASONS:
+      raise disk_full(path, error.errno) from error
+    raise OSError(error.errno, error.strerror, str(path)) from error
+
+
 @contextlib.contextmanager
 def explain_disk_full(path: str | Path) -> Iterator[None]:
   """Raises DiskFullError, naming `path`, where the block raises ENOSPC, EDQUOT or EFBIG."""

@@ -131,6 +131,7 @@ def _watched(arguments: Arguments) -> Iterator["Watcher | None"]:
 def run(arguments: Arguments) -> int:
   """Makes the scene and prints its figures; returns the exit status."""
   from nerf2real.scenes import pipeline
+  from nerf2real.scenes.alignment import overrides
   from nerf2real.scenes.builtin import ground_truth
 
   settings = settings_of(arguments)
@@ -139,6 +140,8 @@ def run(arguments: Arguments) -> int:
     source, measure = ground_truth.VIDEO, ground_truth.measure
     if settings.marker_side is None:
       settings = dataclasses.replace(settings, marker_side=ground_truth.MARKER_SIDE)
+  if arguments.override is not None:
+    overrides.read(arguments.override)
   if arguments.check:
     return _check(arguments, source, settings)
   with _watched(arguments) as watcher:

@@ -38,7 +38,7 @@ class Arguments:
   seed: int | None = None
   """Draws the robot's hidden properties; as in the data sheets if not given."""
   camera: bool = True
-  """Whether to stream pictures; without EGL there are none."""
+  """Whether to stream pictures, which need EGL."""
   ball: bool = False
   """Whether there is a ball, 0.6 m in front of the robot."""
   x: float = 0.0

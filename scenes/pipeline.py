@@ -4,6 +4,7 @@ Every stage is a function of earlier results and settings and is cached by the h
 (`scenes.stages`), so that a second run continues where the first one stopped.
 """
 
+import json
 from pathlib import Path
 
 from nerf2real.core import files
@@ -48,14 +49,17 @@ def make_scene(
 
   Raises:
     FolderInUseError: Another process makes a scene in the folder.
-    ValueError: The capture or a setting cannot be used; the message is one line.
+    ValueError: The capture or a setting cannot be used, or the folder holds a scene of another
+      capture; the message is one line.
   """
   out, source = Path(out), Path(source)
   fixed = overrides.read(override) if override else overrides.Overrides()
   source_kind(source)  # raises where it cannot be used
+  film = Source(source, files.hash_path(source))
+  _check_owner(out, film)
   with lock_folder(out):
     return _run_stages(
-      Source(source, files.hash_path(source)),
+      film,
       out,
       Stages(out / STAGES, show_progress=show_progress),
       settings=settings,
@@ -63,6 +67,20 @@ def make_scene(
       name=name or out.name,
       measure=measure,
       watcher=watcher,
+    )
+
+
+def _check_owner(out: Path, film: Source) -> None:
+  """Raises ValueError where a folder holds a scene of a capture of another name and content."""
+  try:
+    made_from = json.loads((out / "scene.json").read_text())["source"]
+    name, sha256 = made_from["name"], made_from["sha256"]
+  except (OSError, ValueError, KeyError, TypeError):
+    return  # none yet, or a damaged one, which is made again
+  if name != film.path.name and sha256 != film.sha256:
+    raise ValueError(
+      f"{out} holds a scene of {name}, found the capture {film.path.name}: name another folder "
+      "with --out, or remove that one."
     )
 
 

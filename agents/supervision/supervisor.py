@@ -4,6 +4,7 @@ A `Process` runs on this machine (`LocalProcess`), or where Ray places it (`clus
 """
 
 import dataclasses
+import re
 import signal
 import subprocess
 import sys
@@ -219,4 +220,7 @@ def _death(kept: _Kept, status: int | None) -> str:
   who = kept.job.name[0].upper() + kept.job.name[1:]
   meaning = _MEANINGS.get(status, "") if status is not None else ""
   words = kept.process.last_words()
+  reasons = re.findall("^error: (.*)$", words, re.MULTILINE)
+  if status == REFUSED and reasons:  # what libraries logged while they loaded explains nothing
+    return f"{who} ended with status {status}{meaning}: {reasons[-1]}"
   return f"{who} ended with status {status}{meaning}" + (f":\n{words}" if words else ".")

@@ -1,4 +1,4 @@
-"""What a section of a report shows: pictures, grids, tables, figures, charts, text.
+"""What a section of a report shows: answers, pictures, grids, tables, figures, charts, text.
 
 Blocks hold content; `templates/blocks.html` lays each kind out.
 """
@@ -46,6 +46,35 @@ class Warnings(Block):
 
   kind = "warnings"
   messages: Sequence[str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Notes(Block):
+  """Lines set apart that warn of nothing."""
+
+  kind = "notes"
+  messages: Sequence[str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+  """A question that a reader has, its answer in a few words, and what the answer rests on."""
+
+  question: str
+  answer: str
+  details: Sequence[str] = ()
+  tone: str = ""
+  """"good", "warn" or none: the colour of its edge."""
+  bars: Mapping[str, float] = dataclasses.field(default_factory=dict)
+  """Quantities of one kind by name, shown as bars beneath."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Answers(Block):
+  """What a page says, before its tables: a card an answer, two side by side where there is room."""
+
+  kind = "answers"
+  answers: Sequence[Answer]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -92,7 +92,7 @@ def read_messages(
       reason = str(error).splitlines()[0] if str(error) else type(error).__name__
       raise DamagedLogError(
         f"{path.name} is truncated or damaged ({reason}): {count} messages are readable; copy it "
-        "again, or read what is there with recover=True."
+        "again, or save what is readable with `mcap recover` (in Python: recover=True)."
       ) from error
 
 

@@ -35,7 +35,7 @@ class LoopSettings:
   seed: int = 1
   """Of the virtual robot: its own build, and what "drawn" draws."""
   reference: Path | None = None
-  """Folder with logs of a robot's stand from before; the virtual robot records its own."""
+  """Folder with logs of a robot's stand from before; else the virtual robot records its own."""
   scene: Path | None = None
   """Folder of a scene bundle; the built-in room if not given."""
   seconds: float = 12.0
@@ -91,6 +91,7 @@ def claim(settings: LoopSettings) -> None:
     "policy": digest or settings.policy,
     "robot": settings.robot,
     "seed": settings.seed,
+    "reference": str(settings.reference or ""),
     "hidden": hashlib.sha256(repr(settings.hidden).encode()).hexdigest()[:12],
     "scene": str(settings.scene or ""),
     "seconds": settings.seconds,
@@ -102,7 +103,8 @@ def claim(settings: LoopSettings) -> None:
     files.write_atomically(path, json.dumps(own, indent=1))
     return
   found = json.loads(path.read_text())
-  other = sorted(name for name in own if found.get(name) != own[name])
+  # Loops from before references were noted have none: their folders are taken as they are.
+  other = sorted(name for name in own if found.get(name, own[name]) != own[name])
   if other:
     raise ValueError(
       f"{settings.out} holds a loop with another {', '.join(other)}: take another folder with "

@@ -128,7 +128,11 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
 
 
 def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
-  """Records the stand, and the virtual robot's before; returns the folder of the reference."""
+  """Records the stand, and the virtual robot's before where no reference is given.
+
+  Returns:
+    The folder of the reference; None: there is none.
+  """
   seconds, out = settings.seconds, settings.out
   wanted = [out / "stand" / f"{name}.mcap" for name in (*_logs(), recording.FLOOR)]
   if settings.robot != recording.VIRTUAL:
@@ -139,8 +143,11 @@ def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
     recording.record_floor(out / "stand", connection, None)
     return settings.reference
   age = trials.session(settings, BEFORE).seconds / 2  # between the trials: what sags, is half way
-  recordings = ((out / "stand", hidden, age), (out / "reference", (), 0.0))
-  for noise, (folder, altered, used) in enumerate(recordings):
+  given = settings.reference
+  recordings = [(out / "stand", hidden, age, machines.noise_beside(given))]
+  if given is None:
+    recordings.append((out / "reference", (), 0.0, 1))
+  for folder, altered, used, noise in recordings:
     if all((folder / path.name).exists() for path in wanted):
       continue
     say(f"recording the motions of the stand in {folder}")
@@ -149,7 +156,7 @@ def _record(settings: LoopSettings, hidden: Any, say: Say) -> Path | None:
       recording.record_stand(folder, link, robot, seconds=seconds, lens=LENS)
     with made() as (link, robot):
       recording.record_floor(folder, link, robot)
-  return settings.reference or out / "reference"
+  return given or out / "reference"
 
 
 def _logs() -> tuple[str, ...]:

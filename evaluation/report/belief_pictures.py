@@ -36,7 +36,7 @@ def run_episode(
     action = agent.act(flat)
     truth = planar_pose(flat.privileged, layout.pose_columns)[:2]
     heat = belief_plot.draw(floor, *policy.belief(agent.embedding), truth=truth, target=goal)
-    frames.append(_beside(flat.image, heat, f"{len(errors) - 1}: {errors[-1]:.2f} m"))
+    frames.append(_beside(flat.image, heat, f"step {len(errors) - 1}: {errors[-1]:.2f} m off"))
     timestep = environment.step(action)
   chosen = np.unique(np.linspace(0, len(frames) - 1, moments).round().astype(int))
   return [frames[i] for i in chosen], errors
@@ -49,6 +49,7 @@ def _beside(image: np.ndarray | None, heat: np.ndarray, text: str) -> np.ndarray
     image, (width, round(width * image.shape[0] / image.shape[1])), interpolation=cv2.INTER_NEAREST
   )
   picture = np.concatenate([np.asarray(seen), heat])
+  picture[:26] //= 3  # what is behind white letters may be bright
   cv2.putText(
     picture, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
   )

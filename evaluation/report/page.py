@@ -50,10 +50,10 @@ def write(
   """
   sections = [_table(table) for table in tables.paper_tables(found)]
   sections.append(_table(tables.outcome_table(found), _OUTCOME_TEXT))
-  sections.append(meanings.section())
   sections += _paths(found, maps.draw_floor(scene, height=_PATHS_HEIGHT))
   sections += _beliefs(found, maps.draw_floor(scene, height=_BELIEF_HEIGHT))
   sections.append(_episodes(found))
+  sections.append(meanings.section())
   if settings is not None:
     text = json.dumps(dict(settings), indent=1, default=str)
     sections.append(Section("Settings", "", [Details("all settings", [Preformatted(text)])]))

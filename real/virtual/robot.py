@@ -97,13 +97,17 @@ class VirtualRobot:
     return Connection(port=self.port, camera=source, operator=self.operator, clock=clock)
 
   def check(self) -> None:
-    """Raises RuntimeError, in one line, where the robot in real time answers no more."""
-    error = self._wire.error if isinstance(self._wire, Wire) else None
-    if error is not None:
-      raise RuntimeError(
-        f"The virtual robot ended ({type(error).__name__}: {error}): its port answers no more; "
-        "start it again."
-      ) from error
+    """Raises RuntimeError, in one line, where the robot in real time answers or sees no more."""
+    wire = self._wire if isinstance(self._wire, Wire) else None
+    for what, source, lost in (
+      ("virtual robot", wire, "its port answers no more"),
+      ("virtual robot's camera", self.stream, "no pictures come any more"),
+    ):
+      error = None if source is None else source.error
+      if error is not None:
+        raise RuntimeError(
+          f"The {what} ended ({type(error).__name__}: {error}): {lost}; start it again."
+        ) from error
 
   # ---- what a person in the room does and sees ----
 

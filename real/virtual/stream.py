@@ -59,7 +59,7 @@ class CameraStream:
     self._newest: tuple[int, bytes] | None = None
     self._arrived = threading.Condition()
     self._stop = threading.Event()
-    self.error: Exception | None = None  # what ended the pictures, if anything did
+    self.error: Exception | None = None  # what ended pictures and connections, if anything did
     stream = self
 
     class Handler(_Handler):
@@ -105,6 +105,8 @@ class CameraStream:
   def _take_pictures(self) -> None:
     try:
       self._take_until_stopped()
+    except Exception as error:  # whatever a renderer raises: the robot's user is told of it
+      self.error = error
     finally:
       self._release()
 
@@ -113,11 +115,7 @@ class CameraStream:
     while not self._stop.is_set():
       taken = time.monotonic()
       if not self._frozen:
-        try:
-          picture = self._render()
-        except Exception as error:  # whatever a renderer raises: the stream ends with the reason
-          self.error = error
-          return
+        picture = self._render()
         if self._blocked:
           picture = np.zeros_like(picture)
         encoded = cv2.imencode(
@@ -153,8 +151,8 @@ class CameraStream:
 
   @property
   def closed(self) -> bool:
-    """Whether the stream has ended."""
-    return self._stop.is_set()
+    """Whether the stream has ended, by `close` or by an error."""
+    return self._stop.is_set() or self.error is not None
 
   def close(self) -> None:
     """Ends the stream and frees the port."""

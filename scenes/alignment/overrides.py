@@ -121,7 +121,8 @@ def read(path: pathlib.Path) -> Overrides:
     ValueError: it is wrong; one line with the fault.
   """
   if not path.is_file():
-    raise ValueError(f"The override file {path} does not exist.")
+    what = "is a folder, expected a file" if path.is_dir() else "does not exist"
+    raise ValueError(f"The override file {path} {what}.")
   text = path.read_text(encoding="utf-8")
   try:
     values = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
+from nerf2real.core import files
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import gltf, heightfield, mjcf, nerfstudio, texture, usd, views
@@ -109,6 +110,7 @@ def export(kind: Kind, order: Order) -> str:
     A line for the user: what was written and how to open it.
 
   Raises:
+    OSError: The file or folder cannot be written.
     ValueError: The name does not fit the kind, or the bundle lacks what the kind needs.
   """
   suffixes = _SUFFIXES.get(kind, ("",))
@@ -118,4 +120,5 @@ def export(kind: Kind, order: Order) -> str:
   if order.robot is not None and kind != "mjcf":
     raise ValueError(f"A robot can be added to mjcf only, found {kind}: leave --robot out.")
   order.out.parent.mkdir(parents=True, exist_ok=True)
+  files.check_writable(order.out)
   return _EXPORTERS[kind](order)

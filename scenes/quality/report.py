@@ -24,6 +24,7 @@ from nerf2real.core.pages.blocks import (
   Times,
 )
 from nerf2real.core.pages.page import Section
+from nerf2real.scenes.quality import in_short
 from nerf2real.scenes.quality.held_out import ViewScore
 
 _THUMBNAILS = 18
@@ -49,7 +50,7 @@ FIGURES: Mapping[str, Meaning] = {
     "px", "mean distance between seen and predicted feature positions", "lower"
   ),
   "focal_length_px": Meaning("px", "mean focal length of the capture's camera"),
-  "held_out_views": Meaning("", "pictures kept from training, used for the figures below"),
+  "held_out_views": Meaning("", "pictures kept from training, used for the figures of pictures"),
   "held_out_psnr_db": Meaning(
     "dB", "peak signal-to-noise ratio on held-out views, full size, mean", "higher"
   ),
@@ -170,12 +171,13 @@ class ReportData:
 def write(path: Path, data: ReportData) -> None:
   """Writes the page as one file that opens offline."""
   sections = [
-    Section("Figures", "", [_figures(data.figures)]),
-    _keyframes(data),
+    in_short.section(data.figures),
     _views(data),
     *([_robot_views(data.robot_views)] if data.robot_views else []),
     *_geometry(data),
     _free_space(data),
+    _keyframes(data),
+    Section("Figures", "", [_figures(data.figures)]),
     Section("Time", "Wall-clock time of each stage.", [Times(data.seconds)]),
     Section(
       "Settings",

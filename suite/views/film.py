@@ -97,10 +97,12 @@ def open_film(path: Path) -> Iterator[Sink]:
 
   Raises:
     DiskFullError: The disk or the quota is exhausted.
+    OSError: The file cannot be written.
     ValueError: Another suffix.
   """
   check_film(path)
   path.parent.mkdir(parents=True, exist_ok=True)
+  files.check_writable(path)  # the libraries open it late, when all has been rendered
   interrupt: KeyboardInterrupt | None = None
   with files.atomic_path(path) as partial:
     sink: Sink = Video(partial) if path.suffix == ".mp4" else Animation(partial)

@@ -179,7 +179,10 @@ class TaskViewer:
       self._picture = gui.add_image(blank, label="robot's camera")
     self._status = gui.add_markdown("")
     self._bars = gui.add_html("")
+    if getattr(self._environment.task, "goals", ()):
+      gui.add_markdown("Green ball: the goal. Grey balls: the other goals.")
     with gui.add_folder("push"):
+      gui.add_markdown("Drag the arrows over the robot, or:")
       self._force = gui.add_slider("force [N]", 1.0, _MAX_FORCE, 0.5, 8.0)
       gui.add_button_group("direction", tuple(_DIRECTIONS)).on_click(
         lambda event: self._start_push(event.target.value)

@@ -29,8 +29,8 @@ def read_csv(path: Path) -> Log:
   """Reads a CSV log.
 
   Raises:
-    LogError: columns are unknown or missing, a field is no number, time runs backwards, joints have
-      readings at different times, or the log is too short or too slow.
+    LogError: columns are unknown or missing, a field is no finite number, time runs backwards,
+      joints have readings at different times, or the log is too short or too slow.
   """
   columns = _columns(path)
   time = columns.pop("time")
@@ -94,12 +94,17 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
         f"{path.name} line {index + 2} has {len(row)} fields, the header {len(names)}."
       )
     for place, field in enumerate(row):
+      if not field.strip():
+        continue
       try:
-        table[index, place] = float(field) if field.strip() else math.nan
+        table[index, place] = float(field)
       except ValueError:
+        table[index, place] = math.nan
+      if not math.isfinite(table[index, place]):
         raise LogError(
-          f"{path.name} line {index + 2} has {field!r} as {names[place]}, expected a number."
-        ) from None
+          f"{path.name} line {index + 2} has {field!r} as {names[place]}, expected a number, or "
+          "nothing where none was read."
+        )
   return dict(zip(names, table.T, strict=True))
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from nerf2real.core import palette
 from nerf2real.core.pages import charts
-from nerf2real.core.pages.blocks import Grid, Table
+from nerf2real.core.pages.blocks import Answer, Answers, Grid, Table
 from nerf2real.core.pages.charts import Curve
 from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
@@ -18,9 +18,14 @@ _SHOWN = 6  # joints whose residuals are drawn, those that have grown most first
 
 def sentence(found: Drift) -> str:
   """Returns the judgement in one sentence."""
+  words = "The stored result still holds" if found.holds else "The machine has drifted"
+  return f"{words}: {'; '.join(_grounds(found))}."
+
+
+def _grounds(found: Drift) -> list[str]:
+  """Returns what the judgement rests on, in words."""
   if not found.holds:
-    words = [_moved(value) for value in found.moved] + [_grown(error) for error in found.grown]
-    return f"The machine has drifted: {'; '.join(words)}."
+    return [_moved(value) for value in found.moved] + [_grown(error) for error in found.grown]
   worst = max(found.errors, key=lambda e: e.later / e.expected)
   words = [f"it leaves {_size(worst.later, worst)} at {worst.joint}"]
   words[0] += f", up to {_size(worst.expected, worst)} are expected"
@@ -30,7 +35,7 @@ def sentence(found: Drift) -> str:
   hidden = [value for value in found.values if value.state == "not shown"]
   if hidden:
     words.append(f"not shown by these logs: {_named(hidden)}")
-  return f"The stored result still holds: {'; '.join(words)}."
+  return words
 
 
 def _moved(value: Value) -> str:
@@ -60,14 +65,26 @@ def page(found: Drift, stored: Stored, logs: Sequence[Log]) -> Page:
     stored: the result that was judged.
     logs: the later ones.
   """
-  sections = [_errors(found)]
+  sections = [_answer(found), _errors(found)]
   if found.values:
     sections.append(_values(found))
   sections.append(_residuals(found, stored, logs))
   notes = [f"Not compared: {kind}." for kind in found.not_judged]
   return Page(
-    "A stored result and later logs", sentence(found), sections, notes, origin=Origin.of_process()
+    "A stored result and later logs",
+    f"{len(logs)} later {'log' if len(logs) == 1 else 'logs'}: does what was found still hold?",
+    sections,
+    notes,
+    origin=Origin.of_process(),
   )
+
+
+def _answer(found: Drift) -> Section:
+  answer = "Yes" if found.holds else "No, the machine has drifted"
+  words = [f"{ground[:1].upper()}{ground[1:]}." for ground in _grounds(found)]
+  tone = "good" if found.holds else "warn"
+  question = "Does the stored result still hold?"
+  return Section("In short", "", [Answers([Answer(question, answer, words, tone)])])
 
 
 def _errors(found: Drift) -> Section:
@@ -125,5 +142,5 @@ def _residuals(found: Drift, stored: Stored, logs: Sequence[Log]) -> Section:
   return Section(
     "Residuals of the later logs",
     "Measured minus simulated position of the whole machine under the stored extended model.",
-    [Grid(figures, 2)],
+    [Grid(figures, min(2, len(figures)))],
   )

@@ -183,7 +183,14 @@ def _identify(
   progress(_ERRORS, "report")
   content["seconds"] = round(time.perf_counter() - began, 1)
   made = report.page(
-    found, content, details, held=held, effects=whole, shown=shown, window_s=settings.window_s
+    found,
+    content,
+    details,
+    held=held,
+    effects=whole,
+    shown=shown,
+    window_s=settings.window_s,
+    referred=bool(reference),
   )
   page.write(out / "report.html", made)
   content["seconds"] = round(time.perf_counter() - began, 1)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.core.pages import charts
-from nerf2real.core.pages.blocks import Block, Heading, Table, Text, Warnings
+from nerf2real.core.pages.blocks import Block, Heading, Notes, Table, Text, Warnings
 from nerf2real.core.pages.charts import Bars, Interval
 from nerf2real.core.pages.page import Origin, Page, Section
 from nerf2real.core.robot_logs.reading import Log
@@ -33,7 +33,8 @@ _HEADLINES = {
   "unexplained": "It lacks something that has no clear name",
 }
 _VERDICTS = {
-  "none": "The declared model explains the logs as well as any candidate: nothing is named.",
+  "none": "No candidate explains these logs clearly better than the declared model with its"
+  " constants fitted within their tolerances: nothing is named.",
   "effects": "These effects explain what the declared model leaves.",
   "partly": "These effects are certain, and each explains more than it leaves; more"
   " remains than the machine leaves anyway, and no name for it is clear. What remains is said"
@@ -53,6 +54,7 @@ def page(
   effects: Sequence[Effect],
   shown: Sequence[Identifiability],
   window_s: float,
+  referred: bool,
 ) -> Page:
   """Returns the page.
 
@@ -64,6 +66,7 @@ def page(
     effects: calibration and effects of the extended model.
     shown: what the logs can show, by joint.
     window_s: window of restarts.
+    referred: whether there were reference logs.
   """
   items = found.found
   content = {**content, **{k: together(content[k]) for k in ("effects", "in_reference")}}
@@ -72,6 +75,8 @@ def page(
       content,
       beyond=found.least_explained.subject.beyond,
       unit=residual_plots.unit_of(found.least_explained),
+      shown=capability.sentence(shown),
+      referred=referred,
     ),
     _verdict(content, [note for note in content["notes"] if note != capability.sentence(shown)]),
     _errors(found, content),
@@ -86,11 +91,16 @@ def page(
   names = _summary(content["effects"])
   return Page(
     "What the model lacks",
-    f"{_HEADLINES[content['verdict']]}{': ' + names if names else ''}. Model:"
+    f"{_headline(content['verdict'], referred)}{': ' + names if names else ''}. Model:"
     f" {details['model'].rsplit('/', 1)[-1]}. Residuals are measured minus simulated.",
     sections,
     origin=Origin.of_process(),
   )
+
+
+def _headline(verdict: str, referred: bool) -> str:
+  unchanged = verdict == "none" and referred
+  return "Nothing that the reference does not show, too" if unchanged else _HEADLINES[verdict]
 
 
 def _summary(effects: Sequence[dict[str, Any]]) -> str:
@@ -120,7 +130,7 @@ def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
   listed = [a for a in content["alternatives"] if "kinds" not in a]
   nearest, _ = _parameters([a for a in listed if "sensor" not in a])
   alike, _ = _parameters([a for a in listed if "sensor" in a])
-  blocks: list[Block] = [Warnings([*notes, *said])]
+  blocks: list[Block] = [Warnings(notes), Notes(said)]
   if rows:
     blocks.append(Table(_HEADER, rows))
     chart = charts.intervals("95 % intervals", bounds)

@@ -1,9 +1,9 @@
-"""The report in four answers: what is missing, how sure that is, what remains, what to record."""
+"""The report in four answers: what is missing, how sure, what remains, what to record next."""
 
 from collections.abc import Sequence
 from typing import Any
 
-from nerf2real.core.pages.blocks import Table
+from nerf2real.core.pages.blocks import Answer, Answers
 from nerf2real.core.pages.page import Section
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model import simulation
@@ -12,43 +12,76 @@ _FEW = 4  # effects that are said with their values; more are counted
 _LARGE = {"mrad": "rad", "mm": "m"}
 _DIGITS = 4  # of a speed: less is standing
 _CLEAR = 99.0  # standard errors, beyond which a number says nothing more
+_TIMES = 1000.0  # the noise, beyond which a number says nothing more
+_SEEN = 1.0  # noise by which predictions have to differ under a motion that is worth recording
+_CALIBRATED = 1.5  # times by which fitted constants lower the error, from which that is said
 
 
-def section(content: dict[str, Any], *, beyond: float, unit: str) -> Section:
+def section(
+  content: dict[str, Any], *, beyond: float, unit: str, shown: str, referred: bool
+) -> Section:
   """Returns the first section of the report.
 
   Args:
     content: what report.json holds.
     beyond: standard errors that count as clear.
     unit: of small positions, mrad or mm.
+    shown: what the logs can show, in a sentence.
+    referred: whether there were reference logs.
   """
-  rows = [
-    ["What does the model lack?", _missing(content)],
-    ["How sure is that?", _sure(content, beyond)],
-    ["What remains?", _remains(content, unit)],
-    ["What to record next?", _next(content["next_excitation"], _LARGE[unit])],
+  answers = [
+    _missing(content, referred),
+    _sure(content, beyond, shown),
+    _remains(content, unit),
+    _next(content, _LARGE[unit]),
   ]
-  return Section("In short", "", [Table(["", ""], rows)])
+  return Section("In short", "", [Answers(answers)])
 
 
-def _missing(content: dict[str, Any]) -> str:
-  effects = content["effects"]
+def _missing(content: dict[str, Any], referred: bool) -> Answer:
+  question = "What does the model lack?"
+  effects, own = content["effects"], content["in_reference"]
+  known = [f"In the reference, too: {_effect(effect)}." for effect in own[:_FEW]]
   if effects:
-    first = "; ".join(_effect(effect) for effect in effects[:_FEW])
+    several = len(effects) > 1
+    words = [
+      _sentence((f"{_name(effect)}: " if several else "") + f"{_meaning(effect)}.")
+      for effect in effects[:_FEW]
+    ]
     more = len(effects) - _FEW
-    return first + (f"; and {more} more, listed below." if more > 0 else ".")
+    title = ", ".join(_name(effect) for effect in effects[:_FEW])
+    title += f", and {more} more, listed below" if more > 0 else ""
+    partly = content["verdict"] == "partly"
+    title += "; and something that has no clear name" if partly else ""
+    words.append("In brackets: 95 % intervals.")
+    return Answer(question, _sentence(title), [*words, *known], "warn" if partly else "")
   if content["verdict"] == "none":
-    return "Nothing that these logs show."
+    title = "has changed since the reference" if referred else "that these logs show"
+    return Answer(question, f"Nothing {title}", known, tone="good")
   joint = content["residual_at"]["joint"]
   nearest = [a for a in content["alternatives"] if "kinds" not in a and a["parameters"]]
-  words = f"Something at {joint} for which no name is clear."
-  return words + (f" The nearest: {_effect(nearest[0])}." if nearest else "")
+  named = [a for a in nearest if a["kind"] != "parameter_error"] or nearest
+  words = [f"The nearest, which is not claimed: {_effect(named[0])}."] if named else []
+  return Answer(question, f"Something at {joint} that has no clear name", [*words, *known], "warn")
+
+
+def _sentence(words: str) -> str:
+  return words[:1].upper() + words[1:]
+
+
+def _name(effect: dict[str, Any]) -> str:
+  """Returns an effect's kind and place as words."""
+  places = (effect.get("joint"), *(effect.get(noun) for noun in ("body", "geom", "sensor")))
+  where = next((place for place in places if place), "all joints")
+  return f"{effect['kind'].replace('_', ' ')} at {where}"
 
 
 def _effect(effect: dict[str, Any]) -> str:
-  """Returns an effect with what it is, its values and intervals in words."""
-  places = (effect.get("joint"), *(effect.get(noun) for noun in ("body", "geom", "sensor")))
-  where = next((place for place in places if place), "all joints")
+  return f"{_name(effect)}: {_meaning(effect)}"
+
+
+def _meaning(effect: dict[str, Any]) -> str:
+  """Returns what an effect is, its values and intervals in words."""
   values = []
   for name, value in effect["parameters"].items():
     if isinstance(value["value"], list) or None in (value["value"], value["low"], value["high"]):
@@ -56,66 +89,102 @@ def _effect(effect: dict[str, Any]) -> str:
     unit = "" if value["unit"] == "1" else f" {value['unit']}"
     low, high = (f"{value[end]:.3g}" for end in ("low", "high"))
     values.append(f"{name} {value['value']:.3g}{unit} ({low} to {high})")
-  words = f"{effect['kind']} at {where} ({kind_of(effect['kind']).summary})"
-  return words + (f": {', '.join(values)}" if values else "")
+  words = kind_of(effect["kind"]).summary
+  return words + (f"; {', '.join(values)}" if values else "")
 
 
-def _sure(content: dict[str, Any], beyond: float) -> str:
+def _sure(content: dict[str, Any], beyond: float, shown: str) -> Answer:
+  question = "How sure is that?"
   alike = [a["kind"] for a in content["alternatives"] if a.get("confounded")]
   effects = content["effects"]
   if not effects and content["verdict"] == "none":
-    return "No hypothesis with an effect is clear of the one without."
+    return Answer(question, "No effect is clearly better than none", [shown], tone="good")
   if not effects:
-    return "Not sure: no name is clear of every other."
+    return Answer(question, "Not sure: no name is clear of every other", [], tone="warn")
   clear = [effect.get("evidence", {}).get("clear_by_standard_errors") for effect in effects]
   least = min((c for c in clear if c is not None), default=None)
-  words = ""
-  if least is not None:
-    size = f"{least:.1f} standard errors or more"
-    size = size if least < _CLEAR else f"more than {_CLEAR:.0f} standard errors"
-    words = f"Every {'other ' if alike else ''}explanation without it is worse by {size},"
-    words += f" where {beyond:.1f} are asked. "
-  if alike:
-    words += f"These logs do not tell it from {_either(alike)}. "
-  return words + "Brackets hold 95 % intervals."
+  words = [f"These logs do not tell it from {_either(alike, ())}."] if alike else []
+  tone = "warn" if alike else "good"
+  if least is None:
+    return Answer(question, "See the evidence below", words, tone)
+  size = f"{least:.1f}" if least < _CLEAR else f"More than {_CLEAR:.0f}"
+  others = f"By so much every {'other ' if alike else ''}explanation without it is worse"
+  each = " at least" if len(effects) > 1 else ""
+  return Answer(
+    question,
+    f"{size} standard errors{each}; {beyond:.1f} are asked",
+    [f"{others}, on parts of the logs that were left out.", *words],
+    tone,
+  )
 
 
-def _either(names: Sequence[str]) -> str:
-  return " or ".join(dict.fromkeys(name.replace("+", " with ") for name in names))
+def _either(names: Sequence[str], claimed: Sequence[str]) -> str:
+  """Returns hypotheses such as "a+b" in words; `claimed` are the kinds that the report names."""
+  words = []
+  for name in names:
+    kinds = name.split("+")
+    more = [kind for kind in kinds if kind not in claimed]
+    if claimed and more and set(claimed) < set(kinds):
+      words.append(" + ".join(("the same", *more)))
+    else:
+      words.append(" + ".join(kinds))
+  return " or ".join(dict.fromkeys(words))
 
 
-def _remains(content: dict[str, Any], unit: str) -> str:
+def _remains(content: dict[str, Any], unit: str) -> Answer:
+  question = "What remains?"
   held = content["error"]["held"]
   error, which = (held, "were not fitted") if held else (content["error"]["train"], "were fitted")
-  after, floor = error["after"], content["error"]["floor"]
-  words = f"{1e3 * after:.3g} {unit} of {1e3 * error['before']:.3g} on logs that {which},"
-  words += f" {after / max(floor, 1e-12):.1f} times the readings' noise."
+  before, after, floor = error["before"], error["after"], content["error"]["floor"]
+  times = after / max(floor, 1e-12)
+  often = f"{times:.1f}" if times < _TIMES else f"over {_TIMES:.0f}"
+  title = f"{1e3 * after:.3g} {unit}, {often} times the readings' noise"
+  words = [f"The declared model leaves {1e3 * before:.3g} {unit} on the same logs, which {which}."]
+  tone = ""
+  if content["verdict"] == "none" and before > _CALIBRATED * after:
+    known = "what the reference shows, too, and " if content["in_reference"] else ""
+    words.append(f"What lowers it: {known}its constants, fitted within their tolerances.")
   if simulation.is_worse(error):
-    words += " The extended model is worse than the declared one: do not use it."
+    words.append("The extended model is worse than the declared one: do not use it.")
+    tone = "warn"
   if content["verdict"] in ("partly", "unexplained"):
     at = content["residual_at"]
     low, high = (round(at["velocity"][end], _DIGITS) + 0.0 for end in ("low", "high"))
-    words += f" On the fitted logs most is at {at['joint']}, in {at['log']},"
-    words += f" at {low:.2g} to {high:.2g} {_LARGE[unit]}/s."
-  return words
+    words.append(
+      f"On the fitted logs most is at {at['joint']}, in {at['log']},"
+      f" at {low:.2g} to {high:.2g} {_LARGE[unit]}/s."
+    )
+    tone = "warn"
+  sizes = {"declared": before, "extended": after, "noise of the readings": floor}
+  bars = {f"{name}, {1e3 * size:.3g} {unit}": size for name, size in sizes.items()}
+  return Answer(question, title, words, tone or "good", bars)
 
 
-def _next(proposal: dict[str, Any], unit: str) -> str:
-  rivals = _either(["+".join(names) for names in proposal["separates"] if names])
+def _next(content: dict[str, Any], unit: str) -> Answer:
+  question = "What to record next?"
+  proposal = content["next_excitation"]
+  claimed = [e["kind"] for e in content["effects"] if e.get("joint") == proposal.get("joint")]
+  sets = ["+".join(names) for names in proposal["separates"] if names]
+  rivals = _either(sets, claimed)
   apart, would = proposal.get("separation_in_noise"), proposal.get("would")
-  motion = proposal["design"]
+  motion = _sentence(proposal["design"])
   if "centre_rad" in proposal:
     amplitude, centre = proposal["amplitude_rad"], proposal["centre_rad"]
     motion += f", {amplitude:.2g} {unit} about {centre:.2g} {unit}"
-  reasons = [f"it would {would}"] if would else []
+  reasons = [f"It would {would}."] if would else []
   if rivals and apart is None:
-    reasons.append(f"it may tell the effect from {rivals}")
-  elif rivals and apart is not None and apart >= 1.0:
-    reasons.append(f"the nearest rival, of {rivals}, would differ by {apart:.1f} times the noise")
-  if reasons:
-    return f"{motion}: {'; '.join(reasons)}."
-  if rivals:
-    return (
-      f"No motion that was tried tells the effect from {rivals}: they differ by less than noise."
+    reasons.append(f"It may tell what is found from {rivals}.")
+  elif rivals and apart is not None and apart >= _SEEN:
+    reasons.append(
+      f"What is found and its nearest rival, of {rivals}, would differ by {apart:.1f} times the"
+      " noise."
     )
-  return "Nothing in particular."
+  if reasons:
+    return Answer(question, motion, reasons)
+  if rivals and content["verdict"] != "none":
+    return Answer(
+      question,
+      "No motion that was tried would tell more",
+      [f"{_sentence(rivals)} would differ from what is found by less than the noise."],
+    )
+  return Answer(question, "Nothing in particular", [], tone="good")

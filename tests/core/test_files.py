@@ -96,6 +96,18 @@ def test_other_errors_stay_what_they_are(tmp_path):
   assert not files.is_disk_full(PermissionError("no"))
 
 
+def test_what_cannot_be_written_is_named_before_it_is_made(tmp_path):
+  kept = tmp_path / "kept.txt"
+  kept.write_text("mine")
+  files.check_writable(kept)
+  files.check_writable(tmp_path / "new.txt")
+  assert [path.name for path in tmp_path.iterdir()] == ["kept.txt"] and kept.read_text() == "mine"
+  for path in (tmp_path / "none" / "x.glb", tmp_path / ("x" * 300), kept / "x.glb"):
+    with pytest.raises(OSError) as found:
+      files.check_writable(path)
+    assert found.value.filename == str(path)
+
+
 def test_copies_replace(tmp_path):
   source, target = tmp_path / "source", tmp_path / "target"
   for name in ("one", "two"):

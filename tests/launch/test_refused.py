@@ -6,10 +6,12 @@ import socket
 import threading
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from nerf2real.real.safety.operator import Terminal
 from nerf2real.real.virtual.body import Body
+from nerf2real.real.virtual.camera import Eyes
 from nerf2real.real.virtual.robot import VirtualRobot
 from nerf2real.scenes.bundle import BUILT_IN
 from tests.launch.test_identify import _log
@@ -144,6 +146,26 @@ def test_a_page_on_another_port_than_was_asked_for_is_told(run, monkeypatch, ask
   assert ended.status == 0 and "open http://127.0.0.1:8081 " in ended.out
   told = "port 8080 is taken by another program: the page is on port 8081\n"
   assert ended.err == (told if says else "")
+
+
+def test_a_virtual_robot_whose_camera_ends_says_so(run, monkeypatch, tmp_path):
+  link, taken = tmp_path / "op3", []
+
+  def picture(self, time=None):
+    if len(taken) == 3:
+      raise OSError("the context is lost")
+    taken.append(threading.current_thread().name)
+    return np.zeros((24, 32, 3), np.uint8)
+
+  monkeypatch.setattr(Eyes, "picture", picture)
+  ended = run("virtual_robot", "--world", "floor", "--link", link, "--seconds", "100")
+  assert ended.status == 1, ended
+  (line,) = ended.err.splitlines()
+  assert line == (
+    "error: The virtual robot's camera ended (OSError: the context is lost): no pictures come any "
+    "more; start it again."
+  )
+  assert not link.is_symlink()
 
 
 class _Opened:

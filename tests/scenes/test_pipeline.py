@@ -169,6 +169,17 @@ def test_no_source_is_one_clear_line(settings, tmp_path):
   assert not (tmp_path / "out" / "scene.json").exists()
 
 
+def test_a_scene_of_another_capture_is_not_overwritten(settings, tmp_path):
+  other, out = tmp_path / "hall.mp4", tmp_path / "room"
+  other.write_bytes(b"another film")
+  out.mkdir()
+  made_from = {"source": {"name": "room.mp4", "sha256": "0"}}
+  (out / "scene.json").write_text(json.dumps(made_from))
+  with pytest.raises(ValueError, match=r"holds a scene of room.mp4, found the capture hall.mp4"):
+    pipeline.make_scene(other, out, settings=settings)
+  assert json.loads((out / "scene.json").read_text()) == made_from
+
+
 def test_built_in_bundle_is_whole():
   scene = Bundle.load()
   assert scene.folder == bundle.BUILT_IN

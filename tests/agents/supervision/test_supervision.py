@@ -107,6 +107,17 @@ def test_no_restart_where_it_would_not_help(index, status, tmp_path):
   assert run.supervisor.restarts == 0
 
 
+def test_a_refusal_is_said_in_one_line_without_what_libraries_logged(tmp_path):
+  run = Run(tmp_path)
+  run.started[0].last_words = lambda: (
+    "21:00 learner: No module named 'X'\nerror: room has no scene.json: make it.\nlearner: closed"
+  )
+  assert run.die(0, REFUSED) == (
+    f"Learner ended with status {REFUSED} (it cannot start with its arguments): "
+    "room has no scene.json: make it."
+  )
+
+
 def test_more_than_five_restarts_within_the_window_end_the_run(tmp_path):
   run = Run(tmp_path)
   for restart in range(5):

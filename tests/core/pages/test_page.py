@@ -39,6 +39,8 @@ def test_every_text_is_escaped(tmp_path):
     blocks.Text(EVIL),
     blocks.Heading(EVIL),
     blocks.Warnings([EVIL]),
+    blocks.Notes([EVIL]),
+    blocks.Answers([blocks.Answer(EVIL, EVIL, [EVIL], bars={EVIL: 1.0})]),
     Picture(IMAGE, EVIL),
     Table([EVIL], [[EVIL]]),
     Figures([Figure(EVIL, EVIL, EVIL, EVIL, EVIL)]),
@@ -50,7 +52,7 @@ def test_every_text_is_escaped(tmp_path):
     warnings=[EVIL],
     origin=Origin(EVIL, EVIL, EVIL),
   )
-  assert "alert('a')" not in text and text.count("alert(&#39;a&#39;)") == 21
+  assert "alert('a')" not in text and text.count("alert(&#39;a&#39;)") == 26
   (figure,) = figures_in(text)
   assert figure["data"][0]["name"] == figure["layout"]["title"]["text"] == EVIL
 
@@ -67,9 +69,9 @@ def test_page_needs_no_other_file_and_holds_plotly_once_where_a_chart_is(tmp_pat
 
 def test_figures_have_a_column_for_what_is_good_only_where_it_is_known(tmp_path):
   known = written(tmp_path, Figures([Figure("error", 0.123456, "m", "of all", "lower")]))
-  assert "<th>good is</th>" in known and "<td>lower</td>" in known
-  assert '<td class="number">0.1235</td><td>m</td>' in known
-  assert "good is" not in written(tmp_path, Figures([Figure("parts", 3)]))
+  assert "<th>good is</th>" in known and '<td class="good">lower</td>' in known
+  assert '<td class="value">0.1235</td><td class="unit">m</td>' in known
+  assert "<th>good is" not in written(tmp_path, Figures([Figure("parts", 3)]))
 
 
 def test_origin_is_shown_where_it_is_given(tmp_path):
@@ -108,7 +110,7 @@ def test_own_templates_have_the_look_and_must_be_given_their_names(tmp_path):
   data = Figure("</script>", np.float32(0.5), good=None)
   text = page.render(tmp_path / "own.html", plots=False, name="a<b", data=data)
   assert "<p>a&lt;b</p>" in text and "--accent" in text
-  assert '"value":0.5' in text and "good" not in text and text.count("</script>") == 1
+  assert '"value":0.5' in text and '"good"' not in text and text.count("</script>") == 1
   with pytest.raises(jinja2.UndefinedError, match="name"):
     page.render(tmp_path / "own.html", plots=False, data=data)
 

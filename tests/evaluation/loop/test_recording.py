@@ -1,9 +1,11 @@
 """Recordings of a virtual robot: what turning on a floor shows of its slope, and what repeats."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
-from nerf2real.evaluation.loop import naming
+from nerf2real.evaluation.loop import naming, story
 from nerf2real.evaluation.loop.joint_space import closing
 from nerf2real.evaluation.loop.robot import machines, motions, recording
 from nerf2real.evaluation.loop.settings import LoopSettings
@@ -51,6 +53,37 @@ def test_a_recording_beside_a_reference_has_a_noise_of_its_own(tmp_path, monkeyp
     settings = LoopSettings(out=tmp_path / str(expected), reference=given)
     with pytest.raises(Recorded, match=str(expected)):
       closing.close_loop(settings)
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_a_loop_with_a_policy_records_the_reference_that_it_uses(tmp_path, monkeypatch, given):
+  """With --reference it had recorded one more, unused, and the stand with the noise of none."""
+  reference = tmp_path / "before"
+  reference.mkdir()
+  for name in motions.TRAIN:
+    (reference / f"{name}.mcap").write_bytes(b"a log")
+  made = {}
+
+  @contextlib.contextmanager
+  def virtual_robot(seed, altered=(), *, films=False, age=0.0, noise=0):
+    yield noise, altered
+
+  def record_stand(folder, link, robot, *, seconds, lens):
+    made[folder.name] = (link, robot)
+
+  monkeypatch.setattr(machines, "virtual_robot", virtual_robot)
+  monkeypatch.setattr(recording, "record_stand", record_stand)
+  monkeypatch.setattr(recording, "record_floor", lambda folder, link, robot: None)
+  out = tmp_path / "out"
+  settings = LoopSettings(policy="walker", out=out, reference=reference if given else None)
+  hidden = undeclared.parse_all(["command_delay:0.045"])
+  found = story._record(settings, hidden, lambda line: None)
+  if given:
+    assert found == reference
+    assert made == {"stand": (machines.noise_beside(reference), hidden)}
+  else:
+    assert found == out / "reference"
+    assert made == {"stand": (0, hidden), "reference": (1, ())}
 
 
 def test_another_recording_of_the_same_robot_differs_and_the_same_one_repeats():

@@ -29,6 +29,14 @@ def _settings(folder, **changes):
 def test_a_folder_belongs_to_one_loop(tmp_path):
   claim(_settings(tmp_path, hidden=("command_delay:0.045",)))
   claim(_settings(tmp_path, hidden=("command_delay:0.045",), trials=9, minutes=3.0))
+  path = tmp_path / "loop_settings.json"
+  noted = json.loads(path.read_text())
+  path.write_text(json.dumps({k: v for k, v in noted.items() if k != "reference"}))  # an older loop
+  claim(_settings(tmp_path, hidden=("command_delay:0.045",)))
+  path.write_text(json.dumps(noted | {"reference": "elsewhere"}))
+  with pytest.raises(ValueError, match="another reference: take another"):
+    claim(_settings(tmp_path, hidden=("command_delay:0.045",)))
+  path.write_text(json.dumps(noted))
   with pytest.raises(ValueError, match="holds a loop with another hidden, seed: take another"):
     claim(_settings(tmp_path, hidden=("command_delay:0.05",), seed=2))
   assert (

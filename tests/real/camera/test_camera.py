@@ -205,3 +205,11 @@ def test_stream_answers_and_frees_its_port():
   stream.close()
   again = CameraStream(Counter(), port=int(base.rsplit(":", 1)[1]))
   again.close()
+
+
+def test_a_stream_whose_pictures_end_says_so_and_hangs_up():
+  pictures = iter([np.zeros((60, 80, 3), np.uint8)] * 3)
+  with CameraStream(lambda: next(pictures), VirtualCamera(rate=40, latency=0)) as stream:
+    with urllib.request.urlopen(stream.url, timeout=10) as connection:
+      assert connection.read().endswith(b"\r\n")  # to its end
+    assert isinstance(stream.error, StopIteration) and stream.closed

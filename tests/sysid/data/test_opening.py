@@ -75,6 +75,8 @@ def test_a_csv_log(tmp_path):
     (lambda t: [t[0].replace("command_position", "duty"), *t[1:]], "no column command_position"),
     (lambda t: [*t[:9], t[9] + ",4", *t[10:]], "line 10 has 7 fields, the header 6"),
     (lambda t: [*t[:9], t[9].replace(",,,,", ",,x,,"), *t[10:]], "line 10 has 'x' as effort:joint"),
+    (lambda t: [*t[:9], t[9].replace(",,,,", ",,nan,,"), *t[10:]], "'nan' as effort:joint"),
+    (lambda t: [*t[:9], t[9].replace(",,,,", ",,inf,,"), *t[10:]], "or nothing where none was"),
     (lambda t: [*t[:9], *t[19:21], *t[9:19], *t[21:]], "time runs backwards"),
     (lambda t: t[:40], "lasts 0.18 s with commands and states"),
     (lambda t: [t[0], *(r for i, r in enumerate(t[1:]) if i % 40 < 2)], "at least 20 a second"),

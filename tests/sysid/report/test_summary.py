@@ -16,6 +16,7 @@ NAMED = {
   "verdict": "effects",
   "effects": [FRICTION],
   "alternatives": [],
+  "in_reference": [],
   "residual_at": {
     "joint": "knee",
     "log": "train_1.mcap",
@@ -37,9 +38,19 @@ NAMED = {
 }
 
 
-def answers(content, unit="mrad"):
-  (table,) = summary.section(content, beyond=3.0, unit=unit).blocks
-  return [row[1] for row in table.rows]
+SHOWN = "Of 19 kinds of effect these logs would not show cogging."
+
+
+def answers(content, unit="mrad", referred=False):
+  """Returns the four answers, each with its details, and their tones."""
+  part = summary.section(content, beyond=3.0, unit=unit, shown=SHOWN, referred=referred)
+  (block,) = part.blocks
+  return [" | ".join((a.answer, *a.details)) for a in block.answers]
+
+
+def tones(content):
+  (block,) = summary.section(content, beyond=3.0, unit="mrad", shown=SHOWN, referred=False).blocks
+  return [answer.tone for answer in block.answers]
 
 
 @pytest.fixture
@@ -49,71 +60,112 @@ def content():
 
 def test_a_named_effect_has_its_value_its_certainty_and_what_remains(content):
   missing, sure, remains, record = answers(content)
-  words = "coulomb_friction at knee (constant dry friction beyond the declared one)"
-  assert missing == f"{words}: torque 0.25 N m (0.24 to 0.26)."
-  assert "by 8.1 standard errors or more, where 3.0 are asked" in sure
-  assert remains == ("1.5 mrad of 30 on logs that were not fitted, 1.5 times the readings' noise.")
-  assert record.startswith("steps of 1.5 s, 0.9 rad about 0 rad: ")
+  words = "Coulomb friction at knee | Constant dry friction beyond the declared one;"
+  assert missing == f"{words} torque 0.25 N m (0.24 to 0.26). | In brackets: 95 % intervals."
+  assert sure.startswith("8.1 standard errors; 3.0 are asked | By so much every explanation")
+  assert remains.startswith("1.5 mrad, 1.5 times the readings' noise | The declared model leaves")
+  assert record.startswith("Steps of 1.5 s, 0.9 rad about 0 rad | ")
   assert "of stribeck_friction, would differ by 3.2 times the noise" in record
+  (block,) = summary.section(content, beyond=3.0, unit="mrad", shown="", referred=False).blocks
+  assert block.answers[2].bars == {
+    "declared, 30 mrad": 0.03,
+    "extended, 1.5 mrad": 0.0015,
+    "noise of the readings, 1 mrad": 0.001,
+  }
+  assert "warn" not in tones(content)
 
 
 def test_what_logs_do_not_tell_apart_is_said(content):
   rival = {"kind": "spring+viscous_friction", "kinds": [], "confounded": True}
   content["alternatives"] = [rival, {**rival, "kind": "backlash", "confounded": False}]
   _, sure, _, _ = answers(content)
-  assert sure.startswith("Every other explanation")
-  assert "These logs do not tell it from spring with viscous_friction." in sure
+  assert "By so much every other explanation" in sure
+  assert sure.endswith("These logs do not tell it from spring + viscous_friction.")
+  assert tones(content)[1] == "warn"
 
 
 def test_of_many_effects_the_rest_is_counted(content):
   content["effects"] = [FRICTION] * 6
-  assert answers(content)[0].endswith("; and 2 more, listed below.")
+  missing = answers(content)[0]
+  assert ", and 2 more, listed below | Coulomb friction at knee: constant dry" in missing
+
+
+def test_names_that_are_not_all_are_said_not_to_be(content):
+  content["verdict"] = "partly"
+  assert answers(content)[0].startswith("Coulomb friction at knee; and something that has no clear")
+  assert [tone == "warn" for tone in tones(content)] == [True, False, True, False]
 
 
 def test_without_held_logs_the_fitted_ones_are_said(content):
   content["error"]["held"] = None
-  assert answers(content)[2].startswith("2 mrad of 20 on logs that were fitted, 2.0 times")
+  remains = answers(content)[2]
+  assert remains.startswith("2 mrad, 2.0 times") and remains.endswith("which were fitted.")
+
+
+def test_readings_without_noise_are_no_measure(content):
+  content["error"]["floor"] = 1e-9
+  assert answers(content)[2].startswith("1.5 mrad, over 1000 times the readings' noise")
 
 
 def test_an_extended_model_that_is_worse_is_said_to_be(content):
   content["error"]["held"]["after"] = 0.04
   assert answers(content)[2].endswith("worse than the declared one: do not use it.")
+  assert tones(content)[2] == "warn"
 
 
 def test_nothing_and_no_name_are_different_answers(content):
   content["effects"] = []
   content["verdict"] = "none"
   missing, sure, remains, _ = answers(content)
-  assert missing == "Nothing that these logs show."
-  assert sure.startswith("No hypothesis") and "knee" not in remains
+  assert missing == "Nothing that these logs show"
+  assert sure == f"No effect is clearly better than none | {SHOWN}"
+  assert "knee" not in remains
+  assert "What lowers it: its constants, fitted within their tolerances." in remains
   content["verdict"] = "unexplained"
-  content["alternatives"] = [FRICTION]
+  constants = {**FRICTION, "kind": "parameter_error"}
+  content["alternatives"] = [constants, FRICTION]
   missing, sure, remains, _ = answers(content)
-  assert "at knee for which no name is clear. The nearest: coulomb_friction" in missing
+  assert missing.startswith("Something at knee that has no clear name | The nearest, which is not")
+  assert "claimed: coulomb friction at knee: constant" in missing
   assert sure.startswith("Not sure")
   assert remains.endswith(
     "On the fitted logs most is at knee, in train_1.mcap, at -0.1 to 0.2 rad/s."
   )
 
 
+def test_nothing_new_beside_a_reference_is_not_said_to_be_a_model_that_lacks_nothing(content):
+  content |= {"effects": [], "verdict": "none", "in_reference": [FRICTION]}
+  missing, _, remains, _ = answers(content, referred=True)
+  assert missing.startswith("Nothing has changed since the reference | In the reference, too: coul")
+  assert "What lowers it: what the reference shows, too, and its constants" in remains
+
+
 def test_a_motion_without_a_reason_is_not_proposed(content):
   content["next_excitation"] |= {"separates": [], "separation_in_noise": 0.0}
-  assert answers(content)[3] == "Nothing in particular."
+  assert answers(content)[3] == "Nothing in particular"
   content["next_excitation"]["would"] = "show backlash"
-  assert answers(content)[3] == "steps of 1.5 s, 0.9 rad about 0 rad: it would show backlash."
+  assert answers(content)[3] == "Steps of 1.5 s, 0.9 rad about 0 rad | It would show backlash."
 
 
 def test_rivals_that_no_motion_separates_are_said(content):
   content["next_excitation"]["separation_in_noise"] = 0.02
-  words = "No motion that was tried tells the effect from stribeck_friction"
+  words = "No motion that was tried would tell more | Stribeck_friction would differ from what is"
   assert answers(content)[3].startswith(words)
+  content |= {"effects": [], "verdict": "none"}
+  assert answers(content)[3] == "Nothing in particular"
+
+
+def test_a_rival_that_adds_to_what_is_named_is_said_so(content):
+  sets = [["coulomb_friction", "spring"], ["backlash", "spring"]]
+  content["next_excitation"] |= {"joint": "knee", "separates": sets}
+  assert "of the same + spring or backlash + spring, would differ" in answers(content)[3]
 
 
 def test_rivals_with_equal_effects_are_said_once(content):
   content["next_excitation"] |= {"separation_in_noise": 0.02, "separates": [["spring"]] * 2}
-  assert "from spring: they differ" in answers(content)[3]
+  assert "Spring would differ" in answers(content)[3]
 
 
 def test_a_force_driven_joint_has_a_motion_in_words(content):
   content["next_excitation"] = {"design": "a longer log", "separates": [["payload"]], "would": ""}
-  assert answers(content)[3] == "a longer log: it may tell the effect from payload."
+  assert answers(content)[3] == "A longer log | It may tell what is found from payload."
