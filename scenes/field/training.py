@@ -245,18 +245,21 @@ def _load_checkpoint(path: Path, key: str) -> tuple[float, dict[str, np.ndarray]
     with safetensors.safe_open(path, "numpy") as file:
       metadata = file.metadata() or {}
       if (found := metadata.get("format", "1")) != _CHECKPOINT_FORMAT:
-        return _begin_anew(f"{path} is of format {found}, expected {_CHECKPOINT_FORMAT}")
+        _warn_unused(f"{path} is of format {found}, expected {_CHECKPOINT_FORMAT}")
+        return None
       if metadata.get("key") != key:
         return None
       arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
   except (safetensors.SafetensorError, UnicodeDecodeError) as error:
-    return _begin_anew(f"{path} is damaged, as by a full disk or a crash ({error})")
+    _warn_unused(f"{path} is damaged, as by a full disk or a crash ({error})")
+    return None
   if _hash_arrays(arrays) != metadata.get("sha256"):
-    return _begin_anew(f"{path} is damaged: its arrays are not those that were written")
+    _warn_unused(f"{path} is damaged: its arrays are not those that were written")
+    return None
   return float(metadata["seconds"]), arrays
 
 
-def _begin_anew(why: str) -> None:
+def _warn_unused(why: str) -> None:
   """Warns of a checkpoint that is of no use."""
   warnings.warn(
     f"{why}: training starts from the beginning and writes the checkpoint anew.", stacklevel=4
