@@ -26,12 +26,14 @@ class _Listed(NamedTuple):
   files: list[Path]
   depth: list[Path]  # none, or one each
   depth_times: np.ndarray  # [N] [s], or empty
+  without_depth: int = 0  # pictures that were left out, as no depth was measured near their time
 
   def selected(self, rows: np.ndarray) -> "_Listed":
     depth, depth_times = self.depth, self.depth_times
     if depth:
       depth, depth_times = [depth[k] for k in rows], depth_times[rows]
-    return _Listed(self.times[rows], [self.files[k] for k in rows], depth, depth_times)
+    files = [self.files[k] for k in rows]
+    return _Listed(self.times[rows], files, depth, depth_times, self.without_depth)
 
 
 def _first(source: Path, names: tuple[str, ...]) -> Path | None:
@@ -74,8 +76,11 @@ def _listed(source: Path) -> _Listed:
     listed = _table(source / _DEPTH, 2)
     stamps = _stamped(source / _DEPTH, [row[0] for row in listed])
     index, near = trajectory.nearest(stamps, times)
+    if not near.any():
+      return _Listed(times, files, [], np.zeros(0), without_depth=len(times))
     depth = [source / listed[k][1] for k in index]
-    return _Listed(times, files, depth, stamps[index]).selected(np.flatnonzero(near))
+    found = _Listed(times, files, depth, stamps[index], without_depth=int((~near).sum()))
+    return found.selected(np.flatnonzero(near))
   joint = _first(source, _ASSOCIATIONS)
   assert joint is not None  # `is_tum` has found one
   pairs = [row[:3] + row[3].split()[:1] for row in _table(joint, 4)]
@@ -115,6 +120,11 @@ def read_tum(source: Path) -> Recording:
     depth_poses=depth_poses,
     unit=_DEPTH_UNIT,
   ).present(source)
+  if listed.without_depth:
+    near = f"pictures have no depth within {trajectory.SAME_TIME:g} s"
+    of = len(listed.files) + (listed.without_depth if listed.depth else 0)
+    fate = "left out" if listed.depth else f"none of {_DEPTH} used"
+    found = found.warned(f"{listed.without_depth} of {of} {near}: {fate}.")
   lost = len(listed.files) - len(chosen.files)
   if lost:
     found = found.warned(f"{lost} of {len(listed.files)} pictures have no pose: left out.")

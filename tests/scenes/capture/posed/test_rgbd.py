@@ -339,6 +339,20 @@ def test_pictures_without_depth_are_left_out(tum, tmp_path):
   assert not capture.known.depth_files and any("none used" in t for t in capture.warnings)
 
 
+def test_pictures_far_from_all_depth_are_left_out_and_counted(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  rows = (folder / "depth.txt").read_text().splitlines()
+  (folder / "depth.txt").write_text("\n".join(rows[:5] + rows[6:]))
+  capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  assert capture.known.depth_files
+  assert "1 of 16 pictures have no depth within 0.02 s: left out." in capture.warnings
+  (folder / "depth.txt").write_text("7.0 depth/000.png")
+  capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  assert not capture.known.depth_files and not len(capture.known.depth_poses)
+  words = "16 of 16 pictures have no depth within 0.02 s: none of depth.txt used."
+  assert words in capture.warnings
+
+
 @pytest.mark.parametrize("axes", [np.eye(3), OPENGL_FROM_OPENCV])
 @pytest.mark.parametrize("inverse", [False, True])
 def test_unit_and_convention_are_read_as_the_pictures_ask_for(tum, tmp_path, axes, inverse):
