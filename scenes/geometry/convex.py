@@ -64,13 +64,13 @@ def _directions(count: int) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _reach(clearance, i, j, k):
-  """Least and greatest clearance at the corners of the cell behind a voxel's centre."""
-  low = high = clearance[i, j, k]
-  for corner in range(1, 8):
+def _corners(clearance, i, j, k):
+  """Least, greatest and mean clearance at the corners of the cell behind a voxel's centre."""
+  low, high, total = np.inf, -np.inf, 0.0
+  for corner in range(8):
     value = clearance[i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)]
-    low, high = min(low, value), max(high, value)
-  return low, high
+    low, high, total = min(low, value), max(high, value), total + value
+  return low, high, total / 8
 
 
 @numba.njit(cache=True)
@@ -85,35 +85,49 @@ def _between(clearance, i, j, k, u, v, w):
 
 
 @numba.njit(cache=True)
-def _height(planes, x, y, z):
-  """Greatest distance of a place before the planes; negative inside of all."""
+def _height(planes, x, y, z, enough):
+  """Greatest height of a place over the planes, or one that is more than enough."""
   found = -np.inf
   for f in range(len(planes)):
-    ahead = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3]
-    found = max(found, ahead)
+    height = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3]
+    found = max(found, height)
+    if found > enough:
+      break
   return found
 
 
 @numba.njit(cache=True)
-def _intrusion(clearance, lower, voxel, first, last, planes, limit, parts):
-  """Places inside planes with more clearance than the limit, `parts` along a voxel; sum of it."""
+def _intrusion(clearance, lower, voxel, first, last, planes, limit, along):
+  """Counts places inside planes with more clearance than the limit, and sums their clearance.
+
+  Cells of the grid that lie wholly inside and too deep are counted at once.
+  """
   bad, deep = 0, 0.0
-  circumradius = 0.5 * np.sqrt(3.0) * voxel
+  radius = 0.5 * np.sqrt(3.0) * voxel  # of a cell
   for i in range(first[0], last[0]):
     for j in range(first[1], last[1]):
       for k in range(first[2], last[2]):
-        if _reach(clearance, i, j, k)[1] <= limit:
+        low, high, mean = _corners(clearance, i, j, k)
+        if high <= limit:
           continue
         x, y, z = lower[0] + voxel * i, lower[1] + voxel * j, lower[2] + voxel * k
         half = 0.5 * voxel
-        if _height(planes, x + half, y + half, z + half) > circumradius:
+        middle = _height(planes, x + half, y + half, z + half, radius)
+        if middle > radius:
           continue
-        for n in range(parts**3):
-          u = (n % parts + 0.5) / parts
-          v = (n // parts % parts + 0.5) / parts
-          w = (n // parts**2 + 0.5) / parts
+        whole = middle <= -radius
+        if whole and low > limit:
+          bad += along**3
+          deep += along**3 * mean
+          continue
+        for n in range(along**3):
+          u = (n % along + 0.5) / along
+          v = (n // along % along + 0.5) / along
+          w = (n // along**2 + 0.5) / along
           free = _between(clearance, i, j, k, u, v, w)
-          if free > limit and _height(planes, x + u * voxel, y + v * voxel, z + w * voxel) <= 0:
+          if free > limit and (
+            whole or _height(planes, x + u * voxel, y + v * voxel, z + w * voxel, 0.0) <= 0
+          ):
             bad += 1
             deep += free
   return bad, deep
