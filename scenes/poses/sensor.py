@@ -14,6 +14,7 @@ import numpy as np
 from scipy import optimize
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.poses.localisation import Localisation
 
@@ -53,7 +54,7 @@ class Sensor:
     """
     beside = np.eye(4)
     beside[:3, 3] = self._centre
-    return depth_pictures.seen_from(depth, self.camera, beside, camera)
+    return depth_pictures.seen_from(depth, self.camera.rays(), beside, camera)
 
 
 class _Sighted(NamedTuple):
@@ -100,7 +101,12 @@ def _sighted(found: Localisation, depth: np.ndarray, unit: float) -> _Sighted:
 
 
 def at_their_time(
-  found: Localisation, depth: np.ndarray, picture_from_depth: np.ndarray, *, unit: float
+  found: Localisation,
+  depth: np.ndarray,
+  picture_from_depth: np.ndarray,
+  *,
+  unit: float,
+  progress: Progress = no_progress,
 ) -> np.ndarray | None:
   """Depth as it would have been measured when the pictures were taken.
 
@@ -114,18 +120,18 @@ def at_their_time(
     picture_from_depth: The camera's pose [N, 4, 4] when the depth was measured, in its frame when
       the picture was taken [m].
     unit: That unit [m].
+    progress: Called with the fraction done and a text.
 
   Returns:
     The moved depth, of the same shape and unit; None where localised points agree with it no better
     than with the depth as it is.
   """
   camera = found.camera.resized(depth.shape[2], depth.shape[1])
-  moved = np.stack(
-    [
-      np.rint(depth_pictures.seen_from(one * unit, camera, motion, camera) / unit)
-      for one, motion in zip(depth, picture_from_depth, strict=True)
-    ]
-  ).astype(depth.dtype)
+  rays, moved = camera.rays(), np.zeros_like(depth)
+  for number, motion in enumerate(picture_from_depth):
+    seen = depth_pictures.seen_from(depth[number] * unit, rays, motion, camera)
+    moved[number] = np.rint(seen / unit)
+    progress((number + 1) / len(depth), f"depth of picture {number + 1} of {len(depth)}")
   before, after = (_sighted(found, pictures, unit) for pictures in (depth, moved))
   if len(before.picture) < _FEWEST:
     return None

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from nerf2real.core.progress import Progress
+from nerf2real.core.progress import Progress, part
 from nerf2real.core.serialization import write_json
 from nerf2real.scenes.capture import keyframes as keyframe_files
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
@@ -96,7 +96,9 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
     moved = own = None
     if (motion := known.picture_from_depth) is not None:
       rows = [list(of_name).index(name) for name in found.names]
-      moved = sensor.at_their_time(found, depth, motion[rows], unit=known.depth_unit)
+      moved = sensor.at_their_time(
+        found, depth, motion[rows], unit=known.depth_unit, progress=part(progress, 0.0, 0.7)
+      )
       depth = depth if moved is None else moved
     own = sensor.find_sensor(found, depth, unit=known.depth_unit)
     write_json(folder / _SENSOR_RECORD, {"moved": moved is not None, "beside": own is not None})
@@ -110,7 +112,8 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
       path = folder / f"{Path(name).stem}.png"
       if not cv2.imwrite(str(path), np.rint(aligned).astype(np.uint16)):
         raise OSError(f"{path} could not be written: is the disk full?")
-      progress((number + 1) / len(depth), f"depth of picture {number + 1} of {len(depth)}")
+      written = (number + 1) / len(depth)
+      progress(0.8 + 0.2 * written, f"depth of picture {number + 1} of {len(depth)} written")
 
   inputs = {"keyframes": capture.stamp, "poses": poses.stamp}
   stage = cache.run("sensor", write, settings=None, inputs=inputs, version=_SENSOR_VERSION)

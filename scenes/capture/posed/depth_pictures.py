@@ -46,14 +46,14 @@ def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
 
 
 def seen_from(
-  depth: np.ndarray, camera: Camera, other_from_camera: np.ndarray, other: Camera
+  depth: np.ndarray, rays: np.ndarray, other_from_camera: np.ndarray, other: Camera
 ) -> np.ndarray:
   """Moves a depth picture to where another camera would have measured it.
 
   Args:
     depth: z-depth [H, W] [m], 0 where nothing was measured.
-    camera: Which measured it.
-    other_from_camera: Its pose [4, 4] in the other's frame.
+    rays: Of the pixels of the camera that measured it [H, W, 3], of length 1 along its axis.
+    other_from_camera: That camera's pose [4, 4] in the other's frame.
     other: The other camera.
 
   Returns:
@@ -61,7 +61,7 @@ def seen_from(
     measured.
   """
   seen = depth > 0
-  points = (camera.rays() * depth[..., None])[seen] @ other_from_camera[:3, :3].T
+  points = (rays[seen] * depth[seen][:, None]) @ other_from_camera[:3, :3].T
   points += other_from_camera[:3, 3]
   points = points[points[:, 2] > 0]
   column, row = np.floor(other.project(points)).astype(int).T
