@@ -15,7 +15,8 @@ from nerf2real.scenes.capture.posed.recording import Recording, camera_of
 
 _PICTURES, _DEPTH = "rgb.txt", "depth.txt"
 _ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
-_POSES = ("groundtruth.txt", "gt.txt", "trajectory.txt", "CameraTrajectory.txt")
+TRAJECTORY = "groundtruth.txt"
+_POSES = (TRAJECTORY, "gt.txt", "trajectory.txt", "CameraTrajectory.txt")
 _DEPTH_UNIT = 1 / 5000  # m
 
 
@@ -45,6 +46,12 @@ def is_tum(source: Path) -> bool:
   return _first(source, (_PICTURES, *_ASSOCIATIONS)) is not None and (
     _first(source, _POSES) is not None
   )
+
+
+def lists_without_poses(source: Path) -> str | None:
+  """Names the list of pictures of a folder that has no trajectory beside it; None where none is."""
+  listed = _first(source, (_PICTURES, *_ASSOCIATIONS))
+  return None if listed is None or is_tum(source) else listed.name
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:

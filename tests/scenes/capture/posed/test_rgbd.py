@@ -288,6 +288,19 @@ def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
 
 
+def test_a_sequence_without_trajectory_says_what_is_missing(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  (folder / "groundtruth.txt").rename(folder / "poses_of_mine.txt")
+  with pytest.raises(CaptureError) as said:
+    source_kind(folder)
+  assert "rgb.txt of TUM's layout and no trajectory: expected groundtruth.txt" in str(said.value)
+  assert f"or give {folder / 'rgb'} alone" in str(said.value)
+  for name in ("rgb.txt", "depth.txt"):
+    (folder / name).unlink()
+  with pytest.raises(CaptureError, match=r"give one of them, such as .*tum/rgb"):
+    source_kind(folder)
+
+
 def _copied(tum, folder):
   shutil.copytree(tum, folder)
   return folder
