@@ -60,6 +60,8 @@ def assemble(
   capture, poses, alignment = results.capture.value, results.poses.value, results.world.value
   seconds = {stage: result.seconds for stage, result in stages.items()}
   warnings = [*capture.warnings, *poses.warnings, *alignment.warnings]
+  if (lost := capture.without_place(poses.names)) is not None:
+    warnings.append(lost)
   ratio = figures.get("exposure_ratio", 1.0)
   if ratio > _NOTICEABLE_EXPOSURE:
     warnings.append(

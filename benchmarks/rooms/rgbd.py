@@ -34,7 +34,7 @@ _HOLES = 0.2  # share of the picture without depth
 _HOLE_SIZE = 12.0  # pixels that a hole is wide
 _POSITION_ERROR = 0.01  # of a tracker, root mean square [m]
 _ROTATION_ERROR = np.radians(0.5)  # of a tracker, root mean square [rad]
-_DRIFT = 20.0  # frames over which a tracker's errors change
+_DRIFT = 2 / 3  # s over which a tracker's errors change
 _RATE = 30.0  # frames a second of the stamps
 # Kinect: 7-Scenes' nominal depth camera, 25 mm beside a colour camera of shorter focal length
 _SENSOR = Camera(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0)
@@ -60,9 +60,9 @@ class Settings(harness.Options):
   """Of noise, holes and the poses' errors."""
 
 
-def tracked(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-  """Poses [N, 4, 4] with the smooth errors of a tracker, without drift."""
-  errors = ndimage.gaussian_filter1d(rng.standard_normal((len(poses), 6)), _DRIFT, axis=0)
+def tracked(poses: np.ndarray, rng: np.random.Generator, *, rate: float = _RATE) -> np.ndarray:
+  """Poses [N, 4, 4] with the smooth errors of a tracker, without drift; `rate` of them a second."""
+  errors = ndimage.gaussian_filter1d(rng.standard_normal((len(poses), 6)), _DRIFT * rate, axis=0)
   errors /= np.sqrt(np.mean(errors**2, axis=0))
   result = poses.copy()
   result[:, :3, 3] += _POSITION_ERROR / np.sqrt(3) * errors[:, :3]

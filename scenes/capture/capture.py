@@ -1,6 +1,7 @@
 """Keyframes of a capture: what is known of them, and what may ruin a reconstruction from them."""
 
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,17 @@ class Capture:
     found = [name for name, wanted in zip(names, chosen, strict=True) if wanted]
     rest = f" and {len(found) - most} more" if len(found) > most else ""
     return ", ".join(found[:most]) + rest
+
+  def without_place(self, placed: Collection[str]) -> str | None:
+    """Names the stills that are not among the placed keyframes; None where all are, or of films."""
+    lost = np.array([path.name not in placed for path in self.images])
+    if self.origins is None or not lost.any():
+      return None
+    return (
+      f"{lost.sum()} of {len(lost)} pictures have no place and are not used: "
+      f"{self.called(lost, most=4)}. Each needs half of its view in common with others that were "
+      "taken a step beside it."
+    )
 
   @property
   def unit_up(self) -> np.ndarray | None:

@@ -7,6 +7,7 @@ from nerf2real.scenes.capture.media.stills import list_images, list_images_below
 from nerf2real.scenes.capture.posed.colmap_model import find_colmap_model
 from nerf2real.scenes.capture.posed.rgbd import find_rgbd
 from nerf2real.scenes.capture.posed.transforms import find_transforms
+from nerf2real.scenes.capture.posed.tum import TRAJECTORY, lists_without_poses
 
 EXPORT_STREAM = (
   "export its pictures, depth and poses with ScanNet's SensReader (reader.py "
@@ -44,6 +45,13 @@ def _what_instead(source: Path) -> str:
   if streams:
     return f"{streams[0].name}, ScanNet's stream: {EXPORT_STREAM}"
   below = [child.name for child in sorted(source.iterdir()) if child.is_dir() and _holds(child)]
+  below.sort(key=lambda name: "depth" in name.lower())  # depth pictures alone are no capture
+  if (listed := lists_without_poses(source)) is not None:
+    alone = f", or give {source / below[0]} alone: its pictures are localised then" if below else ""
+    return (
+      f"{listed} of TUM's layout and no trajectory: expected {TRAJECTORY} beside it, with time, "
+      f"position and quaternion (x, y, z, w) a line{alone}."
+    )
   if below:
     return f"no capture, but folders that do: give one of them, such as {source / below[0]}."
   return (

@@ -34,7 +34,7 @@ _RECORD_SECONDS = 2.0  # chosen: distance of the points of the report's curve
 SNAPSHOT_SECONDS = 5.0  # chosen: often enough to see it grow
 _WARMUP_START = 0.01  # the warm-up starts at this fraction of the learning rate, as in multinerf
 _CHECKPOINT = "training.safetensors"
-_CHECKPOINT_FORMAT = "2"  # of the arrays; files that name none have format 1
+_CHECKPOINT_FORMAT = "3"  # 3: with a hash of the arrays; files that name none have format 1
 
 
 class TrainError(ValueError):
@@ -219,23 +219,48 @@ def _run_key(views: Views, settings: TrainSettings, seed: int) -> str:
 
 
 def _save_checkpoint(path: Path, key: str, seconds: float, arrays: dict[str, np.ndarray]) -> None:
-  metadata = {"format": _CHECKPOINT_FORMAT, "key": key, "seconds": repr(seconds)}
+  metadata = {
+    "format": _CHECKPOINT_FORMAT,
+    "key": key,
+    "seconds": repr(seconds),
+    "sha256": _hash_arrays(arrays),
+  }
   files.write_atomically(path, safetensors.numpy.save(arrays, metadata=metadata))
+
+
+def _hash_arrays(arrays: dict[str, np.ndarray]) -> str:
+  """Hash of names and contents."""
+  digest = hashlib.sha256()
+  for name in sorted(arrays):
+    digest.update(name.encode())
+    digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+  return digest.hexdigest()
 
 
 def _load_checkpoint(path: Path, key: str) -> tuple[float, dict[str, np.ndarray]] | None:
   """Returns the seconds and arrays of a checkpoint of this very run, or None."""
   if not path.exists():
     return None
-  with safetensors.safe_open(path, "numpy") as file:
-    metadata = file.metadata() or {}
-    if (found := metadata.get("format", "1")) != _CHECKPOINT_FORMAT:
-      warnings.warn(
-        f"{path} is a checkpoint of format {found}, expected {_CHECKPOINT_FORMAT}: training starts "
-        "from the beginning and writes it anew.",
-        stacklevel=3,
-      )
-      return None
-    if metadata.get("key") != key:
-      return None
-    return float(metadata["seconds"]), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+  try:
+    with safetensors.safe_open(path, "numpy") as file:
+      metadata = file.metadata() or {}
+      if (found := metadata.get("format", "1")) != _CHECKPOINT_FORMAT:
+        _warn_unused(f"{path} is of format {found}, expected {_CHECKPOINT_FORMAT}")
+        return None
+      if metadata.get("key") != key:
+        return None
+      arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+  except (safetensors.SafetensorError, UnicodeDecodeError) as error:
+    _warn_unused(f"{path} is damaged, as by a full disk or a crash ({error})")
+    return None
+  if _hash_arrays(arrays) != metadata.get("sha256"):
+    _warn_unused(f"{path} is damaged: its arrays are not those that were written")
+    return None
+  return float(metadata["seconds"]), arrays
+
+
+def _warn_unused(why: str) -> None:
+  """Warns of a checkpoint that is of no use."""
+  warnings.warn(
+    f"{why}: training starts from the beginning and writes the checkpoint anew.", stacklevel=4
+  )

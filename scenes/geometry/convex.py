@@ -9,7 +9,8 @@ import numba
 import numpy as np
 from scipy import spatial
 
-_ALLOWED = 0.002  # share of a part's voxels that may lie deeper in free space than the tolerance
+_ALLOWED = 0.002  # share of a part's volume that may lie deeper in free space than the tolerance
+_SPACING = 0.01  # m between places that are looked at; 0.4 of the tolerance of the parts
 
 
 class Part(NamedTuple):
@@ -22,11 +23,11 @@ class Part(NamedTuple):
 
 
 class Space(NamedTuple):
-  """How far seen free voxels are from matter."""
+  """How far seen free space is from matter."""
 
-  clearance: np.ndarray  # float32 [X, Y, Z]; 0 in matter
-  lower: np.ndarray
-  voxel: float
+  clearance: np.ndarray  # float32 [X, Y, Z] of the voxels' centres [m]; negative in matter
+  lower: np.ndarray  # centre of the first voxel [3]
+  voxel: float  # edge [m]
 
 
 def hull(points: np.ndarray, *, max_vertices: int | None = None) -> Part | None:
@@ -63,46 +64,105 @@ def _directions(count: int) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _intrusion(clearance, lower, voxel, first, last, planes, limit):
-  """Counts the voxels inside planes, those with more clearance than the limit; sums theirs."""
-  inside, bad, deep = 0, 0, 0.0
+def _corners(clearance, i, j, k):
+  """Least, greatest and mean clearance at the corners of the cell behind a voxel's centre."""
+  low, high, total = np.inf, -np.inf, 0.0
+  for corner in range(8):
+    value = clearance[i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)]
+    low, high, total = min(low, value), max(high, value), total + value
+  return low, high, total / 8
+
+
+@numba.njit(cache=True)
+def _between(clearance, i, j, k, u, v, w):
+  """Clearance at a place in that cell, shares u, v, w of its edges from the voxel's centre."""
+  found = 0.0
+  for corner in range(8):
+    a, b, c = corner & 1, corner >> 1 & 1, corner >> 2
+    weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
+    found += weight * clearance[i + a, j + b, k + c]
+  return found
+
+
+@numba.njit(cache=True)
+def _height(planes, x, y, z, enough):
+  """Greatest height of a place over the planes, or one that is more than enough."""
+  found = -np.inf
+  for f in range(len(planes)):
+    height = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3]
+    found = max(found, height)
+    if found > enough:
+      break
+  return found
+
+
+@numba.njit(cache=True)
+def _intrusion(clearance, lower, voxel, first, last, planes, limit, along):
+  """Counts places inside planes with more clearance than the limit, and sums their clearance.
+
+  Cells of the grid that lie wholly inside and too deep are counted at once.
+  """
+  bad, deep = 0, 0.0
+  radius = 0.5 * np.sqrt(3.0) * voxel  # of a cell
   for i in range(first[0], last[0]):
-    x = lower[0] + voxel * i
     for j in range(first[1], last[1]):
-      y = lower[1] + voxel * j
       for k in range(first[2], last[2]):
-        z = lower[2] + voxel * k
-        within = True
-        for f in range(len(planes)):
-          if planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3] > 0:
-            within = False
-            break
-        if within:
-          inside += 1
-          if clearance[i, j, k] > limit:
+        low, high, mean = _corners(clearance, i, j, k)
+        if high <= limit:
+          continue
+        x, y, z = lower[0] + voxel * i, lower[1] + voxel * j, lower[2] + voxel * k
+        half = 0.5 * voxel
+        middle = _height(planes, x + half, y + half, z + half, radius)
+        if middle > radius:
+          continue
+        whole = middle <= -radius
+        if whole and low > limit:
+          bad += along**3
+          deep += along**3 * mean
+          continue
+        for n in range(along**3):
+          u = (n % along + 0.5) / along
+          v = (n // along % along + 0.5) / along
+          w = (n // along**2 + 0.5) / along
+          free = _between(clearance, i, j, k, u, v, w)
+          if free > limit and (
+            whole or _height(planes, x + u * voxel, y + v * voxel, z + w * voxel, 0.0) <= 0
+          ):
             bad += 1
-            deep += clearance[i, j, k]
-  return inside, bad, deep
+            deep += free
+  return bad, deep
 
 
 class Intrusion(NamedTuple):
   """What a part takes of seen free space."""
 
-  inside: int  # voxels inside the part
-  bad: int  # those of them deeper in free space than the tolerance
-  deep: float  # sum of their depths [m]
+  volume: float  # of the part [m^3]
+  bad: float  # of it deeper in free space than the tolerance [m^3]
+  deep: float  # integral of the clearance over that [m^4]
 
   @property
   def allowed(self) -> bool:
-    return self.bad <= _ALLOWED * self.inside
+    return self.bad <= _ALLOWED * self.volume
 
 
 def intrusion_of(part: Part, space: Space, tolerance: float) -> Intrusion:
-  """Counts the seen free cells inside a part, and those that lie too deep in it."""
-  shape = np.array(space.clearance.shape)
+  """Measures how much of a part lies too deep in seen free space.
+
+  The clearance is taken between the voxels' centres, too, at places at most `_SPACING` apart: what
+  is found depends on where the surface is and not on where the voxels are.
+
+  Args:
+    part: The part.
+    space: Clearance around it; outside of its voxels' centres nothing counts.
+    tolerance: So deep a part may reach [m].
+  """
+  shape = np.array(space.clearance.shape) - 1
   first = np.floor((part.vertices.min(0) - space.lower) / space.voxel).astype(int)
-  last = np.ceil((part.vertices.max(0) - space.lower) / space.voxel).astype(int) + 1
+  last = np.ceil((part.vertices.max(0) - space.lower) / space.voxel).astype(int)
   first, last = np.clip(first, 0, shape), np.clip(last, 0, shape)
-  return Intrusion(
-    *_intrusion(space.clearance, space.lower, space.voxel, first, last, part.planes, tolerance)
+  along = int(np.ceil(space.voxel / _SPACING))
+  bad, deep = _intrusion(
+    space.clearance, space.lower, space.voxel, first, last, part.planes, tolerance, along
   )
+  cell = (space.voxel / along) ** 3
+  return Intrusion(part.volume, cell * bad, cell * deep)

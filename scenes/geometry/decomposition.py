@@ -20,7 +20,7 @@ import numpy as np
 from scipy import ndimage
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.geometry import fusion, merging
+from nerf2real.scenes.geometry import fusion, merging, surface_distance
 from nerf2real.scenes.geometry.convex import Part, Space, hull, intrusion_of
 
 
@@ -143,7 +143,7 @@ def _trim(piece: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _halves(piece, start, axis, cut, matter, settings):
-  """Cuts a piece; each half as (voxels, start, hull, voxels of seen free space in the hull)."""
+  """Cuts a piece; each half as (voxels, start, hull, what it takes of free space)."""
   result = []
   for side in (slice(None, cut), slice(cut, None)):
     index = [slice(None)] * 3
@@ -168,9 +168,9 @@ def _split(piece, start, part, matter: _Matter, settings: ConvexSettings) -> lis
   best, score = [], np.inf
   for axis, cut in _cuts(piece, 2):
     halves = _halves(piece, start, axis, cut, matter, settings)
-    # Bad voxels first, then volume: an equal cut that leaves smaller hulls follows the shape
-    # better.
-    total = sum(h[3].bad + 0.02 * h[3].inside for h in halves)
+    # What is too deep first, then volume: an equal cut that leaves smaller hulls follows the
+    # shape better.
+    total = sum(h[3].bad + 0.02 * h[3].volume for h in halves)
     if halves and total < score:
       best, score = halves, total
   parts = []
@@ -199,13 +199,12 @@ def decompose(
     )
   reach = max(1, round(settings.doubt / grid.voxel))
   free = ndimage.binary_dilation(grid.observed & ~grid.solid, iterations=reach, mask=~grid.solid)
-  clearance = ndimage.distance_transform_edt(free).astype(np.float32) * grid.voxel
-  clearance = np.maximum(clearance - 0.5 * grid.voxel, 0)
+  values = np.where(free | grid.solid, grid.values, np.float32(-1))
+  clearance = surface_distance.signed_distance(values, grid.voxel)
   space = Space(clearance, np.asarray(grid.lower, np.float64), grid.voxel)
-  known = free | grid.solid
   depth = ndimage.distance_transform_edt(~grid.solid) * grid.voxel
   solid = ~free & (depth <= settings.inside)
-  matter = _Matter(solid, np.where(known, grid.values, np.float32(-1)), space)
+  matter = _Matter(solid, values, space)
   parts: list[Part] = []
   step = max(4, round(settings.cell / grid.voxel))
   starts = np.stack(

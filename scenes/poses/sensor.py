@@ -14,6 +14,8 @@ import numpy as np
 from scipy import optimize
 
 from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.poses.localisation import Localisation
 
 _MOST_ERROR = 2.0  # points with a larger reprojection error are left out [pixel]
@@ -50,14 +52,9 @@ class Sensor:
     Returns:
       z-depth float32 [H, W] [m], the nearest where several meet; 0 where nothing was measured.
     """
-    seen = depth > 0
-    points = (self.camera.rays() * depth[..., None])[seen] + self._centre
-    column, row = np.floor(camera.project(points)).astype(int).T
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    far_first = np.flatnonzero(inside)[np.argsort(-points[inside, 2], kind="stable")]
-    result = np.zeros((camera.height, camera.width), np.float32)
-    result[row[far_first], column[far_first]] = points[far_first, 2]
-    return result
+    beside = np.eye(4)
+    beside[:3, 3] = self._centre
+    return depth_pictures.seen_from(depth, self.camera.rays(), beside, camera)
 
 
 class _Sighted(NamedTuple):
@@ -101,6 +98,45 @@ def _sighted(found: Localisation, depth: np.ndarray, unit: float) -> _Sighted:
     depth,
     unit,
   )
+
+
+def at_their_time(
+  found: Localisation,
+  depth: np.ndarray,
+  picture_from_depth: np.ndarray,
+  *,
+  unit: float,
+  progress: Progress = no_progress,
+) -> np.ndarray | None:
+  """Depth as it would have been measured when the pictures were taken.
+
+  A sensor with a clock of its own measures up to half a period before or after, and what a hand
+  turned meanwhile puts edges pixels beside those of the picture. Whether stamps tell the truth is
+  asked of the localised points.
+
+  Args:
+    found: The localised pictures, with metric poses in the source's frame.
+    depth: Their depth pictures, z-depth [N, H, W] in a unit, 0 where nothing was measured.
+    picture_from_depth: The camera's pose [N, 4, 4] when the depth was measured, in its frame when
+      the picture was taken [m].
+    unit: That unit [m].
+    progress: Called with the fraction done and a text.
+
+  Returns:
+    The moved depth, of the same shape and unit; None where localised points agree with it no better
+    than with the depth as it is.
+  """
+  camera = found.camera.resized(depth.shape[2], depth.shape[1])
+  rays, moved = camera.rays(), np.zeros_like(depth)
+  for number, motion in enumerate(picture_from_depth):
+    seen = depth_pictures.seen_from(depth[number] * unit, rays, motion, camera)
+    moved[number] = np.rint(seen / unit)
+    progress((number + 1) / len(depth), f"depth of picture {number + 1} of {len(depth)}")
+  before, after = (_sighted(found, pictures, unit) for pictures in (depth, moved))
+  if len(before.picture) < _FEWEST:
+    return None
+  errors = [sighted.error(sighted.pixel, sighted.point[:, 2]) for sighted in (before, after)]
+  return moved if errors[1] < errors[0] else None
 
 
 def find_sensor(found: Localisation, depth: np.ndarray, *, unit: float) -> Sensor | None:

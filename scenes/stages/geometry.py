@@ -27,8 +27,9 @@ from nerf2real.scenes.stages.pictures import PosedPictures
 from nerf2real.scenes.stages.results import Contact, FreeFloor
 
 _SURFACE_VERSION = 2  # 2: the floor is inside of the grid
-# 2: unseen space is matter behind seen matter alone; no tolerance grows; 3: its errors apart
-_CONTACT_VERSION = 3
+# 2: unseen space is matter behind seen matter alone; no tolerance grows; 3: its errors apart;
+# 4: the tolerance holds between voxels
+_CONTACT_VERSION = 4
 
 
 def floor(

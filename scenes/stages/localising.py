@@ -4,13 +4,15 @@ Each runs, or finds done, one stage of the cache: a function of earlier results 
 """
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from nerf2real.core.progress import Progress
+from nerf2real.core.progress import Progress, part
+from nerf2real.core.serialization import write_json
 from nerf2real.scenes.capture import keyframes as keyframe_files
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
@@ -22,9 +24,13 @@ from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Source
 
-_PICTURES_VERSION = 2  # 2: stills turned and without copies; depth checked with the pictures
+# 2: stills turned and without copies, depth checked with the pictures; 3: depth has its own poses
+_PICTURES_VERSIONS = {"video": 1, "rgbd": 3}
+_PICTURES_VERSION = 2  # of all others
 # 2: the unit frame's yaw; 3: the rolling shutter is taken out; 4: up by level right axes
 _POSES_VERSION = 4
+_SENSOR_VERSION = 2  # 2: depth at the pictures' times
+_SENSOR_RECORD = "sensor.json"  # what was done to the depth
 
 
 def keyframes(cache: Stages, source: Source, settings: CaptureSettings) -> Made[Capture]:
@@ -34,7 +40,7 @@ def keyframes(cache: Stages, source: Source, settings: CaptureSettings) -> Made[
     taken = read_capture(source.path, folder / "images", settings=settings, progress=progress)
     keyframe_files.save(taken, folder)
 
-  version = 1 if source_kind(source.path) == "video" else _PICTURES_VERSION
+  version = _PICTURES_VERSIONS.get(source_kind(source.path), _PICTURES_VERSION)
   inputs = {"source": source.sha256}
   stage = cache.run("keyframes", write, settings=settings, inputs=inputs, version=version)
   return Made(keyframe_files.load(stage.folder, stage.folder / "images"), stage)
@@ -73,7 +79,11 @@ def poses(cache: Stages, capture: Made[Capture], settings: LocaliseSettings) -> 
 
 
 def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> Made[Capture]:
-  """Returns the capture with measured depth as the pictures' camera would have measured it."""
+  """Returns the capture with measured depth as the pictures' camera would have measured it.
+
+  Where its sensor sits beside that camera, or measured before or after the picture was taken, depth
+  is moved.
+  """
   known, found = capture.value.known, poses.value
   if known is None or not known.depth_files or not len(found.tracks.view):
     return capture
@@ -82,31 +92,40 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
   }
 
   def write(folder: Path, progress: Progress) -> None:
-    depth = [depth_pictures.read(of_name[name]) for name in found.names]
-    own = sensor.find_sensor(found, np.stack(depth), unit=known.depth_unit)
+    depth = np.stack([depth_pictures.read(of_name[name]) for name in found.names])
+    moved = own = None
+    if (motion := known.picture_from_depth) is not None:
+      rows = [list(of_name).index(name) for name in found.names]
+      moved = sensor.at_their_time(
+        found, depth, motion[rows], unit=known.depth_unit, progress=part(progress, 0.0, 0.7)
+      )
+      depth = depth if moved is None else moved
+    own = sensor.find_sensor(found, depth, unit=known.depth_unit)
+    write_json(folder / _SENSOR_RECORD, {"moved": moved is not None, "beside": own is not None})
+    if moved is None and own is None:
+      return
     for number, (name, raw) in enumerate(zip(found.names, depth, strict=True)):
-      if own is None:
-        break
-      camera = found.camera.resized(raw.shape[1], raw.shape[0])
-      aligned = own.aligned(raw * known.depth_unit, camera) / known.depth_unit
+      aligned = raw
+      if own is not None:
+        camera = found.camera.resized(raw.shape[1], raw.shape[0])
+        aligned = own.aligned(raw * known.depth_unit, camera) / known.depth_unit
       path = folder / f"{Path(name).stem}.png"
       if not cv2.imwrite(str(path), np.rint(aligned).astype(np.uint16)):
         raise OSError(f"{path} could not be written: is the disk full?")
-      progress((number + 1) / len(depth), f"depth of picture {number + 1} of {len(depth)}")
+      written = (number + 1) / len(depth)
+      progress(0.8 + 0.2 * written, f"depth of picture {number + 1} of {len(depth)} written")
 
   inputs = {"keyframes": capture.stamp, "poses": poses.stamp}
-  stage = cache.run("sensor", write, settings=None, inputs=inputs)
+  stage = cache.run("sensor", write, settings=None, inputs=inputs, version=_SENSOR_VERSION)
   aligned = {path.stem: path for path in stage.folder.glob("*.png")}
   if not aligned:
     return capture
   files = [aligned.get(Path(name).stem, file) for name, file in of_name.items()]
-  words = (
-    "The depth was measured by a camera beside the pictures' own, of another focal length: both "
-    "were aligned by localised points."
-  )
-  changed = dataclasses.replace(
-    capture.value,
-    known=dataclasses.replace(known, depth_files=tuple(files)).lifted(),
-    warnings=[*capture.value.warnings, words],
-  )
-  return Made(changed, stage)
+  warnings = list(capture.value.warnings)
+  if json.loads((stage.folder / _SENSOR_RECORD).read_text())["beside"]:
+    warnings.append(
+      "The depth was measured by a camera beside the pictures' own, of another focal length: both "
+      "were aligned by localised points."
+    )
+  still = dataclasses.replace(known, depth_files=tuple(files), depth_poses=known.world_from_camera)
+  return Made(dataclasses.replace(capture.value, known=still.lifted(), warnings=warnings), stage)

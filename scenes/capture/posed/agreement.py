@@ -64,6 +64,8 @@ def settled(known: KnownPoses, images: Sequence[Path]) -> tuple[KnownPoses, list
       off = _distance(known, matches, poses, unit)
       if off < _CLEARLY * own and off < distance:
         best = dataclasses.replace(known, world_from_camera=poses, depth_unit=unit)
+        if len(known.depth_poses):
+          best = dataclasses.replace(best, depth_poses=dict(_conventions(known.depth_poses))[how])
         words, distance = f"depth in units of {1e3 * unit:.3g} mm and poses as {how}", off
   if distance > _WORST * known.camera.width:
     raise CaptureError(

@@ -45,6 +45,33 @@ def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
   return (depth[row][:, column] * unit).astype(np.float32)
 
 
+def seen_from(
+  depth: np.ndarray, rays: np.ndarray, other_from_camera: np.ndarray, other: Camera
+) -> np.ndarray:
+  """Moves a depth picture to where another camera would have measured it.
+
+  Args:
+    depth: z-depth [H, W] [m], 0 where nothing was measured.
+    rays: Of the pixels of the camera that measured it [H, W, 3], of length 1 along its axis.
+    other_from_camera: That camera's pose [4, 4] in the other's frame.
+    other: The other camera.
+
+  Returns:
+    z-depth float32 of the other's size [m], the nearest where several meet; 0 where nothing was
+    measured.
+  """
+  seen = depth > 0
+  points = (rays[seen] * depth[seen][:, None]) @ other_from_camera[:3, :3].T
+  points += other_from_camera[:3, 3]
+  points = points[points[:, 2] > 0]
+  column, row = np.floor(other.project(points)).astype(int).T
+  inside = (column >= 0) & (column < other.width) & (row >= 0) & (row < other.height)
+  far_first = np.flatnonzero(inside)[np.argsort(-points[inside, 2], kind="stable")]
+  result = np.zeros((other.height, other.width), np.float32)
+  result[row[far_first], column[far_first]] = points[far_first, 2]
+  return result
+
+
 def at_pixels(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
   """Reads z-depth float64 [A] at pixels [A, 2] of a camera; 0 where none was measured [unit]."""
   depth = read(path)

@@ -17,6 +17,7 @@ from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
 
 CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera
+_STILL = 1e-6  # m and rad: motions below come from rounding
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +42,9 @@ class KnownPoses:
   """Depth picture of each pose; empty where there was no sensor."""
   depth_unit: float = depth_pictures.MILLIMETRE
   """Of the depth pictures, in the unit of the poses."""
+  depth_poses: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4, 4)))
+  """World from camera [N, 4, 4] when each depth picture was measured; empty: those of the pictures.
+  """
   warnings: tuple[str, ...] = ()
   """What was left out or assumed."""
   sightings: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4)))
@@ -51,6 +55,7 @@ class KnownPoses:
     object.__setattr__(self, "sightings", self.sightings.reshape(-1, 4))
     for name in ("points", "point_colors"):
       object.__setattr__(self, name, getattr(self, name).reshape(-1, 3))
+    object.__setattr__(self, "depth_poses", self.depth_poses.reshape(-1, 4, 4))
 
   def selected(self, indices: list[int], camera: Camera) -> "KnownPoses":
     """Keeps some of the pictures, with the camera of the pictures as they were written."""
@@ -60,12 +65,22 @@ class KnownPoses:
       files=tuple(self.files[i] for i in indices),
       world_from_camera=self.world_from_camera[indices],
       depth_files=tuple(self.depth_files[i] for i in indices) if self.depth_files else (),
+      depth_poses=self.depth_poses[indices] if len(self.depth_poses) else self.depth_poses,
     )
 
   @property
   def is_metric(self) -> bool:
     """Whether a depth sensor measured: poses are then in metres."""
     return len(self.sightings) > 0
+
+  @property
+  def picture_from_depth(self) -> np.ndarray | None:
+    """The camera's motion [N, 4, 4] from each depth picture to its picture; None without any."""
+    if not len(self.depth_poses):
+      return None
+    motion = np.linalg.inv(self.world_from_camera) @ self.depth_poses
+    still = np.abs(motion - np.eye(4)).max() < _STILL
+    return None if still else motion
 
   def lifted(self) -> "KnownPoses":
     """Returns the poses with points from the depth pictures; as they are where there are none."""
@@ -85,10 +100,14 @@ class KnownPoses:
     local = depth[:, None] * camera.rays(seen[:, 1:3])
     seen[:, 3] = np.linalg.norm(local, axis=-1)
     poses = world_from_camera[seen[:, 0].astype(int)]
+    depth_poses = self.depth_poses
+    if len(depth_poses):
+      depth_poses = world_from_camera @ np.linalg.inv(self.world_from_camera) @ depth_poses
     return dataclasses.replace(
       self,
       camera=camera,
       world_from_camera=world_from_camera,
+      depth_poses=depth_poses,
       sightings=seen,
       points=np.einsum("aij,aj->ai", poses[:, :3, :3], local) + poses[:, :3, 3],
     )

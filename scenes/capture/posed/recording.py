@@ -27,6 +27,8 @@ class Recording:
   """Depth pictures: none, or one each."""
   unit: float
   """Of the depth pictures [m]."""
+  depth_poses: np.ndarray | None = None
+  """Poses [N, 4, 4] when the depth was measured; None: when the pictures were taken."""
   camera: Camera | None = None
   """Of the pictures; None until it is known."""
   warnings: tuple[str, ...] = ()
@@ -39,6 +41,7 @@ class Recording:
       files=[self.files[k] for k in rows],
       poses=self.poses[rows],
       depth=[self.depth[k] for k in rows] if self.depth else [],
+      depth_poses=None if self.depth_poses is None else self.depth_poses[rows],
     )
 
   def warned(self, text: str) -> "Recording":
@@ -55,7 +58,7 @@ class Recording:
     sensed = [path.is_file() for path in self.depth]
     if self.depth and 2 * sum(sensed) < len(sensed):
       words = f"{len(sensed) - sum(sensed)} of {len(sensed)} depth pictures are missing: none used."
-      found, sensed = dataclasses.replace(self, depth=[]).warned(words), []
+      found, sensed = dataclasses.replace(self, depth=[], depth_poses=None).warned(words), []
     there = np.array([path.is_file() for path in self.files])
     if 2 * there.sum() < len(there):
       missing = self.files[int(np.argmin(there))].name

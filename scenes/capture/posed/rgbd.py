@@ -119,5 +119,6 @@ def read_rgbd(source: Path) -> KnownPoses:
     point_errors=np.zeros(0),
     depth_files=tuple(found.depth),
     depth_unit=found.unit,
+    depth_poses=np.zeros((0, 4, 4)) if found.depth_poses is None else found.depth_poses,
     warnings=found.warnings,
   )

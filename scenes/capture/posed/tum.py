@@ -5,6 +5,7 @@ file formats; ORB-SLAM, ETH3D and ICL-NUIM write pictures and depth into one lis
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +15,26 @@ from nerf2real.scenes.capture.posed.recording import Recording, camera_of
 
 _PICTURES, _DEPTH = "rgb.txt", "depth.txt"
 _ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
-_POSES = ("groundtruth.txt", "gt.txt", "trajectory.txt", "CameraTrajectory.txt")
+TRAJECTORY = "groundtruth.txt"
+_POSES = (TRAJECTORY, "gt.txt", "trajectory.txt", "CameraTrajectory.txt")
 _DEPTH_UNIT = 1 / 5000  # m
+
+
+class _Listed(NamedTuple):
+  """Pictures of a sequence and the depth picture that goes with each."""
+
+  times: np.ndarray  # [N] of the pictures [s]
+  files: list[Path]
+  depth: list[Path]  # none, or one each
+  depth_times: np.ndarray  # [N] [s], or empty
+  without_depth: int = 0  # pictures that were left out, as no depth was measured near their time
+
+  def selected(self, rows: np.ndarray) -> "_Listed":
+    depth, depth_times = self.depth, self.depth_times
+    if depth:
+      depth, depth_times = [depth[k] for k in rows], depth_times[rows]
+    files = [self.files[k] for k in rows]
+    return _Listed(self.times[rows], files, depth, depth_times, self.without_depth)
 
 
 def _first(source: Path, names: tuple[str, ...]) -> Path | None:
@@ -27,6 +46,12 @@ def is_tum(source: Path) -> bool:
   return _first(source, (_PICTURES, *_ASSOCIATIONS)) is not None and (
     _first(source, _POSES) is not None
   )
+
+
+def lists_without_poses(source: Path) -> str | None:
+  """Names the list of pictures of a folder that has no trajectory beside it; None where none is."""
+  listed = _first(source, (_PICTURES, *_ASSOCIATIONS))
+  return None if listed is None or is_tum(source) else listed.name
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:
@@ -46,27 +71,31 @@ def _stamped(path: Path, words: list[str]) -> np.ndarray:
     raise CaptureError(f"{path}: a time or pose is no number ({error}).") from error
 
 
-def _listed(source: Path) -> tuple[np.ndarray, list[Path], list[Path]]:
-  """Times, pictures and depth pictures (none or one each) of a sequence."""
+def _listed(source: Path) -> _Listed:
+  """Pictures and depth pictures of a sequence; those without depth are left out where there is."""
   path = source / _PICTURES
   if path.is_file():
     rows = _table(path, 2)
     times = _stamped(path, [row[0] for row in rows])
     files = [source / row[1] for row in rows]
     if not (source / _DEPTH).is_file():
-      return times, files, []
+      return _Listed(times, files, [], np.zeros(0))
     listed = _table(source / _DEPTH, 2)
-    index, near = trajectory.nearest(_stamped(source / _DEPTH, [row[0] for row in listed]), times)
-    chosen = np.flatnonzero(near)
-    depth = [source / listed[index[k]][1] for k in chosen]
-    return times[chosen], [files[k] for k in chosen], depth
+    stamps = _stamped(source / _DEPTH, [row[0] for row in listed])
+    index, near = trajectory.nearest(stamps, times)
+    if not near.any():
+      return _Listed(times, files, [], np.zeros(0), without_depth=len(times))
+    depth = [source / listed[k][1] for k in index]
+    found = _Listed(times, files, depth, stamps[index], without_depth=int((~near).sum()))
+    return found.selected(np.flatnonzero(near))
   joint = _first(source, _ASSOCIATIONS)
   assert joint is not None  # `is_tum` has found one
   pairs = [row[:3] + row[3].split()[:1] for row in _table(joint, 4)]
   if all("depth" in row[1].lower() for row in pairs):  # ICL-NUIM lists the depth first
     pairs = [row[2:] + row[:2] for row in pairs]
-  times = _stamped(joint, [row[0] for row in pairs])
-  return times, [source / row[1] for row in pairs], [source / row[3] for row in pairs]
+  times, depth_times = (_stamped(joint, [row[k] for row in pairs]) for k in (0, 2))
+  files, depth = ([source / row[k] for row in pairs] for k in (1, 3))
+  return _Listed(times, files, depth, depth_times)
 
 
 def read_tum(source: Path) -> Recording:
@@ -75,25 +104,35 @@ def read_tum(source: Path) -> Recording:
   Raises:
     CaptureError: A list is damaged, or no picture has a pose and, where there is depth, depth.
   """
-  times, files, depth = _listed(source)
+  listed = _listed(source)
   path = _first(source, _POSES)
   assert path is not None  # `is_tum` has found one
   words = [row[:7] + row[7].split()[:1] for row in _table(path, 8)]
   values = np.stack([_stamped(path, list(column)) for column in zip(*words, strict=True)], -1)
-  poses, known = trajectory.poses_at(values, times)
+  poses, known = trajectory.poses_at(values, listed.times)
   if not known.any():
     raise CaptureError(
       f"{source}: no picture has a pose within {trajectory.SAME_TIME:g} s: expected pictures, "
       f"depth and {path.name} of one recording."
     )
-  chosen = np.flatnonzero(known)
+  chosen = listed.selected(np.flatnonzero(known))
+  depth_poses = None
+  if chosen.depth:
+    measured, timely = trajectory.poses_at(values, chosen.depth_times)
+    depth_poses = np.where(timely[:, None, None], measured, poses[known])
   found = Recording(
-    files=[files[k] for k in chosen],
-    poses=poses[chosen],
-    depth=[depth[k] for k in chosen] if depth else [],
+    files=chosen.files,
+    poses=poses[known],
+    depth=chosen.depth,
+    depth_poses=depth_poses,
     unit=_DEPTH_UNIT,
   ).present(source)
-  lost = len(files) - len(chosen)
+  if listed.without_depth:
+    near = f"pictures have no depth within {trajectory.SAME_TIME:g} s"
+    of = len(listed.files) + (listed.without_depth if listed.depth else 0)
+    fate = "left out" if listed.depth else f"none of {_DEPTH} used"
+    found = found.warned(f"{listed.without_depth} of {of} {near}: {fate}.")
+  lost = len(listed.files) - len(chosen.files)
   if lost:
-    found = found.warned(f"{lost} of {len(files)} pictures have no pose: left out.")
+    found = found.warned(f"{lost} of {len(listed.files)} pictures have no pose: left out.")
   return camera_of(found, source, focal=525.0, what="TUM's")

@@ -1,5 +1,6 @@
 """Tests of reading captures: videos, pictures, posed data sets."""
 
+import dataclasses
 import json
 
 import av
@@ -186,6 +187,18 @@ def test_folder_of_images(frames, tmp_path):
   fractions = [fraction for fraction, _ in reports]
   assert fractions == sorted(fractions)
   assert fractions[-1] == 1.0
+
+
+def test_stills_without_a_place_are_named_as_their_files(tmp_path):
+  names = synthetic.write_images(tmp_path / "in", synthetic.walk(10))
+  capture = read_capture(tmp_path / "in", tmp_path / "out")
+  keyframes = [path.name for path in capture.images]
+  assert capture.without_place(keyframes) is None
+  said = capture.without_place(keyframes[:3] + keyframes[4:])
+  assert said is not None and said.startswith("1 of 10 pictures have no place and are not used: ")
+  assert names[3] in said and names[2] not in said
+  assert "and 2 more" in (capture.without_place(keyframes[6:]) or "")
+  assert dataclasses.replace(capture, origins=None).without_place([]) is None
 
 
 def test_an_error_leaves_the_last_good_keyframes(frames, tmp_path, monkeypatch):

@@ -1,4 +1,5 @@
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,11 +110,54 @@ def test_a_checkpoint_of_another_format_is_not_used(views, tmp_path, monkeypatch
   with monkeypatch.context() as before:
     before.setattr(train, "_CHECKPOINT_FORMAT", "1")
     train.train(views, short, checkpoint_dir=tmp_path)
-  with pytest.warns(
-    UserWarning, match=r"training\.safetensors is a checkpoint of format 1, expected"
-  ):
+  with pytest.warns(UserWarning, match=r"training\.safetensors is of format 1, expected"):
     _, report = train.train(views, short, checkpoint_dir=tmp_path)
   assert report.resumed_at_step is None and report.steps == 4
+
+
+@pytest.mark.parametrize("share", [0.0, 0.0001, 0.5, 0.99])
+@pytest.mark.parametrize("filled", [False, True])
+def test_a_checkpoint_that_was_cut_off_is_one_line_and_training_begins_anew(
+  views, tmp_path, monkeypatch, share, filled
+):
+  """Files end early where a copy stopped, and in zeros where a machine lost its power."""
+  monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
+  short = dataclasses.replace(FAST, max_steps=3)
+  train.train(views, short, checkpoint_dir=tmp_path)
+  path = tmp_path / "training.safetensors"
+  whole = path.read_bytes()
+  kept = whole[: int(share * len(whole))]
+  path.write_bytes(kept.ljust(len(whole), b"\0") if filled else kept)
+  with pytest.warns(UserWarning, match=r"training\.safetensors is damaged") as said:
+    _, report = train.train(views, short, checkpoint_dir=tmp_path)
+  assert len(said) == 1 and "\n" not in str(said[0].message)
+  assert report.resumed_at_step is None and report.steps == 3
+  _, report = train.train(views, short, checkpoint_dir=tmp_path)  # it is written anew
+  assert report.resumed_at_step == 3
+
+
+def test_a_run_that_ends_while_it_writes_a_checkpoint_goes_on_from_the_one_before(
+  views, tmp_path, monkeypatch
+):
+  monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
+  short = dataclasses.replace(FAST, max_steps=6)
+  replaced = []
+
+  def cut_off(self, target):
+    replaced.append(target)
+    if len(replaced) == 4:
+      raise KeyboardInterrupt
+    return rename(self, target)
+
+  rename = Path.replace
+  with monkeypatch.context() as crash:
+    crash.setattr(Path, "replace", cut_off)
+    crash.setattr(Path, "unlink", lambda self, missing_ok=False: None)  # as after SIGKILL
+    with pytest.raises(KeyboardInterrupt):
+      train.train(views, short, checkpoint_dir=tmp_path)
+  assert len(list(tmp_path.iterdir())) == 2  # the whole one, and what was being written
+  _, report = train.train(views, short, checkpoint_dir=tmp_path)
+  assert report.resumed_at_step == 3 and report.steps == 6
 
 
 def test_known_points_make_the_geometry_better(trained):

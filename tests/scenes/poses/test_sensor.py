@@ -5,10 +5,12 @@ import types
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.poses import sensor
 from nerf2real.scenes.poses.tracks import Tracks
@@ -102,14 +104,15 @@ def _made(folder, value, made):
   return Made(value, StageResult(folder, "key", made, 0.0, cached=False))
 
 
-def test_a_capture_gets_the_depth_that_its_camera_would_have_measured(localised, beside, tmp_path):
-  images, depth = [], []
-  for row, raw in enumerate(beside):
-    images.append(tmp_path / f"frame_{row:06d}.png")
-    depth.append(tmp_path / f"{row}.depth.png")
+def _capture(folder, depth, **known):
+  """A capture whose pictures come with depth [N, H, W]."""
+  images, files = [], []
+  for row, raw in enumerate(depth):
+    images.append(folder / f"frame_{row:06d}.png")
+    files.append(folder / f"{row}.depth.png")
     cv2.imwrite(str(images[-1]), np.zeros((120, 160, 3), np.uint8))
-    cv2.imwrite(str(depth[-1]), raw)
-  known = KnownPoses(
+    cv2.imwrite(str(files[-1]), raw)
+  about = KnownPoses(
     kind="rgbd",
     camera=_PICTURES,
     files=tuple(images),
@@ -117,19 +120,68 @@ def test_a_capture_gets_the_depth_that_its_camera_would_have_measured(localised,
     points=np.zeros((0, 3)),
     point_colors=np.zeros((0, 3), np.uint8),
     point_errors=np.zeros(0),
-    depth_files=tuple(depth),
+    depth_files=tuple(files),
     depth_unit=_UNIT,
+    **known,
   ).lifted()
   ones = np.ones(len(images))
-  capture = Capture("rgbd", tmp_path, images, 160, 120, ones, ones, None, [], known)
-  localised.names = tuple(path.name for path in images)
-  cache = Stages(tmp_path / "stages", show_progress=False)
-  poses = _made(tmp_path, localised, "poses")
-  before = _made(tmp_path, capture, "keyframes")
+  return Capture("rgbd", folder, images, 160, 120, ones, ones, None, [], about)
+
+
+def _sensed_stage(localised, capture, folder):
+  """What the stage makes of it, before and after, and whether a second run finds it done."""
+  found = types.SimpleNamespace(**vars(localised))
+  found.names = tuple(path.name for path in capture.images)
+  cache = Stages(folder / "stages", show_progress=False)
+  before, poses = _made(folder, capture, "keyframes"), _made(folder, found, "poses")
   after = localising.sensed(cache, before, poses)
+  assert after is before or localising.sensed(cache, before, poses).stage.cached
+  return before, after
+
+
+def _off(capture, share=90):
+  return np.percentile(furnished_room.distance(capture.known.points), share)
+
+
+def test_a_capture_gets_the_depth_that_its_camera_would_have_measured(localised, beside, tmp_path):
+  before, after = _sensed_stage(localised, _capture(tmp_path, beside), tmp_path)
   assert after.stamp != before.stamp and "aligned by localised points" in after.value.warnings[0]
-  off = [
-    np.percentile(furnished_room.distance(made.value.known.points), 90) for made in (before, after)
-  ]
-  assert off[1] < 0.6 * off[0]
-  assert localising.sensed(cache, before, poses).stage.cached
+  assert _off(after.value) < 0.6 * _off(before.value)
+
+
+@pytest.fixture(scope="module")
+def later():
+  """Where a hand has turned the camera when its depth is measured."""
+  turn = np.eye(4)
+  turn[:3, :3] = Rotation.from_rotvec([0.01, 0.025, 0.0]).as_matrix()
+  turn[:3, 3] = 0.01, 0.0, 0.005
+  return _POSES @ turn
+
+
+def test_depth_is_moved_to_when_the_picture_was_taken(localised, later, tmp_path):
+  capture = _capture(tmp_path, _sensed(later, _PICTURES), depth_poses=later)
+  before, after = _sensed_stage(localised, capture, tmp_path)
+  assert not after.value.warnings and after.value.known.picture_from_depth is None
+  assert _off(after.value) < 0.5 * _off(before.value)
+  true = _raw(furnished_room.depth_views(_POSES, _PICTURES)).astype(float)
+  off = []
+  for made in (before, after):
+    found = np.stack([depth_pictures.read(path) for path in made.value.known.depth_files])
+    both = (found > 0) & (true > 0)
+    assert both.mean() > 0.9
+    off.append((np.abs(found / np.maximum(true, 1) - 1)[both] > 0.05).mean())
+  assert off[1] < 0.5 * off[0]  # pixels on the wrong side of an edge
+
+
+def test_depth_whose_stamps_are_wrong_stays_where_it_is(localised, later, tmp_path):
+  """A driver may stamp when a picture arrives, not when it was taken."""
+  capture = _capture(tmp_path, _sensed(_POSES, _PICTURES), depth_poses=later)
+  before, after = _sensed_stage(localised, capture, tmp_path)
+  assert after is before
+
+
+def test_the_motion_between_depth_and_picture_follows_adjusted_poses(later, tmp_path):
+  known = _capture(tmp_path, _sensed(later, _PICTURES), depth_poses=later).known
+  moved = known.with_views(_PICTURES, _POSES[::-1])
+  np.testing.assert_allclose(moved.picture_from_depth, known.picture_from_depth, atol=1e-9)
+  assert len(known.selected([2, 5], _PICTURES).picture_from_depth) == 2

@@ -95,6 +95,28 @@ def test_a_tum_sequence_gives_poses_and_depth(tum, tmp_path):
   np.testing.assert_allclose(again.known.sightings, capture.known.sightings)
 
 
+def _check_motion(capture):
+  """The depth of every picture but the last was measured 0.12 of a step later."""
+  numbers = [int(path.stem.split("_")[1]) for path in capture.images][:-1]
+  steps = np.linalg.norm(np.diff(POSES[:, :3, 3], axis=0), axis=-1)[numbers]
+  moved = np.linalg.norm(capture.known.picture_from_depth[:-1, :3, 3], axis=-1)
+  np.testing.assert_allclose(moved, 0.12 * steps, rtol=0.02)
+
+
+def test_depth_of_another_clock_has_poses_of_its_own(tum, tmp_path):
+  """Its list says that it came 4 ms later, an eighth of the way to the next pose."""
+  _check_motion(read_capture(tum, tmp_path / "images", settings=SETTINGS))
+  joint = _copied(tum, tmp_path / "tum")
+  rows = [
+    f"{100 + k / 30:.4f} rgb/{k:03d}.png {100 + k / 30:.4f} depth/{k:03d}.png" for k in range(16)
+  ]
+  (joint / "associations.txt").write_text("\n".join(rows))
+  for name in ("rgb.txt", "depth.txt"):
+    (joint / name).unlink()
+  known = read_capture(joint, tmp_path / "images", settings=SETTINGS).known
+  assert known.picture_from_depth is None
+
+
 def test_a_seven_scenes_sequence_gives_poses_and_depth(tmp_path):
   folder = tmp_path / "seq-01"
   _pictures(folder, "frame-{:06d}.color.png", "frame-{:06d}.depth.png", 1e-3)
@@ -266,6 +288,19 @@ def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
 
 
+def test_a_sequence_without_trajectory_says_what_is_missing(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  (folder / "groundtruth.txt").rename(folder / "poses_of_mine.txt")
+  with pytest.raises(CaptureError) as said:
+    source_kind(folder)
+  assert "rgb.txt of TUM's layout and no trajectory: expected groundtruth.txt" in str(said.value)
+  assert f"or give {folder / 'rgb'} alone" in str(said.value)
+  for name in ("rgb.txt", "depth.txt"):
+    (folder / name).unlink()
+  with pytest.raises(CaptureError, match=r"give one of them, such as .*tum/rgb"):
+    source_kind(folder)
+
+
 def _copied(tum, folder):
   shutil.copytree(tum, folder)
   return folder
@@ -317,6 +352,20 @@ def test_pictures_without_depth_are_left_out(tum, tmp_path):
   assert not capture.known.depth_files and any("none used" in t for t in capture.warnings)
 
 
+def test_pictures_far_from_all_depth_are_left_out_and_counted(tum, tmp_path):
+  folder = _copied(tum, tmp_path / "tum")
+  rows = (folder / "depth.txt").read_text().splitlines()
+  (folder / "depth.txt").write_text("\n".join(rows[:5] + rows[6:]))
+  capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  assert capture.known.depth_files
+  assert "1 of 16 pictures have no depth within 0.02 s: left out." in capture.warnings
+  (folder / "depth.txt").write_text("7.0 depth/000.png")
+  capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  assert not capture.known.depth_files and not len(capture.known.depth_poses)
+  words = "16 of 16 pictures have no depth within 0.02 s: none of depth.txt used."
+  assert words in capture.warnings
+
+
 @pytest.mark.parametrize("axes", [np.eye(3), OPENGL_FROM_OPENCV])
 @pytest.mark.parametrize("inverse", [False, True])
 def test_unit_and_convention_are_read_as_the_pictures_ask_for(tum, tmp_path, axes, inverse):
@@ -334,6 +383,7 @@ def test_unit_and_convention_are_read_as_the_pictures_ask_for(tum, tmp_path, axe
     cv2.imwrite(str(path), (depth / 5.0).astype(np.uint16))
   capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
   _check(capture)
+  _check_motion(capture)
   assert capture.known.depth_unit == 1e-3 and any("1 mm" in text for text in capture.warnings)
 
 
