@@ -11,7 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerf2real.sysid.selection.joints.changed import CONSTANTS_OFF, Changed
-from nerf2real.sysid.selection.joints.doubts import constants_off, is_new, is_something, supported
+from nerf2real.sysid.selection.joints.doubts import (
+  constants_off,
+  is_new,
+  is_something,
+  pressed,
+  supported,
+)
 from nerf2real.sysid.selection.joints.leaving import leaves, may_leave, remaining
 from nerf2real.sysid.selection.joints.naming import conclude
 from nerf2real.sysid.selection.joints.subject import Subject, following
@@ -59,7 +65,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
   if before is not None and usual is not None and not subject.paired:
     something = [k for k in something if is_new(subject, found.best, k)]
-  named = tuple(k for k in found.named if k in something)
+  named = () if pressed(found.best) else tuple(k for k in found.named if k in something)
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
   if named and (typical or few):

@@ -28,6 +28,8 @@ _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
 
 
+_AT_END = 1e-3  # of a range: a value as near to its end has been stopped there
+
 _SCATTER = ("friction",)  # constants that no drawing or data sheet holds
 
 
@@ -97,6 +99,18 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   return any(
     not low - own.get(n, 0.0) <= sizes[n] <= high for n, (low, high) in bounds.items() if n in sizes
   )
+
+
+def pressed(best: Scored) -> bool:
+  """Tells whether constants that may be off lie at an end of what is plausible: they stand in for
+  something that no hypothesis holds, and what else it names may as well."""
+  term = best.terms[0]
+  if not term.freed:
+    return False
+  values = np.array(list(best.fit.values(term).values()))
+  low, high = np.array(term.low), np.array(term.high)
+  near = np.minimum(values - low, high - values) < _AT_END * (high - low)
+  return any(n for n, name in zip(near, term.names, strict=True) if name not in (*CLOCKS, "zero"))
 
 
 def is_new(subject: Subject, best: Scored, kind: str) -> bool:

@@ -344,3 +344,14 @@ def test_a_constant_is_off_by_more_than_copies_differ_by(monkeypatch, name, valu
   monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
   judged = SimpleNamespace(before=None, now=None, beyond=3.2)
   assert doubts.constants_off(judged, best, SETTINGS) == off
+
+
+@pytest.mark.parametrize(
+  "mass, freed, stopped", [(-0.15, True, True), (-0.14, True, False), (-0.15, False, False)]
+)
+def test_constants_that_are_stopped_by_their_range_stand_in_for_something(mass, freed, stopped):
+  names = ("mass", "latency")
+  term = SimpleNamespace(names=names, low=(-0.15, 0.0), high=(0.15, 0.01), freed=freed)
+  values = {"mass": mass, "latency": 0.0}  # no latency is not the end of a range
+  best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
+  assert doubts.pressed(best) == stopped
