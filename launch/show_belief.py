@@ -1,5 +1,6 @@
 """Draws where a policy expects to be, over an episode.
 
+  python launch/show_belief.py shipped
   python launch/show_belief.py runs/nav/policy/newest
 
 Runs an episode of the policy's environment with its mean action and draws, at moments spread over
@@ -21,8 +22,8 @@ from nerf2real.launch import command
 class Arguments:
   """Draws where a policy expects to be, over an episode."""
 
-  policy: Annotated[Path, tyro.conf.Positional]
-  """Folder of an exported policy."""
+  policy: Annotated[str, tyro.conf.Positional]
+  """Folder of an exported policy, or "shipped": that of navigation."""
   env: str | None = None
   """Another environment than the one that it was trained on."""
   seed: int = 0
@@ -41,12 +42,14 @@ def run(arguments: Arguments) -> None:
   import numpy as np
 
   from nerf2real.core.files import write_atomically
+  from nerf2real.evaluation.policies.names import SHIPPED, shipped_folder
   from nerf2real.evaluation.report.belief_pictures import draw_episode
 
   if not cv2.haveImageWriter(str(arguments.out)):
     raise ValueError(f"{arguments.out} is no name of a picture: expected one such as belief.png.")
+  shipped = arguments.policy == SHIPPED
   drawn = draw_episode(
-    arguments.policy,
+    shipped_folder("nerf_nav") if shipped else Path(arguments.policy),
     environment=arguments.env,
     seed=arguments.seed,
     moments=arguments.moments,
