@@ -155,9 +155,9 @@ def _identify(
     joints = ", ".join(item.joint for item in found.followed)
     content["notes"] = [
       *content["notes"],
-      f"Found by a simulation that follows the readings, as courses do not repeat (play, where a"
-      f" motion stops, or where no actuator holds a position): {joints}. The errors before and"
-      f" after are of whole courses, which stray.",
+      "Found by a simulation that follows the readings, as courses do not repeat (play, where a "
+      f"motion stops, or where no actuator holds a position): {joints}. The errors before and "
+      f"after are of {'whole courses' if _holds(found) else 'windows'}, which stray.",
     ]
   if found.in_reference:
     counts = collections.Counter(row["kind"] for row in found.in_reference)

@@ -9,17 +9,14 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.layout import CLOCKS, Layout
-from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.fit.layout import CLOCKS
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
-from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.remainder import mean_left
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.search.evidence import Scored, clear, more_likely
-from nerf2real.sysid.selection.search.explain import Explainer
+from nerf2real.sysid.selection.search.explain import Explainer, scored_on
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
@@ -128,22 +125,15 @@ def is_new(subject: Subject, best: Scored, kind: str) -> bool:
   held = term.held_at(np.array(list(best.fit.values(term).values())))
   kept = [(t, usual.fit.values(t)) for t in usual.terms if t.kind != kind]
   x = np.array([v for _, values in kept for v in values.values()])
-  theirs = _fitted(before, (*[t for t, _ in kept], held), x)
+  theirs = scored_on(before, (*[t for t, _ in kept], held), x, iterations=3)
   constants = tuple(theirs.fit.values(theirs.terms[0]).values())
   instead = dataclasses.replace(best.terms[0], centre=constants, starts=(constants,))
   terms = (instead, *[held if t is term else t for t in best.terms[1:]])
   values = [v for t in terms[1:] if t is not held for v in best.fit.values(t).values()]
-  ours = _fitted(subject.now, terms, np.array([*constants, *values]))
+  ours = scored_on(subject.now, terms, np.array([*constants, *values]), iterations=3)
   gains = np.concatenate([usual.nats - theirs.nats, best.nats - ours.nats])
   prior = usual.prior - theirs.prior + best.prior - ours.prior
   return more_likely(gains, prior, before.settings.level)
-
-
-def _fitted(joint: JointLikelihood, terms: tuple[Term, ...], x: Array) -> Scored:
-  """Returns a hypothesis fitted on from values [n], with its predictions of left-out blocks."""
-  fitter = Fitter([joint], Layout([terms]))
-  fit = fitter.leave_out(fitter.fit(x, iterations=3))
-  return Scored(terms, fit, joint.loglik(fit.held[0]))
 
 
 def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:

@@ -38,6 +38,15 @@ _TWINS = {
 """Effects of one value that does what a constant does, and that constant."""
 
 
+def scored_on(
+  joint: JointLikelihood, terms: tuple[Term, ...], x: Array, *, iterations: int
+) -> Scored:
+  """Returns a hypothesis fitted on from values [n], scored on left-out blocks and kept nowhere."""
+  fitter = Fitter([joint], Layout([terms]))
+  fit = fitter.leave_out(fitter.fit(x, iterations=iterations))
+  return Scored(terms, fit, joint.loglik(fit.held[0]))
+
+
 def _handed_over(parent: Scored, term: Term) -> list[Array]:
   """Returns where a parent's fit is with what a constant is off by as its twin's value, if it has
   one: the same simulation, and a constant as it was known."""

@@ -14,14 +14,13 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.fit.layout import Layout
-from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.changes import Changed, may_leave
 from nerf2real.sysid.selection.joints.naming import USUAL
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search import rivals
-from nerf2real.sysid.selection.search.evidence import Scored, more_likely
+from nerf2real.sysid.selection.search.evidence import more_likely
+from nerf2real.sysid.selection.search.explain import scored_on
 from nerf2real.sysid.selection.wider import wide
 from nerf2real.sysid.selection.wider.wide import Evidence, Wide
 from nerf2real.sysid.settings import Settings
@@ -218,9 +217,7 @@ def _is_new(item: Wide) -> bool:
     if before is None or usual is None or member.paired:
       return True
     terms = (*usual.terms, held)
-    fitter = Fitter([before], Layout([terms]))
-    fit = fitter.leave_out(fitter.fit(usual.fit.x, iterations=3))
-    beside = Scored(terms, fit, before.loglik(fit.held[0]))
+    beside = scored_on(before, terms, usual.fit.x, iterations=3)
     rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
   return more_likely(np.concatenate(list(rows.values())), prior, level)
 

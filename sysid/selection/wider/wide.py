@@ -21,6 +21,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.point_mass import carrying
 from nerf2real.sysid.selection.joints.subject import WHOLE, Subject
 from nerf2real.sysid.selection.search.evidence import Scored, clearness
+from nerf2real.sysid.selection.search.explain import scored_on
 
 Array = np.ndarray
 
@@ -228,9 +229,7 @@ def _evidence(members: Sequence[Subject], fit: Fit) -> Evidence:
 def without(member: Subject, item: Scored, held: Term) -> Scored:
   """Returns a joint's hypothesis without one of its effects of wider scope, fitted on."""
   terms = tuple(t for t in item.terms if t != held)
-  fitter = Fitter([member.now], Layout([terms]))
-  fit = fitter.leave_out(fitter.fit(item.fit.x, iterations=4))
-  return Scored(terms, fit, member.now.loglik(fit.held[0]))
+  return scored_on(member.now, terms, item.fit.x, iterations=4)
 
 
 def with_twin(member: Subject, item: Scored, held: Term, other: Term) -> bool:
