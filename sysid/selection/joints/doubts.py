@@ -12,6 +12,7 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CLOCKS
 from nerf2real.sysid.hypotheses.constants import OWN
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.remainder import mean_left
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search import rivals
@@ -111,19 +112,30 @@ def pressed(best: Scored) -> bool:
 
 
 def is_new(subject: Subject, best: Scored, kind: str) -> bool:
-  """Tells whether logs and reference are less likely where both have an effect of these values than
-  where the logs alone have it.
-
-  Declared constants that are far off may do in the reference what undoes the effect; the logs have
-  the same constants, but for what recordings of one machine differ by.
-  """
-  before, usual = subject.before, subject.usual
-  assert before is not None and usual is not None
+  """Tells whether an effect of the logs' best hypothesis is what has changed, by `newness`."""
   term = next(t for t in best.terms if t.name == kind)
   if term.freed:
     return True
   held = term.held_at(np.array(list(best.fit.values(term).values())))
-  kept = [(t, usual.fit.values(t)) for t in usual.terms if t.kind != kind]
+  return more_likely(*newness(subject, best, term, held), subject.now.settings.level)
+
+
+def newness(subject: Subject, best: Scored, term: Term, held: Term) -> tuple[Array, float]:
+  """Returns by how much logs and reference are more likely where the logs alone have an effect of
+  these values than where both have it: nats of the blocks of all logs, and what priors cost.
+
+  Declared constants that are far off may do in the reference what undoes the effect; the logs have
+  the same constants, but for what recordings of one machine differ by.
+
+  Args:
+    subject: the joint, with a reference.
+    best: the logs' hypothesis.
+    term: the effect among its terms.
+    held: the same with its values.
+  """
+  before, usual = subject.before, subject.usual
+  assert before is not None and usual is not None
+  kept = [(t, usual.fit.values(t)) for t in usual.terms if t.kind != term.kind]
   x = np.array([v for _, values in kept for v in values.values()])
   theirs = scored_on(before, (*[t for t, _ in kept], held), x, iterations=3)
   constants = tuple(theirs.fit.values(theirs.terms[0]).values())
@@ -132,8 +144,7 @@ def is_new(subject: Subject, best: Scored, kind: str) -> bool:
   values = [v for t in terms[1:] if t is not held for v in best.fit.values(t).values()]
   ours = scored_on(subject.now, terms, np.array([*constants, *values]), iterations=3)
   gains = np.concatenate([usual.nats - theirs.nats, best.nats - ours.nats])
-  prior = usual.prior - theirs.prior + best.prior - ours.prior
-  return more_likely(gains, prior, before.settings.level)
+  return gains, usual.prior - theirs.prior + best.prior - ours.prior
 
 
 def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:

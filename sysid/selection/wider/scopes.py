@@ -16,6 +16,7 @@ from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.changes import Changed, may_leave
+from nerf2real.sysid.selection.joints.doubts import newness
 from nerf2real.sysid.selection.joints.naming import USUAL
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search import rivals
@@ -208,18 +209,20 @@ def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency
 
 
 def _is_new(item: Wide) -> bool:
-  """Tells whether references, of other commands, are less likely with an effect of these values
-  than without: else it is theirs, too."""
-  rows, prior, level = {}, 0.0, item.members[0].now.settings.level
+  """Tells whether an effect is what has changed, by the logs and references of all its joints
+  together (`newness`): else it is the references', too. References of the same commands say so by
+  themselves."""
+  rows, prior = [], 0.0
   held = item.term.held_at(item.x)
-  for member in item.members:
-    before, usual = member.before, member.usual
-    if before is None or usual is None or member.paired:
+  for at, member in enumerate(item.members):
+    if member.before is None or member.paired:
       return True
-    terms = (*usual.terms, held)
-    beside = scored_on(before, terms, usual.fit.x, iterations=3)
-    rows[member.joint], prior = usual.nats - beside.nats, prior + usual.prior - beside.prior
-  return more_likely(np.concatenate(list(rows.values())), prior, level)
+    terms = (*member.explainer.null.terms, held)
+    best = scored_on(member.now, terms, item.own(at), iterations=3)
+    gains, more = newness(member, best, held, held)
+    rows.append(gains)
+    prior += more
+  return more_likely(np.concatenate(rows), prior, item.members[0].now.settings.level)
 
 
 def open_scopes(changed: Sequence[Changed]) -> set[str]:
