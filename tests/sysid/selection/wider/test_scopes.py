@@ -22,9 +22,9 @@ LATE = Effect("command_delay", None, {"delay": 0.021})
 PAYLOAD = Effect("payload", "lower", {"mass": 0.25, "x": 0.0, "y": 0.02, "z": -0.12})
 
 
-def _logs(effects, seed=0):
+def _logs(effects, seed=0, xml=ARM):
   return [
-    log_of(ARM, kind, effects, duration=5.0, seed=seed + i)
+    log_of(xml, kind, effects, duration=5.0, seed=seed + i)
     for i, kind in enumerate(("sweep", "slow", "steps"))
   ]
 
@@ -55,6 +55,17 @@ def test_one_joint_s_friction_stays_its_own_beside_a_reference(model):
   rough = Effect("coulomb_friction", "shoulder", {"torque": 0.25})
   found = analysis.analyse(model, _logs([LATE, rough]), _logs([LATE], seed=10))
   assert [(e["kind"], e["joint"]) for e in found.effects] == [("coulomb_friction", "shoulder")]
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.03])
+def test_a_load_is_new_where_a_reference_s_constants_could_undo_it(model, mass):
+  heavier = ARM.replace('mass="0.4"', 'mass="0.448"').replace('mass="0.3"', 'mass="0.336"')
+  load = Effect("payload", "lower", {"mass": mass, "x": 0.0, "y": 0.01, "z": -0.08})
+  found = analysis.analyse(model, _logs([load], xml=heavier), _logs([], seed=10, xml=heavier))
+  assert [e["kind"] for e in found.effects] == ["payload"] * (mass > 0)
+  if mass:
+    size = found.effects[0]["parameters"]["mass"]
+    assert size["low"] <= mass <= size["high"]
 
 
 def test_a_load_that_is_screened_has_left_its_start(model):
