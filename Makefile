@@ -26,7 +26,7 @@ loop: install
 	@echo "open out/make_loop/loop.html"
 
 test: install lint
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadscope
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadscope --durations 15
 
 lint: install
 	$(BIN)/ruff check .
