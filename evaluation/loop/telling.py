@@ -34,6 +34,7 @@ from nerf2real.suite.scene import open_scene
 
 _HEIGHT = 360  # of maps [pixel]
 _NOTHING = "-"
+_ENOUGH = "1,500 or more; 500 on a machine with other work brought nothing back"
 
 
 _LEAD = (
@@ -215,6 +216,7 @@ def _training(story: Story) -> Section:
   chosen = "; ".join(f"{n}: {k} of {made.trials}" for n, k in made.teachers.items())
   figures = [
     Figure("training", round(made.minutes, 1), "min", "of updates"),
+    Figure("updates", made.updates, "", "of the student in these minutes", _ENOUGH),
     Figure("frames", made.frames, "", "control steps collected"),
     Figure(
       "teacher",

@@ -210,7 +210,7 @@ def _story(tmp_path, after, *, trained=True):
     story.WITH_EFFECTS: made("fall", "fall", "success", "fall"),
     story.AFTER: made(*after),
   }
-  made_on = training.Trained(tmp_path, "quick", {"quick": 5, "steady": 4}, 6, 20.0, 9000)
+  made_on = training.Trained(tmp_path, "quick", {"quick": 5, "steady": 4}, 6, 20.0, 9000, 700)
   return story.Story(
     LoopSettings(out=tmp_path, policy="walker"),
     episodes,
