@@ -35,8 +35,8 @@ from nerf2real.suite.scene import open_scene
 _HEIGHT = 360  # of maps [pixel]
 _NOTHING = "-"
 _SIDE_BY_SIDE = (
-  "By the clock, of each stage. Trials under different conditions run side by side: the total is "
-  "more than the whole took."
+  "By the clock, of each stage. Where trials under different conditions ran side by side the total "
+  "is more than the whole took."
 )
 _ENOUGH = "1,500 or more; 500 on a machine with other work brought nothing back"
 
