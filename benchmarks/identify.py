@@ -2,8 +2,8 @@
 
 Runs `launch/identify.py` on every set of a folder made by `make_blind_sets.py` (made first if it is
 not there), compares the reports with answers.json, prints the table and the confusions, and keeps
-both in `benchmarks/results/`. Sets that were analysed already are not analysed again, so it can be
-stopped and run on. Seeds 100 to 199 are for development; figures are reported of others.
+both in `benchmarks/results/analyser/`. Sets that were analysed already are not analysed again, so
+it can be stopped and run on. Seeds 100 to 199 are for development; figures are reported of others.
 """
 
 import concurrent.futures
@@ -23,7 +23,7 @@ from benchmarks.blind_sets import scoring
 from benchmarks.ledger.records import ROOT
 from nerf2real.core import markdown
 
-RESULTS = ROOT / "benchmarks" / "results"
+RESULTS = ROOT / "benchmarks" / "results" / "analyser"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Settings:
   redo: bool = False
   """Analyse again what was analysed."""
   name: str = "identify"
-  """Of the files in benchmarks/results."""
+  """Of the files in benchmarks/results/analyser."""
   results: pathlib.Path = RESULTS
   """Folder of the table and the scores."""
   write: bool = False

@@ -1,4 +1,4 @@
-"""One writer a folder: an advisory lock with its owner's process and host.
+"""One writer a folder: an advisory lock with its owner's process and host; whose a folder is.
 
 The lock is `flock` on a file in the folder, so that the kernel releases it however its owner ends:
 a lock file without a living owner is stale and is taken over. Where the file system knows no
@@ -74,6 +74,27 @@ def discarded_on(error: type[Exception], folder: str | Path) -> Iterator[None]:
       shutil.rmtree(folder, ignore_errors=True)
       _remove_empty(missing)
     raise
+
+
+def expect_own(folder: str | Path, mark: str, *, of: str) -> None:
+  """Raises ValueError for a folder that holds files, but not the one that its command leaves first.
+
+  Hidden files, locks among them, do not count.
+
+  Args:
+    folder: An output folder; it may be missing.
+    mark: Name of the file that every folder of that command has.
+    of: Whose folder is expected, in words, such as "a loop".
+  """
+  folder = Path(folder)
+  if not folder.is_dir() or (folder / mark).exists():
+    return
+  found = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+  if found:
+    raise ValueError(
+      f"{folder} holds {found[0]} and no {mark}: expected a new or empty folder, or that of {of} "
+      "to go on with; take another one with --out."
+    )
 
 
 def owner_of(folder: str | Path, *, name: str = FILE) -> dict[str, Any]:

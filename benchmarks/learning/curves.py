@@ -3,7 +3,7 @@
   python benchmarks/learning/curves.py --name cartpole_swingup runs/x runs/y
 
 Reads the folders that `launch/local_distributed.py` writes, one a seed, and writes
-benchmarks/results/curves_<name>.jsonl and .png. The rows: one "run" row a run (command, seed,
+benchmarks/results/curves/<name>.jsonl and .png. The rows: one "run" row a run (command, seed,
 settings, time, hardware), its evaluations (means over some episodes with the policy's mean action),
 its acting returns and localisation errors as means over blocks of episodes. --target draws a line.
 """
@@ -41,7 +41,7 @@ class Settings:
   """Draws a dashed line at this return."""
   note: str = ""
   """A remark kept with the rows, such as the load."""
-  out: Path = Path("benchmarks/results")
+  out: Path = Path("benchmarks/results/curves")
   """Folder of the curves."""
   write: bool = False
   """Keep the best returns as records in benchmarks/results/records/."""
@@ -190,7 +190,7 @@ def main(settings: Settings) -> None:
   """Writes the rows and the picture, prints the best returns."""
   runs = [read_run(folder) for folder in settings.runs]
   settings.out.mkdir(parents=True, exist_ok=True)
-  path = settings.out / f"curves_{settings.name}.jsonl"
+  path = settings.out / f"{settings.name}.jsonl"
   with path.open("w") as stream:
     for run in runs:
       about = run["about"] | ({"note": settings.note} if settings.note else {})

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf2real.core import files
+from nerf2real.core.folder_lock import expect_own
 
 _IDENTITY = "loop_settings.json"
 TASK = "nerf_nav"
@@ -54,7 +55,8 @@ class LoopSettings:
   """Settings of that distillation."""
   teacher: str = AUTO
   """quick, swift, steady, a walker's settings as JSON, the folder of a policy, or auto: the walker
-  that succeeds most often with the effects in the simulation, fitted to them if all fail."""
+  that succeeds most often with the effects in the simulation, of equal ones the fastest, fitted to
+  them if all fail."""
   actors: int = 1
   """Collectors of the distillation."""
   out: Path = Path("out/loop")
@@ -80,7 +82,7 @@ def claim(settings: LoopSettings) -> None:
   What is hidden is written as a digest alone until the end.
 
   Raises:
-    ValueError: It is another loop's, or a stage would refuse the settings.
+    ValueError: It is another loop's or holds something else, or a stage would refuse the settings.
   """
   from nerf2real.agents.dmpo.policy.export import read_record
 
@@ -98,6 +100,7 @@ def claim(settings: LoopSettings) -> None:
     "time_limit": settings.time_limit,
   }
   path = settings.out / _IDENTITY
+  expect_own(settings.out, _IDENTITY, of="a loop")
   settings.out.mkdir(parents=True, exist_ok=True)
   if not path.exists():
     files.write_atomically(path, json.dumps(own, indent=1))

@@ -1,5 +1,8 @@
 """The teacher of a loop's training: the walker that copes best with the effects, or a fitted one.
 
+Of walkers that succeed as often the fastest teaches, as a slower one would teach the policy to be
+slow.
+
 The scripted gaits were searched for on the nominal robot. Where none of them copes with what was
 identified (a load and a slope that push the same way, say), a few parameters of the best one are
 searched for in the simulation with the effects, on trials that are not the protocol's.
@@ -69,11 +72,12 @@ def choose_teacher(
   folder.mkdir(parents=True, exist_ok=True)
   with _plant(scene, effects, time_limit) as plant:
     fresh = _Trials(plant, scene)
-    successes = {name: fresh.successes(TEACHERS[name]()) for name in WALKERS}
-    teacher = max(successes, key=lambda name: successes[name])
+    ranks = {name: fresh.rank(TEACHERS[name]()) for name in WALKERS}
+    teacher = max(ranks, key=lambda name: ranks[name])
+    successes = {name: rank.successes for name, rank in ranks.items()}
     if successes[teacher] < _COPES * len(fresh.chosen):
       fitted = fit(plant, scene, TEACHERS[teacher](), seed=seed)
-      successes["fitted"] = fresh.successes(fitted)
+      successes["fitted"] = fresh.rank(fitted).successes
       if successes["fitted"] > successes[teacher]:
         write_json(folder / FITTED, fitted)
         teacher = str((folder / FITTED).resolve())
@@ -117,18 +121,27 @@ def _score(plant: Plant, scene: Any, settings: WalkerSettings, trials: Sequence[
   return total / len(trials)
 
 
+class _Rank(NamedTuple):
+  """How well a walker did: of two that succeed as often the faster one did better."""
+
+  successes: int
+  haste: float  # mean time of the successes [s], negative
+
+
 class _Trials:
-  """Trials of the protocol that walkers are counted on."""
+  """Trials of the protocol that walkers are ranked on."""
 
   def __init__(self, plant: Plant, scene: Any):
     self._plant, self._scene = plant, scene
     self.chosen = [trial for _, (_, trial) in choose(plants.trials(NAVIGATION), _TRIALS)]
 
-  def successes(self, settings: WalkerSettings) -> int:
-    return sum(
-      _episode(self._plant, self._scene, settings, trial, index).success
+  def rank(self, settings: WalkerSettings) -> _Rank:
+    ran = [
+      _episode(self._plant, self._scene, settings, trial, index)
       for index, trial in enumerate(self.chosen)
-    )
+    ]
+    times = [episode.duration for episode in ran if episode.success]
+    return _Rank(len(times), -float(np.mean(times)) if times else 0.0)
 
 
 def _episode(plant: Plant, scene: Any, settings: WalkerSettings, trial: Trial, index: int) -> Any:

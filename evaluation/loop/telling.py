@@ -34,6 +34,11 @@ from nerf2real.suite.scene import open_scene
 
 _HEIGHT = 360  # of maps [pixel]
 _NOTHING = "-"
+_SIDE_BY_SIDE = (
+  "By the clock, of each stage. Where trials under different conditions ran side by side the total "
+  "is more than the whole took."
+)
+_ENOUGH = "1,500 or more; 500 on a machine with other work brought nothing back"
 
 
 _LEAD = (
@@ -77,7 +82,7 @@ def write(path: Path, story: Story) -> None:
     after,
     _outcomes(list(story.tallies.values()), _cooled(story)),
     *([] if story.comparison is None else [_hidden(story.comparison)]),
-    Section("Time", "", [Times(story.times)]),
+    Section("Time", _SIDE_BY_SIDE, [Times(story.times)]),
     Section("Settings", "", [Details("all", [settings])]),
   ]
   lead = _LEAD + (_VIRTUAL if story.settings.robot == "virtual" else "")
@@ -106,6 +111,8 @@ def five_numbers(story: Story) -> list[Figure]:
     for name, meaning, good in wanted
   ]
   value = _NOTHING if share is None else f"{100 * share:.0f} %"
+  if share is None and loop.HEALTHY in tallies:
+    value = "nothing was lost"
   back = "after less before, of what was lost"
   return [*figures, Figure("lost success that came back", value, "", back, "100 %")]
 
@@ -215,6 +222,7 @@ def _training(story: Story) -> Section:
   chosen = "; ".join(f"{n}: {k} of {made.trials}" for n, k in made.teachers.items())
   figures = [
     Figure("training", round(made.minutes, 1), "min", "of updates"),
+    Figure("updates", made.updates, "", "of the student in these minutes", _ENOUGH),
     Figure("frames", made.frames, "", "control steps collected"),
     Figure(
       "teacher",

@@ -27,6 +27,7 @@ class Trained(NamedTuple):
   trials: int
   minutes: float  # of training
   frames: int  # collected
+  updates: int  # of the student; few in many minutes: the machine had other work
 
 
 def environment_name(settings: LoopSettings, policy: Path | None, effects: Path) -> str:
@@ -97,7 +98,8 @@ def train(
       f"the same command with more than --minutes {settings.minutes:g} goes on with it."
     )
   info = export.read_record(run / POLICY)["info"]
-  return Trained(run / POLICY, teacher, teachers, count, _minutes(run), int(info["steps"]))
+  frames, updates = int(info["steps"]), int(info["updates"])
+  return Trained(run / POLICY, teacher, teachers, count, _minutes(run), frames, updates)
 
 
 @contextlib.contextmanager

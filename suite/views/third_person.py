@@ -1,7 +1,8 @@
 """A spectator's view of the robot in its room: the radiance field with the moving geoms in it.
 
 No GL is needed: field and geoms come from the same renderers as the robot's own picture. The view
-stays where nothing of the room stands between it and the robot. Shapes: H height, W width.
+stays where nothing of the room stands between it and the robot, and turns around it where the room
+would bring it too near. Shapes: H height, W width.
 """
 
 from typing import Any
@@ -23,6 +24,8 @@ _DIRECTIONS = 24  # directions that are tried
 _FLOOR_BONUS, _TURN_COST = 0.7, 0.05  # worth of free floor below the view [m], of turning [m/rad]
 _CLEARANCE = 0.15  # m kept from what stands behind the view
 _FOLLOW = 0.06  # share of the way by which the view follows the robot in a frame
+_NEAR = 1.0  # m: from nearer the robot, 0.5 m tall, fills two thirds of the picture's height
+_BESIDE = 0.2  # share of its distance by which the view may look past the robot; 0.38 is the edge
 _FIELD_SHARE = 3  # the field is rendered at this fraction of the size: it takes most of the time
 _DEPTH_SLACK = 0.03  # m by which the field's depth may err before it hides a geom
 _FLOOR_HEIGHT = 0.04  # m: what is lower than this takes a shadow
@@ -46,7 +49,7 @@ def clear_distance(physics: Any, start: np.ndarray, way: np.ndarray) -> float:
   return float(np.clip(free, 0.3, _DISTANCE))
 
 
-def best_azimuth(task: RobotTask, physics: Any) -> float:
+def best_azimuth(task: RobotTask, physics: Any, *, preferred: float | None = None) -> float:
   """Returns the direction [rad] from the robot in which a view sees it best.
 
   It is clear of the room's parts and, if there is such a one, above floor where the robot could
@@ -56,8 +59,10 @@ def best_azimuth(task: RobotTask, physics: Any) -> float:
   Args:
     task: The task.
     physics: Its compiled model and state.
+    preferred: The preferred direction [rad]; beside the robot and a little behind it if None.
   """
-  position, preferred = task.state.position, task.state.yaw + _PREFERRED
+  position = task.state.position
+  preferred = task.state.yaw + _PREFERRED if preferred is None else preferred
   turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
   turns = np.where(turns > np.pi, turns - 2 * np.pi, turns)  # from the preferred direction
   ways = np.array([direction(preferred + turn) for turn in turns])
@@ -109,14 +114,12 @@ class ThirdPerson:
   def restart(self) -> None:
     """Chooses the view anew, as at the start of an episode."""
     self._target = self._task.state.position.copy()
-    self._azimuth = best_azimuth(self._task, self._physics)
+    self._azimuth = self._wanted = best_azimuth(self._task, self._physics)
+    self._distance = clear_distance(self._physics, self._target, direction(self._azimuth))
 
   def draw(self) -> np.ndarray:
     """Returns the picture now, RGB uint8 [H, W, 3]."""
-    self._target += _FOLLOW * (self._task.state.position - self._target)
-    way = direction(self._azimuth)
-    free = clear_distance(self._physics, self._target, way)
-    pose = look_at(self._target + free * way, self._target)
+    pose = self._follow()
     color, depth = self._camera.render_field(pose, self._lens)
     color = self._shadow(color, depth, pose)
     picture = cv2.resize(color, self._size, interpolation=cv2.INTER_LINEAR)
@@ -126,6 +129,24 @@ class ThirdPerson:
     shade = self._caster.shade(ids[front], normals[front])
     picture.reshape(-1, 3)[pixels[front]] = shade
     return picture
+
+  def _follow(self) -> np.ndarray:
+    """Moves the view a frame on; returns its pose, world from camera [4, 4].
+
+    It draws near at once where something is in the way, and back little by little.
+    """
+    position = self._task.state.position
+    if clear_distance(self._physics, position, direction(self._wanted)) < _NEAR:
+      self._wanted = best_azimuth(self._task, self._physics, preferred=self._wanted)
+    self._azimuth += _FOLLOW * (self._wanted - self._azimuth)
+    way = direction(self._azimuth)
+    self._target += _FOLLOW * (position - self._target)
+    free = clear_distance(self._physics, self._target, way)
+    self._distance = min(free, self._distance + _FOLLOW * (free - self._distance))
+    behind = position - self._target
+    most = _BESIDE * self._distance
+    self._target = position - behind * min(1.0, most / max(float(np.linalg.norm(behind)), most))
+    return look_at(self._target + self._distance * way, self._target)
 
   def _shadow(self, color: np.ndarray, depth: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Darkens the floor under the robot and the ball."""

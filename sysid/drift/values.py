@@ -13,6 +13,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 from scipy.stats import norm
 
@@ -26,6 +27,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import FREE, Term
+from nerf2real.sysid.selection.wider import zeros
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
@@ -79,7 +81,7 @@ def compare(
   """
   found, skipped = [], []
   for row in stored.content["effects"]:
-    refit = _refit(row, stored.joints, now, settings)
+    refit = _refit(row, stored, now, settings)
     if refit is None:
       skipped.append(row["kind"])
     else:
@@ -111,7 +113,7 @@ def _value(refit: _Refit, name: str, then: dict[str, Any], beyond: float) -> Val
 
 def _refit(
   row: dict[str, Any],
-  joints: Sequence[StoredJoint],
+  stored: Stored,
   now: Mapping[str, JointLikelihood],
   settings: Settings,
 ) -> _Refit | None:
@@ -126,9 +128,12 @@ def _refit(
   if row["kind"] == "parameter_error" and members:  # medians over joints
     return None
   if members:
-    return _shared(row, [j for j in joints if j.joint in members], now, settings)
+    together = [j for j in stored.joints if j.joint in members]
+    if row["kind"] == zeros.KIND:
+      return _zero_of_tilt(row, stored.model, together, now, settings)
+    return _shared(row, together, now, settings)
   mine = next(
-    (j for j in joints if row["joint"] in (None, j.joint) and _named(j, row["kind"])), None
+    (j for j in stored.joints if row["joint"] in (None, j.joint) and _named(j, row["kind"])), None
   )
   return None if mine is None else _own(row, mine, now[mine.joint], settings)
 
@@ -199,6 +204,25 @@ def _shared(
   reaches = intervals.reaches(fit, intervals.spread(fit, joints), layout.spans[0])
   bounds = intervals.around(term, fit.x[: len(values)], *reaches)
   return _Refit(row, where, term.effect(fit.x[: len(values)], bounds))
+
+
+def _zero_of_tilt(
+  row: dict[str, Any],
+  model: mujoco.MjModel,
+  members: Sequence[StoredJoint],
+  now: Mapping[str, JointLikelihood],
+  settings: Settings,
+) -> _Refit | None:
+  """Returns a joint's zero that a tilt of the machine was told as, fitted anew as that tilt."""
+  refit = _shared(row | {"kind": zeros.TILT}, members, now, settings)
+  if refit is None:
+    return None
+  effect = refit.effect
+  if effect is not None:
+    x = np.array([effect.parameters[name] for name in ("x", "y")], float)
+    offset, interval = zeros.part_of_tilt(model, x, effect.intervals)
+    effect = Effect(row["kind"], row["joint"], {"offset": offset}, {"offset": interval})
+  return _Refit(row, row["joint"], effect)
 
 
 def _held(

@@ -8,7 +8,7 @@ import numpy as np
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.effects.registry import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.selection.findings import Identified, effects_of
+from nerf2real.sysid.selection.findings import Identified, Zero, effects_of
 from nerf2real.sysid.selection.joints.changes import Changed
 
 COUNT = 64
@@ -24,7 +24,8 @@ def with_samples(
   """Returns effects with joint draws of those that joints have of their own.
 
   Fits near the best take turns, so that draws scatter among them as well. Effects of bodies and of
-  the machine and those of sensors keep their intervals alone.
+  the machine and those of sensors keep their intervals alone; a joint's zero that was found over
+  all joints is drawn from its own.
 
   Args:
     found: the joints' fits.
@@ -34,21 +35,23 @@ def with_samples(
   rows: Rows = {}
   targets = {effect.target for effect in effects}
   for item in (j for j in found.joints if j.joint in targets):
-    rows |= _of_joint(item, random)
+    rows |= _of_joint(item, found.zeros.get(item.joint, Zero()), random)
   return [_with(effect, rows.get((effect.kind, effect.target), {})) for effect in effects]
 
 
-def _of_joint(item: Changed, random: np.random.Generator) -> Rows:
+def _of_joint(item: Changed, zero: Zero, random: np.random.Generator) -> Rows:
   """Returns the draws of a joint's values; of effects that all fits near the best have."""
   near = item.near
   each = [
     intervals.draws(item.likelihood, scored.fit, -(-COUNT // len(near)), random) for scored in near
   ]
+  offsets = zero.offset + zero.deviation * random.standard_normal(COUNT)
   rows: Rows = {}
   for at in range(COUNT):
     which, k = at % len(near), at // len(near)
     fit = dataclasses.replace(near[which].fit, x=each[which][k])
-    effects, _ = effects_of(item.joint, dataclasses.replace(near[which], fit=fit))
+    scored = dataclasses.replace(near[which], fit=fit)
+    effects, _ = effects_of(item.joint, scored, offset=float(offsets[at]))
     for effect in effects:
       values = rows.setdefault((effect.kind, effect.target), {})
       for name, value in effect.parameters.items():

@@ -17,7 +17,7 @@ from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import claims, whole_machine
-from nerf2real.sysid.selection.findings import Identified
+from nerf2real.sysid.selection.findings import Identified, Zero
 from nerf2real.sysid.selection.joints import changes
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.joints.naming import Name
@@ -166,11 +166,11 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
     "held_out_gain_nats": round(shared.nats, 2),
     "joints": [m.joint for m in shared.members],
   }
-  zero = shared.term.kind == "gravity_tilt" and zeros.of_tilt(result.model, shared.x, bounds)
+  zero = shared.term.kind == zeros.TILT and zeros.of_tilt(result.model, shared.x, bounds)
   if zero:
-    joint, offset, interval = zero
-    result.zeros[joint] = offset
-    result.effects.append(claims.zero(joint, offset, interval, evidence))
+    joint, offset, (low, high) = zero
+    result.zeros[joint] = Zero(offset, (high - low) / (2 * intervals.SIGMAS))
+    result.effects.append(claims.zero(joint, offset, (low, high), evidence))
     result.twins.append(claims.alike(shared.term, shared.x))
     return
   effect, row = claims.shared(shared.term, shared.x, bounds, evidence)
@@ -202,7 +202,7 @@ def _write_down(result: Identified, item: Changed) -> None:
   best = item.extended
   terms = sorted(best.terms, key=lambda t: t.kind == STICKING)  # a friction of its own holds, too
   names = {n.kind: n for n in item.found.names}
-  offset = result.zeros.get(item.joint, 0.0)
+  offset = result.zeros.get(item.joint, Zero()).offset
   for term in terms:
     values = best.fit.values(term)
     if term.kind == CONSTANTS:

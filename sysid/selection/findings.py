@@ -1,7 +1,7 @@
 """What an identification found, before it is written down."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -40,6 +40,13 @@ def effects_of(joint: str, item: Scored, *, offset: float = 0.0) -> tuple[list[E
   return effects, clocks
 
 
+class Zero(NamedTuple):
+  """A joint's shifted zero that was found over all joints."""
+
+  offset: float = 0.0  # rad
+  deviation: float = 0.0  # its standard deviation, rad
+
+
 @dataclasses.dataclass
 class Identified:
   """What an identification found, before it is written down."""
@@ -59,8 +66,8 @@ class Identified:
   calibration: list[Effect] = dataclasses.field(default_factory=list)
   """Declared constants corrected, one effect a joint."""
   clocks: dict[str, Clocks] = dataclasses.field(default_factory=dict)
-  zeros: dict[str, float] = dataclasses.field(default_factory=dict)
-  """Offsets of joints' zeros that were found over all joints, rad, beside those found at one."""
+  zeros: dict[str, Zero] = dataclasses.field(default_factory=dict)
+  """Joints' zeros that were found over all joints, beside those found at one."""
   in_reference: list[dict[str, Any]] = dataclasses.field(default_factory=list)
   """Entries of effects that reference logs show, too: the model lacks them, nothing has changed."""
 
@@ -83,8 +90,8 @@ class Identified:
       theirs = {(e.kind, e.target) for e in effects_of(item.joint, item.near[0])[0]}
       theirs.add(("encoder_offset", item.joint))
       effects = [e for e in effects if (e.kind, e.target) not in theirs]
-      near, zero = item.near[at % len(item.near)], self.zeros.get(item.joint, 0.0)
-      other, clocks[item.joint] = effects_of(item.joint, near, offset=zero)
+      near, zero = item.near[at % len(item.near)], self.zeros.get(item.joint, Zero())
+      other, clocks[item.joint] = effects_of(item.joint, near, offset=zero.offset)
       effects += other
     return Member(effects, clocks)
 

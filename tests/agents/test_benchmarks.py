@@ -135,7 +135,7 @@ def test_curves(tmp_path):
     timeout=60,
     env=os.environ | {"PYTHONPATH": str(ROOT)},
   )
-  rows = [json.loads(line) for line in (tmp_path / "curves_x.jsonl").read_text().splitlines()]
+  rows = [json.loads(line) for line in (tmp_path / "x.jsonl").read_text().splitlines()]
   assert [r["seconds"] for r in rows if r["row"] == "run"] == [5, 5]
   assert [r["return"] for r in rows if r["row"] == "evaluation"] == [
     100,
@@ -147,7 +147,7 @@ def test_curves(tmp_path):
     600,
     800,
   ]
-  picture = cv2.imread(str(tmp_path / "curves_x.png")).astype(int)
+  picture = cv2.imread(str(tmp_path / "x.png")).astype(int)
   red, blue = (
     np.argwhere(np.abs(picture - colour[::-1]).max(-1) == 0)
     for colour in ((214, 39, 40), (31, 119, 180))

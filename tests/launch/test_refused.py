@@ -62,6 +62,18 @@ def test_refused_at_once(run, tmp_path, script, arguments, status, words):
 
 
 @pytest.mark.parametrize(
+  "arguments", [(), ("--policy", "walker"), ("--policy", "walker", "--find-severity")]
+)
+def test_a_folder_of_something_else_is_not_written(run, tmp_path, arguments):
+  (tmp_path / "notes.txt").write_text("mine")
+  ended = run("close_loop", *arguments, "--hidden", "command_delay:0.1", "--out", tmp_path)
+  assert ended.status == 1, ended
+  (line,) = ended.err.splitlines()
+  assert line.startswith(f"error: {tmp_path} holds notes.txt and no loop_settings.json: expected")
+  assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
   ("script", "arguments", "late"),
   [
     (

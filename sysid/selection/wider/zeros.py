@@ -22,7 +22,8 @@ from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
 
-KIND = "encoder_offset"
+KIND, TILT = "encoder_offset", "gravity_tilt"
+_FIRST = 0  # the joint that carries all others, if one does: joints come from the root outwards
 _LEVEL = 0.9  # cosine of how far an axis may be from level; about an upright one nothing is tilted
 
 
@@ -64,21 +65,47 @@ def of_tilt(
     x: the tilt [2]: a rotation vector's part in the plane, rad.
     bounds: its interval by name.
   """
-  first, carriers = 0, model.body_rootid[model.jnt_bodyid]
-  if model.njnt == 0 or model.jnt_type[first] != mujoco.mjtJoint.mjJNT_HINGE:
+  along = _level_axis(model)
+  if along is None:
     return None
-  if np.any(carriers != carriers[first]) or model.body_jntnum[model.jnt_bodyid[first]] != 1:
+  across = np.array([-along[1], along[0]])
+  if abs(x @ across) > np.abs(across) @ _half(bounds):
+    return None
+  return model.joint(_FIRST).name, *part_of_tilt(model, x, bounds)
+
+
+def part_of_tilt(
+  model: mujoco.MjModel, x: Array, bounds: Mapping[str, tuple[float, float]]
+) -> tuple[float, tuple[float, float]]:
+  """Returns what `of_tilt` does but the joint, whatever a tilt is across that joint's axis.
+
+  Raises:
+    ValueError: the model has no joint of a level axis that carries all others.
+  """
+  along = _level_axis(model)
+  if along is None:
+    raise ValueError("Found no joint that carries all others, expected one of a level axis.")
+  offset = float(x @ along / (along @ along))
+  reach = float(np.abs(along) @ _half(bounds) / (along @ along))
+  return offset, (offset - reach, offset + reach)
+
+
+def _half(bounds: Mapping[str, tuple[float, float]]) -> Array:
+  """Returns half the widths [2] of a tilt's intervals, rad."""
+  return np.array([0.5 * np.ptp(bounds[name]) for name in ("x", "y")])
+
+
+def _level_axis(model: mujoco.MjModel) -> Array | None:
+  """Returns the axis [2] in the plane of the joint that carries all others; None without one."""
+  if model.njnt == 0 or model.jnt_type[_FIRST] != mujoco.mjtJoint.mjJNT_HINGE:
+    return None
+  carriers = model.body_rootid[model.jnt_bodyid]
+  if np.any(carriers != carriers[_FIRST]) or model.body_jntnum[model.jnt_bodyid[_FIRST]] != 1:
     return None
   data = mujoco.MjData(model)
   mujoco.mj_kinematics(model, data)
-  axis = data.xaxis[first]
-  along = axis[:2]
-  half = np.array([0.5 * np.ptp(bounds[name]) for name in ("x", "y")])
-  across = np.array([-along[1], along[0]])
-  if abs(x @ across) > np.abs(across) @ half or float(along @ along) < _LEVEL**2:
-    return None
-  offset, reach = float(x @ along / (along @ along)), float(np.abs(along) @ half / (along @ along))
-  return model.joint(first).name, offset, (offset - reach, offset + reach)
+  along = np.array(data.xaxis[_FIRST][:2])
+  return along if float(along @ along) >= _LEVEL**2 else None
 
 
 def _without(log: Log, joint: str, offset: float) -> Log:

@@ -210,7 +210,7 @@ def _story(tmp_path, after, *, trained=True):
     story.WITH_EFFECTS: made("fall", "fall", "success", "fall"),
     story.AFTER: made(*after),
   }
-  made_on = training.Trained(tmp_path, "quick", {"quick": 5, "steady": 4}, 6, 20.0, 9000)
+  made_on = training.Trained(tmp_path, "quick", {"quick": 5, "steady": 4}, 6, 20.0, 9000, 700)
   return story.Story(
     LoopSettings(out=tmp_path, policy="walker"),
     episodes,
@@ -243,6 +243,7 @@ def test_where_no_success_was_lost_none_can_come_back(tmp_path):
   told = _story(tmp_path, ("success",) * 4)
   same = told._replace(episodes=told.episodes | {story.BEFORE: told.episodes[story.HEALTHY]})
   assert story.recovered(same) is None
+  assert telling.five_numbers(same)[-1].value == "nothing was lost"
 
 
 def test_the_page_tells_the_story_in_order_and_what_was_hidden_last(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 from nerf2real.evaluation.episodes import Store
 from nerf2real.evaluation.loop import story
 from nerf2real.evaluation.loop.robot import recording
+from nerf2real.evaluation.loop.settings import LoopSettings, claim
 from nerf2real.suite.effects import Effect, write_effects
 
 SCRIPT = Path(__file__).parents[3] / "launch" / "close_loop.py"
@@ -25,8 +26,9 @@ def _run(out, *extra):
   )
 
 
-def _found_before(out, effects, verdict):
+def _found_before(out, effects, verdict, hidden=()):
   """Leaves logs and a finding as an interrupted loop does."""
+  claim(LoopSettings(policy="walker", hidden=hidden, time_limit=1.0, out=out))
   for folder in ("stand", "reference"):
     (out / folder).mkdir(parents=True)
     for name in (*recording.TRAIN, *recording.HELD, recording.FLOOR):
@@ -41,7 +43,7 @@ def _found_before(out, effects, verdict):
 @pytest.mark.slow
 def test_a_loop_goes_on_from_its_finding_and_ends_with_the_page(tmp_path):
   delay = Effect("command_delay", None, {"delay": 0.04}, {"delay": (0.035, 0.05)})
-  _found_before(tmp_path, [delay], "effects")
+  _found_before(tmp_path, [delay], "effects", hidden=("command_delay:0.045",))
   found = _run(tmp_path, "--hidden", "command_delay:0.045")
   assert found.returncode == 0, found.stdout + found.stderr
   before_the_end, _, end = found.stdout.partition("success, robot as it was")

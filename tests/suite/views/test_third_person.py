@@ -56,6 +56,22 @@ def test_the_view_comes_nearer_where_a_wall_is_in_the_way(environment):
   assert distance == pytest.approx(max(0.3, to_wall - 0.15), abs=1e-6)
 
 
+def test_the_view_turns_where_a_wall_would_bring_it_near(environment):
+  """The robot walks to the wall that the view stood before; it stays whole in the picture."""
+  view = _stand(environment, 1.0, 0.0)
+  state = environment.task.state
+  view._azimuth = view._wanted = np.pi  # towards the wall at x = -3
+  near, edge = [], []
+  for x in np.arange(1.0, -2.75, -0.02):  # m a frame: 0.4 m/s
+    state.position[:2] = x, 0.0
+    pose = view._follow()
+    seen = (np.linalg.inv(pose) @ np.append(state.position, 1.0))[:3]
+    near.append(seen[2])
+    edge.append(np.abs(seen[:2]).max() / seen[2])
+  assert min(near) > 0.9 and max(edge) < 0.22
+  assert np.cos(view._wanted) > np.cos(np.deg2rad(120))  # along the wall, or away from it
+
+
 def test_look_at_is_upright_and_centred():
   position, target = np.array([1.0, -2.0, 1.5]), np.array([0.3, 0.4, 0.2])
   pose = third_person.look_at(position, target)

@@ -27,6 +27,7 @@ from tests.sysid.synthetic import ARM, COUNT, PENDULUM, log_of
 
 FRICTION = 0.25  # N m
 LATE, WIDE = 0.03, 0.003  # s, a delay and half of its interval
+ZERO = 0.05  # rad
 KINDS = ("sweep", "slow", "steps")
 
 
@@ -220,6 +221,24 @@ def test_an_effect_of_the_machine_is_fitted_to_all_joints(later, tmp_path):
   (value,) = sysid.check_drift(folder, [Path("later")]).moved
   assert value.later is not None and value.where == "all"
   assert value.later[0] == pytest.approx(LATE + 0.02, abs=0.004)
+
+
+def test_a_zero_that_a_tilt_was_told_as_is_fitted_anew(later, tmp_path):
+  tilted = [Effect("gravity_tilt", None, {"x": 0.0, "y": ZERO})]
+  folder = store(tmp_path, ARM, tilted, "gravity_tilt", [0.0, ZERO], shared=True)
+  content = json.loads((folder / "report.json").read_text())
+  (row,) = content["effects"]
+  offset = row["parameters"].pop("y")
+  row |= {"kind": "encoder_offset", "joint": "shoulder", "parameters": {"offset": offset}}
+  (folder / "report.json").write_text(json.dumps(content))
+  for name, zero in (("same", ZERO), ("later", ZERO + 0.1)):
+    effects = [Effect("encoder_offset", "shoulder", {"offset": zero})]
+    later[name] = recorded(name, ARM, "sweep", effects, seed=9)
+  same = sysid.check_drift(folder, [Path("same")])
+  assert same.holds and not same.not_judged
+  (value,) = sysid.check_drift(folder, [Path("later")]).moved
+  assert (value.kind, value.where, value.name) == ("encoder_offset", "shoulder", "offset")
+  assert value.later is not None and value.later[0] == pytest.approx(ZERO + 0.1, abs=0.02)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.report.samples import COUNT, with_samples
+from nerf2real.sysid.selection.findings import Zero
 from nerf2real.sysid.selection.search.explain import Scored
 from tests.sysid.fit.test_likelihood import joint_of
 
@@ -47,17 +48,25 @@ def test_draws_lie_in_the_intervals_and_go_together_as_the_fit_says(fitted):
 def test_effects_get_as_many_draws_of_every_value(fitted):
   joint, item = fitted
   found = types.SimpleNamespace(
-    joints=[types.SimpleNamespace(joint="joint", likelihood=joint, near=[item, item])]
+    joints=[types.SimpleNamespace(joint="joint", likelihood=joint, near=[item, item])],
+    zeros={"joint": Zero(0.1, 0.02)},
   )
   claimed = [
     Effect("viscous_friction", "joint", {"coefficient": 0.5}),
     Effect("parameter_error", "joint", {"damping": 1.0, "gain": 1.0}),
     Effect("command_delay", None, {"delay": 0.01}),
+    Effect("encoder_offset", "joint", {"offset": 0.1}),
   ]
   drawn = with_samples(found, claimed, np.random.default_rng(0))
-  assert [sorted(e.samples) for e in drawn] == [["coefficient"], ["damping", "gain"], []]
+  assert [sorted(e.samples) for e in drawn] == [
+    *(["coefficient"], ["damping", "gain"], []),
+    ["offset"],
+  ]
   added, factor = drawn[0].samples["coefficient"], drawn[1].samples["damping"]
   assert len(added) == len(factor) == COUNT
   total = np.array(added) + np.array(factor)  # declared damping is 1 N m s/rad
   assert np.std(total) < 0.5 * np.std(added)
   assert np.median(total) == pytest.approx(1.5, abs=0.05)
+  zero = drawn[3].samples["offset"]  # beside what the constants say of it
+  assert np.mean(zero) == pytest.approx(0.1, abs=0.01)
+  assert np.std(zero) == pytest.approx(0.02, rel=0.4)
