@@ -37,7 +37,7 @@ def _parts(server: viser.ViserServer, bundle: Bundle) -> list[Any]:
     by_color.setdefault(palette.rgb(palette.cycle(index)), []).append(trimesh.load_mesh(path))
   handles = []
   for number, (color, parts) in enumerate(by_color.items()):
-    joined = trimesh.util.concatenate(parts)
+    joined: Any = trimesh.util.concatenate(parts)
     handles.append(
       server.scene.add_mesh_simple(
         f"/parts/{number}",
