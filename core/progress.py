@@ -1,6 +1,7 @@
 """Progress reports of long computations, and what shows them: a bar, or lines where it is piped."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -8,6 +9,7 @@ from rich import progress as rich_progress
 from rich.console import Console
 
 _LINE_PERIOD = 10.0  # s between lines
+_SILENCE = 60.0  # s without a report after which the last one is printed again
 Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is being done
 
 
@@ -33,14 +35,22 @@ def progress_bar(
 ) -> Iterator[Progress]:
   """Shows progress while the block runs; yields what moves it.
 
-  A terminal gets a bar. A pipe or a file gets plain lines, at most one in ten seconds.
+  A terminal gets a bar. A pipe or a file gets plain lines, at most one in ten seconds, and in a
+  minute without a report the last one again.
   """
   if not shown:
     yield no_progress
     return
   console = console or Console(stderr=True)
   if not console.is_terminal:
-    yield _Lines(name, console)
+    lines, ended = _Lines(name, console), threading.Event()
+    watch = threading.Thread(target=lines.keep_telling, args=(ended,), daemon=True)
+    watch.start()
+    try:
+      yield lines
+    finally:
+      ended.set()
+      watch.join()
     return
   columns = (
     rich_progress.TextColumn(f"{name:<12}"),
@@ -62,14 +72,27 @@ class _Lines:
     self._name, self._console = name, console
     self._begin = self._printed = time.monotonic()
     self._told = False
+    self._last = (0.0, "")
+    self._lock = threading.Lock()
 
   def __call__(self, fraction: float, text: str) -> None:
-    now = time.monotonic()
-    ends = fraction >= 1.0 and self._told  # a short stage says nothing
-    if now - self._printed < _LINE_PERIOD and not ends:
-      return
-    self._printed, self._told = now, True
-    took = now - self._begin
+    with self._lock:
+      self._last = (fraction, text)
+      ends = fraction >= 1.0 and self._told  # a short stage says nothing
+      if time.monotonic() - self._printed >= _LINE_PERIOD or ends:
+        self._print()
+
+  def keep_telling(self, ended: threading.Event) -> None:
+    """Prints the last report again after each silence, until the end."""
+    while not ended.wait(_LINE_PERIOD):
+      with self._lock:
+        if self._last[1] and time.monotonic() - self._printed >= _SILENCE:
+          self._print()
+
+  def _print(self) -> None:
+    fraction, text = self._last
+    self._printed, self._told = time.monotonic(), True
+    took = self._printed - self._begin
     left = f", about {took / fraction - took:.0f} s left" if 0.01 < fraction < 1.0 else ""
     line = f"{self._name}: {fraction:.0%} after {took:.0f} s{left}: {text}"
     self._console.print(line, soft_wrap=True, highlight=False, markup=False)

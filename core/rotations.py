@@ -17,7 +17,7 @@ _RIGID = 1e-2  # of R R^T to the identity: written with few digits a rotation is
 _OPPOSITE = 1e-12  # 1 + cosine under which two directions count as opposite
 
 # How a hand holds a camera; chosen, and two rooms' floors change by half a degree with half of it.
-_ROLL, _PITCH = np.radians([5.0, 30.0])  # standard deviations from level
+ROLL, PITCH = np.radians([5.0, 30.0])  # standard deviations from level
 _MOST_ROLLED = 0.5  # sine of the roll of a camera that is held so
 
 
@@ -128,7 +128,7 @@ def level_up(world_from_camera: np.ndarray, rough: np.ndarray) -> np.ndarray:
   held = np.abs(right @ rough) < _MOST_ROLLED * np.linalg.norm(rough)
   if not held.any():
     return rough / np.linalg.norm(rough)
-  right, forward = right[held] / _ROLL, forward[held] / _PITCH
+  right, forward = right[held] / ROLL, forward[held] / PITCH
   up: np.ndarray = np.linalg.eigh(right.T @ right + forward.T @ forward)[1][:, 0]
   return up if up @ rough > 0 else -up
 

@@ -2,7 +2,9 @@
 
 The plane with the most points can be a table top, and the lowest plane a reflection or a few stray
 points. So planes are measured by the ground they cover, not by their points, and of those that
-cover enough the lowest is taken. Shapes: P points.
+cover enough the lowest is taken. Both the search and the choice weigh a plane by how likely its
+normal is up as cameras are held (`up.UpBelief`): else they end at slabs through walls, which hold
+the more points the more they tilt. Shapes: P points.
 """
 
 import dataclasses
@@ -10,14 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core import rotations
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.alignment.planes import across, best_plane, fit_plane
+from nerf2real.scenes.alignment.up import UpBelief, by_hand, up_of_cameras
 
 _MIN_POINTS = 30
 _PLANES = 12  # candidate planes that are peeled off one after another
 _SAME = 0.9  # of the lowest plane's distance from the cameras: 14 cm at 1.4 m
+_LEAST = 0.01  # of the points: a plane with fewer is none
+_SURE = 3.0  # deviations of the sign test of a plane against what is beside it
+UNLIKELY = 3.0  # deviations of a floor's normal from the cameras' up, beyond which it is doubted
+_BESIDE = 2.5, 4.5  # tolerances from a plane, on both sides: slabs as thick as its own
 _PEEL = 2.5  # tolerances taken off with a plane, or its noise would be the next, lower plane
 
 
@@ -25,8 +31,9 @@ _PEEL = 2.5  # tolerances taken off with a plane, or its noise would be the next
 class FloorSettings:
   """Settings of the search for the floor; lengths relative to the median distance of the points."""
 
-  max_tilt_deg: float = 20.0
-  """Between the floor's normal and the cameras' up direction."""
+  max_tilt_deg: float = 45.0
+  """Between the floor's normal and the cameras' up direction, however unsure that is: what is
+  steeper is a wall rather than a floor."""
   tolerance: float = 0.012
   """a point this near belongs to a plane: about 2.5 cm in a room."""
   cell: float = 0.05
@@ -56,28 +63,40 @@ class Floor(NamedTuple):
     return points @ self.normal - self.offset
 
 
-def mean_up(frame_from_camera: np.ndarray) -> np.ndarray:
-  """The cameras' up direction [3]: a phone is held upright, see `rotations.level_up`."""
-  up = -frame_from_camera[:, :3, 1].mean(0)
-  length = np.linalg.norm(up)
-  if length < 0.2:
-    raise ValueError(
-      f"The cameras' up directions cancel (mean length {length:.2f}): the pictures are rolled all "
-      'ways. Give "up" or "floor_points" in the override file.'
-    )
-  return rotations.level_up(frame_from_camera, up)
-
-
 def _cover(points: np.ndarray, normal: np.ndarray, cell: float) -> float:
   """Ground [unit^2] that points cover, in cells that hold one or more."""
   flat = np.floor(points @ across(normal).T / cell).astype(np.int64)
   return len(np.unique(flat, axis=0)) * cell * cell
 
 
+def _stands_out(
+  points: np.ndarray, normal: np.ndarray, offset: float, *, tolerance: float, cell: float
+) -> bool:
+  """Whether a plane holds more points than a slab above it and one below, by the number of cells.
+
+  Slabs through a wall or through clutter hold about as many as their neighbours. A cell counts once
+  however many points it holds: a sign test.
+  """
+  heights = (points @ normal - offset) / tolerance
+  near = np.abs(heights) < _BESIDE[1]
+  heights = heights[near]
+  ground = np.floor(points[near] @ across(normal).T / cell).astype(np.int64)
+  _, cells = np.unique(ground, axis=0, return_inverse=True)
+  inside, above, below = (
+    np.bincount(cells.ravel(), weights=held)
+    for held in (np.abs(heights) < 1, heights > _BESIDE[0], heights < -_BESIDE[0])
+  )
+  for beside in (above, below):
+    more, fewer = (inside > beside).sum(), (inside < beside).sum()
+    if more - fewer < _SURE * np.sqrt(more + fewer):
+      return False
+  return True
+
+
 def find_floor(
   points: np.ndarray,
   *,
-  up: np.ndarray,
+  up: UpBelief,
   camera_positions: np.ndarray,
   settings: FloorSettings | None = None,
 ) -> Floor:
@@ -85,7 +104,7 @@ def find_floor(
 
   Args:
     points: Points of the scene [P, 3].
-    up: Rough up direction [3].
+    up: What the cameras show of up.
     camera_positions: Camera centres [N, 3]; the floor lies below nearly all of them.
     settings: Settings.
 
@@ -103,35 +122,47 @@ def find_floor(
   if len(points) > settings.max_points:
     chosen = np.random.default_rng(0).permutation(len(points))[: settings.max_points]
     points = points[chosen]
-  up = np.asarray(up, np.float64) / np.linalg.norm(up)
   size = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=-1)))
   tolerance, cell = settings.tolerance * size, settings.cell * size
+  max_tilt = np.radians(settings.max_tilt_deg)
+
+  def prior(normals: np.ndarray) -> np.ndarray:
+    return np.where(normals @ up.direction >= np.cos(max_tilt), up.density(normals), 0.0)
+
   rest, candidates = points, []
   for _ in range(_PLANES):
-    if len(rest) < max(_MIN_POINTS // 2, 0.01 * len(points)):
+    if len(rest) < max(_MIN_POINTS // 2, _LEAST * len(points)):
       break
     normal, offset = best_plane(
-      rest, up, tolerance=tolerance, max_tilt=np.radians(settings.max_tilt_deg)
+      rest,
+      up.direction,
+      tolerance=tolerance,
+      max_tilt=max_tilt,
+      prior=prior,
+      least=_LEAST,
     )
     inside = np.abs(rest @ normal - offset) < tolerance
     below = (camera_positions @ normal - offset > 0).mean()
     if inside.sum() < 10:
       break
     residual = float(np.sqrt(np.mean((rest[inside] @ normal - offset) ** 2)))
-    tilt = np.degrees(np.arccos(np.clip(normal @ up, -1, 1)))
-    floor = Floor(
-      normal, offset, int(inside.sum()), _cover(rest[inside], normal, cell), residual, float(tilt)
-    )
-    if below > 0.9:
-      candidates.append(floor)
+    tilt = np.degrees(np.arccos(np.clip(normal @ up.direction, -1, 1)))
+    cover = _cover(rest[inside], normal, cell)
+    if below > 0.9 and _stands_out(points, normal, offset, tolerance=tolerance, cell=cell):
+      candidates.append(Floor(normal, offset, int(inside.sum()), cover, residual, float(tilt)))
     rest = rest[np.abs(rest @ normal - offset) > _PEEL * tolerance]
   if not candidates:
     raise FloorError(
-      f"No plane within {settings.max_tilt_deg:g} degrees of the cameras' up direction lies below "
-      'the cameras: film the floor, or give "floor_points" in the override file.'
+      "The pictures show no floor: no level plane below the cameras stands out from what is above "
+      "and below it, as where a facade or one thing fills the pictures: film the floor as well, or "
+      'give "floor_points" in the override file.'
     )
-  largest = max(c.cover for c in candidates)
-  large = [c for c in candidates if c.cover >= settings.min_cover * largest]
+  covers = [c.cover * float(prior(c.normal)) for c in candidates]
+  large = [
+    c
+    for c, cover in zip(candidates, covers, strict=True)
+    if cover >= settings.min_cover * max(covers)
+  ]
   centre = camera_positions.mean(0)
   depths = [float(c.heights(centre)) for c in large]
   # What is left of a floor after peeling may pass for a plane of its own: of those near the lowest
@@ -165,19 +196,17 @@ class FoundFloor(NamedTuple):
   """The floor plane, and whether dense and sparse points give the same."""
 
   floor: Floor
-  dense_trusted: bool  # False where the dense points show a floor well above the sparse ones'
+  dense_trusted: bool  # False where the dense points show a floor that the sparse ones contradict
 
 
-def rough_up(evidence: Evidence, override: Overrides) -> np.ndarray:
-  """The cameras' up direction [3]; the unit frame's where only the override has one."""
-  if evidence.up is not None:
-    return evidence.up
+def cameras_up(evidence: Evidence, override: Overrides) -> UpBelief:
+  """What the cameras show of up; the unit frame's up where an override stands in for them."""
   try:
-    return mean_up(evidence.frame_from_camera)
+    return up_of_cameras(evidence.frame_from_camera, evidence.up)
   except ValueError:
     if override.up is None and override.floor_points is None:
       raise
-    return np.array([0.0, 0.0, 1.0])
+    return by_hand(np.array([0.0, 0.0, 1.0]))
 
 
 def choose_floor(
@@ -198,33 +227,30 @@ def choose_floor(
   Raises:
     FloorError: No floor was found.
   """
-  camera_up = rough_up(evidence, override)
+  up = cameras_up(evidence, override) if override.up is None else by_hand(override.up)
   if override.floor_points is not None:
-    normal, offset = fit_plane(override.floor_points, camera_up)
+    normal, offset = fit_plane(override.floor_points, up.direction)
     error = override.floor_points @ normal - offset
     floor = Floor(normal, offset, len(error), 0.0, float(np.sqrt(np.mean(error**2))), 0.0)
     return Choice(FoundFloor(floor, True), "manual_points")
-  up, source = camera_up, "plane"
-  if override.up is not None:  # a person's up is exact: only the height is searched
-    up, source = override.up / np.linalg.norm(override.up), "manual_up"
-    settings = dataclasses.replace(settings, max_tilt_deg=1.0)
   found = _search(evidence, up, settings, max_gap)
   warnings: tuple[str, ...] = ()
   if not found.dense_trusted:
     warnings = (
-      "The field's depth shows its floor well above that of the sparse points: the field is "
-      "blurred, and so will be its contact geometry. Train it longer; floor, yaw and extent are "
-      "taken from the sparse points.",
+      "The field's depth shows no floor, or one well above that of the sparse points or askew: the "
+      "field is blurred, and so will be its contact geometry. Train it longer; floor, yaw and "
+      "extent are taken from the sparse points.",
     )
-  if override.up is not None:
-    floor = found.floor
-    moved = floor.offset + float((up - floor.normal) @ evidence.positions.mean(0))
-    found = found._replace(floor=floor._replace(normal=up, offset=moved))
-  return Choice(found, source, warnings)
+  if override.up is None:
+    return Choice(found, "plane", warnings)
+  floor = found.floor  # a person's up is exact: only the height is searched
+  moved = floor.offset + float((up.direction - floor.normal) @ evidence.positions.mean(0))
+  exact = floor._replace(normal=up.direction, offset=moved)
+  return Choice(found._replace(floor=exact), "manual_up", warnings)
 
 
 def _search(
-  evidence: Evidence, up: np.ndarray, settings: FloorSettings, max_gap: float
+  evidence: Evidence, up: UpBelief, settings: FloorSettings, max_gap: float
 ) -> FoundFloor:
   """Searches the floor in the dense and in the sparse points and compares both."""
   positions = evidence.positions
@@ -244,7 +270,8 @@ def _search(
     return FoundFloor(dense, True)
   centre = positions.mean(0)
   above = 1 - float(dense.heights(centre)) / float(sparse.heights(centre))
-  return FoundFloor(dense, True) if above < max_gap else FoundFloor(sparse, False)
+  askew = up.deviations(dense.normal) > UNLIKELY >= up.deviations(sparse.normal)
+  return FoundFloor(sparse, False) if above >= max_gap or askew else FoundFloor(dense, True)
 
 
 def _thin(points: np.ndarray) -> np.ndarray:

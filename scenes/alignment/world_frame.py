@@ -13,18 +13,18 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.extent import choose_extent
 from nerf2real.scenes.alignment.floor import (
+  UNLIKELY,
   Floor,
   FloorSettings,
+  cameras_up,
   choose_floor,
   refine_floor,
-  rough_up,
 )
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.alignment.scale import Scale, choose_scale
 from nerf2real.scenes.alignment.yaw import choose_yaw
 
 _ABOVE_FLOOR = 0.1  # m: points above belong to the room, not to its floor
-_MAX_TILT_DEG = 15.0  # of the floor against the cameras' up direction, without a warning
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -154,13 +154,14 @@ def align(
     camera_margin=settings.camera_margin,
   )
   progress(1.0, "aligned")
-  cosine = np.clip(floor.normal @ rough_up(evidence, override), -1, 1)
-  tilt = float(np.degrees(np.arccos(cosine)))
+  up = cameras_up(evidence, override)
+  tilt = float(np.degrees(np.arccos(np.clip(floor.normal @ up.direction, -1, 1))))
   warnings = found.warnings + scale.warnings + rotation.warnings + extent.warnings
-  if tilt > _MAX_TILT_DEG:
+  if found.source == "plane" and up.deviations(floor.normal) > UNLIKELY:
     warnings += (
-      f"The floor tilts {tilt:.0f} degrees against the cameras' up direction: check it in the "
-      "report, and give floor_points in the override file if it is wrong.",
+      f"The floor tilts {tilt:.0f} degrees against the cameras' up direction, more than they are "
+      "held askew: check it in the report, and give floor_points in the override file if it is "
+      "wrong.",
     )
   return Alignment(
     world_from_unit=similarity.Similarity(metres, rotation.value, -extent.value.origin),

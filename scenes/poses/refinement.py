@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.posed import agreement
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
@@ -27,6 +27,7 @@ from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
 _PARTNERS = 10  # pictures each is matched with; chosen: as COLMAP's sequence of ten
 _SAME_VIEW = np.cos(np.radians(60.0))  # of the optical axes of a pair
 _LOOSE = 16.0  # pixels that poses of a degree may be off at first, in a view of a thousand
+_TRIANGULATED = 0.15  # of the progress of both rounds: where one's points are made
 _FEWEST = 0.5  # of the pictures must see enough points, or the poses stay as they came
 
 
@@ -123,7 +124,7 @@ def refine_known(
   bare = dataclasses.replace(known, points=empty, point_colors=empty.astype(np.uint8))
   found = bare
   for share, error in ((0.0, _LOOSE), (0.5, mapping.MAX_ERROR)):
-    report(share, "adjusting poses and lens to the pictures")
+    report(share, f"points of {len(names)} pictures, matches within {error:g} pixels")
     model = mapping.triangulate(database, images_folder, found, names, max_error=error)
     strong = {i.name for i in mapping.registered(model) if _carries(i)}
     if len(strong) < max(3, _FEWEST * len(names)):
@@ -131,7 +132,7 @@ def refine_known(
     for image in mapping.registered(model):
       if image.name not in strong:
         model.deregister_frame(image.frame_id)
-    model, _ = mapping.refine(model)
+    model, _ = mapping.refine(model, report=part(report, share + _TRIANGULATED, share + 0.5))
     found = _moved_back(model, bare, names)
   return known.with_views(found.camera, found.world_from_camera), model
 

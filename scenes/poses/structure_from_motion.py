@@ -33,7 +33,7 @@ from nerf2real.scenes.poses.matching.parallax import parallax_share
 from nerf2real.scenes.poses.registered import check_registered
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
-from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
+from nerf2real.scenes.poses.work import KNOWN_SHARES, Mapped, Steps, prepare_work
 
 _MODEL_FOLDER, _WORK_FOLDER = "sfm", "work"
 
@@ -74,11 +74,12 @@ def localise(
   steps = Steps(progress)
   refined = None
   if known is not None and known.is_metric and settings.refine_known:
+    few = Steps(progress, KNOWN_SHARES)
     refined = refinement.localise_known(
-      images_folder, out_folder / _WORK_FOLDER, names, settings, known, steps
+      images_folder, out_folder / _WORK_FOLDER, names, settings, known, few
     )
   if refined is not None:
-    result = refined
+    result, steps = refined, few
   elif known is not None and len(known.points):
     model = mapping.model_from_poses(known, names)
     for point, error in zip(model.points3D.values(), known.point_errors, strict=True):

@@ -5,6 +5,7 @@ import hashlib
 import json
 import shutil
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from nerf2real.core.progress import Progress, part
@@ -16,13 +17,16 @@ from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.shutter import Shutter
 
 _DATABASE = "database.db"
-_STAGE_SHARES = {
+_SHARES = {
   "features": 0.25,
   "matching": 0.4,
   "mapping": 0.25,
   "refining": 0.05,
   "shutter": 0.05,
 }
+# Where poses came with the pictures few pairs are matched, and all are triangulated and adjusted
+# twice.
+KNOWN_SHARES = {"features": 0.3, "matching": 0.2, "refining": 0.5}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +45,8 @@ class Mapped:
 class Steps:
   """Times the steps and turns their progress into one fraction."""
 
-  def __init__(self, progress: Progress):
-    self._progress = progress
+  def __init__(self, progress: Progress, shares: Mapping[str, float] = _SHARES):
+    self._progress, self._shares = progress, shares
     self._name, self._start = "", time.perf_counter()
     self.seconds: dict[str, float] = {}
 
@@ -58,7 +62,7 @@ class Steps:
 
   def report(self, fraction: float, text: str) -> None:
     done = 0.0
-    for name, share in _STAGE_SHARES.items():
+    for name, share in self._shares.items():
       if name == self._name:
         part(self._progress, done, done + share)(fraction, text)
         return

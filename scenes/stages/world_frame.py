@@ -19,8 +19,8 @@ from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Given
 
-_OUTLOOK_VERSION = 3  # 2: no floor is warned of; 3: markers' corners without rolling shutter
-_WORLD_VERSION = 4  # 2: unique axes; 3: markers are looked for before; 4: all tilts are searched
+_OUTLOOK_VERSION = 4  # 3: markers' corners without rolling shutter; 4: tilts by the cameras' up
+_WORLD_VERSION = 5  # 3: markers are looked for before; 4: all tilts; 5: by the cameras' up
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 

@@ -31,15 +31,19 @@ class Layer(NamedTuple):
 
 
 def _parts(server: viser.ViserServer, bundle: Bundle) -> list[Any]:
-  handles = []
+  """One mesh a colour: a browser draws eight meshes sooner than hundreds."""
+  by_color: dict[palette.Rgb, list[trimesh.Trimesh]] = {}
   for index, path in enumerate(bundle.collision_parts):
-    part = trimesh.load_mesh(path)
+    by_color.setdefault(palette.rgb(palette.cycle(index)), []).append(trimesh.load_mesh(path))
+  handles = []
+  for number, (color, parts) in enumerate(by_color.items()):
+    joined: Any = trimesh.util.concatenate(parts)
     handles.append(
       server.scene.add_mesh_simple(
-        f"/parts/{index:03d}",
-        part.vertices,
-        part.faces,
-        color=palette.rgb(palette.cycle(index)),
+        f"/parts/{number}",
+        joined.vertices,
+        joined.faces,
+        color=color,
         opacity=0.85,
         flat_shading=True,
       )
@@ -67,13 +71,28 @@ def _cameras(server: viser.ViserServer, bundle: Bundle) -> list[Any]:
   return handles
 
 
+def _rectangles(cells: np.ndarray) -> np.ndarray:
+  """Rectangles [R, 4] that tile the true cells of a map [H, W]: first row and column, and the ends.
+
+  Runs along the rows, of which equal ones in rows that follow each other are one rectangle.
+  """
+  edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+  row, start = np.nonzero(edges == 1)
+  end = np.nonzero(edges == -1)[1]
+  order = np.lexsort((row, end, start))
+  row, start, end = row[order], start[order], end[order]
+  ends = (np.diff(start) != 0) | (np.diff(end) != 0) | (np.diff(row) != 1)
+  breaks = np.concatenate([[len(row) > 0], ends, [len(row) > 0]])
+  first, last = np.nonzero(breaks)[0][:-1], np.nonzero(breaks)[0][1:] - 1
+  return np.stack([row[first], start[first], row[last] + 1, end[first]], -1)
+
+
 def free_floor_mesh(space: FreeSpaceMap, *, height: float) -> tuple[np.ndarray, np.ndarray]:
-  """Squares over the C reachable cells of a map: vertices [4 C, 3] [m] and faces [2 C, 3]."""
-  row, column = np.nonzero(space.reachable)
-  corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-  places = space.origin + space.resolution * (np.stack([column, row], -1)[:, None] + corners)
+  """R rectangles over the reachable cells of a map: vertices [4 R, 3] [m] and faces [2 R, 3]."""
+  corners = _rectangles(space.reachable)[:, [[1, 0], [3, 0], [3, 2], [1, 2]]]  # column, row
+  places = space.origin + space.resolution * corners
   vertices = np.concatenate([places, np.full((*places.shape[:2], 1), height)], -1)
-  first = 4 * np.arange(len(row))[:, None]
+  first = 4 * np.arange(len(places))[:, None]
   faces = np.concatenate([first + np.array(three) for three in ([0, 1, 2], [0, 2, 3])])
   return vertices.reshape(-1, 3), faces
 

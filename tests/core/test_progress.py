@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from nerf2real.core import progress as progress_module
 from nerf2real.core.progress import no_progress, part, progress_bar
 
 fractions = st.floats(0.0, 1.0)
@@ -64,3 +65,15 @@ def test_a_short_stage_says_nothing_in_a_pipe():
   with progress_bar("depth", console=Console(file=stream)) as progress:
     progress(1.0, "done before")
   assert stream.getvalue() == ""
+
+
+def test_a_pipe_is_told_what_is_done_in_a_long_silence(monkeypatch):
+  monkeypatch.setattr(progress_module, "_LINE_PERIOD", 0.02)
+  monkeypatch.setattr(progress_module, "_SILENCE", 0.05)
+  stream = io.StringIO()
+  with progress_bar("poses", console=Console(file=stream)) as progress:
+    progress(0.5, "adjusting")
+    deadline = time.monotonic() + 10
+    while "adjusting" not in stream.getvalue() and time.monotonic() < deadline:
+      time.sleep(0.01)
+  assert stream.getvalue().startswith("poses: 50% after 0 s")

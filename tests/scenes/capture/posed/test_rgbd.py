@@ -198,16 +198,21 @@ def test_metric_poses_are_adjusted_to_the_pictures(tum, tmp_path):
     angle = (steps.inv() * true).magnitude()
     return np.median(place), np.degrees(np.median(angle)), abs(found.camera.fx / 280 - 1)
 
+  told: list[float] = []
+
   def located(name, refine_known):
+    told.clear()
     return localise(
       tmp_path / "images",
       tmp_path / name,
       known=capture.known,
       settings=LocaliseSettings(refine_known=refine_known),
+      progress=lambda fraction, _: told.append(fraction),
     )
 
   plain, refined = located("plain", False), located("refined", True)
   assert "adjusted" in refined.strategy and "adjusted" not in plain.strategy
+  assert told == sorted(told) and sum(fraction >= 0.5 for fraction in told) >= 6
   assert refined.registered_fraction == 1.0 and refined.reprojection_error_px < 1.0
   for after, before in zip(off(refined), off(plain), strict=True):
     assert after < 0.5 * before
