@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 _RIGID = 1e-2  # of R R^T to the identity: written with few digits a rotation is one still
-_OPPOSITE = 1e-12  # 1 + cosine under which two directions count as opposite
+_OPPOSITE = 1e-8  # sine of the angle below which two vectors are taken for opposite
 
 # How a hand holds a camera; chosen, and two rooms' floors change by half a degree with half of it.
 ROLL, PITCH = np.radians([5.0, 30.0])  # standard deviations from level
@@ -33,7 +33,8 @@ def shortest_rotation(
 ) -> np.ndarray:
   """Returns the rotation [3, 3] by the smallest angle that takes one unit vector [3] to another.
 
-  R = I + K + K^2 / (1 + cos), K the cross product matrix of start x end (Rodrigues' formula). It
+  R = I + K + K^2 / (1 + cos), K the cross product matrix of start x end (Rodrigues' formula); for
+  obtuse angles with (1 - cos) / sin^2 in place of 1 / (1 + cos), which cancels near a half turn. It
   runs at every control step, so without scipy's align_vectors, which is some ten times slower.
 
   Args:
@@ -43,15 +44,17 @@ def shortest_rotation(
       smallest rotation is not unique; if None, as near to x as possible, or else to y.
   """
   cosine = float(start @ end)
-  if 1 + cosine < _OPPOSITE:
+  x, y, z = np.cross(start, end)
+  square = float(x * x + y * y + z * z)
+  if cosine < 0 and square < _OPPOSITE**2:
     if half_turn_axis is None:
       near = np.eye(3)[0 if abs(start[0]) < 0.9 else 1]
       half_turn_axis = near - (near @ start) * start
       half_turn_axis /= np.linalg.norm(half_turn_axis)
     return 2 * np.outer(half_turn_axis, half_turn_axis) - np.eye(3)
-  x, y, z = np.cross(start, end)
   cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-  return np.eye(3) + cross + cross @ cross / (1 + cosine)
+  scale = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square
+  return np.eye(3) + cross + cross @ cross * scale
 
 
 def rotation_to_up(up: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ def test_shortest_rotation(start, end):
   assume(start @ end > -0.999)
   found = rotations.shortest_rotation(start, end)
   is_rotation(found)
-  np.testing.assert_allclose(found @ start, end, atol=1e-9)
+  np.testing.assert_allclose(found @ start, end, atol=1e-12)
   angle = np.arccos(np.clip(start @ end, -1, 1))
   assert np.linalg.norm(Rotation.from_matrix(found).as_rotvec()) == pytest.approx(angle, abs=1e-6)
 
@@ -53,7 +53,15 @@ def test_half_turn_about_a_given_axis():
 
 @given(up=directions())
 def test_up_is_turned_to_z(up):
-  np.testing.assert_allclose(rotations.rotation_to_up(up) @ up, [0, 0, 1], atol=1e-6)
+  np.testing.assert_allclose(rotations.rotation_to_up(up) @ up, [0, 0, 1], atol=1e-7)
+
+
+@pytest.mark.parametrize("tilt", [1e-3, 2e-6, 1e-7, 1e-9])
+def test_nearly_opposite_directions(tilt):
+  start = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
+  found = rotations.rotation_to_up(start)
+  is_rotation(found)
+  np.testing.assert_allclose(found @ start, [0, 0, 1], atol=2e-9)
 
 
 @given(yaw=angles)
