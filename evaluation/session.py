@@ -66,7 +66,11 @@ def each_plant(settings: EvaluationSettings) -> list[EvaluationSettings]:
 
 
 def choose(
-  listed: tuple[Any, ...], count: int | None, *, repetition: int | None = None
+  listed: tuple[Any, ...],
+  count: int | None,
+  *,
+  repetition: int | None = None,
+  group: str | None = None,
 ) -> list[tuple[int, Any]]:
   """Returns trials with their indices: all, or `count` spread over them.
 
@@ -74,14 +78,22 @@ def choose(
     listed: Groups and trials of a protocol.
     count: How many; all if None.
     repetition: Of the starts; all if None.
+    group: Of the trials; all if None.
 
   Raises:
-    ValueError: No start is repeated so often.
+    ValueError: No start is repeated so often, or there is no such group.
   """
   known = sorted({trial.trial for _, trial in listed})
   if repetition is not None and repetition not in known:
     raise ValueError(f"--repetition {repetition}: expected one of {', '.join(map(str, known))}.")
-  indices = [i for i, (_, trial) in enumerate(listed) if repetition in (None, trial.trial)]
+  groups = dict.fromkeys(name for name, _ in listed)
+  if group is not None and group not in groups:
+    raise ValueError(f"--group {group}: expected one of {', '.join(groups)}.")
+  indices = [
+    index
+    for index, (name, trial) in enumerate(listed)
+    if repetition in (None, trial.trial) and group in (None, name)
+  ]
   if count is not None and count < len(indices):
     spread = np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))
     indices = [indices[place] for place in spread]
@@ -237,7 +249,12 @@ def _run_share(
   policy = load_policy(settings, scene)
   size = policy.image_size or settings.camera_size
   size = _FILMED if settings.video and size is None else size
-  chosen = choose(plants.trials(settings.protocol), settings.trials, repetition=settings.repetition)
+  chosen = choose(
+    plants.trials(settings.protocol),
+    settings.trials,
+    repetition=settings.repetition,
+    group=settings.group,
+  )
   log = None
   if settings.record and settings.plant != "sim":
     name = f"{settings.plant}_{settings.protocol}" + (f"_share{share[0]}" if share[1] > 1 else "")

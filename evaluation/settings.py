@@ -35,6 +35,9 @@ class EvaluationSettings:
   """Runs only the first trials of the protocol, spread over it; all if not given."""
   repetition: int | None = None
   """Runs only this repetition of every start, counted from 0; all if not given."""
+  group: str | None = None
+  """Runs only this group of the protocol's trials, "center" or "wall" of the ball's; all if not
+  given."""
   processes: int = 1
   """Processes that share the trials in simulation and on virtual robots; each has a plant of its
   own, so that a virtual robot's noise is another than with one."""

@@ -169,3 +169,8 @@ def test_trials_may_be_spread():
   assert [index for index, _ in session.choose(listed, 3, repetition=1)] == [1, 27, 53]
   with pytest.raises(ValueError, match="--repetition 2: expected one of 0, 1"):
     session.choose(listed, None, repetition=2)
+  ball = plants.trials("ball")
+  assert [index for index, _ in session.choose(ball, None, group="wall")] == list(range(32, 46))
+  assert [index for index, _ in session.choose(ball, 2, group="center")] == [0, 31]
+  with pytest.raises(ValueError, match="--group walls: expected one of center, wall"):
+    session.choose(ball, None, group="walls")
