@@ -136,7 +136,7 @@ def readings(plant: JointModel, terms: Sequence[Term], x: Array, command: Array)
   fields = [np.full(count, mean) for mean in (*np.mean(around[:3], axis=1), 0.0)]
   out = np.zeros((4, len(TIMES)))
   kernel.simulate(  # type: ignore[call-arg]
-    p,
+    kernel.record(p),
     plant.step,
     np.arange(len(command)) / _RATE,
     command,

@@ -18,6 +18,7 @@ Shapes: C commands, S samples, T grid points, W windows.
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -59,6 +60,7 @@ NAMES = (
   "surroundings_delay",
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
+_RECORD = np.dtype([(name, np.float64) for name in NAMES])
 
 NEUTRAL = {
   "heat_tells": 1.0,
@@ -125,6 +127,11 @@ def _turned(cosine: float, sine: float, angle: float, by: float) -> tuple[float,
   return cosine * c - sine * s, sine * c + cosine * s
 
 
+def record(p: Array) -> np.void:
+  """Returns parameters [P] as what the kernel reads by name, without a copy where it can."""
+  return np.ascontiguousarray(p, np.float64).view(_RECORD)[0]
+
+
 def table_force(q: Array, v: Array, weights: Array, bounds: Array) -> Array:
   """Returns the force [N] of a table at positions and velocities [N]."""
   return np.array([force_at(a, b, weights, bounds) for a, b in zip(q, v, strict=True)])
@@ -132,7 +139,7 @@ def table_force(q: Array, v: Array, weights: Array, bounds: Array) -> Array:
 
 @numba.njit(cache=_CACHE, nogil=True, fastmath=False, error_model="numpy")
 def simulate(
-  p: Array,
+  p: Any,
   step: float,
   command_time: Array,
   command: Array,
@@ -157,7 +164,7 @@ def simulate(
   """Simulates one log and writes position, velocity and actuator torque at the samples [S].
 
   Args:
-    p: parameters in the order of NAMES.
+    p: parameters, as `record` gives them.
     step: s between grid points, which start at time 0.
     command_time: [C] s, increasing.
     command: [C] held until the next.
@@ -180,29 +187,30 @@ def simulate(
     out_jump: [S], written: how much the torque jumps within two steps of the sample; a reading
       there depends on microseconds.
   """
-  slope, constant, per_q, per_v = p[0], p[1], p[2], p[3]
-  lowest, highest = p[4], p[5]
-  armature, damping, friction, drag = p[6], p[7], p[8], p[9]
-  stiffness, reference = p[10], p[11]
-  gain, delay, late, late_effort, rate = p[12], p[13], p[14], p[15], p[16]
-  breakaway, stribeck, load_share, offset_force = p[17], p[18], p[19], p[20]
-  half, on_motor, encoder = 0.5 * p[21], p[22], p[23]
-  droop, fade, heating, cooling, derating = p[24], p[25], p[26], p[27], p[28]
-  amplitude, periods, phase = p[29], p[30], p[31]
-  load_kind = p[32]
-  softness, stopping_rate = p[33], p[34]
-  heat_limits, heat_tells = p[35] > 0.5, p[36] > 0.5
-  load_square, load_at_rest, load_velocity = p[37], p[38], p[39]
-  tooth_stiffness, tooth_damping, friction_on_link = p[40], p[41], p[42]
-  follow, follow_speed = p[43], p[44]
-  sag_limits, sag_tells = p[45] > 0.5, p[46] > 0.5
-  others_late = p[48]
+  slope, constant, per_q, per_v = p.input, p.constant, p.position, p.velocity
+  lowest, highest = p.lowest, p.highest
+  armature, damping, friction, drag = p.armature, p.damping, p.friction, p.drag
+  stiffness, reference = p.stiffness, p.reference
+  gain, delay, rate = p.gain, p.command_delay, p.clock_rate
+  late, late_effort, others_late = p.measurement_delay, p.effort_delay, p.surroundings_delay
+  breakaway, stribeck, offset_force = p.breakaway, p.stribeck_velocity, p.offset_force
+  half, on_motor, encoder = 0.5 * p.gap, p.encoder_on_motor, p.encoder_offset
+  droop, fade, heating, derating = p.droop, p.fade, p.heating, p.derating
+  amplitude, periods, phase = p.amplitude, p.periods, p.phase
+  softness, stopping_rate = p.softness, p.stopping_rate
+  heat_limits, heat_tells = p.heat_scales_limit > 0.5, p.heat_tells > 0.5
+  load_kind, load_share, load_square = p.load_kind, p.load_coefficient, p.load_square
+  load_at_rest, load_velocity = p.load_at_rest, p.load_velocity
+  tooth_stiffness, tooth_damping = p.tooth_stiffness, p.tooth_damping
+  friction_on_link = p.friction_on_link
+  follow, follow_speed = p.follow, p.follow_speed
+  sag_limits, sag_tells = p.sag_scales_limit > 0.5, p.sag_tells > 0.5
   learned = weights.size > 0
   samples = sample_time.size
   windows = window_start.size
   last = inertia.size - 1
   rotor = armature * (1.0 - LINK_SHARE)
-  keep_cool = 1.0 - step / max(cooling, step)
+  keep_cool = 1.0 - step / max(p.time_constant, step)
   rate_of_steps, true_time = 1.0 / step, 1.0 / (1.0 + rate)
   stamped = (1.0 + rate) / step
 

@@ -171,7 +171,7 @@ class JointPlant:
     out = np.zeros((4, len(log.time)))
     weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
     kernel.simulate(  # type: ignore
-      np.ascontiguousarray(p, float),
+      kernel.record(p),
       self.step,
       log.command_time,
       log.command,
