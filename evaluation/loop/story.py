@@ -1,13 +1,14 @@
 """Closes the loop with a policy: it fails on a robot, the data say why, it is trained on.
 
 Stages, each of which leaves files and is not repeated: trials before, recordings, finding, trials
-in the simulation with the effects put in, training, trials after.
+in the simulation with the effects put in, training, trials after. A policy that lost no success is
+not trained: there is nothing to bring back.
 """
 
 import functools
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,7 +43,7 @@ class Story(NamedTuple):
   settings: LoopSettings
   episodes: dict[str, list[Episode]]  # by condition
   named: Named
-  trained: Trained | None  # None: nothing entered the simulation, the policy stays
+  trained: Trained | None  # None: nothing was named, or nothing lost: the policy stays
   comparison: Comparison | None  # with what was hidden; None: of a real robot nobody knows
   cooled: dict[str, list[Cooled]]  # sessions that heat ended, by condition
   times: dict[str, float]  # s of each stage
@@ -112,10 +113,13 @@ def close(settings: LoopSettings, scripts: Scripts, say: Say) -> Story:
   if named.named or named.forces:
     effects = named.entering_path
     run(Condition(name=WITH_EFFECTS, policy=policy, simulated=True, effects=effects))
-    with stages.timed("training"):
-      trained = training.train(settings, policy, effects, scene=scene, scripts=scripts)
-    after = trained.policy
-    last.append(Condition(name=TRAINED, policy=after, simulated=True, effects=effects))
+    if lost({name: tally(name, episodes) for name, episodes in found.items()}) > 0:
+      with stages.timed("training"):
+        trained = training.train(settings, policy, effects, scene=scene, scripts=scripts)
+      after = trained.policy
+      last.append(Condition(name=TRAINED, policy=after, simulated=True, effects=effects))
+    else:
+      say("no success was lost: the policy stays")
   run(*last, Condition(name=AFTER, policy=after, altered=hidden))
   comparison = None
   if virtual:
@@ -175,6 +179,7 @@ def summary(story: Story) -> dict[str, Any]:
     "share_explained": named.share,
     "error_held_rad": named.content["error"]["held"],
     "notes": named.notes,
+    "lost": lost(story.tallies),
     "trained": None if story.trained is None else to_plain(story.trained),
     "hidden": None if story.comparison is None else to_plain(story.comparison),
     "recovered": recovered(story),
@@ -206,13 +211,21 @@ def gaps(story: Story) -> dict[str, Gap]:
   return {name: gap(tallies[name]) for name in (NOMINAL, WITH_EFFECTS) if name in tallies}
 
 
+def lost(tallies: Mapping[str, Tally]) -> float:
+  """Returns the success that a robot lost: as it was less before.
+
+  Of a real robot nobody knows how it was: there it is the nominal simulation's less before.
+  """
+  known = tallies[HEALTHY] if HEALTHY in tallies else tallies[NOMINAL]
+  return known.share - tallies[BEFORE].share
+
+
 def recovered(story: Story) -> float | None:
   """Returns the share of the lost success that came back; None where none was lost."""
   tallies = story.tallies
-  if HEALTHY not in tallies:
+  if HEALTHY not in tallies or lost(tallies) <= 0:
     return None
-  lost = tallies[HEALTHY].share - tallies[BEFORE].share
-  return None if lost <= 0 else (tallies[AFTER].share - tallies[BEFORE].share) / lost
+  return (tallies[AFTER].share - tallies[BEFORE].share) / lost(tallies)
 
 
 class _Stages:

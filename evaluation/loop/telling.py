@@ -217,7 +217,9 @@ def _left_out(named: Named) -> str:
 
 def _training(story: Story) -> Section:
   if story.trained is None:
-    return Section("Trained on", "Nothing was named: the policy stays as it was.")
+    named = story.named.named or story.named.forces
+    why = "No success was lost in these trials" if named else "Nothing was named"
+    return Section("Trained on", f"{why}: the policy stays as it was.")
   made = story.trained
   chosen = "; ".join(f"{n}: {k} of {made.trials}" for n, k in made.teachers.items())
   figures = [

@@ -259,10 +259,29 @@ def test_the_page_tells_the_story_in_order_and_what_was_hidden_last(tmp_path):
   assert "robot before, after 3 trials: l_knee: 71 degrees C." in page
 
 
-def test_a_policy_that_was_not_trained_is_said_so(tmp_path):
+@pytest.mark.parametrize(
+  ("verdict", "effects", "why"),
+  [
+    ("none", [], "Nothing was named: the policy stays as it was"),
+    (
+      "effects",
+      [Effect("command_delay", None, {"delay": 0.04})],
+      "No success was lost in these trials: the policy stays as it was",
+    ),
+  ],
+)
+def test_why_a_policy_was_not_trained_is_said(tmp_path, verdict, effects, why):
   told = _story(tmp_path, ("success",) * 4, trained=False)
+  told = told._replace(named=_finding(tmp_path / "other", effects, verdict))
   telling.write(tmp_path / "loop.html", told)
-  assert "the policy stays as it was" in (tmp_path / "loop.html").read_text()
+  assert why in (tmp_path / "loop.html").read_text()
+
+
+def test_what_a_real_robot_lost_is_judged_by_the_nominal_simulation(tmp_path):
+  tallies = _story(tmp_path, ("success",) * 4).tallies
+  assert story.lost(tallies) == pytest.approx(0.75)
+  del tallies[story.HEALTHY]
+  assert story.lost(tallies) == pytest.approx(1.0)
 
 
 def test_severity_stops_where_success_has_fallen(tmp_path, monkeypatch):
