@@ -109,8 +109,8 @@ def conditions_of(settings: EvaluationSettings) -> str:
   Episodes under other conditions are others, also where they share a folder.
 
   Returns:
-    Scene, effects, length of an episode, drawn actions and errors of placing, in words with digests
-    of the files; empty for what the paper evaluates, in the built-in room.
+    Scene, effects, length of an episode, drawn actions, errors of placing and swapped parts, in
+    words with digests of the files; empty for what the paper evaluates, in the built-in room.
   """
   found = []
   if settings.scene is not None:
@@ -125,6 +125,8 @@ def conditions_of(settings: EvaluationSettings) -> str:
     found.append("drawn actions")
   if settings.plant == "virtual" and settings.placing != EvaluationSettings.placing:
     found.append("placed within {:g} m, {:g} rad".format(*settings.placing))
+  if settings.swap:
+    found.append("swapped " + " and ".join(sorted(set(settings.swap))))
   return ", ".join(found)
 
 

@@ -90,12 +90,10 @@ class RehearsedPlant(RobotPlant):
     robot_seed = settings.robot_seed[0]
     self.plant_id = f"robot {robot_seed}"
     self._placing = settings.placing
-    known = swaps.PHYSICS in settings.swap
-    self.plant_id += ", data sheet's physics" if known else ""
-    self.plant_id += swaps.told("the simulation's", settings.swap)
     self._intruder = make_intruder(self, self._starts)
     if altered:
       self.plant_id += ", altered"
+    known = swaps.PHYSICS in settings.swap
     build = undeclared.build(None if known else robot_seed, altered, age=session)
     simulated = simulated or CameraSettings()
     camera = swaps.camera_on_the_robot(build.camera, simulated, settings.swap)

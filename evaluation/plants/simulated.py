@@ -41,7 +41,7 @@ class SimulatedPlant(Plant):
     """
     super().__init__(scene, settings)
     seed, swap = settings.seed, settings.swap
-    self.plant_id = f"seed {seed}" + swaps.told("the robot's", swap)
+    self.plant_id = f"seed {seed}"
     self._room = swaps.TrueRoom(scene) if swaps.PICTURE in swap and image_size else None
     self._seed = seed
     self._intruder = make_intruder(self, protocols.scene_starts(scene))

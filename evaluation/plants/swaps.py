@@ -121,12 +121,6 @@ def _mean_delay() -> float:
   return float(np.mean(RandomisationSettings().delay_range))
 
 
-def told(whose: str, parts: Sequence[str]) -> str:
-  """Returns the end of a plant's name that tells swapped parts of the camera; empty without."""
-  found = " and ".join(part for part in _OF_THE_CAMERA if part in parts)
-  return f", {whose} {found}" if found else ""
-
-
 def check(parts: Sequence[str], *, plant: str, built_in: bool) -> None:
   """Raises ValueError where a part cannot be swapped.
 

@@ -65,7 +65,8 @@ def test_a_robot_without_secrets_is_that_of_the_data_sheets():
     for swap in ((), ("physics",))
   )
   sheet = Hidden.none()
-  assert plain.plant_id == "robot 2" and known.plant_id == "robot 2, data sheet's physics"
+  assert plain.plant_id == known.plant_id == "robot 2"
+  assert plain.conditions == "" and known.conditions == "swapped physics"
   for plant, same in ((plain, False), (known, True)):
     found = plant.robot.body.hidden
     assert np.allclose(found.motors.strength, sheet.motors.strength) == same
@@ -83,7 +84,7 @@ def test_a_robot_sees_the_fields_pictures():
     simulated=CameraSettings(rate=20.0),
     world="floor",
   )
-  assert plant.plant_id == "robot 1, the simulation's picture and lens and delay"
+  assert plant.conditions == "swapped delay and lens and picture"
   first = plant.start(plants.trials("navigation")[0][1])
   assert plant.robot.camera is not None and plant.robot.eyes is not None
   picture = plant.robot.eyes.picture()
