@@ -22,8 +22,7 @@ harness.one_thread()
 import numpy as np
 
 from nerf2real.agents.dmpo.policy.acting import task_of
-from nerf2real.agents.dmpo.policy.export import load_policy
-from nerf2real.agents.dmpo.policy.inference import Policy
+from nerf2real.agents.dmpo.policy.export import ExportedPolicy, load_policy
 from nerf2real.agents.environments.loading import make_environment
 from nerf2real.core import files
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant
@@ -125,10 +124,10 @@ def films(film: Film) -> dict[str, np.ndarray]:
   }
 
 
-def errors(policy: Policy, pictures: np.ndarray, film: Film) -> np.ndarray:
+def errors(loaded: ExportedPolicy, pictures: np.ndarray, film: Film) -> np.ndarray:
   """Distances [N] [m] of the belief from the truth, its state fresh in every trial."""
-  found = np.empty(len(pictures))
-  nothing = np.zeros(_proprioception(policy), np.float32)
+  found, policy = np.empty(len(pictures)), loaded.policy
+  nothing = np.zeros(loaded.layout.state_size, np.float32)  # the belief does not depend on it
   for index, picture in enumerate(pictures):
     if index == 0 or film.trial[index] != film.trial[index - 1]:
       state = policy.initial_state()
@@ -136,11 +135,6 @@ def errors(policy: Policy, pictures: np.ndarray, film: Film) -> np.ndarray:
     state = step.state
     found[index] = np.linalg.norm(policy.believed_position(step.embedding) - film.place[index])
   return found
-
-
-def _proprioception(policy: Policy) -> int:
-  """Width of the proprioception, which the belief does not depend on."""
-  return int(policy._policy["mlp"]["layer0"]["w"].shape[0]) - policy.lstm_size
 
 
 def main(settings: Settings) -> None:
@@ -157,9 +151,9 @@ def main(settings: Settings) -> None:
   low = film.tilt < _LOW
   rows: dict[str, dict[str, harness.Value]] = {}
   for folder in settings.policies:
-    policy = load_policy(folder).policy
+    loaded = load_policy(folder)
     for name, pictures in films(film).items():
-      found = errors(policy, pictures, film)
+      found = errors(loaded, pictures, film)
       rows[f"{folder}: {name}"] = {
         "mean_m": float(found.mean()),
         "head_low_m": float(found[low].mean()),
