@@ -280,6 +280,16 @@ class JointLikelihood:
     n = self.independent[:, None] * self.counts
     return -(n * np.log1p(squares / self.scale[:, None] ** 2)).sum(axis=-2)
 
+  def told_apart(self, apart: Array) -> Array:
+    """Returns the nats of blocks [B] by which two predictions are told apart if one of them holds
+    but for what remains.
+
+    Args:
+      apart: one less the other [C, N].
+    """
+    n = self.independent[:, None] * self.counts
+    return (n * np.log1p(self.squares(apart) / (2.0 * self.scale[:, None] ** 2))).sum(axis=0)
+
   def weights(self, squares: Array) -> Array:
     """Returns the weight of every sample [C, N] in a step of least squares."""
     n = self.independent[:, None] * self.counts

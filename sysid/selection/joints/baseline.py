@@ -32,6 +32,9 @@ def known_terms(found: Scored, settings: Settings = SETTINGS) -> tuple[Term, ...
 
 
 _MAY_CHANGE = ("damping", "armature", "friction")
+_ADDED_TO = ("damping", "friction")
+"""Constants that effects add to (viscous and dry friction): more of them is such an effect, so that
+the constant itself has changed only where it is less."""
 _FACTORS = (0.7, 1.4, 1.9)  # of a changed constant where searches start, chosen: within its range
 
 
@@ -53,10 +56,12 @@ def _freed(known: Term, names: Collection[str]) -> Term:
     if name not in names:
       continue
     before, (least, most) = 1.0 + known.centre[at], ends(kind_of("parameter_error").parameter(name))
+    most = 1.0 if name in _ADDED_TO else most
     low[at], high[at], sigma[at] = least * before - 1.0, most * before - 1.0, float("inf")
     starts += [
       tuple(s * before - 1.0 if k == at else v for k, v in enumerate(known.starts[0]))
       for s in _FACTORS
+      if s < most
     ]
   return dataclasses.replace(
     known, low=tuple(low), high=tuple(high), prior=tuple(sigma), starts=tuple(starts), freed=True

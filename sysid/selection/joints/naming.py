@@ -127,7 +127,8 @@ def carries_over(joint: JointLikelihood, item: Scored, plain: Scored) -> bool:
   """Tells whether a hypothesis predicts no log clearly worse than one without an effect.
 
   Logs are of different motions. Their blocks are predicted with values that were fitted to the
-  other logs, so that an effect that holds has nothing to lose on any.
+  other logs, so that an effect that holds has nothing to lose on any. Blocks share what the priors
+  cost, as in `clearness`: constants that are strained do not pass for a hypothesis without.
 
   Args:
     joint: the logs.
@@ -137,6 +138,7 @@ def carries_over(joint: JointLikelihood, item: Scored, plain: Scored) -> bool:
   logs = np.unique(joint.log_of)
   least = float(norm.isf(joint.settings.level / len(logs)))
   gains = item.nats - plain.nats
+  gains = gains - (item.prior - plain.prior) / len(gains)
   return all(standardised(gains[joint.log_of == log], least=1.0) > -least for log in logs)
 
 

@@ -79,7 +79,7 @@ def _begun(
       for start in term.starts:
         begin = fitter.linearise(np.concatenate([x, start]), known=blank, fresh=fresh)
         fit = fitter.fit(begin, iterations=_FIRST, quick=True)
-        tried.append((fitter, Scored((*terms, term), fit, np.zeros(0))))
+        tried.append((fitter, Scored(joint, (*terms, term), fit, np.zeros(0))))
   return tried
 
 

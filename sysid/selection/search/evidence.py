@@ -4,9 +4,11 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.stats import rankdata
+from scipy.stats import norm, rankdata
+from scipy.stats import t as student
 
 from nerf2real.sysid.fit.layout import Fit
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 
 Array = np.ndarray
@@ -14,6 +16,7 @@ Array = np.ndarray
 UNREPEATED = ("backlash",)
 """Kinds under which a course does not repeat: which way teeth bounce depends on microradians."""
 
+_LEAST_SHARE = 1e-3  # of a sum, that others hold beside one block
 _NAT = 1.0  # that a further value costs (Akaike 1974): a smaller difference says nothing
 
 
@@ -21,6 +24,7 @@ _NAT = 1.0  # that a further value costs (Akaike 1974): a smaller difference say
 class Scored:
   """A fitted hypothesis of one joint, with its evidence."""
 
+  joint: JointLikelihood
   terms: tuple[Term, ...]
   fit: Fit
   nats: Array
@@ -64,30 +68,61 @@ def kinds_of(terms: Sequence[Term]) -> frozenset[str]:
 
 def clear(better: Scored, other: Scored) -> float:
   """Returns how clear a difference of evidence is, in standard errors; see `clearness`."""
-  return clearness([better.nats - other.nats], better.prior - other.prior)
+  apart = better.fit.residuals[0] - other.fit.residuals[0]
+  expected = [better.joint.told_apart(apart)]
+  return clearness([better.nats - other.nats], better.prior - other.prior, expected)
 
 
-def clearness(rows: Sequence[Array], prior: float) -> float:
+def clearness(rows: Sequence[Array], prior: float, expected: Sequence[Array]) -> float:
   """Returns how clear a difference of two hypotheses is, in standard errors.
 
-  The larger of two paired tests: of the sum over its standard error by blocks (Vuong 1989), and of
-  the signed ranks of neighbouring pairs of blocks (Wilcoxon 1945), as one without a distribution is
-  wanted where few blocks hold most of a sum (Clarke 2007): a motion excites an effect in some of
-  them. Ranks know no size: pairs that differ by less than a nat, as an effect that imitates what no
-  hypothesis holds makes them, agree with neither hypothesis.
+  The larger of two paired tests: of the sum over its standard error by blocks (`by_pattern`), and
+  of the signed ranks of neighbouring pairs of blocks (Wilcoxon 1945), as one without a distribution
+  is wanted where few blocks hold most of a sum (Clarke 2007). Ranks know no size: pairs that differ
+  by less than a nat, as an effect that imitates what no hypothesis holds makes them, agree with
+  neither hypothesis.
 
   Args:
     rows: differences of nats of blocks, one array for each joint; joints are independent.
     prior: nats that the priors cost more.
+    expected: nats by which the blocks tell the two apart if one of them holds, as `rows`.
   """
-  total = float(sum(row.sum() for row in rows)) - prior
-  error = float(np.sqrt(sum(variance(row) for row in rows)))
-  by_sum = total / max(error, _NAT)
   pairs = np.concatenate([np.add.reduceat(row, np.arange(0, len(row), 2)) for row in rows])
   pairs = pairs - prior / len(pairs)
   ranks = rankdata(np.abs(pairs))
   agree = np.sign(pairs) * (np.abs(pairs) >= _NAT)
-  return max(by_sum, float(agree @ ranks / np.sqrt(ranks @ ranks)))
+  return max(by_pattern(rows, prior, expected), float(agree @ ranks / np.sqrt(ranks @ ranks)))
+
+
+def by_pattern(rows: Sequence[Array], prior: float, expected: Sequence[Array]) -> float:
+  """Returns a sum of blocks' differences over its standard error, the scatter of blocks about what
+  they are expected to differ by.
+
+  A motion excites an effect in some blocks far more than in others. About their mean (Vuong 1989)
+  differences would scatter by that alone; about the line through the origin that the two
+  predictions draw (a ratio estimate, Cochran 1977) they scatter by what neither hypothesis holds.
+  A block counts as if the line had been drawn without it, and few blocks that tell have few degrees
+  of freedom (Student).
+
+  Args:
+    rows: differences of nats [B] a joint.
+    prior: nats that the priors cost more.
+    expected: what they are expected to be [B] a joint, up to one factor.
+  """
+  total, whole = (
+    float(sum(row.sum() for row in rows)) - prior,
+    float(sum(g.sum() for g in expected)),
+  )
+  if whole <= 0.0:
+    return 0.0
+  squares = sum(
+    _scatter((row - total / whole * g) / np.maximum(1.0 - g / whole, _LEAST_SHARE))
+    for row, g in zip(rows, expected, strict=True)
+  )
+  telling = whole**2 / float(sum(g @ g for g in expected))  # blocks
+  over_error = total / max(float(np.sqrt(squares)), _NAT)
+  rare = student.sf(abs(over_error), max(telling - 1.0, _LEAST_SHARE))
+  return float(np.sign(over_error) * norm.isf(rare))
 
 
 def standardised(differences: Array, total: float | None = None, least: float = 1e-300) -> float:
@@ -98,9 +133,15 @@ def standardised(differences: Array, total: float | None = None, least: float = 
 
 def variance(differences: Array) -> float:
   """Returns the variance of a sum of blocks' differences, of which neighbours may go together."""
-  e = differences - differences.mean()
-  own = float(e @ e)
-  return max(own + 2.0 * float(e[1:] @ e[:-1]), own) * len(e) / max(len(e) - 1, 1)
+  return (
+    _scatter(differences - differences.mean()) * len(differences) / max(len(differences) - 1, 1)
+  )
+
+
+def _scatter(errors: Array) -> float:
+  """Returns the sum of squares of blocks' errors, with what neighbours have in common."""
+  own = float(errors @ errors)
+  return max(own + 2.0 * float(errors[1:] @ errors[:-1]), own)
 
 
 def more_likely(differences: Array, prior: float, level: float) -> bool:

@@ -18,6 +18,7 @@ Array = np.ndarray
 _LOOKS = 2  # rounds of fitting constants in which other latencies are looked at
 _SCREENED = 2  # times as many kinds as are fitted to the end take a second step
 _SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
+_OF_KNOWN = (1.0, 0.5, 1.5, 3.0)  # times its size in a reference, where an effect's search starts
 
 
 def _best_of_kinds(
@@ -44,7 +45,7 @@ def scored_on(
   """Returns a hypothesis fitted on from values [n], scored on left-out blocks and kept nowhere."""
   fitter = Fitter([joint], Layout([terms]))
   fit = fitter.leave_out(fitter.fit(x, iterations=iterations))
-  return Scored(terms, fit, joint.loglik(fit.held[0]))
+  return Scored(joint, terms, fit, joint.loglik(fit.held[0]))
 
 
 def _handed_over(parent: Scored, term: Term) -> list[Array]:
@@ -133,7 +134,7 @@ class Explainer:
   def score(self, terms: tuple[Term, ...], fit: Fit, *, neutral: bool = False) -> Scored:
     fitter = Fitter([self.joint], Layout([terms]))
     fitter.leave_out(fit)
-    result = Scored(terms, fit, self.joint.loglik(fit.held[0]), neutral)
+    result = Scored(self.joint, terms, fit, self.joint.loglik(fit.held[0]), neutral)
     self.scored[terms] = result
     return result
 
@@ -193,21 +194,22 @@ class Explainer:
     known, x = parent.fit.jacobian[0], parent.fit.x
     old = [t.kind for t in parent.terms]
     at = 0
-    for position, term in enumerate(parent.terms):  # an effect that references show may be larger
+    # An effect that references show may be larger, or of another form.
+    for position, term in enumerate(parent.terms):
       count = len(term.names)
-      if term.known:
-        free = next(
-          (t for t in self.library if t.kind == term.kind and t.fixed == term.fixed), None
-        )
-        if free is not None:
-          terms = (*parent.terms[:position], free, *parent.terms[position + 1 :])
-          starts = [x]
-          for factor in (0.5, 1.5, 3.0):
-            starts.append(x.copy())
-            starts[-1][at] *= factor
-          fresh = np.zeros(len(x), bool)
-          fresh[at : at + count] = True
-          yield terms, np.array(starts), [known], fresh
+      for free in self.library if term.known else ():
+        if free.kind != term.kind or free.names != term.names:
+          continue
+        terms = (*parent.terms[:position], free, *parent.terms[position + 1 :])
+        here = x[at : at + count]
+        places = [np.array(start) for start in free.starts]
+        if free.fixed == term.fixed:
+          places += [np.append(factor * here[0], here[1:]) for factor in _OF_KNOWN]
+        starts = np.tile(x, (len(places), 1))
+        starts[:, at : at + count] = places
+        fresh = np.zeros(len(x), bool)
+        fresh[at : at + count] = True
+        yield terms, starts, [known], fresh
       at += count
     for freed in () if parent.terms[0].freed else self.changed:
       fresh = np.arange(len(x)) < len(freed.names)

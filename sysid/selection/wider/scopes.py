@@ -23,7 +23,7 @@ from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.search.evidence import more_likely
 from nerf2real.sysid.selection.search.explain import scored_on
 from nerf2real.sysid.selection.wider import wide
-from nerf2real.sysid.selection.wider.wide import Evidence, Wide
+from nerf2real.sysid.selection.wider.wide import Evidence, Row, Wide
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
@@ -244,9 +244,8 @@ def better(these: Sequence[Changed], others: Sequence[Changed]) -> bool:
   present scales: what was found beside others may not be found again from the start."""
   rows, prior = {}, 0.0
   for one, other in zip(these, others, strict=True):
-    best, now = one.found.best, other.subject.now
-    rows[one.joint] = now.loglik(best.fit.held[0]) - now.loglik(other.found.best.fit.held[0])
-    prior += best.prior - other.found.best.prior
+    rows[one.joint] = Row.of(other.found.best, one.found.best).turned()
+    prior += one.found.best.prior - other.found.best.prior
   return Evidence(rows, prior).clear > max(c.subject.beyond for c in others)
 
 
@@ -284,7 +283,7 @@ def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared
       without = wide.without(item.subject, best, shared.held)
       if item.more_remains:
         best, without = (rivals.beside(item.subject.explainer, s) for s in (best, without))
-      rows[item.joint], prior = best.nats - without.nats, prior + best.prior - without.prior
+      rows[item.joint], prior = Row.of(best, without), prior + best.prior - without.prior
     if Evidence(rows, prior).clear < shared.origin.beyond:
       result.append(shared)
   return result

@@ -8,12 +8,14 @@ Shapes: B blocks, n shared values.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from nerf2real.sysid.fit import rough
 from nerf2real.sysid.fit.layout import CLOCKS, Fit, Layout
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
@@ -67,30 +69,57 @@ class Wide:
     return dataclasses.replace(found, prior=found.prior - promised)
 
 
+class Row(NamedTuple):
+  """A joint under two hypotheses."""
+
+  joint: JointLikelihood
+  nats: Array
+  """[B] by which the one is more likely than the other."""
+  one: Array
+  """[C, N] residuals of the one."""
+  other: Array
+  """[C, N] residuals of the other."""
+
+  @classmethod
+  def of(cls, best: Scored, other: Scored) -> "Row":
+    """Returns two hypotheses of a joint under the scale of the first."""
+    nats = [best.joint.loglik(s.fit.held[0]) for s in (best, other)]
+    return cls(best.joint, nats[0] - nats[1], best.fit.residuals[0], other.fit.residuals[0])
+
+  def turned(self) -> "Row":
+    """Returns the other less the one."""
+    return Row(self.joint, -self.nats, self.other, self.one)
+
+  def less(self, row: "Row") -> "Row":
+    """Returns the one less the one of another comparison with the same."""
+    return Row(self.joint, self.nats - row.nats, self.one, row.one)
+
+
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-  """Nats of blocks, joint by joint, and what the priors take."""
+  """Two hypotheses over several joints, and what the priors take."""
 
-  rows: dict[str, Array]
-  """[B] by joint."""
+  rows: dict[str, Row]
   prior: float = 0.0
 
   def __sub__(self, other: "Evidence") -> "Evidence":
-    """Returns the difference; joints that one lacks count as zero there."""
+    """Returns the difference to a comparison with the same; joints that one lacks are as there."""
     rows = dict(self.rows)
     for joint, row in other.rows.items():
-      rows[joint] = rows[joint] - row if joint in rows else -row
+      rows[joint] = rows[joint].less(row) if joint in rows else row.turned()
     return Evidence(rows, self.prior - other.prior)
 
   @property
   def total(self) -> float:
     """Nats in all."""
-    return float(sum(row.sum() for row in self.rows.values())) - self.prior
+    return float(sum(row.nats.sum() for row in self.rows.values())) - self.prior
 
   @property
   def clear(self) -> float:
     """Standard errors from zero: joints are independent, so that their variances add."""
-    return clearness(list(self.rows.values()), self.prior)
+    rows = list(self.rows.values())
+    expected = [row.joint.told_apart(row.one - row.other) for row in rows]
+    return clearness([row.nats for row in rows], self.prior, expected)
 
 
 def hypotheses(
@@ -220,7 +249,8 @@ def _evidence(members: Sequence[Subject], fit: Fit) -> Evidence:
   nulls = [m.explainer.null for m in members]
   squares = fit.held or [m.now.squares(r) for m, r in zip(members, fit.residuals, strict=True)]
   rows = {
-    m.joint: m.now.loglik(s) - null.nats for m, s, null in zip(members, squares, nulls, strict=True)
+    m.joint: Row(m.now, m.now.loglik(s) - null.nats, residual, null.fit.residuals[0])
+    for m, s, residual, null in zip(members, squares, fit.residuals, nulls, strict=True)
   }
   prior = float(Fitter([m.now for m in members], fit.layout).prior(fit.x[None])[0])
   return Evidence(rows, prior - sum(n.prior for n in nulls))

@@ -30,7 +30,7 @@ def fitted():
     fit = fitter.fit(start, iterations=3)
     joint.rescale(fit.residuals[0])
     start = fit.x
-  return joint, Scored(terms, fit, np.zeros(0))
+  return joint, Scored(joint, terms, fit, np.zeros(0))
 
 
 def test_draws_lie_in_the_intervals_and_go_together_as_the_fit_says(fitted):

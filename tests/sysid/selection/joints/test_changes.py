@@ -16,7 +16,13 @@ from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.joints import doubts, leaving, naming, remainder, subject
 from nerf2real.sysid.selection.search import rivals
-from nerf2real.sysid.selection.search.evidence import Scored, clearness, more_likely, standardised
+from nerf2real.sysid.selection.search.evidence import (
+  Scored,
+  by_pattern,
+  clearness,
+  more_likely,
+  standardised,
+)
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
@@ -45,17 +51,26 @@ class _Joint:
   def squares(residuals):
     return residuals.reshape(1, -1, 10).var(axis=2)
 
+  independent = np.array([0.1])
+  counts = np.full((1, 30), 10.0)
+
   @classmethod
   def alike(cls, apart):
     return JointLikelihood.alike(cls, apart)
 
+  @classmethod
+  def told_apart(cls, apart):
+    return JointLikelihood.told_apart(cls, apart)
 
-def _scored(kinds, nats, prediction=0.0):
+
+def _scored(kinds, nats, prediction=None):
+  """Returns a hypothesis; those with an effect predict another motion than the one without."""
+  prediction = (5.0 if kinds else 0.0) if prediction is None else prediction
   layout = Layout([()])
-  residuals = [np.tile([1.0, -1.0], 100)[None] * prediction]
+  residuals = [np.tile([1.0, -1.0], 150)[None] * prediction]
   fit = Fit(layout, np.zeros(0), 0.0, residuals, np.zeros((1, 0, 0)), np.zeros((1, 0)), [])
   fit.held = [np.exp(-np.asarray(nats))[None]]
-  item = Scored((), fit, np.asarray(nats, float))
+  item = Scored(_Joint, (), fit, np.asarray(nats, float))
   item.__class__ = type("Named", (Scored,), {"names": frozenset(kinds)})
   return item
 
@@ -65,8 +80,8 @@ def test_a_name_needs_all_that_lack_it_to_be_clearly_worse():
   noise = random.normal(0, 0.1, 30)
   null = _scored((), noise - 3.0)
   right = _scored(("a",), noise + random.normal(0, 0.1, 30))
-  worse = _scored(("b",), noise - 1.0 + random.normal(0, 0.1, 30), prediction=5.0)
-  as_good = _scored(("c",), noise - 0.001 + random.normal(0, 0.1, 30), prediction=5.0)
+  worse = _scored(("b",), noise - 1.0 + random.normal(0, 0.1, 30), prediction=10.0)
+  as_good = _scored(("c",), noise - 0.001 + random.normal(0, 0.1, 30), prediction=10.0)
   assert naming.conclude(_Joint, [null, right, worse], 3.0).named == ("a",)
   assert naming.conclude(_Joint, [null, right, worse, as_good], 3.0).named == ()
 
@@ -119,8 +134,8 @@ def test_a_name_that_makes_one_motion_clearly_worse_does_not_stand():
 def test_a_twin_with_more_beside_it_is_no_rival():
   null = _scored((), np.linspace(-4, -3, 30))
   right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
-  more = _scored(("b", "c"), np.linspace(0, 0.11, 30), prediction=5.0)
-  other = _scored(("c", "d"), np.linspace(0, 0.11, 30), prediction=5.0)
+  more = _scored(("b", "c"), np.linspace(0, 0.11, 30), prediction=10.0)
+  other = _scored(("c", "d"), np.linspace(0, 0.11, 30), prediction=10.0)
   assert naming.conclude(_Joint, [null, right, twin, more], 3.0).named == ("a",)
   assert naming.conclude(_Joint, [null, right, twin, more, other], 3.0).named == ()
 
@@ -146,19 +161,34 @@ def test_few_blocks_that_hold_most_of_a_sum_do_not_hide_that_all_agree():
   gains = np.full(36, 3.0)
   gains[12:16] = 100.0  # a motion that shows the effect most
   assert standardised(gains) < 2.6
-  assert clearness([gains], 0.0) > 3.5
+  even = [np.ones(36)]
+  assert by_pattern([gains], 0.0, even) < 2.6 and clearness([gains], 0.0, even) > 3.5
   gains[2::4] = -9.0  # as many pairs lose
-  assert clearness([gains], 0.0) == pytest.approx(standardised(gains), abs=0.05)
+  assert clearness([gains], 0.0, even) == by_pattern([gains], 0.0, even) < 2.6
+
+
+def test_gains_that_lie_where_they_are_expected_are_clear_however_uneven():
+  """Five blocks of which each gains what it should, and the same gains where none is expected."""
+  random = np.random.default_rng(0)
+  expected, gains = np.full(36, 0.1), random.normal(0.0, 0.3, 36)
+  expected[[3, 9, 15, 22, 30]] = 40.0, 90.0, 60.0, 120.0, 50.0
+  gains += expected * random.normal(1.0, 0.1, 36)
+  assert standardised(gains) < 2.6
+  assert by_pattern([gains], 0.0, [expected]) > 3.5
+  assert by_pattern([gains], 0.0, [np.roll(expected, 1)]) < 2.0
+  assert by_pattern([-gains], 0.0, [expected]) < -3.5
+  one = np.where(np.arange(36) == 3, 90.0, 0.01)
+  assert by_pattern([one], 0.0, [one]) < 1.0  # a single block draws its own line
 
 
 def test_differences_of_less_than_a_nat_agree_with_nothing():
   small = np.full(36, 0.4)
-  assert clearness([small], 14.0) < 1.0  # pairs of 0.8 nats each, less the prior
-  assert clearness([5.0 * small], 0.0) > 3.5
+  assert clearness([small], 14.0, [small]) < 1.0  # pairs of 0.8 nats each, less the prior
+  assert clearness([5.0 * small], 0.0, [small]) > 3.5
 
 
 def test_hypotheses_without_a_difference_are_not_clear():
-  assert clearness([np.zeros(36)], 0.0) == 0.0
+  assert clearness([np.zeros(36)], 0.0, [np.zeros(36)]) == 0.0
 
 
 def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):

@@ -86,11 +86,15 @@ def test_a_load_that_is_screened_has_left_its_start(model):
   assert screened.possible().total == pytest.approx(fitted, rel=0.1)
 
 
+def _less(nats):
+  return nats - 0.3 - (-1.0) ** np.arange(len(nats))
+
+
 def test_a_scope_that_is_open_leaves_the_kind_certain(model, monkeypatch):
   def alone(item, at):
     """Returns the evidence of one joint as nearly all there is."""
     rows = item.evidence().rows
-    rows = {j: row - 0.3 - (-1.0) ** np.arange(len(row)) for j, row in rows.items()}
+    rows = {j: row._replace(nats=_less(row.nats)) for j, row in rows.items()}
     return wide.Evidence(rows, item.evidence().prior), 1.02 * item.x
 
   monkeypatch.setattr(wide, "alone", alone)
@@ -122,10 +126,13 @@ def test_what_joints_each_have_is_one_effect_of_the_machine(model, monkeypatch):
 
 @pytest.mark.parametrize(("square", "stands"), [(0.1, True), (1.0, False), (9.0, False)])
 def test_explanations_beside_a_further_effect_must_be_better(square, stands):
+  now = SimpleNamespace(
+    loglik=lambda squares: -np.log1p(squares).sum(axis=0), told_apart=_Even.told_apart
+  )
+
   def explained(left):
-    fit = SimpleNamespace(held=[np.full((1, 20), left)])
-    now = SimpleNamespace(loglik=lambda squares: -np.log1p(squares).sum(axis=0))
-    best = SimpleNamespace(fit=fit, prior=0.0)
+    fit = SimpleNamespace(held=[np.full((1, 20), left)], residuals=[np.full((1, 20), left)])
+    best = SimpleNamespace(joint=now, fit=fit, prior=0.0)
     subject = SimpleNamespace(now=now, beyond=3.0)
     return SimpleNamespace(joint="elbow", subject=subject, found=SimpleNamespace(best=best))
 
@@ -161,16 +168,28 @@ def test_a_body_is_carried_by_the_joints_on_its_way():
   assert np.all([j.startswith("s") for j in wide.ancestors(model, model.body("upper").id)])
 
 
+class _Even:
+  """A joint all of whose blocks tell two hypotheses apart equally well."""
+
+  @staticmethod
+  def told_apart(apart):
+    return np.full(apart.shape[-1], 0.3)
+
+
+def _row(nats):
+  return wide.Row(_Even, nats, np.ones((1, len(nats))), np.zeros((1, len(nats))))
+
+
 def test_joints_add_up_where_each_alone_would_not_do():
   random = np.random.default_rng(0)
-  rows = {f"joint_{i}": random.normal(0.3, 1.0, 30) for i in range(20)}
+  rows = {f"joint_{i}": _row(random.normal(0.3, 1.0, 30)) for i in range(20)}
   alone = [wide.Evidence({joint: row}).clear for joint, row in rows.items()]
   assert np.median(alone) < 2.5 < 5.0 < wide.Evidence(rows).clear
   assert (wide.Evidence(rows) - wide.Evidence(rows)).total == 0.0
 
 
 def test_a_difference_counts_joints_that_one_side_lacks():
-  row = np.linspace(0.9, 1.1, 10)
+  row = _row(np.linspace(0.9, 1.1, 10))
   both = wide.Evidence({"a": row, "b": row}, prior=2.0)
   assert both.total == pytest.approx(18.0)
   assert (both - wide.Evidence({"a": row}, prior=0.5)).total == pytest.approx(8.5)
@@ -181,6 +200,7 @@ def test_a_shared_name_stands_beside_a_free_force_where_more_remains(monkeypatch
   joint = SimpleNamespace(joint="elbow", beyond=3.0, explainer=None)
   nats = np.linspace(0.9, 1.1, 30)
   best, without = SimpleNamespace(nats=nats, prior=0.0), SimpleNamespace(nats=0 * nats, prior=0.0)
+  monkeypatch.setattr(wide.Row, "of", lambda one, other: _row(one.nats - other.nats))
   monkeypatch.setattr(wide, "without", lambda *_: without)
   monkeypatch.setattr(rivals, "beside", lambda *_: best)  # the force does as well without the name
   shared = SimpleNamespace(members=(joint,), held=None, origin=joint)
