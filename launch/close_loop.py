@@ -1,6 +1,6 @@
 """Closes the loop: a policy fails on a robot, the data say why, it is trained on and works again.
 
-  python launch/close_loop.py --robot virtual --hidden command_delay:0.18 --policy shipped
+  python launch/close_loop.py --hidden motor_gain@l_knee:0.15 --policy shipped
   python launch/close_loop.py --hidden drawn --seed 7 --policy runs/walk/policy/newest --trials 54
   python launch/close_loop.py --hidden weak_knee --policy shipped --find-severity --out out/severity
   python launch/close_loop.py --robot virtual --seed 1
