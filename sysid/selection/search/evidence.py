@@ -73,33 +73,40 @@ def clear(better: Scored, other: Scored) -> float:
   return clearness([better.nats - other.nats], better.prior - other.prior, expected)
 
 
+TESTS = 3
+"""Of which `clearness` is the largest."""
+
+
 def clearness(rows: Sequence[Array], prior: float, expected: Sequence[Array]) -> float:
   """Returns how clear a difference of two hypotheses is, in standard errors.
 
-  The larger of two paired tests: of the sum over its standard error by blocks (`by_pattern`), and
-  of the signed ranks of neighbouring pairs of blocks (Wilcoxon 1945), as one without a distribution
-  is wanted where few blocks hold most of a sum (Clarke 2007). Ranks know no size: pairs that differ
-  by less than a nat, as an effect that imitates what no hypothesis holds makes them, agree with
-  neither hypothesis.
+  The largest of three paired tests of blocks: of their sum about their mean (Vuong 1989), about
+  what each is expected to differ by (`by_pattern`), and of the signed ranks of neighbouring pairs
+  (Wilcoxon 1945), as one without a distribution is wanted where few blocks hold most of a sum
+  (Clarke 2007). Ranks know no size: pairs that differ by less than a nat, as an effect that
+  imitates what no hypothesis holds makes them, agree with neither hypothesis.
 
   Args:
     rows: differences of nats of blocks, one array for each joint; joints are independent.
     prior: nats that the priors cost more.
     expected: nats by which the blocks tell the two apart if one of them holds, as `rows`.
   """
+  total = float(sum(row.sum() for row in rows)) - prior
+  by_sum = total / max(float(np.sqrt(sum(variance(row) for row in rows))), _NAT)
   pairs = np.concatenate([np.add.reduceat(row, np.arange(0, len(row), 2)) for row in rows])
   pairs = pairs - prior / len(pairs)
   ranks = rankdata(np.abs(pairs))
   agree = np.sign(pairs) * (np.abs(pairs) >= _NAT)
-  return max(by_pattern(rows, prior, expected), float(agree @ ranks / np.sqrt(ranks @ ranks)))
+  by_ranks = float(agree @ ranks / np.sqrt(ranks @ ranks))
+  return max(by_sum, by_pattern(rows, prior, expected), by_ranks)
 
 
 def by_pattern(rows: Sequence[Array], prior: float, expected: Sequence[Array]) -> float:
   """Returns a sum of blocks' differences over its standard error, the scatter of blocks about what
   they are expected to differ by.
 
-  A motion excites an effect in some blocks far more than in others. About their mean (Vuong 1989)
-  differences would scatter by that alone; about the line through the origin that the two
+  A motion excites an effect in some blocks far more than in others. About their mean differences
+  scatter by that alone; about the line through the origin that the two
   predictions draw (a ratio estimate, Cochran 1977) they scatter by what neither hypothesis holds.
   A block counts as if the line had been drawn without it, and few blocks that tell have few degrees
   of freedom (Student).
