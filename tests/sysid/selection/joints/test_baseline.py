@@ -1,13 +1,14 @@
 """Constants that are off, where no reference shows them and where one does."""
 
 import mujoco
+import numpy as np
 import pytest
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.selection.joints import subject
-from nerf2real.sysid.selection.joints.baseline import widened
+from nerf2real.sysid.selection.joints.baseline import changed_constants, known_terms, widened
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
@@ -32,3 +33,20 @@ def test_a_reference_tells_a_stronger_servo_from_a_heavier_arm(strength, mass):
   values = usual.fit.values(usual.terms[0])
   assert 1.0 + values["gain"] == pytest.approx(strength, rel=0.05)
   assert 1.0 + values["mass"] == pytest.approx(mass, rel=0.05)
+
+
+def test_more_friction_than_a_reference_has_is_an_effect_and_less_is_a_changed_constant():
+  logs = [log_of(PENDULUM, kind, duration=5.0) for kind in ("sweep", "slow")]
+  plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
+  usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
+  known = known_terms(usual)[0]
+  for freed in changed_constants(known):
+    (at,) = np.flatnonzero(np.isinf(freed.prior))
+    name, value = freed.names[at], known.centre[at]
+    assert freed.low[at] < value - 0.1
+    ends = [start[at] for start in freed.starts]
+    assert all(freed.low[at] <= v <= max(freed.high[at], value) for v in ends)
+    if name == "armature":  # no effect adds to it
+      assert freed.high[at] > value + 0.5 and max(ends) > value + 0.5
+    else:
+      assert freed.high[at] == pytest.approx(value) and max(ends) == value

@@ -1,5 +1,7 @@
 """Sets of effects that are found one by one, and what single steps do not lead to."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -73,3 +75,23 @@ def test_a_late_command_is_near_one_of_the_starts(explainer):
   values = np.array(starts)[:, 0]
   assert values[0] < 0.005 and values[-1] > 0.15
   assert np.all(values[1:] / values[:-1] < 1.4)
+
+
+def test_what_a_reference_shows_of_an_effect_may_be_larger_or_of_another_form(explainer):
+  """A load friction that a reference shows is tried with its own size, others, and other forms."""
+  forms = [t for t in candidates.library(explainer.joint.plant) if t.kind == "load_friction"]
+  known = dataclasses.replace(
+    forms[0], prior=(0.01,), centre=(0.05,), starts=((0.05,),), known=True
+  )
+  library = [*forms, *explainer.library]
+  own = Explainer(explainer.joint, explainer.constants, library, known=[known])
+  size = own.null.fit.x[-1]
+  tried = {
+    terms[-1].fixed: starts[:, -1]
+    for terms, starts, *_ in own._candidates(own.null)
+    if terms[-1].kind == "load_friction" and len(terms) == 2
+  }
+  assert set(tried) == {t.fixed for t in forms}
+  usual = [s[0] for s in forms[0].starts]
+  assert tried[known.fixed] == pytest.approx([*usual, size, 0.5 * size, 1.5 * size, 3.0 * size])
+  assert all(tried[t.fixed] == pytest.approx(usual) for t in forms[1:])
