@@ -27,6 +27,7 @@ FOLLOWED_S = 0.02
 
 
 _NEAR = 0.1  # s on either side of a sample over which an error is averaged; chosen
+_CHANGED = (0, 1, 2, 4)  # rows of the fields that loads change; of the others is the position
 _KEPT = 2  # sets of loads of a log whose fields are kept: a fit's and that of a difference to it
 
 
@@ -75,7 +76,7 @@ class JointModel(JointPlant):
     """Returns the parts [K, 4, T] of a basis, one array a log: inertia, here, across, bias."""
     if key not in self._bases:
       if key == "mass":
-        self._bases[key] = [f[None, [0, 1, 2, 4]] for f in self._fields]
+        self._bases[key] = [f[None, list(_CHANGED)] for f in self._fields]
       elif key == "gravity":
         self._bases[key] = self._parts([r.gravity(self.joint) for r in self.reductions])
       else:
@@ -119,7 +120,9 @@ class JointModel(JointPlant):
     if loads:
       fields = fields.copy()
       for load in loads:
-        fields[[0, 1, 2, 4]] += np.tensordot(load.factors, self.basis(load.key)[index], 1)
+        for factor, part in zip(load.factors, self.basis(load.key)[index], strict=True):
+          for row, change in zip(_CHANGED, part, strict=True):
+            fields[row] += factor * change
     return fields
 
   def forces(self, loads: Sequence[Load], index: int) -> tuple[Array, ...]:
