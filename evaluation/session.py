@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import math
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,7 @@ def choose(
   *,
   repetition: int | None = None,
   group: str | None = None,
+  indices: Sequence[int] = (),
 ) -> list[tuple[int, Any]]:
   """Returns trials with their indices: all, or `count` spread over them.
 
@@ -79,9 +80,10 @@ def choose(
     count: How many; all if None.
     repetition: Of the starts; all if None.
     group: Of the trials; all if None.
+    indices: Of the trials; all if there are none.
 
   Raises:
-    ValueError: No start is repeated so often, or there is no such group.
+    ValueError: No start is repeated so often, or there is no such group or trial.
   """
   known = sorted({trial.trial for _, trial in listed})
   if repetition is not None and repetition not in known:
@@ -89,15 +91,20 @@ def choose(
   groups = dict.fromkeys(name for name, _ in listed)
   if group is not None and group not in groups:
     raise ValueError(f"--group {group}: expected one of {', '.join(groups)}.")
-  indices = [
+  beyond = [index for index in indices if not 0 <= index < len(listed)]
+  if beyond:
+    raise ValueError(f"--indices {beyond[0]}: expected 0 to {len(listed) - 1}.")
+  chosen = [
     index
     for index, (name, trial) in enumerate(listed)
-    if repetition in (None, trial.trial) and group in (None, name)
+    if repetition in (None, trial.trial)
+    and group in (None, name)
+    and (not indices or index in indices)
   ]
-  if count is not None and count < len(indices):
-    spread = np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))
-    indices = [indices[place] for place in spread]
-  return [(index, listed[index]) for index in indices]
+  if count is not None and count < len(chosen):
+    spread = np.unique(np.linspace(0, len(chosen) - 1, count).round().astype(int))
+    chosen = [chosen[place] for place in spread]
+  return [(index, listed[index]) for index in chosen]
 
 
 def _line(episode: episodes.Episode, number: int, count: int) -> str:
@@ -254,6 +261,7 @@ def _run_share(
     settings.trials,
     repetition=settings.repetition,
     group=settings.group,
+    indices=settings.indices,
   )
   log = None
   if settings.record and settings.plant != "sim":

@@ -38,6 +38,8 @@ class EvaluationSettings:
   group: str | None = None
   """Runs only this group of the protocol's trials, "center" or "wall" of the ball's; all if not
   given."""
+  indices: tuple[int, ...] = ()
+  """Runs only these of the protocol's trials, counted from 0; all if not given."""
   processes: int = 1
   """Processes that share the trials in simulation and on virtual robots; each has a plant of its
   own, so that a virtual robot's noise is another than with one."""

@@ -172,5 +172,9 @@ def test_trials_may_be_spread():
   ball = plants.trials("ball")
   assert [index for index, _ in session.choose(ball, None, group="wall")] == list(range(32, 46))
   assert [index for index, _ in session.choose(ball, 2, group="center")] == [0, 31]
+  found = session.choose(ball, None, indices=(44, 3), group="wall")
+  assert [index for index, _ in found] == [44]
+  with pytest.raises(ValueError, match="--indices 46: expected 0 to 45"):
+    session.choose(ball, None, indices=(46,))
   with pytest.raises(ValueError, match="--group walls: expected one of center, wall"):
     session.choose(ball, None, group="walls")
