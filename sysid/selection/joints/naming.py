@@ -13,13 +13,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.selection.search.evidence import (
-  TESTS,
-  Scored,
-  clear,
-  of_size,
-  standardised,
-)
+from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size, standardised
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
@@ -67,9 +61,8 @@ class Explanation:
 
 
 def threshold(tried: int, settings: Settings = SETTINGS) -> float:
-  """Returns the standard errors that one of so many effects must be clear by, by one of the tests
-  of `clearness`."""
-  return float(norm.isf(settings.level / (TESTS * max(tried, 1))))
+  """Returns the standard errors that one of so many effects must be clear by."""
+  return float(norm.isf(settings.level / max(tried, 1)))
 
 
 def conclude(
