@@ -1,5 +1,5 @@
-"""Set-up of all tests: MuJoCo draws through EGL where there is no screen, as on a server; BLAS has one
-thread, as in the commands, since tests run side by side."""
+"""Set-up of all tests: MuJoCo draws through EGL where there is no screen, as on a server; BLAS has
+one thread, as in the commands, since tests run side by side."""
 
 import os
 import signal

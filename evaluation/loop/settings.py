@@ -31,8 +31,8 @@ class LoopSettings:
   lens: Path | None = None
   """Its camera's camera_info YAML: with it the stand is filmed, and the camera identified."""
   hidden: tuple[str, ...] = ()
-  """Undeclared effects of the virtual robot: motor_gain@l_knee:0.15, a case such as weak_knee, a file
-  with one a line, or "drawn" by the seed; printed at the end alone."""
+  """Undeclared effects of the virtual robot: motor_gain@l_knee:0.15, a case such as weak_knee, a
+  file with one a line, or "drawn" by the seed; printed at the end alone."""
   seed: int = 1
   """Of the virtual robot: its own build, and what "drawn" draws."""
   reference: Path | None = None
