@@ -110,6 +110,8 @@ def combined(tests: Sequence[float]) -> float:
   """
   rare = np.maximum(norm.sf(tests), _RAREST)
   mean = float(np.where(rare < _SMALL, 1.0 / (np.pi * rare), np.tan(np.pi * (0.5 - rare))).mean())
+  if mean < 0.0:  # probabilities near 1 are not resolved
+    return -combined([-test for test in tests])
   together = 1.0 / (np.pi * mean) if mean > 1.0 / _SMALL else 0.5 - np.arctan(mean) / np.pi
   return float(norm.isf(together))
 
@@ -119,20 +121,17 @@ def by_pattern(rows: Sequence[Array], prior: float, expected: Sequence[Array]) -
   they are expected to differ by.
 
   A motion excites an effect in some blocks far more than in others. About their mean differences
-  scatter by that alone; about the line through the origin that the two
-  predictions draw (a ratio estimate, Cochran 1977) they scatter by what neither hypothesis holds.
-  A block counts as if the line had been drawn without it, and few blocks that tell have few degrees
-  of freedom (Student).
+  scatter by that alone; about the line through the origin that the two predictions draw (a ratio
+  estimate, Cochran 1977) they scatter by what neither hypothesis holds. A block counts as if the
+  line had been drawn without it, and few blocks that tell have few degrees of freedom (Student).
 
   Args:
     rows: differences of nats [B] a joint.
     prior: nats that the priors cost more.
     expected: what they are expected to be [B] a joint, up to one factor.
   """
-  total, whole = (
-    float(sum(row.sum() for row in rows)) - prior,
-    float(sum(g.sum() for g in expected)),
-  )
+  total = float(sum(row.sum() for row in rows)) - prior
+  whole = float(sum(g.sum() for g in expected))
   if whole <= 0.0:
     return 0.0
   squares = sum(
@@ -153,9 +152,8 @@ def standardised(differences: Array, total: float | None = None, least: float = 
 
 def variance(differences: Array) -> float:
   """Returns the variance of a sum of blocks' differences, of which neighbours may go together."""
-  return (
-    _scatter(differences - differences.mean()) * len(differences) / max(len(differences) - 1, 1)
-  )
+  count = len(differences)
+  return _scatter(differences - differences.mean()) * count / max(count - 1, 1)
 
 
 def _scatter(errors: Array) -> float:

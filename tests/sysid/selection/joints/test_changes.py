@@ -196,7 +196,8 @@ def test_tests_that_agree_lose_nothing_by_their_number():
   assert combined([3.0, 3.0, 3.0]) == pytest.approx(3.0, abs=0.01)
   alone = combined([4.0, 0.0, 0.0])  # as by one of three tests (Bonferroni)
   assert norm.sf(alone) == pytest.approx(3.0 * norm.sf(4.0), rel=0.01)
-  assert combined([-3.0, -2.0, -3.0]) < -2.0
+  assert combined([-3.0, -2.0, -3.0]) == -combined([3.0, 2.0, 3.0]) < -2.0
+  assert -40.0 < combined([-50.0, -40.0, -30.0]) < -30.0  # finite: reports are JSON
   assert combined([12.0, 0.0, 0.0]) > 11.0  # beyond what tan resolves
 
 
