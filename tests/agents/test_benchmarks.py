@@ -55,8 +55,6 @@ def test_errors_of_a_belief_begin_afresh_in_every_trial():
   class Counts:
     """A policy whose belief is (steps of this trial, 0)."""
 
-    lstm_size, _policy = 2, {"mlp": {"layer0": {"w": np.zeros((5, 1))}}}
-
     def initial_state(self):
       return 0
 
@@ -69,7 +67,8 @@ def test_errors_of_a_belief_begin_afresh_in_every_trial():
 
   pictures, trial = np.zeros((5, 2, 2, 3), np.uint8), np.array([0, 0, 0, 7, 7])
   film = Film(pictures, pictures, pictures, np.zeros((5, 2)), np.zeros(5), trial)
-  assert errors(Counts(), pictures, film).tolist() == [1, 2, 3, 1, 2]
+  loaded = SimpleNamespace(policy=Counts(), layout=SimpleNamespace(state_size=3))
+  assert errors(loaded, pictures, film).tolist() == [1, 2, 3, 1, 2]
 
 
 def test_paired_trials_are_compared_one_by_one():
