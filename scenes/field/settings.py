@@ -75,8 +75,8 @@ class TrainSettings:
 
   # Engine "fused".
   empty_samples: int = 1024
-  """Points a step in cells that sight lines to localised points cross; at most 768 a thread.
-  Chosen: walls without texture are explained as well by fog before the cameras."""
+  """Points a step in cells that sight lines to localised points cross. Chosen: walls without
+  texture are explained as well by fog before the cameras."""
   empty_weight: float = 0.01
   """Weight of the mean of log(1 + density) there. Chosen, not tuned."""
   batch_samples: int = 1 << 15

@@ -125,19 +125,20 @@ def build(f: Functions) -> Chunks:
       f.base_backward(w, m, 0, count, total)
       f.network_gradient(w, 0, count, 1, 0, 1)
       total += count
-    count = s.empty_samples
-    if p.empty.shape[0] > 0 and count > 0:
-      weight = s.empty_weight * wp.float32(rays_done) / wp.float32(count)
-      for n in range(count):
-        draw_empty(p, s, w.work, seed, first_ray + wp.int64(n), n)
-      f.encode(w, m, 0, count)
-      f.base_forward(w, m, 0, count)
-      for n in range(count):
-        empty_loss(s, w.work, weight, n)
-      clear(w.work, count, count + PADDING)
-      f.base_backward(w, m, 0, count, total)
-      f.network_gradient(w, 0, count, 0, 0, 1)
-      total += count
+    if p.empty.shape[0] > 0:
+      weight = s.empty_weight * wp.float32(rays_done) / wp.float32(wp.max(s.empty_samples, 1))
+      for begin in range(0, s.empty_samples, CHUNK_SAMPLES):
+        count = wp.min(s.empty_samples - begin, CHUNK_SAMPLES)
+        for n in range(count):
+          draw_empty(p, s, w.work, seed, first_ray + wp.int64(begin + n), n)
+        f.encode(w, m, 0, count)
+        f.base_forward(w, m, 0, count)
+        for n in range(count):
+          empty_loss(s, w.work, weight, n)
+        clear(w.work, count, count + PADDING)
+        f.base_backward(w, m, 0, count, total)
+        f.network_gradient(w, 0, count, 0, 0, 1)
+        total += count
     w.figures[0] = wp.float64(rays_done)
     w.figures[1] = wp.float64(total)
     w.figures[2] = wp.float64(marched)

@@ -65,7 +65,7 @@ class FusedTrainer:
     stride, columns = layout.STRIDE, layout.CHUNK_RAYS
     # A step ends with the chunk that fills the budget, the rays of it that are marched again, and
     # the points known to be empty.
-    kept = self._budget + 2 * layout.CHUNK_SAMPLES + PADDING
+    kept = self._budget + layout.CHUNK_SAMPLES + PADDING + settings.empty_samples
     kept += layout.CHUNK_RAYS * settings.ray_samples
     if self._phased:
       samples = self._spare + int(_ROOM * self._budget)
