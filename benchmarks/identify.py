@@ -38,7 +38,7 @@ class Settings:
   """Seed of the sets where they must be made."""
   count: int = 72
   """Number of sets where they must be made."""
-  generator: Literal["blind_sets", "independent_sets"] = "blind_sets"
+  generator: Literal["blind_sets", "independent_sets", "servo_bench"] = "blind_sets"
   """Which package makes them."""
   references: bool = True
   """Give the analyser the reference logs that a set has."""

@@ -1,9 +1,10 @@
 """Makes blind sets: `python benchmarks/make_blind_sets.py --out out/blind --seed 0 --count 20`.
 
 Each set is a folder with the declared `model.xml`, three logs to identify from and two held out;
-`answers.json` beside them holds what each machine has that its model lacks. Two generators that
-share no code with each other or with the analyser: `blind_sets` and `independent_sets`, which has
-one log held out and always three of the healthy machine. The same seed gives the same logs.
+`answers.json` beside them holds what each machine has that its model lacks. Three generators that
+share no code with each other or with the analyser: `blind_sets`; `independent_sets`, which has one
+log held out and always three of the healthy machine; `servo_bench`, one servo with an arm, which
+has those three, too. The same seed gives the same logs.
 """
 
 import contextlib
@@ -18,11 +19,16 @@ from typing import Any, Literal
 from benchmarks import harness
 from benchmarks.blind_sets import sets
 from benchmarks.independent_sets import sets as independent_sets
+from benchmarks.servo_bench import sets as servo_sets
 
 GENERATORS: dict[str, Callable[..., Any]] = {
   "blind_sets": sets.make_set,
   "independent_sets": independent_sets.make_set,
+  "servo_bench": servo_sets.make_set,
 }
+
+WITH_REFERENCES = ("independent_sets", "servo_bench")
+"""Generators whose sets always have logs of the healthy machine."""
 
 HALF_HEALTHY = (
   *("healthy", "single", "healthy", "pair", "healthy"),
@@ -43,17 +49,19 @@ class Settings:
   """Number of sets."""
   first: int = 0
   """Index of the first set; a set depends on seed and index alone."""
-  generator: Literal["blind_sets", "independent_sets"] = "blind_sets"
+  generator: Literal["blind_sets", "independent_sets", "servo_bench"] = "blind_sets"
   """Which package makes them."""
   mix: Literal["single", "pair", "outside", "healthy", "all", "half"] = "all"
   """What the machines have: one effect, two, one that no library has, none, or all of these, drawn
   (all) or in turn with every second machine healthy (half)."""
   plants: tuple[str, ...] = ()
-  """Kinds of apparatus, of pendulum, arm, op3, or of slider, arm, wheel; empty: all."""
+  """Kinds of apparatus: of pendulum, arm, op3; of slider, arm, wheel; of hanging, bent, level,
+  turntable; empty: all."""
   kinds: tuple[str, ...] = ()
   """Kinds of effect to draw from; empty: all."""
   reference: bool = False
-  """Also write reference_*.mcap: the same machine without the effects; `independent_sets` does."""
+  """Also write reference_*.mcap: the same machine without the effects; `independent_sets` and
+  `servo_bench` always do."""
   processes: int = 1
   """Sets made at the same time."""
 
@@ -101,7 +109,7 @@ def _make(job: tuple[Settings, int]) -> tuple[str, dict, float]:
     mix=mix_of(settings.mix, index),
     plants=settings.plants or None,
     kinds=settings.kinds or None,
-    reference=settings.reference or settings.generator == "independent_sets",
+    reference=settings.reference or settings.generator in WITH_REFERENCES,
   )
   return _name(settings, index), truth.answer, time.perf_counter() - start
 
