@@ -41,6 +41,8 @@ class Arguments:
   """Pictures to take from the capture; the preset's number if not given."""
   train_seconds: float | None = None
   """Seconds of training; the preset's if not given."""
+  train_steps: int | None = None
+  """Steps of training in place of seconds: a busy machine takes longer for the same field."""
   marker_side: float | None = None
   """Side of the black square of an ArUco or AprilTag marker in the room [m]: gives the scale."""
   camera_height: float | None = None
@@ -72,6 +74,11 @@ def settings_of(arguments: Arguments) -> "SceneSettings":
     settings = dataclasses.replace(settings, capture=taken)
   if arguments.train_seconds is not None:
     training = dataclasses.replace(settings.train, max_seconds=arguments.train_seconds)
+    settings = dataclasses.replace(settings, train=training)
+  if arguments.train_steps is not None:
+    training = dataclasses.replace(
+      settings.train, max_steps=arguments.train_steps, max_seconds=arguments.train_seconds
+    )
     settings = dataclasses.replace(settings, train=training)
   if arguments.camera_height is not None:
     placing = dataclasses.replace(settings.align, camera_height=arguments.camera_height)
