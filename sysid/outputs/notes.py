@@ -2,6 +2,9 @@
 
 from typing import Any
 
+from nerf2real.sysid.selection.joints.changed import Changed
+from nerf2real.sysid.settings import SETTINGS
+
 
 def of_one(row: dict[str, Any]) -> str:
   """Returns a sentence on an effect of several joints that may be of one alone."""
@@ -9,6 +12,18 @@ def of_one(row: dict[str, Any]) -> str:
     f"These logs do not tell whether {row['kind']} is of all joints or of {row['joint']} alone,"
     f" which is behind by {row['evidence']['behind_by_standard_errors']:.1f} standard errors."
   )
+
+
+def another_session(item: Changed) -> list[str]:
+  """Returns a sentence on what a reference of another session cannot show."""
+  if not (item.subject.paired and item.subject.another_session):
+    return []
+  friction = dict(SETTINGS.repeat)["friction"]
+  return [
+    f"The reference of {item.joint} is of another session: no more than what constants move, which"
+    f" differ from one to the next (friction by {100 * friction:.0f} %), is taken for nothing. A"
+    " reference of the same hour shows less."
+  ]
 
 
 def spread(error: dict[str, Any]) -> str:

@@ -4,7 +4,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.selection.joints.remainder import grown, mean_left, scatter, structured
+from nerf2real.sysid.selection.joints.remainder import (
+  grown,
+  mean_left,
+  repeats,
+  scatter,
+  structured,
+)
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.settings import Settings
@@ -15,11 +21,12 @@ Array = np.ndarray
 def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   """Tells whether a hypothesis leaves more than the machine does anyway.
 
-  Beside a reference with the same commands only noise may remain; beside another its blocks are the
-  measure; without one, a multiple of the readings' noise.
+  Beside a reference with the same commands only noise may remain, and what a machine differs by
+  from one session to another; beside another its blocks are the measure; without one, a multiple of
+  the readings' noise.
   """
   if subject.paired:
-    return structured(subject.now, item, settings)
+    return structured(subject.now, item, settings, _of_another_day(subject))
   if subject.usual is not None:
     return grown(item, subject.usual, subject.beyond, settings)
   left, noise = np.median(item.fit.held[0][0]), np.median(subject.now.noise_squares)
@@ -38,6 +45,14 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   return leaves(subject, item, settings)
 
 
+def _of_another_day(subject: Subject) -> Array:
+  """Returns the mean squares of blocks [B] by which a machine's constants, as far as they differ
+  between two recordings, move its course; 0 where the reference is of the same session."""
+  if not subject.another_session:
+    return np.zeros(len(subject.now.starts))
+  return repeats(subject.now, subject.explainer.null)
+
+
 def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
   """Returns what a machine leaves anyway, and what a hypothesis does: mean squares [2] of
   the median block, and of all blocks by `mean_left`."""
@@ -47,6 +62,8 @@ def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
     return np.array([np.median(squares), mean_left(joint, squares)])
 
   readings = now.noise_squares * (2.0 if subject.paired else 1.0)
+  if subject.paired:
+    readings = readings + _of_another_day(subject)
   anyway = np.array([np.median(readings), readings.mean()])
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])

@@ -109,12 +109,25 @@ def _name(
   rivals = [s for s in ranked if kind not in s.names and not s.beside_force]
   behind = [(clear(best, s), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
-  alike = tuple(s for s in near if not s.names < best.names and _same(joint, best, s))
+  alike = tuple(
+    s
+    for s in near
+    if not s.names < best.names
+    and (_same(joint, best, s) or any(_same(joint, s, t) for t in _exchanged(s, kind, ranked)))
+  )
   told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
   certain = least >= beyond and carries_over(joint, best, plain)
   return Name(kind, least, certain, alike)
+
+
+def _exchanged(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:
+  """Returns a rival's hypotheses with a kind in the place of one of its own. One that predicts what
+  the rival does is as good an explanation: what the rival is ahead by speaks not against the kind,
+  but for what both have besides."""
+  same = of_size(ranked, len(rival.names))
+  return [s for s in same if s.names - rival.names == {kind}]
 
 
 def _holds(item: Scored, twin: Scored) -> bool:

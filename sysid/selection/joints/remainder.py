@@ -12,13 +12,22 @@ from nerf2real.sysid.settings import Settings
 Array = np.ndarray
 
 
-def structured(joint: JointLikelihood, item: Scored, settings: Settings) -> bool:
+def structured(
+  joint: JointLikelihood, item: Scored, settings: Settings, allowed: Array | float = 0.0
+) -> bool:
   """Tells whether neighbouring readings' residuals go together in more than one block, which may
   hold a knock, by more than rounding makes them where a joint is slow. A log's first block is not
-  judged: its course begins at one reading, which is rounded."""
+  judged: its course begins at one reading, which is rounded.
+
+  Args:
+    joint: the logs.
+    item: the hypothesis.
+    settings: limits.
+    allowed: mean squares [B] of what may go together besides.
+  """
   certain, size = _together(joint, item.fit.residuals[0][0])
   later = np.append(False, np.diff(joint.log_of) == 0)
-  certain, size = certain[later], size[later]
+  certain, size = certain[later], (size - allowed)[later]
   # Two of B blocks exceed z by chance with a probability of (B p)^2 / 2 at most.
   rare = float(norm.isf(np.sqrt(2.0 * settings.level) / len(certain)))
   step = min(quantum(log.position) for log in joint.plant.logs)
@@ -26,6 +35,16 @@ def structured(joint: JointLikelihood, item: Scored, settings: Settings) -> bool
   rounding = recordings * step**2 / 12.0
   large = size > (settings.structured * joint.position_noise) ** 2 + rounding
   return int(np.sum((certain > rare) & large)) >= 2
+
+
+def repeats(joint: JointLikelihood, item: Scored) -> Array:
+  """Returns the mean squares of blocks [B] by which a hypothesis' values, as far as their priors
+  let them differ (between two recordings of one machine), move its course."""
+  sigma = item.fit.layout.sigma
+  known = np.isfinite(sigma)
+  moved = item.fit.jacobian[0][known] * sigma[known, None, None]
+  squares: Array = np.sum([joint.squares(row)[0] for row in moved], axis=0)
+  return squares
 
 
 def mean_left(joint: JointLikelihood, squares: Array) -> float:

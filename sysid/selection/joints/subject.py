@@ -37,6 +37,9 @@ from nerf2real.sysid.settings import Settings
 WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
 """Kinds that have no target: they concern all joints of a machine or none."""
 
+_SESSION = (
+  3600.0  # s after which a machine is another day's, chosen: it has cooled down and settled
+)
 _WEIGHTED = 4  # fits of a reference's constants under weights of their priors, at most
 _SETTLED = 0.1  # share by which these weights differ at the end
 
@@ -64,6 +67,17 @@ class Subject:
   """The reference's best hypothesis."""
   paired: bool = False
   """Whether every log was driven by the same commands as a reference."""
+
+  @property
+  def another_session(self) -> bool:
+    """Whether a log was recorded long before or after every reference."""
+    if self.before is None:
+      return False
+    now, before = (
+      np.array([r.log.start_ns for r in j.plant.reductions]) for j in (self.now, self.before)
+    )
+    apart = np.abs(now[:, None] - before[None]).min(axis=1)
+    return bool(apart.max() > 1e9 * _SESSION)
 
   @property
   def left(self) -> float:

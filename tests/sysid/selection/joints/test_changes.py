@@ -1,5 +1,6 @@
 """Names of what changed since a reference: one rule, and a machine that had something before."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import mujoco
@@ -18,7 +19,7 @@ from nerf2real.sysid.selection.joints import doubts, leaving, naming, remainder,
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.settings import SETTINGS
-from tests.sysid.synthetic import PENDULUM, log_of
+from tests.sysid.synthetic import PENDULUM, log_of, logs_of
 
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
 
@@ -86,6 +87,22 @@ def test_a_rival_that_predicts_the_same_is_said_beside_the_name():
   (name,) = naming.conclude(_Joint, [null, right, twin], 3.0).names
   assert name.certain
   assert [sorted(s.names) for s in name.confounded] == [["b"]]
+
+
+def test_a_rival_that_is_ahead_by_what_it_has_besides_holds_nothing_against_a_name():
+  """a and b predict the same beside c, which is not clearly better; b alone was not found."""
+  null = _scored((), np.linspace(-4, -3, 30))
+  right = _scored(("a",), np.linspace(0, 0.1, 30))
+  ahead = np.linspace(0, 0.1, 30) + 0.3 * (-1.0) ** np.arange(30) + 0.01
+  with_a, with_b = (_scored((k, "c"), ahead, prediction=8.0) for k in "ab")
+  alone = _scored(("c",), np.linspace(-4, -3, 30), prediction=3.0)
+  ranked = [null, right, with_b, alone]
+  assert naming.conclude(_Joint, ranked, 3.0).named == ()  # b with c is another motion
+  (name,) = naming.conclude(_Joint, [*ranked, with_a], 3.0).names
+  assert name.kind == "a" and name.certain
+  assert [sorted(s.names) for s in name.confounded] == [["b", "c"]]
+  other = _scored(("a", "c"), ahead, prediction=12.0)
+  assert naming.conclude(_Joint, [*ranked, other], 3.0).named == ()
 
 
 def test_an_effect_without_which_the_same_is_predicted_is_needless():
@@ -218,6 +235,23 @@ def test_a_rotor_of_twice_the_inertia_since_the_reference_is_named(monkeypatch):
   assert row["kind"] == "parameter_error"
   assert row["parameters"]["armature"]["value"] == pytest.approx(1.9, rel=0.03)
   assert row["parameters"]["damping"]["value"] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+  ("torque", "days", "more"), [(0.03, 0, True), (0.03, 3, False), (0.2, 3, True)]
+)
+def test_a_machine_of_another_session_differs_as_its_constants_do(torque, days, more):
+  """A wave of torque over position that no constant makes, since references of the same motions."""
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  wave = Effect("cogging", "joint", {"amplitude": torque, "periods": 8.0, "phase": 0.0})
+  before = [dataclasses.replace(log, start_ns=-days * 86_400 * 10**9) for log in logs_of(PENDULUM)]
+  logs = logs_of(PENDULUM, [wave])
+  reductions = tuple([Reduction(model, log) for log in some] for some in (logs, before))
+  found = subject.prepare(
+    model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
+  )
+  assert found.paired and found.another_session == (days > 0)
+  assert leaving.leaves(found, found.explainer.null, SETTINGS) == more
 
 
 def test_a_misfit_in_few_blocks_remains():
