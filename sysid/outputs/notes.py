@@ -20,9 +20,9 @@ def another_session(item: Changed) -> list[str]:
     return []
   friction = dict(SETTINGS.repeat)["friction"]
   return [
-    f"The reference of {item.joint} is of another session, and a machine's constants differ from one"
-    f" to the next (friction by {100 * friction:.0f} %): differences no larger than these make are"
-    " taken for nothing. A reference of the same hour shows smaller ones."
+    f"The reference of {item.joint} is of another session, and a machine's constants differ from"
+    f" one to the next (friction by {100 * friction:.0f} %): differences no larger than that makes"
+    " are taken for nothing. A reference of the same hour shows smaller ones."
   ]
 
 
