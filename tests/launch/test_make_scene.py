@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from nerf2real.launch.make_scene import Arguments, settings_of
+
 _ROOT = Path(__file__).parents[2]
 
 
@@ -45,3 +47,10 @@ def test_bad_captures_are_one_clear_line(three_pictures, tmp_path):
     assert "Traceback" not in done.stderr
     assert not (out / "scene.json").exists()
     assert not (out / "field.safetensors").exists()
+
+
+@pytest.mark.parametrize(("seconds", "expected"), [(None, None), (60.0, 60.0)])
+def test_steps_stand_in_place_of_seconds(seconds, expected):
+  arguments = Arguments(capture="x", out=Path("y"), train_steps=500, train_seconds=seconds)
+  train = settings_of(arguments).train
+  assert (train.max_steps, train.max_seconds) == (500, expected)
