@@ -113,7 +113,7 @@ def _name(
     s
     for s in near
     if not s.names < best.names
-    and (_same(joint, best, s) or any(_same(joint, s, t) for t in _exchanged(s, kind, ranked)))
+    and (_same(joint, best, s) or any(_same(joint, s, t) for t in _with_instead(s, kind, ranked)))
   )
   told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
@@ -122,7 +122,7 @@ def _name(
   return Name(kind, least, certain, alike)
 
 
-def _exchanged(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:
+def _with_instead(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:
   """Returns a rival's hypotheses with a kind in the place of one of its own. One that predicts what
   the rival does is as good an explanation: what the rival is ahead by speaks not against the kind,
   but for what both have besides."""

@@ -37,9 +37,7 @@ from nerf2real.sysid.settings import Settings
 WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
 """Kinds that have no target: they concern all joints of a machine or none."""
 
-_SESSION = (
-  3600.0  # s after which a machine is another day's, chosen: it has cooled down and settled
-)
+_SESSION = 3600.0  # s between recordings, chosen: a machine has cooled down and settled by then
 _WEIGHTED = 4  # fits of a reference's constants under weights of their priors, at most
 _SETTLED = 0.1  # share by which these weights differ at the end
 
