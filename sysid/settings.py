@@ -45,7 +45,15 @@ class Settings:
     ("skew", 0.0003),
     ("latency", 0.0003),
   )
-  """The same between two recordings of one machine."""
+  """The same between two recordings of one machine in one session."""
+  another_session: tuple[tuple[str, float], ...] = (
+    ("damping", 0.05),
+    ("friction", 0.15),
+    ("gain", 0.015),
+    ("latency", 0.0005),
+  )
+  """Those that differ by more from one session to another, chosen: 3 K change a grease's viscosity
+  by 10 to 20 % and a copper winding by 1.2 %, a supply is set to 1 %, a USB frame lasts 1 ms."""
   repeat_effect: float = 0.05
   """Share by which an effect that a machine always had differs between two recordings."""
   rounds: int = 15

@@ -18,7 +18,7 @@ def another_session(item: Changed) -> list[str]:
   """Returns a sentence on what a reference of another session cannot show."""
   if not (item.subject.paired and item.subject.another_session):
     return []
-  friction = dict(SETTINGS.repeat)["friction"]
+  friction = dict(SETTINGS.another_session)["friction"]
   return [
     f"The reference of {item.joint} is of another session, and a machine's constants differ from"
     f" one to the next (friction by {100 * friction:.0f} %): differences no larger than that makes"

@@ -11,10 +11,14 @@ from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 
-def known_terms(found: Scored, settings: Settings = SETTINGS) -> tuple[Term, ...]:
+def known_terms(
+  found: Scored, settings: Settings = SETTINGS, *, another_session: bool = False
+) -> tuple[Term, ...]:
   """Returns the terms of a reference's hypothesis with priors about the values found there."""
   result = []
   repeat = dict(settings.repeat)
+  if another_session:
+    repeat |= dict(settings.another_session)
   for term in found.terms:
     values = tuple(found.fit.values(term).values())
     if term.kind == CONSTANTS:

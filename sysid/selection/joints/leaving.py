@@ -26,7 +26,7 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   the readings' noise.
   """
   if subject.paired:
-    return structured(subject.now, item, settings, _of_another_day(subject))
+    return structured(subject.now, item, settings, _of_another_day(subject, item))
   if subject.usual is not None:
     return grown(item, subject.usual, subject.beyond, settings)
   left, noise = np.median(item.fit.held[0][0]), np.median(subject.now.noise_squares)
@@ -45,12 +45,23 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   return leaves(subject, item, settings)
 
 
-def _of_another_day(subject: Subject) -> Array:
+def _of_another_day(subject: Subject, item: Scored) -> Array:
   """Returns the mean squares of blocks [B] by which a machine's constants, as far as they differ
-  between two recordings, move its course; 0 where the reference is of the same session."""
+  from one session to another, move its course; 0 where the reference is of the same session.
+
+  Beside an effect it is as far as they differ within a session: it must explain the rest.
+  """
+  now, null = subject.now, subject.explainer.null
   if not subject.another_session:
-    return np.zeros(len(subject.now.starts))
-  return repeats(subject.now, subject.explainer.null)
+    return np.zeros(len(now.starts))
+  repeat = dict(now.settings.repeat)
+  if not item.names:
+    repeat |= dict(now.settings.another_session)
+  layout, own = null.fit.layout, subject.known[0]
+  start, stop = layout.spans[layout.terms.index(own)]
+  sigma = layout.sigma.copy()
+  sigma[start:stop] = [repeat[name] for name in own.names]
+  return repeats(now, null, sigma)
 
 
 def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
@@ -63,7 +74,7 @@ def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
 
   readings = now.noise_squares * (2.0 if subject.paired else 1.0)
   if subject.paired:
-    readings = readings + _of_another_day(subject)
+    readings = readings + _of_another_day(subject, item)
   anyway = np.array([np.median(readings), readings.mean()])
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])

@@ -37,10 +37,15 @@ def structured(
   return int(np.sum((certain > rare) & large)) >= 2
 
 
-def repeats(joint: JointLikelihood, item: Scored) -> Array:
-  """Returns the mean squares of blocks [B] by which a hypothesis' values, as far as their priors
-  let them differ (between two recordings of one machine), move its course."""
-  sigma = item.fit.layout.sigma
+def repeats(joint: JointLikelihood, item: Scored, sigma: Array) -> Array:
+  """Returns the mean squares of blocks [B] by which a hypothesis' values, as far as they differ
+  between two recordings of one machine, move its course.
+
+  Args:
+    joint: the logs.
+    item: the hypothesis.
+    sigma: standard deviations of its values [n]; those that are infinite do not count.
+  """
   known = np.isfinite(sigma)
   moved = item.fit.jacobian[0][known] * sigma[known, None, None]
   squares: Array = np.sum([joint.squares(row)[0] for row in moved], axis=0)

@@ -69,13 +69,7 @@ class Subject:
   @property
   def another_session(self) -> bool:
     """Whether a log was recorded long before or after every reference."""
-    if self.before is None:
-      return False
-    now, before = (
-      np.array([r.log.start_ns for r in j.plant.reductions]) for j in (self.now, self.before)
-    )
-    apart = np.abs(now[:, None] - before[None]).min(axis=1)
-    return bool(apart.max() > 1e9 * _SESSION)
+    return self.before is not None and _apart(self.now, self.before)
 
   @property
   def left(self) -> float:
@@ -193,11 +187,17 @@ def _subject(
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
   now.ahead = None if before.law is None else _ahead(before.law, settings)
   usual = reference_constants(before, settings)
-  known = known_terms(usual, settings)
+  known = known_terms(usual, settings, another_session=_apart(now, before))
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   freed = freed_constants(known[0])
   explainer = _explainer(now, before, known, library, freed)
   return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
+
+
+def _apart(now: JointLikelihood, before: JointLikelihood) -> bool:
+  """Tells whether one of the logs was recorded long before or after every reference."""
+  times, known = (np.array([r.log.start_ns for r in j.plant.reductions]) for j in (now, before))
+  return bool(np.abs(times[:, None] - known[None]).min(axis=1).max() > 1e9 * _SESSION)
 
 
 def _ahead(law: ServoLaw, settings: Settings) -> tuple[float, float]:
@@ -232,11 +232,11 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
     return
   own = subject.usual.terms[0]
   library = own_library(before.plant, alone=subject.alone)
-  known = [sticking(before.plant)]
-  first = Explainer(before, own, library, settings=settings, known=known)
+  first = Explainer(before, own, library, settings=settings, known=[sticking(before.plant)])
   usual = conclude(before, grow(first, settings.reference_depth), subject.beyond).best
   shared = [t for t in subject.known if t.wider]
-  subject.usual, subject.known = usual, (*known_terms(usual, settings), *shared)
+  known = known_terms(usual, settings, another_session=subject.another_session)
+  subject.usual, subject.known = usual, (*known, *shared)
   subject.paired = subject.now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   subject.freed = freed_constants(subject.known[0])
   subject.explainer = _explainer(subject.now, before, subject.known, subject.library, subject.freed)

@@ -15,4 +15,4 @@ def test_a_reference_of_another_session_is_said(paired, apart, said):
   subject = SimpleNamespace(paired=paired, another_session=apart)
   notes = another_session(SimpleNamespace(joint="knee", subject=subject))  # type: ignore[arg-type]
   assert len(notes) == said
-  assert all("reference of knee" in note and "friction by 5 %" in note for note in notes)
+  assert all("reference of knee" in note and "friction by 15 %" in note for note in notes)

@@ -50,3 +50,13 @@ def test_more_friction_than_a_reference_has_is_an_effect_and_less_is_a_changed_c
       assert freed.high[at] > value + 0.5 and max(ends) > value + 0.5
     else:
       assert freed.high[at] == pytest.approx(value) and max(ends) == value
+
+
+def test_constants_of_another_session_may_differ_by_more():
+  logs = [log_of(PENDULUM, kind, duration=5.0) for kind in ("sweep", "slow")]
+  plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
+  usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
+  same, other = (known_terms(usual, another_session=apart)[0] for apart in (False, True))
+  more = {n for n, a, b in zip(same.names, same.prior, other.prior, strict=True) if a < b}
+  assert more == {"damping", "friction", "gain", "latency"}
+  assert same.centre == other.centre
