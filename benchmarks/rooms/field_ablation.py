@@ -18,6 +18,7 @@ from nerf2real.scenes.bundle import STAGES
 from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.engine.device import num_threads
+from nerf2real.scenes.field.field import FieldSettings
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.poses import localisation
@@ -26,13 +27,18 @@ from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages.cache import Made, StageResult
 from nerf2real.scenes.stages.pictures import PosedPictures
 
-Part = Literal["falloff", "near_gradient", "points", "distortion", "blur"]
-CHANGES: dict[str, dict[str, Any]] = {  # all turn a part off but near_gradient, which is off
+Part = Literal[
+  "falloff", "near_gradient", "points", "distortion", "blur", "rate", "padding", "table"
+]
+CHANGES: dict[str, dict[str, Any]] = {  # the first turn a part off, but near_gradient, which is off
   "falloff": {},
   "near_gradient": {"near_gradient": 1.0},
   "points": {"anchor_fraction": 0.0, "empty_samples": 0},
   "distortion": {"distortion_weight": 0.0},
   "blur": {"blur_max": 0.0},
+  "rate": {"final_learning_rate": 3e-4},
+  "padding": {"charbonnier_padding": 1e-3},
+  "table": {"field": FieldSettings(log2_table_size=19)},
 }
 
 
@@ -75,6 +81,12 @@ def without_falloff(views: Views) -> Views:
   return dataclasses.replace(views, exposure=flat)
 
 
+def small_db(renderer: Renderer, held: Views, height: int, width: int) -> float:
+  """Mean PSNR [dB] of held-out views at a policy's size."""
+  scores = [held_out.compare(renderer, held, i, height, width).psnr_db for i in range(len(held))]
+  return float(np.mean(scores))
+
+
 def main(settings: Settings) -> None:
   """Trains and prints the table."""
   everything = read_posed(settings.scene, width=SceneSettings().train_width).views()
@@ -94,6 +106,7 @@ def main(settings: Settings) -> None:
     figures[f"{part} changed" if part else "as it is"] = {
       "psnr_db": float(np.mean([score.psnr_db for score in scores])),
       "ssim": float(np.mean([score.ssim for score in scores])),
+      **{f"psnr_{h}x{w}_db": small_db(renderer, held, h, w) for h, w in held_out.ROBOT_SIZES},
       "samples_per_ray": report.samples / report.rays,
       "training_s": report.seconds,
     }
