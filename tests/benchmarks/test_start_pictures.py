@@ -25,6 +25,7 @@ class Believer:
 
   def step(self, picture, proprioception, state):
     assert proprioception.shape == (3,) and not proprioception.any()
+    assert state == picture[0, 0, 2]
     return SimpleNamespace(embedding=picture[0, 0], state=state + 1)
 
   def believed_position(self, embedding):
@@ -55,7 +56,7 @@ class Corridor:
 
   def sight(self):
     pose = Pose(0.1 * self._steps, -1.0, 0.5)
-    return Sight(pose, None, False, self._steps == self._collides)
+    return Sight(pose, None, self._steps == self._collides, False)
 
   def _timestep(self):
     picture = np.full((2, 2, 3), self._steps, np.uint8)
@@ -86,7 +87,7 @@ def test_a_film_ends_where_the_robot_collides():
 
 def test_errors_are_of_the_mean_place_and_of_the_likeliest_heading():
   pictures = np.zeros((3, 2, 2, 3), np.uint8)
-  pictures[:, 0, 0, :2] = [(0, 0), (3, 4), (6, 8)]
+  pictures[:, 0, 0] = [(0, 0, 0), (3, 4, 1), (6, 8, 2)]  # the place, and which of the film
   place = np.array([[0.0, 0.0], [0.0, 0.0], [6.0, 7.5]])
   yaw = np.array([3.0, -3.1, -np.pi / 2])
   film = Film(pictures, pictures, place, yaw)
