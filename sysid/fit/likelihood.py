@@ -192,7 +192,9 @@ class JointLikelihood:
 
     Args:
       reference: logs of the machine before.
-      residuals: what its baseline leaves there [C, N], weighted as `residuals` gives it.
+      residuals: what its baseline leaves there [C, N], weighted as `residuals` gives it. Of a
+        channel that only one side has, such as the duty of a servo that lost its law, nothing is
+        expected.
       terms: of that baseline.
       x: their values [n].
 
@@ -202,7 +204,7 @@ class JointLikelihood:
     ends = np.cumsum([len(log.time) for log in reference.plant.logs])
     starts = np.append(0, ends[:-1])
     likes = []
-    residuals = residuals / np.maximum(reference.gain, 1e-9)
+    residuals = self._channels_of(reference, residuals / np.maximum(reference.gain, 1e-9))
     for log in self.plant.logs:
       like = next((i for i, r in enumerate(reference.plant.logs) if _same_commands(log, r)), None)
       if like is None:
@@ -217,6 +219,14 @@ class JointLikelihood:
       apart = min(spread * float(student.isf(_RARE, len(late) - 1)), most)
     self.expectation = Expectation(self.plant.logs, likes, baseline, apart=apart)
     return True
+
+  def _channels_of(self, other: "JointLikelihood", rows: Array) -> Array:
+    """Returns other logs' rows [C', N'] as these logs' channels [C, N'], 0 where only one has it."""
+    result = np.zeros((len(self.channels), rows.shape[1]))
+    alike = (self.law is None) == (other.law is None)
+    count = min(len(self.channels), len(rows)) if alike else 1
+    result[:count] = rows[:count]
+    return result
 
   def _duties(self, p: Array) -> Array:
     """Returns measured duty minus that of the law of kernel parameters [P].

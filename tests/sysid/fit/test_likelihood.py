@@ -1,5 +1,7 @@
 """The likelihood by blocks and its mode, against hand computation and made logs."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -138,6 +140,29 @@ def test_what_a_reference_leaves_cancels_beside_the_same_commands():
   assert beside < 1e-9 < 1e-3 < alone
   _, other = joint_of(kinds=("steps", "slow"), effects=effect)
   assert not other.expect(before, left)
+
+
+@pytest.mark.parametrize("before_has_them", [True, False])
+def test_of_efforts_that_one_side_lacks_nothing_is_expected(before_has_them):
+  made = [log_of(PENDULUM, kind, duration=5.0) for kind in ("sweep", "slow")]
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  felt = [
+    dataclasses.replace(
+      log, states=dataclasses.replace(log.states, effort=np.sin(5.0 * log.states.position))
+    )
+    for log in made
+  ]
+  before, now = (
+    JointLikelihood(JointModel(model, "joint", logs))
+    for logs in ((felt, made) if before_has_them else (made, felt))
+  )
+  assert sorted((len(before.channels), len(now.channels))) == [1, 2]
+  nothing = (), np.zeros((1, 0))
+  alone = now.residuals(*nothing)[0]
+  assert now.expect(before, before.residuals(*nothing)[0])
+  beside = now.residuals(*nothing)[0]
+  assert np.abs(beside[0]).max() < 1e-9 < 1e-4 < np.abs(alone[0]).max()
+  np.testing.assert_array_equal(beside[1:], alone[1:])
 
 
 @pytest.mark.parametrize("clock", ["command_delay", "measurement_delay"])
