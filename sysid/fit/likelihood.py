@@ -221,7 +221,7 @@ class JointLikelihood:
     return True
 
   def _channels_of(self, other: "JointLikelihood", rows: Array) -> Array:
-    """Returns other logs' rows [C', N'] as these logs' channels [C, N'], 0 where only one has it."""
+    """Returns other logs' rows [C', N'] as these logs' channels [C, N'], 0 where one lacks it."""
     result = np.zeros((len(self.channels), rows.shape[1]))
     alike = (self.law is None) == (other.law is None)
     count = min(len(self.channels), len(rows)) if alike else 1
