@@ -131,7 +131,9 @@ def _reference_losses(params, trainer, count):
   weights = sampling.interval_weights(density, length)
   rest = 1 - weights.sum(1)
   total = (weights[..., None] * color).sum(1) + rest[:, None] * rays[:, 10:13]
-  photometric = field_losses.charbonnier(total, targets, padding=1e-3) * count
+  photometric = (
+    field_losses.charbonnier(total, targets, padding=SETTINGS.charbonnier_padding) * count
+  )
   extent = sampling.spacing(distance + length / 2) - sampling.spacing(distance - length / 2)
   order = jnp.argsort(distance + (length == 0) * 1e3, axis=-1)
 
@@ -307,14 +309,15 @@ def views():
 def _train(views, steps=FAST.max_steps, **options):
   trainer = FusedTrainer(views, FAST, seed=0, **options)
   for step in range(steps):
-    trainer.step(train.learning_rate(FAST, step / FAST.max_steps, step))
+    trainer.step(train.learning_rate(FAST, step / max(steps, FAST.max_steps), step))
   return trainer
 
 
-@pytest.mark.parametrize("phased", [False, True])
-def test_training_reproduces_views_it_has_not_seen(views, phased):
+@pytest.mark.parametrize(("phased", "steps"), [(False, 300), (True, 600)])
+def test_training_reproduces_views_it_has_not_seen(views, phased, steps):
+  """In phases 300 steps end at 20 dB with some seeds, under any rate that was tried; 600 do not."""
   held_out = box_views.make_views(3, width=64, height=48, seed=100)
-  renderer = Renderer(_train(views, phased=phased).field())
+  renderer = Renderer(_train(views, steps, phased=phased).field())
   figures = []
   for index in range(3):
     picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
