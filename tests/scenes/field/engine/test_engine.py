@@ -49,6 +49,7 @@ FAST = TrainSettings(
   field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
   max_steps=300,
   max_seconds=None,
+  final_learning_rate=3e-4,  # in so few steps a higher one leaves fog, in phases
   batch_samples=1 << 14,
   inner_cells=32,
   outer_cells=16,
@@ -309,15 +310,14 @@ def views():
 def _train(views, steps=FAST.max_steps, **options):
   trainer = FusedTrainer(views, FAST, seed=0, **options)
   for step in range(steps):
-    trainer.step(train.learning_rate(FAST, step / max(steps, FAST.max_steps), step))
+    trainer.step(train.learning_rate(FAST, step / FAST.max_steps, step))
   return trainer
 
 
-@pytest.mark.parametrize(("phased", "steps"), [(False, 300), (True, 600)])
-def test_training_reproduces_views_it_has_not_seen(views, phased, steps):
-  """In phases 300 steps end at 20 dB with some seeds, under any rate that was tried; 600 do not."""
+@pytest.mark.parametrize("phased", [False, True])
+def test_training_reproduces_views_it_has_not_seen(views, phased):
   held_out = box_views.make_views(3, width=64, height=48, seed=100)
-  renderer = Renderer(_train(views, steps, phased=phased).field())
+  renderer = Renderer(_train(views, phased=phased).field())
   figures = []
   for index in range(3):
     picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
