@@ -44,6 +44,10 @@ class Arguments:
   preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
+  view_scenes: tuple[Path, ...] = ()
+  """Other reconstructions of the same room (another quality, another film), from one marker: where
+  the preset has views, they are rendered in these, too, so that the encoder learns the room and not
+  one field's flaws."""
   relabel: Path | None = None
   """Folder `data` of an earlier run in such an environment: a new run begins with its episodes,
   labelled by the teacher of now. They count among the frames, but the teacher's share falls over
@@ -68,10 +72,12 @@ def settings_of(arguments: Arguments) -> Any:
   """Returns the settings of a run: the preset's with changes, or those it began with.
 
   Raises:
-    ValueError: The preset is unknown, or there is no policy to begin with.
+    ValueError: The preset is unknown or has no views for the scenes given, a scene is no bundle,
+      or there is no policy to begin with.
   """
   from nerf2real.agents.distill import settings
   from nerf2real.agents.distill.learning import beginning
+  from nerf2real.suite.scene import open_scene
 
   if arguments.resume:
     if not (arguments.run / settings.SETTINGS).exists():
@@ -86,8 +92,18 @@ def settings_of(arguments: Arguments) -> Any:
   if arguments.init_from is not None:
     changes["init_from"] = str(arguments.init_from)
     changes["agent"] = beginning.agent_of(arguments.init_from)
+  if arguments.view_scenes:
+    for scene in arguments.view_scenes:
+      open_scene(scene)
+    changes["view_scenes"] = tuple(str(scene) for scene in arguments.view_scenes)
   given = {name: value for name, value in changes.items() if value is not None}
-  return dataclasses.replace(settings.preset(arguments.preset), **given)
+  found = dataclasses.replace(settings.preset(arguments.preset), **given)
+  if found.view_scenes and not found.views:
+    raise ValueError(
+      f"--view-scenes: preset {arguments.preset} has no views; nerf_nav_on, nerf_nav_60x80, "
+      "ball_push and ball_push_on have."
+    )
+  return found
 
 
 def run(arguments: Arguments) -> None:

@@ -116,6 +116,9 @@ class DistillSettings:
   """Pictures rendered at drawn places besides those of the episodes (`views`), for the encoder."""
   views_share: float = 0.5
   """Of the pictures in an update of the encoder stage, where there are views; chosen."""
+  view_scenes: tuple[str, ...] = ()
+  """Folders of other reconstructions of the same room, with the same origin (one marker): views are
+  rendered in them, too, the same number in each."""
   copies: int = 2
   """Augmented copies of which features are cached."""
   pose_weight: float = 0.3

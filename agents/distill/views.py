@@ -7,14 +7,17 @@ place then says nothing about the robot's.
 Shape letters: N views.
 """
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nerf2real.agents.distill.dataset import BALL_SIZE, POSE_SIZE
+from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.specs import BALL, POSITION, ROTATION, Layout
+from nerf2real.agents.environments.loading import make_environment
 from nerf2real.core import files, rotations
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.light import draw_light
@@ -72,22 +75,28 @@ def make_views(
 
 
 def kept_views(
-  path: Path, task: Any, layout: Layout, data: Path, *, seed: int, count: int
+  path: Path, names: Sequence[str], layout: Layout, data: Path, *, seed: int, count: int
 ) -> dict[str, np.ndarray]:
   """Returns a run's views: those that its file holds, or new ones, which the file then holds.
 
   Args:
     path: the file.
-    task: see `make_views`.
+    names: of the environments that they are rendered in, the same number in each: where they are
+      several reconstructions of one room, an encoder learns what these have in common.
     layout: see `make_views`.
     data: folder of the episodes whose postures are used.
     seed: of what is drawn.
-    count: of views.
+    count: of views in all.
   """
   if not path.exists():
     postures = np.concatenate([_postures(file) for file in sorted(data.glob("[0-9]*.npz"))])
     rng = np.random.default_rng(seed)
-    made = make_views(task, layout, postures, rng=rng, count=count)
+    shares = [len(share) for share in np.array_split(np.arange(count), len(names))]
+    parts = []
+    for name, share in zip(names, shares, strict=True):
+      with contextlib.closing(make_environment(name, seed=seed)) as environment:
+        parts.append(make_views(task_of(environment), layout, postures, rng=rng, count=share))
+    made = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     with files.atomic_path(path) as partial:
       np.savez(partial, **made)  # type: ignore[arg-type]
   with np.load(path, allow_pickle=False) as stored:

@@ -162,6 +162,13 @@ def evaluation_name(name: str) -> str:
   return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
 
 
+def in_scene(name: str, scene: str | Path) -> str:
+  """The name of a suite's environment that is the same in another scene bundle."""
+  path, _, query = name.partition("?")
+  options = dict(urllib.parse.parse_qsl(query)) | {"scene": str(scene)}
+  return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
+
+
 def trials_of(environment: Any) -> Trials | None:
   """The protocol below the wrappers of an environment; None if its episodes are no trials."""
   while not isinstance(environment, Trials) and hasattr(environment, "_environment"):

@@ -25,10 +25,9 @@ from nerf2real.agents.distill.learning.training import Trainer
 from nerf2real.agents.distill.schedule import BORROWED, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
 from nerf2real.agents.distill.views import kept_views
-from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.environments.loading import make_environment
+from nerf2real.agents.environments.loading import in_scene, make_environment
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.limiter import LimiterSettings, RateLimiter
 from nerf2real.agents.link.server import LearnerLink
@@ -188,18 +187,15 @@ class Learner:
 
   def _make_views(self) -> dict[str, np.ndarray]:
     """Returns the run's pictures at drawn places: on a loaded core some 3 ms each, once a run."""
-    environment = make_environment(self._settings.environment, seed=self._seed)
-    try:
-      return kept_views(
-        self._run / VIEWS,
-        task_of(environment),
-        self._layout,
-        self._run / "data",
-        seed=self._seed,
-        count=self._settings.views,
-      )
-    finally:
-      environment.close()
+    name = self._settings.environment
+    return kept_views(
+      self._run / VIEWS,
+      [name, *(in_scene(name, scene) for scene in self._settings.view_scenes)],
+      self._layout,
+      self._run / "data",
+      seed=self._seed,
+      count=self._settings.views,
+    )
 
   # ---- stages ----
 

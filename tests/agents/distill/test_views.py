@@ -1,23 +1,31 @@
 """Pictures at drawn places, for the encoder."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
+from nerf2real import scenes
 from nerf2real.agents.distill import relabelling, views
 from nerf2real.agents.distill import teacher as teachers
 from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.specs import BALL, POSITION, Layout
-from nerf2real.agents.environments.loading import make_environment
+from nerf2real.agents.environments.loading import in_scene, make_environment
 from nerf2real.core import rotations
 from tests.agents.distill.test_turned_heads import world as plain_world  # noqa: F401
 
 COUNT = 24
+NAME = "suite:ball_push?image_size=12x16&pushes=false&light=true"
+DATA = Path(scenes.__file__).parent / "data"
 
 
 @pytest.fixture(scope="module")
 def world():
   """Task, layout and postures of a drawn light's environment with a ball."""
-  environment = make_environment("suite:ball_push?image_size=12x16&pushes=false&light=true", seed=0)
+  environment = make_environment(NAME, seed=0)
   layout = Layout.of(environment)
   rows = [layout.flatten(environment.reset().observation).privileged]
   for _ in range(3):
@@ -83,13 +91,35 @@ def _seen(task, layout, row, place, made, view):
 
 
 def test_a_runs_views_are_made_once(world, made, tmp_path):
-  task, layout, postures = world
+  _, layout, postures = world
   np.savez(tmp_path / "000000_0000000000000001_1.npz", privileged=postures)
   path = tmp_path / "views.npz"
-  first = views.kept_views(path, task, layout, tmp_path, seed=1, count=COUNT)
-  assert all(np.array_equal(first[name], array) for name, array in made.items())
-  again = views.kept_views(path, None, layout, tmp_path, seed=2, count=5)
+  first = views.kept_views(path, [NAME], layout, tmp_path, seed=1, count=COUNT)
+  assert all(np.array_equal(first[name], made[name]) for name in ("pose", "ball"))
+  again = views.kept_views(path, [], layout, tmp_path, seed=2, count=5)
   assert np.array_equal(again["image"], first["image"])
+
+
+def test_views_are_of_several_reconstructions(world, made, tmp_path):
+  """Half of them in the built-in room, half in a copy of it whose field is darker."""
+  _, layout, postures = world
+  np.savez(tmp_path / "000000_0000000000000001_1.npz", privileged=postures)
+  names = [NAME, in_scene(NAME, _darker_copy(tmp_path / "other"))]
+  found = views.kept_views(tmp_path / "v.npz", names, layout, tmp_path, seed=1, count=COUNT)
+  assert {len(array) for array in found.values()} == {COUNT}
+  first, second = found["image"].reshape(2, -1).mean(axis=1)
+  assert second < 0.5 * first
+
+
+def _darker_copy(folder):
+  shutil.copytree(DATA / "room", folder)
+  path = folder / "field.safetensors"
+  with safe_open(path, "np") as stored:
+    tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+    metadata = stored.metadata()
+  tensors["view_b2"] = tensors["view_b2"] - 2.0
+  save_file(tensors, path, metadata)
+  return folder
 
 
 def test_a_batch_holds_frames_and_views(made):
