@@ -62,12 +62,17 @@ class Settings:
   reference: bool = False
   """Also write reference_*.mcap: the same machine without the effects; `independent_sets` and
   `servo_bench` always do."""
+  same_day: bool = False
+  """References of the same day, so that only noise is another (`servo_bench`; of
+  `independent_sets` they always are)."""
   processes: int = 1
   """Sets made at the same time."""
 
 
 def main(settings: Settings) -> None:
   """Writes sets that are not there yet and answers.json."""
+  if settings.same_day and settings.generator != "servo_bench":
+    raise ValueError(f"--same-day is of servo_bench, found --generator {settings.generator}.")
   settings.out.mkdir(parents=True, exist_ok=True)
   path = settings.out / "answers.json"
   answers = json.loads(path.read_text()) if path.is_file() else {}
@@ -102,6 +107,7 @@ def mix_of(mix: str, index: int) -> str:
 def _make(job: tuple[Settings, int]) -> tuple[str, dict, float]:
   settings, index = job
   start = time.perf_counter()
+  days = {"same_day": True} if settings.same_day else {}
   truth = GENERATORS[settings.generator](
     settings.out / _name(settings, index),
     seed=settings.seed,
@@ -110,6 +116,7 @@ def _make(job: tuple[Settings, int]) -> tuple[str, dict, float]:
     plants=settings.plants or None,
     kinds=settings.kinds or None,
     reference=settings.reference or settings.generator in WITH_REFERENCES,
+    **days,
   )
   return _name(settings, index), truth.answer, time.perf_counter() - start
 

@@ -26,6 +26,8 @@ _ATTEMPTS = 25
 """Benches that are tried for an effect."""
 _GROWTH = 0.2
 """Of an effect's size, from one trial to the next."""
+_DAYS = 3
+"""Since the references, where they are of another day."""
 _STREAM = 77003
 """Sets these draws apart from another generator's of the same seed."""
 
@@ -63,6 +65,7 @@ def make_set(
   plants: Sequence[str] | None = None,
   kinds: Sequence[str] | None = None,
   reference: bool = True,
+  same_day: bool = False,
 ) -> Truth:
   """Writes a set and returns its truth; seed and index alone determine it, with mix and choices.
 
@@ -74,6 +77,7 @@ def make_set(
     plants: of `bench.PLANTS` to draw from.
     kinds: of effects to draw from.
     reference: also write logs of the healthy machine on another day.
+    same_day: they are of the same day: only the noise is another.
 
   Raises:
     ValueError: a plant or kind that is not there, or none that fits the mix.
@@ -90,11 +94,14 @@ def make_set(
   ]
   seen, seeds = False, (_STREAM, seed, index)
   for attempt in range(_ATTEMPTS):
-    scene = _draw_scene(str(random.choice(where)), random, (*seeds, attempt))
+    scene = _draw_scene(str(random.choice(where)), random, (*seeds, attempt), same_day=same_day)
     faulty, entries, seen = _break(scene, {name: kind_of[name] for name in names}, random)
     if seen:
       break
-  answer = _write(pathlib.Path(folder), scene, faulty, index=index, reference=reference)
+  days = 0 if same_day else _DAYS
+  answer = _write(
+    pathlib.Path(folder), scene, faulty, index=index, reference=reference, days_after=days
+  )
   return Truth(
     {
       "plant": scene.machine.paper.plant,
@@ -140,11 +147,12 @@ def _together(source: dict[str, Kind], first: str, other: str, plants: Sequence[
   return a.group != b.group and bool(set(a.plants) & set(b.plants) & set(plants))
 
 
-def _draw_scene(plant: str, random: Random, seed: tuple[int, ...]) -> _Scene:
+def _draw_scene(plant: str, random: Random, seed: tuple[int, ...], *, same_day: bool) -> _Scene:
   paper = benches.on_paper(plant, random)
   copy = benches.copy_of(paper, random)
   host = recording.draw_host(paper.bench.motor, random)
-  machine = Machine(paper, benches.another_day(copy, random), host)
+  today = benches.another_day(copy, random)
+  machine = Machine(paper, copy if same_day else today, host)
   reach = motions.Reach(1.0, random.uniform(0.5, 0.75) * motor.no_load_speed(paper.bench.motor))
   commands = {
     f"{part}_{name}": motion(recording.command_times(host, duration), reach, random)
@@ -203,7 +211,13 @@ def _mean_error(courses: dict[str, following.Course], logs: dict[str, Recording]
 
 
 def _write(
-  folder: pathlib.Path, scene: _Scene, faulty: Machine, *, index: int, reference: bool
+  folder: pathlib.Path,
+  scene: _Scene,
+  faulty: Machine,
+  *,
+  index: int,
+  reference: bool,
+  days_after: int,
 ) -> dict[str, float]:
   """Writes model and logs; returns the errors that the answer has."""
   folder.mkdir(parents=True, exist_ok=True)
@@ -212,8 +226,8 @@ def _write(
   logs = {name: _record(scene, faulty, name) for name in scene.commands}
   start = recording.EPOCH + 10 * 86_400 * index
   for number, (name, log) in enumerate(logs.items()):
-    # A bench is used every quarter of an hour or so, the healthy one three days before.
-    today = start + 3 * 86_400 + 900 * number
+    # A bench is used every quarter of an hour or so; on one day the healthy one at the same times.
+    today = start + days_after * 86_400 + 900 * number
     recording.write(folder / f"{name}.mcap", log, faulty.host, start=today)
     if reference and name.startswith("train"):
       before = _record(scene, scene.reference, name, reference=True)

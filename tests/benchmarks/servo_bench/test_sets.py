@@ -55,6 +55,15 @@ def test_the_same_seed_and_index_give_the_same_bytes(made, tmp_path):
   assert not list((tmp_path / "other").glob("reference*"))
 
 
+@pytest.mark.parametrize("same_day", [True, False])
+def test_references_of_the_same_day_are_of_the_same_machine(same_day):
+  scene = sets._draw_scene("hanging", np.random.default_rng(1), (1,), same_day=same_day)
+  assert (scene.machine.bench == scene.reference.bench) == same_day
+  name = "held_1_points"
+  now, before = (sets._record(scene, scene.machine, name, reference=r) for r in (False, True))
+  assert not np.array_equal(now.angle, before.angle)  # other noise
+
+
 def test_the_kinds_are_the_librarys_and_others():
   assert len(effects.LIBRARY) >= 12 and len(effects.OUTSIDE) >= 5
   assert set(effects.LIBRARY) <= set(KINDS)
