@@ -45,6 +45,10 @@ class Arguments:
   """Steps of training in place of seconds: a busy machine takes longer for the same field."""
   marker_side: float | None = None
   """Side of the black square of an ArUco or AprilTag marker in the room [m]: gives the scale."""
+  marker_at: tuple[float, float, float] | None = None
+  """Where the marker is to be on the map: x, y of its centre [m] and the heading [degrees] of its
+  upper edge from the x axis. The map's origin and axes are then the same in every film of the room,
+  and places on it can be measured from the marker; else the origin is the middle of the room."""
   camera_height: float | None = None
   """Median height of the camera above the floor [m]: gives the scale where there is no marker."""
   override: Path | None = None
@@ -66,7 +70,8 @@ class Arguments:
 
 def settings_of(arguments: Arguments) -> "SceneSettings":
   """Applies the arguments to their preset."""
-  from nerf2real.scenes.settings import preset
+  from nerf2real.scenes.alignment.marker_place import MarkerPlace
+  from nerf2real.scenes.settings import preset, with_marker
 
   settings = preset(arguments.preset)
   if arguments.keyframes is not None:
@@ -85,6 +90,8 @@ def settings_of(arguments: Arguments) -> "SceneSettings":
     settings = dataclasses.replace(settings, align=placing)
   if arguments.marker_side is not None:
     settings = dataclasses.replace(settings, marker_side=arguments.marker_side)
+  if arguments.marker_at is not None:
+    settings = with_marker(settings, MarkerPlace(*arguments.marker_at))
   if arguments.baseline is not None:
     settings = dataclasses.replace(settings, baseline=arguments.baseline)
   return settings
@@ -140,6 +147,7 @@ def run(arguments: Arguments) -> int:
   from nerf2real.scenes import pipeline
   from nerf2real.scenes.alignment import overrides
   from nerf2real.scenes.builtin import ground_truth
+  from nerf2real.scenes.settings import with_marker
 
   settings = settings_of(arguments)
   source, measure = Path(arguments.capture), None
@@ -147,6 +155,8 @@ def run(arguments: Arguments) -> int:
     source, measure = ground_truth.VIDEO, ground_truth.measure
     if settings.marker_side is None:
       settings = dataclasses.replace(settings, marker_side=ground_truth.MARKER_SIDE)
+    if settings.align.marker_at is None:
+      settings = with_marker(settings, ground_truth.MARKER_AT)
   if arguments.override is not None:
     overrides.read(arguments.override)
   if arguments.check:

@@ -159,6 +159,7 @@ def _figures(results: SceneResults) -> dict[str, Any]:
     "floor_tilt_from_cameras_deg": alignment.floor_tilt_from_cameras_deg,
     "scale_source": alignment.scale_source,
     "scale_spread": alignment.scale_spread,
+    **({} if alignment.marker is None else {"marker_place": alignment.marker.words}),
   }
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from nerf2real.core.serialization import from_plain, write_json
 from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.geometry import map_server
 from nerf2real.scenes.geometry.free_space import FreeSpaceMap
 
@@ -119,6 +120,12 @@ class Bundle:
   def world_from_unit(self) -> Similarity:
     """Maps the field's frame to the world."""
     return from_plain(self.scene["world_from_unit"], Similarity)
+
+  @property
+  def marker(self) -> MarkerPlace | None:
+    """Where a marker lies in the world, which places in the room are measured from."""
+    place = self.scene.get("alignment", {}).get("marker")
+    return None if place is None else from_plain(place, MarkerPlace)
 
   @property
   def extent(self) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.alignment.world_frame import AlignSettings
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.field import settings as training
@@ -56,8 +57,15 @@ class SceneSettings:
   def __post_init__(self):
     check_length("The marker's side", self.marker_side, MARKER_SIDES)
     check_length("The cameras' height", self.align.camera_height, CAMERA_HEIGHTS)
+    if self.align.marker_at is not None and self.marker_side is None:
+      raise ValueError("A marker's place needs its side: give --marker-side, too.")
     if self.baseline not in ("none", "colmap"):
       raise ValueError(f"Unknown baseline {self.baseline!r}; expected 'none' or 'colmap'.")
+
+
+def with_marker(settings: SceneSettings, place: MarkerPlace) -> SceneSettings:
+  """Returns settings whose world frame has its origin and axes from a marker."""
+  return dataclasses.replace(settings, align=dataclasses.replace(settings.align, marker_at=place))
 
 
 PRESETS = ("fast", "quality", "demo", "tiny", "paper")

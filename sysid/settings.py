@@ -46,6 +46,9 @@ class Settings:
     ("latency", 0.0003),
   )
   """The same between two recordings of one machine in one session."""
+  wandering: tuple[str, ...] = ("friction", "latency")
+  """Those of them that differ within a recording, too: friction from place to place and with what
+  the teeth carry, a command's way with where the firmware's tick is when it comes."""
   another_session: tuple[tuple[str, float], ...] = (
     ("damping", 0.05),
     ("friction", 0.15),

@@ -38,7 +38,7 @@ from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.media import stills
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses.matching import features
-from nerf2real.scenes.settings import preset
+from nerf2real.scenes.settings import preset, with_marker
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
 _LENS = filming.LENS.resized(1920, 1440)
@@ -242,6 +242,7 @@ def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str,
     return ground_truth.compare(result, poses[rows])
 
   used = dataclasses.replace(preset(settings.preset), marker_side=ground_truth.MARKER_SIDE)
+  used = with_marker(used, ground_truth.MARKER_AT)
   began = time.perf_counter()
   made = pipeline.make_scene(folder, settings.work / "scene", settings=used, measure=measure)
   seconds = time.perf_counter() - began

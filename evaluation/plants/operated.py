@@ -90,6 +90,8 @@ class OperatedPlant(RobotPlant):
       prefer_this_thread(acting=True)
     self._dry_run = settings.dry_run
     self._steps = 0
+    if scene.marker is not None:
+      self._say(f"Places are on the scene's map. {scene.marker.words}")
 
   def start(self, trial: Trial) -> dm_env.TimeStep:
     pose, ball = self._places(trial)

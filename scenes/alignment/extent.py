@@ -1,4 +1,5 @@
-"""Finds the scene's bounding box along the world's axes; its middle is the world's origin."""
+"""Finds the scene's bounding box along the world's axes, and the world's origin: the box's middle,
+or where it is from a marker."""
 
 from typing import NamedTuple
 
@@ -6,6 +7,7 @@ import numpy as np
 
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.alignment.overrides import Overrides
 
 _CELL = 0.1  # m: surface counts by area, not by pixels
@@ -30,8 +32,9 @@ def choose_extent(
   outliers: float,
   margin: float,
   camera_margin: float,
+  marker_at: MarkerPlace | None = None,
 ) -> Choice[Extent]:
-  """Finds the box that holds nearly all surface and all cameras, and the origin in its middle.
+  """Finds the box that holds nearly all surface and all cameras, and the origin.
 
   Args:
     evidence: Points and cameras.
@@ -42,6 +45,7 @@ def choose_extent(
     outliers: Share of surface cells outside the box, on each side.
     margin: Added around the surface [m].
     camera_margin: Room around every camera [m].
+    marker_at: Where the marker is to be in the world; None: the origin is the box's middle.
 
   Raises:
     ValueError: The box is empty.
@@ -58,6 +62,8 @@ def choose_extent(
   if override.origin is not None:
     picked = override.origin if len(override.origin) == 3 else np.append(override.origin, 0.0)
     centre = metric.apply(picked)
+  elif marker_at is not None and evidence.marker is not None:
+    centre = metric.apply(evidence.marker.corners[0].mean(0)) - [marker_at.x, marker_at.y, 0.0]
   shift = np.array([centre[0], centre[1], 0.0])
   lower, upper = lower - shift, upper - shift
   lower[2], upper[2] = 0.0, min(upper[2], max_height)

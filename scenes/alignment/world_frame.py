@@ -1,4 +1,5 @@
-"""Aligns the model with the world frame: metres, z up, floor at z = 0, walls along the axes.
+"""Aligns the model with the world frame: metres, z up, floor at z = 0, walls along the axes or the
+axes from a marker.
 
 Does automatically what the paper does by hand in Blender (section "Collision mesh extraction");
 every choice can be overridden (`scenes.alignment.overrides`). Shapes: N cameras, P points.
@@ -20,6 +21,7 @@ from nerf2real.scenes.alignment.floor import (
   choose_floor,
   refine_floor,
 )
+from nerf2real.scenes.alignment.marker_place import MarkerPlace, place_of
 from nerf2real.scenes.alignment.overrides import Overrides
 from nerf2real.scenes.alignment.scale import Scale, choose_scale
 from nerf2real.scenes.alignment.yaw import choose_yaw
@@ -35,6 +37,9 @@ class AlignSettings:
   """Of a phone held by a standing adult, if nothing gives scale."""
   camera_height: float | None = None
   """Known median height of the camera above the floor."""
+  marker_at: MarkerPlace | None = None
+  """Where the marker is to be in the world, which gives origin and axes: the same in every film of
+  the room. None: the origin is the middle of the room, the axes lie along its walls."""
   max_marker_spread: float = 0.03
   """a marker whose scale is less certain (relative) is not used."""
   margin: float = 0.15
@@ -78,9 +83,11 @@ class Alignment:
   floor_threshold: float
   """m."""
   yaw_source: str
-  """"walls", "points" or "manual"."""
+  """"walls", "points", "marker" or "manual"."""
   camera_height: float
   """Median height of the cameras above the floor [m]."""
+  marker: MarkerPlace | None = None
+  """Where a marker lies in the world: what places on the map are measured from in the room."""
   warnings: tuple[str, ...] = ()
 
   def tilt_deg(self, true_up: np.ndarray) -> float:
@@ -140,6 +147,7 @@ def align(
     override,
     upright=rotations.rotation_to_up(floor.normal),
     in_room=(heights > _ABOVE_FLOOR) & (heights < settings.max_height),
+    marker_at=settings.marker_at,
   )
 
   progress(0.7, "extent")
@@ -152,7 +160,9 @@ def align(
     outliers=settings.outliers,
     margin=settings.margin,
     camera_margin=settings.camera_margin,
+    marker_at=settings.marker_at,
   )
+  world_from_unit = similarity.Similarity(metres, rotation.value, -extent.value.origin)
   progress(1.0, "aligned")
   up = cameras_up(evidence, override)
   tilt = float(np.degrees(np.arccos(np.clip(floor.normal @ up.direction, -1, 1))))
@@ -164,7 +174,7 @@ def align(
       "wrong.",
     )
   return Alignment(
-    world_from_unit=similarity.Similarity(metres, rotation.value, -extent.value.origin),
+    world_from_unit=world_from_unit,
     extent_lower=extent.value.lower,
     extent_upper=extent.value.upper,
     scale_source=scale.source,
@@ -176,5 +186,6 @@ def align(
     floor_threshold=override.floor_threshold or settings.floor_threshold,
     yaw_source=rotation.source,
     camera_height=float(np.median(floor.heights(evidence.positions))) * metres,
+    marker=None if evidence.marker is None else place_of(evidence.marker, world_from_unit),
     warnings=warnings,
   )

@@ -4,6 +4,7 @@ import numpy as np
 
 from nerf2real.core.rotations import yaw_matrix
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.marker_place import MarkerPlace, upper_edge
 from nerf2real.scenes.alignment.overrides import Overrides
 
 # Of the unit frame's angles about z, the one that the world's x axis is nearest to. Walls lie along
@@ -59,7 +60,12 @@ def point_yaw(points: np.ndarray) -> float:
 
 
 def choose_yaw(
-  evidence: Evidence, override: Overrides, *, upright: np.ndarray, in_room: np.ndarray
+  evidence: Evidence,
+  override: Overrides,
+  *,
+  upright: np.ndarray,
+  in_room: np.ndarray,
+  marker_at: MarkerPlace | None = None,
 ) -> Choice[np.ndarray]:
   """Finds the rotation [3, 3] from the unit frame to the world's axes.
 
@@ -68,9 +74,13 @@ def choose_yaw(
     override: Values given by hand.
     upright: Rotation [3, 3] that turns the floor's normal to z.
     in_room: Which of the densest points stand on the floor, bool [P].
+    marker_at: Where the marker is to be in the world; None: along the walls.
   """
   if override.yaw_deg is not None:
     return Choice(yaw_matrix(-np.radians(override.yaw_deg)) @ upright, "manual")
+  if marker_at is not None and evidence.marker is not None:
+    turn = np.radians(marker_at.heading_deg) - upper_edge(evidence.marker, upright)
+    return Choice(yaw_matrix(turn) @ upright, "marker")
   yaw, source = None, "walls"
   if evidence.surface_normals is not None:
     yaw = wall_yaw(evidence.surface_normals[in_room] @ upright.T)

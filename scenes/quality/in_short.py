@@ -74,6 +74,8 @@ def _size(figures: Mapping[str, Any]) -> Answer | None:
   words = []
   if "scale_spread" in figures:
     words.append(f"Its sightings differ by {100 * figures['scale_spread']:.1f} % (deviation).")
+  if "marker_place" in figures:
+    words.append(figures["marker_place"])
   guessed = source == "unknown"
   if guessed:
     words.append(

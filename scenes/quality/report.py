@@ -102,6 +102,9 @@ FIGURES: Mapping[str, Meaning] = {
   "floor_height_error_m": Meaning("m", "height of the floor found against the truth", "near 0"),
   "scale_source": Meaning("", "where the metric scale comes from"),
   "scale_spread": Meaning("", "relative standard deviation of the scale", "lower"),
+  "marker_place": Meaning("", "what places on the map are measured from in the room"),
+  "map_shift_m": Meaning("m", "how far the map's origin is from the truth's", "near 0"),
+  "map_turn_deg": Meaning("deg", "how far the map is turned against the truth's", "near 0"),
   "scale_error": Meaning("", "relative error of the scale against the truth", "near 0"),
   "camera_rmse_m": Meaning(
     "m", "RMSE of the camera positions against the truth after alignment", "lower"

@@ -20,7 +20,7 @@ from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Given
 
 _OUTLOOK_VERSION = 4  # 3: markers' corners without rolling shutter; 4: tilts by the cameras' up
-_WORLD_VERSION = 5  # 3: markers are looked for before; 4: all tilts; 5: by the cameras' up
+_WORLD_VERSION = 6  # 4: all tilts; 5: by the cameras' up; 6: tells the marker's place
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 

@@ -1,5 +1,6 @@
 """Simulation, virtual robot and robot as plants of an evaluation, and what disturbs them."""
 
+import dataclasses
 import itertools
 
 import mujoco
@@ -219,6 +220,8 @@ def _nearest_trial(plant, scene):
 
 def test_robot_prompts_for_placement_and_verdict(scene):
   """The robot is a virtual one here; the plant only sees its port and asks a person."""
+  alignment = {**scene.scene["alignment"], "marker": {"x": 0.45, "y": -0.08, "heading_deg": 20.1}}
+  scene = dataclasses.replace(scene, scene={**scene.scene, "alignment": alignment})
   asked, said = [], []
   answers = iter(["", "x", "l"])
 
@@ -237,8 +240,9 @@ def test_robot_prompts_for_placement_and_verdict(scene):
     found = _nearest_trial(plant, scene)
   _, trial = plants.trials("navigation")[NEAREST]
   start = protocols.scene_starts(scene)[trial.position]
-  assert f"x = {start[0]:.2f} m" in asked[0] and "Goal 3" in said[0]
-  assert "Walk slowly around" in said[1] and "Expected one of" in said[2]
+  assert f"x = {start[0]:.2f} m" in asked[0]
+  assert "marker lies at x = 0.45 m, y = -0.08 m, its upper edge heading 20" in said[0]
+  assert "Goal 3" in said[1] and "Walk slowly around" in said[2] and "Expected one of" in said[3]
   assert len(asked) == 3 and found.outcome == "lost" and found.setting.plant == "robot"
 
 

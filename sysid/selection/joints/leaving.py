@@ -22,11 +22,11 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   """Tells whether a hypothesis leaves more than the machine does anyway.
 
   Beside a reference with the same commands only noise may remain, and what a machine differs by
-  from one session to another; beside another its blocks are the measure; without one, a multiple of
-  the readings' noise.
+  between two recordings; beside another its blocks are the measure; without one, a multiple of the
+  readings' noise.
   """
   if subject.paired:
-    return structured(subject.now, item, settings, _of_another_day(subject, item))
+    return structured(subject.now, item, settings, _of_two_recordings(subject, item))
   if subject.usual is not None:
     return grown(item, subject.usual, subject.beyond, settings)
   left, noise = np.median(item.fit.held[0][0]), np.median(subject.now.noise_squares)
@@ -45,22 +45,24 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   return leaves(subject, item, settings)
 
 
-def _of_another_day(subject: Subject, item: Scored) -> Array:
+def _of_two_recordings(subject: Subject, item: Scored) -> Array:
   """Returns the mean squares of blocks [B] by which a machine's constants, as far as they differ
-  from one session to another, move its course; 0 where the reference is of the same session.
+  between its reference and its logs, move its course.
 
-  Beside an effect it is as far as they differ within a session: it must explain the rest.
+  In one session those that wander within a recording, too: what one value for all of it explains
+  was fitted before. From one session to another all do, and beside an effect as far as within one:
+  the effect must explain the rest.
   """
   now, null = subject.now, subject.explainer.null
+  differ = dict(now.settings.repeat)
   if not subject.another_session:
-    return np.zeros(len(now.starts))
-  repeat = dict(now.settings.repeat)
-  if not item.names:
-    repeat |= dict(now.settings.another_session)
+    differ = {name: differ[name] for name in now.settings.wandering}
+  elif not item.names:
+    differ |= dict(now.settings.another_session)
   layout, own = null.fit.layout, subject.known[0]
   start, stop = layout.spans[layout.terms.index(own)]
-  sigma = layout.sigma.copy()
-  sigma[start:stop] = [repeat[name] for name in own.names]
+  sigma = layout.sigma.copy() if subject.another_session else np.full_like(layout.sigma, np.inf)
+  sigma[start:stop] = [differ.get(name, np.inf) for name in own.names]
   return repeats(now, null, sigma)
 
 
@@ -74,7 +76,7 @@ def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
 
   readings = now.noise_squares * (2.0 if subject.paired else 1.0)
   if subject.paired:
-    readings = readings + _of_another_day(subject, item)
+    readings = readings + _of_two_recordings(subject, item)
   anyway = np.array([np.median(readings), readings.mean()])
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])

@@ -11,7 +11,9 @@ from nerf2real.core import cameras, similarity
 from nerf2real.core.serialization import from_plain, to_plain
 from nerf2real.scenes.alignment import markers, overrides, world_frame, yaw
 from nerf2real.scenes.alignment.evidence import Evidence
+from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.settings import SceneSettings, with_marker
 from tests.scenes import furnished_room
 
 CAMERA = cameras.Camera.from_vertical_fov(0.9, 96, 72)
@@ -67,6 +69,41 @@ def test_marker_floor_walls_and_extent(room):
   np.testing.assert_allclose((found.extent_upper + found.extent_lower)[:2], 0, atol=1e-9)
   assert found.extent_lower[2] == 0
   assert found.camera_height == pytest.approx(1.4, abs=0.08)
+
+
+@pytest.mark.parametrize("yaw_deg", [33.0, -140.0])
+def test_a_marker_gives_the_same_frame_in_every_film(room, yaw_deg):
+  """Its centre at (0.7, -0.3) m and its upper edge at 20 degrees, in the room's own frame."""
+  transform = unit_frame(yaw_deg=yaw_deg)
+  local = 0.1 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+  turn = Rotation.from_euler("z", 20, degrees=True).as_matrix()
+  corners = transform.apply(local @ turn.T + [0.7, -0.3, 0.0])[None]
+  seen = marker(transform)._replace(corners=corners)
+
+  told = solve(room, transform, marker=seen)
+  total = told.world_from_unit @ transform
+  assert told.yaw_source == "walls" and told.marker is not None
+  np.testing.assert_allclose(told.marker[:2], total.apply([0.7, -0.3, 0.0])[:2], atol=1e-9)
+  wanted = np.radians(20) + np.arctan2(total.rotation[1, 0], total.rotation[0, 0])
+  assert np.cos(np.radians(told.marker.heading_deg) - wanted) == pytest.approx(1.0, abs=1e-6)
+
+  place = MarkerPlace(1.7, 0.2, 20.0)  # so that the room is moved by (1, 0.5) m and not turned
+  settings = world_frame.AlignSettings(marker_at=place)
+  found = solve(room, transform, marker=seen, settings=settings)
+  assert found.yaw_source == "marker"
+  np.testing.assert_allclose(found.marker, place, atol=1e-9)
+  total = found.world_from_unit @ transform
+  np.testing.assert_allclose(total.apply([0.0, 0.0, 0.0])[:2], [1.0, 0.5], atol=2e-3)
+  np.testing.assert_allclose(total.rotation, np.eye(3), atol=3e-3)
+  middle = (found.extent_upper + found.extent_lower)[:2] / 2
+  np.testing.assert_allclose(middle, [1.0, 0.5], atol=0.12)  # the room's own middle is its origin
+
+
+def test_a_markers_place_needs_its_side():
+  with pytest.raises(ValueError, match="--marker-side"):
+    with_marker(SceneSettings(), MarkerPlace(0.0, 0.0, 0.0))
+  settings = with_marker(SceneSettings(marker_side=0.2), MarkerPlace(1.0, 2.0, 30.0))
+  assert settings.align.marker_at == (1.0, 2.0, 30.0)
 
 
 @pytest.mark.parametrize("side", [4.0, 6.0])
@@ -171,7 +208,7 @@ def test_every_choice_can_be_overridden(room, tmp_path):
 
 def test_alignment_of_the_shipped_bundle_is_read():
   values = Bundle.load().scene["alignment"]
-  assert to_plain(from_plain(values, world_frame.Alignment)) == values
+  assert to_plain(from_plain(values, world_frame.Alignment)) == {"marker": None, **values}
 
 
 def test_alignment_survives_json(room):

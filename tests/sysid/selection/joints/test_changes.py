@@ -12,6 +12,7 @@ from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
+from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
@@ -19,7 +20,7 @@ from nerf2real.sysid.selection.joints import doubts, leaving, naming, remainder,
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.settings import SETTINGS
-from tests.sysid.synthetic import PENDULUM, log_of, logs_of
+from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
 
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
 
@@ -251,6 +252,34 @@ def test_a_machine_of_another_session_differs_as_its_constants_do(torque, days, 
     model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
   )
   assert found.paired and found.another_session == (days > 0)
+  assert leaving.leaves(found, found.explainer.null, SETTINGS) == more
+
+
+_FINE = COUNT / 4  # rad, of an encoder that shows a millisecond
+
+
+def _with_ticks(nominal, tick, random):
+  """A log whose commands each wait for the firmware, up to a tick [s], with a fine encoder."""
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  sent = nominal.commands
+  arrives = sent.stamp + tick * random.random(len(sent.stamp))
+  heard = dataclasses.replace(nominal, commands=dataclasses.replace(sent, stamp=arrives))
+  position = np.round(evaluation.simulate(model, heard, []) / _FINE) * _FINE
+  return dataclasses.replace(nominal, states=dataclasses.replace(nominal.states, position=position))
+
+
+@pytest.mark.parametrize(("tick", "more"), [(1e-3, False), (4e-3, True)])
+def test_a_command_waits_for_the_firmwares_tick(tick, more):
+  """Two recordings of one machine in one session, whose commands meet other ticks."""
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  random = np.random.default_rng(0)
+  sweep_and_slow = logs_of(PENDULUM)[:2]
+  logs, before = ([_with_ticks(log, tick, random) for log in sweep_and_slow] for _ in range(2))
+  reductions = tuple([Reduction(model, log) for log in some] for some in (logs, before))
+  found = subject.prepare(
+    model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
+  )
+  assert found.paired and not found.another_session
   assert leaving.leaves(found, found.explainer.null, SETTINGS) == more
 
 
