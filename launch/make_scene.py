@@ -1,6 +1,7 @@
 """Makes a scene bundle from a video or pictures of a room.
 
   python launch/make_scene.py --capture room.mp4 --out out/room --marker-side 0.2
+  python launch/make_scene.py --capture room.mp4 --out out/room --marker-side 0.2 --marker-at 0 0 0
   python launch/make_scene.py --capture builtin --out out/demo --preset demo
   python launch/make_scene.py --capture builtin --out out/demo --preset demo --viewer
   python launch/make_scene.py --capture room.mp4 --out out/room --check
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
   from nerf2real.scenes.settings import SceneSettings
   from nerf2real.scenes.stages.results import Watcher
 
+BUILT_IN = "builtin"  # the capture that is the project's own room
 FILM_AGAIN = 3  # exit status of --check
 
 
@@ -71,6 +73,7 @@ class Arguments:
 def settings_of(arguments: Arguments) -> "SceneSettings":
   """Applies the arguments to their preset."""
   from nerf2real.scenes.alignment.marker_place import MarkerPlace
+  from nerf2real.scenes.builtin import ground_truth
   from nerf2real.scenes.settings import preset, with_marker
 
   settings = preset(arguments.preset)
@@ -88,10 +91,14 @@ def settings_of(arguments: Arguments) -> "SceneSettings":
   if arguments.camera_height is not None:
     placing = dataclasses.replace(settings.align, camera_height=arguments.camera_height)
     settings = dataclasses.replace(settings, align=placing)
-  if arguments.marker_side is not None:
-    settings = dataclasses.replace(settings, marker_side=arguments.marker_side)
-  if arguments.marker_at is not None:
-    settings = with_marker(settings, MarkerPlace(*arguments.marker_at))
+  side = arguments.marker_side
+  place = None if arguments.marker_at is None else MarkerPlace(*arguments.marker_at)
+  if arguments.capture == BUILT_IN:
+    side, place = side or ground_truth.MARKER_SIDE, place or ground_truth.MARKER_AT
+  if side is not None:
+    settings = dataclasses.replace(settings, marker_side=side)
+  if place is not None:
+    settings = with_marker(settings, place)
   if arguments.baseline is not None:
     settings = dataclasses.replace(settings, baseline=arguments.baseline)
   return settings
@@ -147,16 +154,11 @@ def run(arguments: Arguments) -> int:
   from nerf2real.scenes import pipeline
   from nerf2real.scenes.alignment import overrides
   from nerf2real.scenes.builtin import ground_truth
-  from nerf2real.scenes.settings import with_marker
 
   settings = settings_of(arguments)
   source, measure = Path(arguments.capture), None
-  if arguments.capture == "builtin":
+  if arguments.capture == BUILT_IN:
     source, measure = ground_truth.VIDEO, ground_truth.measure
-    if settings.marker_side is None:
-      settings = dataclasses.replace(settings, marker_side=ground_truth.MARKER_SIDE)
-    if settings.align.marker_at is None:
-      settings = with_marker(settings, ground_truth.MARKER_AT)
   if arguments.override is not None:
     overrides.read(arguments.override)
   if arguments.check:
