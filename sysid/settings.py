@@ -83,6 +83,12 @@ class Settings:
   effect counts as seen from twice the healthy machine's error on)."""
   level: float = 0.05
   """Family-wise significance of all names together."""
+  sigmas: float = 1.96
+  """Standard deviations from a value to the ends of its 95 % interval."""
+  saturated: float = 0.98
+  """Of the largest duty or effort: what is above has met its limit."""
+  settled: float = 0.5
+  """Nats that a round of fitting gains at which it ends."""
 
 
 SETTINGS = Settings()

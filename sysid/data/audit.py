@@ -10,11 +10,11 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import JointSeries, Log
 from nerf2real.sysid.model.measured import fresh, quantum
 from nerf2real.sysid.model.motion import smooth_motion
+from nerf2real.sysid.settings import SETTINGS
 
 _GAP = 3.0  # median periods without a message that count as a gap
 _DRIFT = 200e-6  # s/s between the stamps' clock and the recorder's that is worth a warning
 _STALE = 0.02  # share of repeated readings that is worth a warning
-_AT_LIMIT = 0.98  # of the largest effort: saturated
 
 
 def audit(log: Log) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def _saturated(states: JointSeries) -> float:
     return 0.0
   size = np.abs(states.effort)
   top = size.max(axis=0)
-  return round(float(np.mean(size > _AT_LIMIT * np.maximum(top, 1e-12), axis=0).max()), 4)
+  return round(float(np.mean(size > SETTINGS.saturated * np.maximum(top, 1e-12), axis=0).max()), 4)
 
 
 def _warnings(log: Log, found: dict[str, Any]) -> list[str]:

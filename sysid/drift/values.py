@@ -28,16 +28,14 @@ from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.selection.wider import zeros
-from nerf2real.sysid.settings import Settings
+from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
-_HALF = 1.96  # standard deviations in half of a 95 % interval
 _SHARES = (0.0, 0.5, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0)
 """Of the stored size, where fits begin: chosen, from an effect that has gone to a threefold one."""
 _HELD = 1e-6  # of a value's scale: the prior of one that is held
 _ROUNDS, _ITERATIONS = 4, 6  # of fitting and setting the residual's scale in turn
-_SETTLED = 0.5  # nats that a round gains at which the fit ends
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +105,7 @@ def _value(refit: _Refit, name: str, then: dict[str, Any], beyond: float) -> Val
   widths = (
     (before[2] - before[0], value - low) if move > 0 else (before[0] - before[1], high - value)
   )
-  apart = _HALF * abs(move) / max(float(np.hypot(*widths)), 1e-300) if move else 0.0
+  apart = SETTINGS.sigmas * abs(move) / max(float(np.hypot(*widths)), 1e-300) if move else 0.0
   return Value(*words, (value, low, high), apart, "moved" if apart > beyond else "fits")
 
 
@@ -277,7 +275,7 @@ def _fitted(
     _rescale(joints, layout, fit.x)
     before = float(fitter.costs(fit.x[None])[0])
     fit = fitter.fit(fit.x, iterations=_ITERATIONS)
-    if fit.cost > before - _SETTLED:
+    if fit.cost > before - joints[0].settings.settled:
       break
   return fit
 

@@ -19,6 +19,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import typical_speed
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
 
@@ -34,7 +35,6 @@ _DRY = ("torque", "positive", "negative")  # dry friction that is added to the d
 _PLAY = {"gap": (0.85, 1.35), "stiffness": (0.4, 2.5), "damping": (0.4, 2.5)}
 """Times a value of play, the least of an interval: gears that give way take a part of the gap, and
 costs are too rough for derivatives to say how sure values are. Ours, on blind sets."""
-SIGMAS = 1.96  # standard deviations from a value to the ends of its interval
 _RESOLVED = 1e-4
 """Of a curvature scaled to 1 for each value: twins whose derivatives agree to a hundredth have
 less."""
@@ -137,7 +137,7 @@ def reaches(fit: Fit, covariance: Array, span: tuple[int, int]) -> tuple[Array, 
     span: which ones.
   """
   own = slice(*span)
-  half = SIGMAS * np.sqrt(np.maximum(np.diag(covariance)[own], 0.0))
+  half = SETTINGS.sigmas * np.sqrt(np.maximum(np.diag(covariance)[own], 0.0))
   random = np.random.default_rng(0)
   draws = random.multivariate_normal(fit.x, covariance, _DRAWS, check_valid="ignore", method="eigh")
   others = np.ones(len(fit.x), bool)
@@ -241,7 +241,7 @@ def around(
   """
   result = {}
   for name, value, less, more, lowest in zip(term.names, x, down, up, term.low, strict=True):
-    model = SIGMAS * unmodelled(term, name, value, usual=usual, relative=relative)
+    model = SETTINGS.sigmas * unmodelled(term, name, value, usual=usual, relative=relative)
     below = OWN_LATENCY if name == "delay" and own_latency else 0.0
     low = max(value - float(np.hypot(less, model)) - below, lowest)
     high = value + float(np.hypot(more, model))

@@ -30,7 +30,6 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 Array = np.ndarray
 
 _NOTHING = np.zeros(0)
-_AT_LIMIT = 0.98  # of the largest duty: saturated
 _RARE = 0.025  # share of recordings whose latency is later than what is allowed, as many earlier
 
 
@@ -244,7 +243,7 @@ class JointLikelihood:
       return np.concatenate([duty_of(self.plant, p, i, ahead=ahead) for i in logs])
 
     law = duties(ahead)
-    free = self.gain[1] ** 2 * (np.abs(law) < _AT_LIMIT * np.abs(law).max())
+    free = self.gain[1] ** 2 * (np.abs(law) < self.settings.saturated * np.abs(law).max())
     factor = float(free * law @ measured) / max(float(free * law @ law), 1e-12)
     known = self.law.gain if self.law.is_off(self.settings.duty_scale) else 1.0
     p = p.copy()

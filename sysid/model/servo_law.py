@@ -21,6 +21,7 @@ from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model.kernel import INDEX, NAMES
 from nerf2real.sysid.model.measured import Measured, quantum
 from nerf2real.sysid.model.plant import JointPlant
+from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
 
@@ -30,11 +31,7 @@ first round, a quarter of a period at 60 Hz, faster than position errors change;
 its best delay a second round goes, which a held command's plateau must not leave."""
 _BANDS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Dead bands that are tried, in steps of the position's reading."""
-_AT_LIMIT = 0.98  # of the largest duty: saturated
-_BLOCK_S = 1.0  # s that are independent of others: as `settings.block_s`
 _FEWEST = 50  # samples of a line
-_Z = 1.96
-_CLEAR = 2.8  # standard errors from which a dead band or an integral is said to be there
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +64,8 @@ class ServoLaw:
   @property
   def interval(self) -> tuple[float, float]:
     """95 % interval of the gain."""
-    return self.gain - _Z * self.gain_deviation, self.gain + _Z * self.gain_deviation
+    reach = SETTINGS.sigmas * self.gain_deviation
+    return self.gain - reach, self.gain + reach
 
   def is_off(self, tolerance: float) -> bool:
     """Tells whether the gain is off the declared one by more than a share, all of its interval.
@@ -92,7 +90,7 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
   duty = np.concatenate([log.duty for log in logs])  # type: ignore[misc]
   speed = np.concatenate([log.velocity for log in logs])
   top = float(np.abs(duty).max())
-  kept = (np.abs(duty) < _AT_LIMIT * top) & np.concatenate([log.valid for log in logs])
+  kept = (np.abs(duty) < SETTINGS.saturated * top) & np.concatenate([log.valid for log in logs])
   if kept.sum() < _FEWEST:
     return None
   log_of = np.repeat(np.arange(len(logs)), [len(log.time) for log in logs])
@@ -107,9 +105,10 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
 
   delay = _best_delay(lambda delay: line(delay)[0])
   best, band = min((line(delay, steps * step)[0], steps * step) for steps in _BANDS)
-  block = np.concatenate([np.floor(log.time / _BLOCK_S) + 1e6 * i for i, log in enumerate(logs)])
-  nothing = line(delay)[0]
-  if (nothing - best) / best * len(np.unique(block[kept])) < _CLEAR**2:  # a likelihood ratio
+  second = [np.floor(log.time / SETTINGS.block_s) + 1e6 * i for i, log in enumerate(logs)]
+  block = np.concatenate(second)
+  ratio = (line(delay)[0] - best) / best * len(np.unique(block[kept]))  # of likelihoods
+  if ratio < SETTINGS.worth**2:
     band = 0.0
   columns = line(delay, band)[1]
   beta, spread = _regressed(columns[kept], duty[kept], block[kept])
@@ -127,7 +126,7 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
   between = apart.std(axis=0, ddof=1) / np.sqrt(len(apart)) if len(apart) > 1 else np.zeros(2)
   gain_deviation, speed_deviation = np.maximum(spread[:2], between)
   left = duty - np.clip(columns[:, :2] @ beta[:2], -top, top)
-  is_clear = abs(wound[0]) > _CLEAR * wide[0]
+  is_clear = abs(wound[0]) > SETTINGS.worth * wide[0]
   law = ServoLaw(
     gain=float(beta[0]),
     gain_deviation=float(gain_deviation),

@@ -169,7 +169,7 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   zero = shared.term.kind == zeros.TILT and zeros.of_tilt(result.model, shared.x, bounds)
   if zero:
     joint, offset, (low, high) = zero
-    result.zeros[joint] = Zero(offset, (high - low) / (2 * intervals.SIGMAS))
+    result.zeros[joint] = Zero(offset, (high - low) / (2 * SETTINGS.sigmas))
     result.effects.append(claims.zero(joint, offset, (low, high), evidence))
     result.twins.append(claims.alike(shared.term, shared.x))
     return

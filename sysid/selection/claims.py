@@ -11,6 +11,7 @@ from nerf2real.sysid.hypotheses import free_force
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.joints.subject import WHOLE
+from nerf2real.sysid.settings import SETTINGS
 
 Claim = tuple[Effect, dict[str, Any]]
 """An effect and its entry in the report."""
@@ -144,7 +145,7 @@ def constants_of_all(claimed: list[dict[str, Any]]) -> dict[str, Any]:
     middle = float(np.median(values))
     scatter = 1.4826 * float(np.median(np.abs(values - middle))) / np.sqrt(len(values))
     # Of a median: 1.25 times the deviation of a mean.
-    reach = float(np.hypot(1.96 * 1.25 * scatter, 0.5 * np.median(widths)))
+    reach = float(np.hypot(SETTINGS.sigmas * 1.25 * scatter, 0.5 * np.median(widths)))
     parameters[name] = {"value": middle, "low": middle - reach, "high": middle + reach, "unit": "1"}
   return {
     "kind": "parameter_error",

@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.sensors import optical, pictures
+from nerf2real.sysid.sensors import optical, pictures, sensed
 from nerf2real.sysid.sensors.sensed import Part, row
 from nerf2real.sysid.sensors.viewpoint import View
+from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
 
@@ -34,10 +35,7 @@ _FEWEST_PIXELS = 200
 _OUTSIDE = -1e4  # level of pixels that a picture does not show
 _SHIFT = 5.0  # pixel by which poses may be wrong
 _USUAL = 0.1  # of the logarithm: lamps and daylight; ours
-_GAIN = 0.05  # nats
-_BLOCK_S = 1.0  # s
 _FLOOR = 0.02  # of the logarithm: no two pictures are closer
-_SIGMAS = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +77,7 @@ def find(
       ratio = _compared(small, n, known, seen.scale)
       if ratio is not None:
         levels.append(ratio)
-        blocks.append(1_000_000 * number + int(small.time[n] / _BLOCK_S))
+        blocks.append(1_000_000 * number + int(small.time[n] / SETTINGS.block_s))
   if len(levels) < _FEWEST:
     note = (
       "The reference logs' pictures do not show what the logs' show: the camera's gain is unknown."
@@ -92,13 +90,13 @@ def _judge(levels: Array, block: Array, camera: str) -> Part:
   """Returns what logarithms of ratios [M] in blocks [M] say."""
   means = np.array([levels[block == b].mean() for b in range(block.max() + 1)])
   value = float(np.median(means)) if len(means) > 2 else float(means.mean())
-  half = _SIGMAS * max(float(means.std()), _FLOOR) / np.sqrt(max(len(means) - 1, 1))
+  half = sensed.SIGMAS * max(float(means.std()), _FLOOR) / np.sqrt(max(len(means) - 1, 1))
   odd = np.arange(len(means)) % 2 == 1
   left = means - np.where(odd, means[~odd].mean(), means[odd].mean() if odd.any() else value)
   before, after = (float(np.sqrt(np.mean(e**2) + _FLOOR**2)) for e in (means, left))
   part = Part(before=before, after=before)
   gain = float(np.log(before / after))
-  if gain > _GAIN and (value - half > _USUAL or value + half < -_USUAL):
+  if gain > sensed.GAIN and (value - half > _USUAL or value + half < -_USUAL):
     values = {
       "gain": (float(np.exp(value)), float(np.exp(value - half)), float(np.exp(value + half)))
     }

@@ -25,7 +25,7 @@ import numpy as np
 
 from nerf2real.core import least_squares
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.sensors import standing
+from nerf2real.sysid.sensors import sensed, standing
 from nerf2real.sysid.sensors.sensed import Estimate, Part, row
 from nerf2real.sysid.sensors.stops import Stood, Stops, find_stops, join_stops, known_stops
 
@@ -37,9 +37,7 @@ _ROUGH = (
   0.01  # rad that stops may differ by from the rule: else it was held, or stepped on something
 )
 _FEWEST = 3  # headings
-_GAIN = 0.05  # nats
 _GRAVITY = 9.81  # m/s^2
-_SIGMAS = 3.0
 _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
@@ -143,7 +141,7 @@ def _judge(stops: Stops, plane: str) -> Part:
     x, covariance = _fit(stops, True, every)
     left = stops.tilt - _design(stops) @ x
     noise = np.sqrt(_NOISE**2 + np.sum(left**2) / max(2 * count - 4, 1))
-    half = _SIGMAS * noise * least_squares.standard_deviations(covariance)[:2]
+    half = sensed.SIGMAS * noise * least_squares.standard_deviations(covariance)[:2]
     gain = _left_out(stops, False) - _left_out(stops, True)
     well = np.linalg.norm(x[:2]) - half.max() > _USUAL and half.max() < np.linalg.norm(x[:2])
     told = np.linalg.matrix_rank(_design(stops).reshape(-1, 4), tol=0.3) == 4
@@ -152,7 +150,7 @@ def _judge(stops: Stops, plane: str) -> Part:
         ("floor_slope", axis): Estimate(*values, _USUAL)
         for axis, values in _about_axes(x[:2], half).items()
       }
-    if well and told and gain > _GAIN and np.sqrt(np.mean(left**2)) < _ROUGH:
+    if well and told and gain > sensed.GAIN and np.sqrt(np.mean(left**2)) < _ROUGH:
       part.rows.append(_row(plane, x[:2], half, gain))
       part.after = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
       mean, size = x[2:], float(np.linalg.norm(x[2:]))
@@ -160,7 +158,7 @@ def _judge(stops: Stops, plane: str) -> Part:
       return part
   if size > _USUAL and not part.rows:
     spread = stops.tilt.std(axis=0) if count > 1 else np.zeros(2)
-    half = _SIGMAS * np.hypot(_NOISE, spread)
+    half = sensed.SIGMAS * np.hypot(_NOISE, spread)
     part.alternatives.append(_row(plane, mean, half, 0.0))
   if size > _USUAL:
     part.alternatives += _of_imu(stops.sensor, mean)
@@ -189,8 +187,8 @@ def _of_imu(sensor: Array, normal: Array) -> list[dict[str, Any]]:
   bias = sensor.T @ [-_GRAVITY * normal[0], -_GRAVITY * normal[1], 0.0]
   rows = []
   for kind, prefix, vector, half in (
-    ("imu_tilt", "", tilt, _SIGMAS * _NOISE),
-    ("imu_bias", "accelerometer_", bias, _SIGMAS * _NOISE * _GRAVITY),
+    ("imu_tilt", "", tilt, sensed.SIGMAS * _NOISE),
+    ("imu_bias", "accelerometer_", bias, sensed.SIGMAS * _NOISE * _GRAVITY),
   ):
     values = {
       f"{prefix}{axis}": (float(v), float(v - half), float(v + half))

@@ -24,7 +24,9 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model.motion import smooth_motion
+from nerf2real.sysid.sensors import sensed
 from nerf2real.sysid.sensors.sensed import Estimate, Estimates, Part
+from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
 
@@ -49,15 +51,10 @@ _USUAL = {
 }
 """rad, 1, 1, rad/s, m/s^2, s; ours: what a data sheet, soldering and the zeros of encoders allow,
 and a chip's low-pass (5.9 ms at 41 Hz, MPU-9250) with a bus cycle."""
-_GAIN = 0.05  # nats on held-out seconds that a kind must gain
 _LATEST = 0.1  # s
-_BLOCK_S = 1.0  # s
 _FEWEST = 200  # readings
-_STEPS = 6  # of Gauss-Newton
 _MOVE = 1e-4  # of finite differences
-_SOFT = 3.0  # noise units beyond which residuals count less
 _MOST = 600  # readings of a log that are looked at
-_SIGMAS = 3.0  # an interval's half width in standard deviations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,14 +87,14 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Part | None:
   for name in names:
     values, sure = _claimed(name, names, fitted, bounds)
     gain = without[name] - full
-    if sure and gain > _GAIN:
+    if sure and gain > sensed.GAIN:
       row = _row(name, values, bounds[name], where, gain, bare - full)
       known = rows.setdefault(row["kind"], row)
       known["parameters"] |= row["parameters"]
   alternatives = []
-  for name in names if not rows and bare - full > _GAIN else ():
+  for name in names if not rows and bare - full > sensed.GAIN else ():
     alone, x = _score(parts, noise, (name,))
-    if alone - full < _GAIN:  # explains as much by itself as all together
+    if alone - full < sensed.GAIN:  # explains as much by itself as all together
       own = _intervals(parts, noise, (name,), x)
       values, sure = _claimed(name, (name,), x, own)
       if sure:
@@ -236,10 +233,10 @@ def _fit(
 ) -> Array:
   """Returns the values [n] that explain the chosen readings best: Gauss-Newton, robust."""
   x = start.copy()
-  for _ in range(_STEPS if len(x) else 0):
+  for _ in range(sensed.STEPS if len(x) else 0):
     base = _residuals(parts, noise, kinds, x)[chosen]
     jacobian = _jacobian(parts, noise, kinds, x)[:, chosen]
-    weight = least_squares.cauchy_weights(base, _SOFT)
+    weight = least_squares.cauchy_weights(base, sensed.SOFT)
     x = x - least_squares.gauss_newton_step(jacobian * weight, base * weight, rcond=1e-9)
     if "imu_lag" in kinds:
       place = sum(len(_LAYOUT[k]) for k in kinds[: kinds.index("imu_lag")])
@@ -267,7 +264,7 @@ def _blocks(parts: Sequence[_Readings]) -> Array:
   """Returns the number of the second, counted over all logs, that a reading is in [all N]."""
   labels, first = [], 0
   for p in parts:
-    block = np.floor((p.stamp - p.stamp[0]) / _BLOCK_S).astype(int) + first
+    block = np.floor((p.stamp - p.stamp[0]) / SETTINGS.block_s).astype(int) + first
     first = int(block.max()) + 1
     labels.append(block)
   return np.concatenate(labels)
@@ -297,7 +294,7 @@ def _intervals(
   found = least_squares.block_covariance(
     _jacobian(parts, noise, kinds, x), base, _blocks(parts), rcond=1e-9
   )
-  spread = _SIGMAS * least_squares.standard_deviations(found)
+  spread = sensed.SIGMAS * least_squares.standard_deviations(found)
   low, high = _unpack(kinds, x - spread), _unpack(kinds, x + spread)
   return {
     k: {n: (float(low[k][i]), float(high[k][i])) for i, n in enumerate(_LAYOUT[k])} for k in kinds

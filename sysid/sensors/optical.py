@@ -24,10 +24,11 @@ from scipy.spatial.transform import Rotation
 from nerf2real.core import least_squares
 from nerf2real.core.cameras import Camera
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.sensors import pictures, tracks, viewpoint
+from nerf2real.sysid.sensors import pictures, sensed, tracks, viewpoint
 from nerf2real.sysid.sensors.sensed import Estimate, Part, row
 from nerf2real.sysid.sensors.tracks import Tracks
 from nerf2real.sysid.sensors.viewpoint import View
+from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
 
@@ -38,17 +39,12 @@ _NOMINAL = {"camera_latency": 0.0, "camera_focal": 1.0}
 _STAMPS = 0.002  # s by which the joints' own stamps are off, as a bus cycle takes that; ours
 _MOUNT = 0.05  # rad, standard deviation of a mount's rotation; ours
 _NEARNESS = (0.5, 0.5)  # 1/m, mean and standard deviation of rho: a room, or the open; ours
-_GAIN = 0.05  # nats on held-out seconds that a kind must gain
 _LATEST = (-0.1, 0.4)  # s
-_BLOCK_S = 1.0  # s
-_STEPS = 6  # of Gauss-Newton
 _MOVES = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-2])  # of finite differences
-_SOFT = 3.0  # noise units beyond which residuals count less
 _FLOOR = 0.05  # pixel: nobody tracks better
 _MOST = 6000  # tracks that are looked at, of all logs
 _FEWEST = 30  # pairs of pictures, of all logs
 _TURN = 0.03  # rad that a camera must turn in some log
-_SIGMAS = 3.0  # an interval's half width in standard deviations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +157,7 @@ class _Problem:
     )
     blocks, first = [], 0
     for s in self.scenes:
-      own = np.floor((s.tracks.first - s.tracks.first[0]) / _BLOCK_S).astype(int)
+      own = np.floor((s.tracks.first - s.tracks.first[0]) / SETTINGS.block_s).astype(int)
       blocks.append(own + first)
       first += int(own.max()) + 1
     self.block = np.concatenate(blocks)[self.pair]
@@ -183,9 +179,9 @@ class _Problem:
     """Returns weights [N, 1]: robust, tracks of a pair count as one, all in units of noise."""
     alike = np.sqrt(len(self.pair) / (self.pair[-1] + 1))
     size = np.linalg.norm(base, axis=1, keepdims=True) / self.noise
-    return least_squares.cauchy_weights(size, _SOFT) / (self.noise * alike)
+    return least_squares.cauchy_weights(size, sensed.SOFT) / (self.noise * alike)
 
-  def fit(self, free: Array, start: Array, chosen: Array, steps: int = _STEPS) -> Array:
+  def fit(self, free: Array, start: Array, chosen: Array, steps: int = sensed.STEPS) -> Array:
     """Returns the values that explain the chosen tracks best."""
     x = start.copy()
     for _ in range(steps):
@@ -290,13 +286,13 @@ def _judge(problem: _Problem, camera: str) -> tuple[Part, float]:
     rest = tuple(n for n in names if n != kind)
     gain = problem.score(rest)[0] - full
     value, low, high = _value(kind, fitted, spread)
-    if gain > _GAIN and _sure(kind, low, high):
+    if gain > sensed.GAIN and _sure(kind, low, high):
       part.rows.append(row(kind, camera, {KINDS[kind]: (value, low, high)}, gain, bare - full))
-  if not part.rows and bare - full > _GAIN:
+  if not part.rows and bare - full > sensed.GAIN:
     for kind in names:
       alone, x = problem.score((kind,))
       value, low, high = _value(kind, x, problem.spread((kind,), x))
-      if alone - full < _GAIN and _sure(kind, low, high):
+      if alone - full < sensed.GAIN and _sure(kind, low, high):
         found = row(kind, camera, {KINDS[kind]: (value, low, high)}, bare - alone, bare - full)
         part.alternatives.append(found)
   _, low, high = _value("camera_latency", fitted, spread)
@@ -313,7 +309,7 @@ def _judge(problem: _Problem, camera: str) -> tuple[Part, float]:
 def _value(kind: str, x: Array, spread: Array) -> tuple[float, float, float]:
   """Returns a kind's value with its interval."""
   index = list(KINDS).index(kind)
-  reach = _SIGMAS * spread[index]
+  reach = sensed.SIGMAS * spread[index]
   if kind == "camera_latency":
     reach = np.hypot(reach, _STAMPS)
   ends: list[Any] = [x[index] + s * reach for s in (0, -1, 1)]

@@ -8,6 +8,15 @@ import numpy as np
 
 from nerf2real.suite.effects import Effect, kind_of
 
+GAIN = 0.05
+"""Nats on held-out seconds that a kind must gain."""
+SIGMAS = 3.0
+"""Half width of an interval in standard deviations: all of it must be beyond what is usual."""
+SOFT = 3.0
+"""Noise units beyond which residuals count less."""
+STEPS = 6
+"""Of Gauss-Newton."""
+
 
 class Estimate(NamedTuple):
   """A parameter as it was estimated."""

@@ -164,7 +164,7 @@ def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
     low, high = bounds[name]
     if name not in _SCATTER:
       return bool(low > tolerance[name] or high < -tolerance[name])
-    sure = (high - low) / (2 * intervals.SIGMAS)
+    sure = (high - low) / (2 * settings.sigmas)
     return bool(abs(values[name]) > subject.beyond * np.hypot(tolerance[name], sure))
 
   return any(off(name) for name in term.names if name not in (*CLOCKS, "zero"))

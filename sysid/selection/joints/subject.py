@@ -203,7 +203,7 @@ def _apart(now: JointLikelihood, before: JointLikelihood) -> bool:
 def _ahead(law: ServoLaw, settings: Settings) -> tuple[float, float]:
   """Returns the interval of what positions are ahead of duties in another recording than the law's:
   by the law's own deviation, and by what readings differ between two recordings."""
-  reach = 1.96 * float(np.hypot(law.ahead_deviation, dict(settings.repeat)["skew"]))
+  reach = settings.sigmas * float(np.hypot(law.ahead_deviation, dict(settings.repeat)["skew"]))
   return law.ahead - reach, law.ahead + reach
 
 

@@ -17,7 +17,6 @@ Array = np.ndarray
 
 _LOOKS = 2  # rounds of fitting constants in which other latencies are looked at
 _SCREENED = 2  # times as many kinds as are fitted to the end take a second step
-_SETTLED = 0.5  # nats that a fit under a new scale gains at which both have settled
 _OF_KNOWN = (1.0, 0.5, 1.5, 3.0)  # times its size in a reference, where an effect's search starts
 
 
@@ -244,7 +243,7 @@ class Explainer:
       best = self.score(
         best.terms, rough.look_about(fitter, fitter.fit(best.fit, iterations=4), ("delay",))
       )
-      if best.fit.cost > before - _SETTLED:
+      if best.fit.cost > before - self.settings.settled:
         break
     if self.joint.follows and best.names & set(UNREPEATED):
       fitter = Fitter([self.joint], Layout([best.terms]))

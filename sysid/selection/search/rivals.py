@@ -16,7 +16,6 @@ from nerf2real.sysid.selection.search.explain import Explainer
 
 _PUSH = 0.2  # step of finite differences of a free force, of its values' deviations
 _ITERATIONS = 10  # of its fit
-_SETTLED = 0.5  # nats that a fit must be better by to be fitted on
 
 
 def lacking(explainer: Explainer, item: Scored, kind: str) -> Scored:
@@ -104,7 +103,8 @@ def neutralise(explainer: Explainer, item: Scored) -> None:
     if terms not in scored or explainer.cost(scored[terms]) > fit.cost:
       explainer.score(terms, fit, neutral=before is None)
     plain = scored.get(tuple(t for t in item.terms if t is not term))
-    if plain is not None and before is None and fit.cost < explainer.cost(plain) - _SETTLED:
+    enough = explainer.settings.settled
+    if plain is not None and before is None and fit.cost < explainer.cost(plain) - enough:
       again = Fitter([explainer.joint], Layout([plain.terms])).fit(fit.x, iterations=4)
       if again.cost < explainer.cost(plain):
         explainer.score(plain.terms, again)
