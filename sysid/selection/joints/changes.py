@@ -37,11 +37,13 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   One with play is explained by a simulation that follows the readings.
 
   A course through play does not repeat, so that no model of it is near a whole log; what it
-  predicts from each reading on is judged where play is in the best hypothesis of whole logs.
+  predicts from each reading on is judged where play is in the best hypothesis of whole logs, or in
+  the likeliest, which is seldom clear of the others there.
   """
   whole = _explained(subject, settings)
   done = subject.now.follows or whole.verdict in ("none", "effects")
-  if done or not whole.found.best.names & set(UNREPEATED):
+  likely = max((s for s in whole.ranked if not s.neutral), key=lambda s: s.evidence)
+  if done or not (whole.found.best.names | likely.names) & set(UNREPEATED):
     return whole
   near = _explained(following(subject), settings)
   stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)

@@ -1,5 +1,7 @@
 """Play in a gear: a course that does not repeat is judged by a state that follows the readings."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.selection.analysis import analyse
+from nerf2real.sysid.selection.joints import changes
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
 
 _PLAY = {"gap": 0.03, "stiffness": 800.0, "damping": 0.3, "encoder_on_motor": 0.0}
@@ -68,3 +71,27 @@ def test_what_is_no_play_is_not_judged_by_following() -> None:
   found = analyse(model, logs_of(PENDULUM, [late], duration=6.0))
   assert not found.joints[0].likelihood.follows
   assert [row["kind"] for row in found.effects] == ["command_delay"]
+
+
+@pytest.mark.parametrize(
+  ("likeliest", "named", "stands"),
+  [
+    ({"backlash"}, ("backlash",), True),
+    ({"cogging"}, ("backlash",), False),  # nothing speaks of play
+    ({"backlash"}, ("cogging",), False),  # the play is not what is named
+  ],
+)
+def test_play_that_is_likeliest_but_not_clear_is_judged_from_each_reading_on(
+  monkeypatch, likeliest, named, stands
+) -> None:
+  nothing = SimpleNamespace(names=frozenset(), neutral=False, evidence=-9.0)
+  best = SimpleNamespace(names=frozenset(likeliest), neutral=False, evidence=-1.0)
+  whole = SimpleNamespace(
+    verdict="unexplained", ranked=[best, nothing], found=SimpleNamespace(best=nothing)
+  )
+  near = SimpleNamespace(verdict="effects", named=named)
+  subject = SimpleNamespace(now=SimpleNamespace(follows=False))
+  again = SimpleNamespace(now=SimpleNamespace(follows=True))
+  monkeypatch.setattr(changes, "following", lambda _: again)
+  monkeypatch.setattr(changes, "_explained", lambda of, _: near if of is again else whole)
+  assert changes.explain(subject) is (near if stands else whole)
