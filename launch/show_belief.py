@@ -42,14 +42,13 @@ def run(arguments: Arguments) -> None:
   import numpy as np
 
   from nerf2real.core.files import write_atomically
-  from nerf2real.evaluation.policies.names import SHIPPED, shipped_folder
+  from nerf2real.evaluation.policies.names import policy_folder
   from nerf2real.evaluation.report.belief_pictures import draw_episode
 
   if not cv2.haveImageWriter(str(arguments.out)):
     raise ValueError(f"{arguments.out} is no name of a picture: expected one such as belief.png.")
-  shipped = arguments.policy == SHIPPED
   drawn = draw_episode(
-    shipped_folder("nerf_nav") if shipped else Path(arguments.policy),
+    policy_folder(arguments.policy, task="nerf_nav"),
     environment=arguments.env,
     seed=arguments.seed,
     moments=arguments.moments,

@@ -12,17 +12,22 @@ WALKERS = (WALKER, "gait")  # the second is its name in records
 _IN_A_RUN = ("policy/best", "policy/newest")
 
 
-def shipped_folder(task: str) -> Path:
-  """Returns where the policy of a task is shipped, whether there is one or not."""
-  return Path(agents.__path__[0]) / "policies" / task
+def shipped_folder(task: str, variant: str = "") -> Path:
+  """Returns where a policy of a task is shipped, whether there is one or not.
+
+  Args:
+    task: The task.
+    variant: Of its policies: "" for its first, "60x80" for one of such pictures.
+  """
+  return Path(agents.__path__[0]) / "policies" / (f"{task}_{variant}" if variant else task)
 
 
 def policy_folder(name: str, *, task: str) -> Path:
   """Returns the folder of an exported policy.
 
   Args:
-    name: "shipped", a run's folder (its best policy, or else its newest one is taken), or an
-      exported policy's folder.
+    name: "shipped", "shipped_60x80", a run's folder (its best policy, or else its newest one is
+      taken), or an exported policy's folder.
     task: The task that it is to act in.
 
   Raises:
@@ -39,11 +44,12 @@ def policy_folder(name: str, *, task: str) -> Path:
 
 
 def _find(name: str, *, task: str) -> Path:
-  if name == SHIPPED:
-    folder = shipped_folder(task)
+  shipped, _, variant = name.partition("_")
+  if shipped == SHIPPED:
+    folder = shipped_folder(task, variant)
     if not (folder / RECORD).is_file():
       raise ValueError(
-        f"No policy for {task} is shipped with this version (expected one in {folder}): use "
+        f"No policy {name} for {task} comes with this version (expected one in {folder}): use "
         f"--policy {WALKER}, or the folder of a run."
       )
     return folder

@@ -40,10 +40,12 @@ def test_folders_of_runs_and_policies(tmp_path):
 
 def test_shipped_policy_is_found_where_it_is_dropped(tmp_path, monkeypatch):
   monkeypatch.setattr(policy_names.agents, "__path__", [str(tmp_path)])
-  with pytest.raises(ValueError, match="No policy for nerf_nav is shipped .* --policy walker"):
+  with pytest.raises(ValueError, match="No policy shipped for nerf_nav .* --policy walker"):
     policy_names.policy_folder("shipped", task="nerf_nav")
   folder = _put(tmp_path / "policies" / "nerf_nav")
   assert policy_names.policy_folder("shipped", task="nerf_nav") == folder
+  larger = _put(tmp_path / "policies" / "nerf_nav_60x80")
+  assert policy_names.policy_folder("shipped_60x80", task="nerf_nav") == larger
 
 
 @pytest.mark.parametrize("name", ["walker", "gait"])
