@@ -23,7 +23,7 @@ class Arguments:
   """Draws where a policy expects to be, over an episode."""
 
   policy: Annotated[str, tyro.conf.Positional]
-  """Folder of an exported policy, or "shipped": that of navigation."""
+  """Folder of an exported policy, "shipped" or "shipped_60x80": those of navigation."""
   env: str | None = None
   """Another environment than the one that it was trained on."""
   seed: int = 0
@@ -42,13 +42,14 @@ def run(arguments: Arguments) -> None:
   import numpy as np
 
   from nerf2real.core.files import write_atomically
-  from nerf2real.evaluation.policies.names import policy_folder
+  from nerf2real.evaluation.policies.names import SHIPPED, policy_folder
   from nerf2real.evaluation.report.belief_pictures import draw_episode
 
   if not cv2.haveImageWriter(str(arguments.out)):
     raise ValueError(f"{arguments.out} is no name of a picture: expected one such as belief.png.")
+  name = arguments.policy
   drawn = draw_episode(
-    policy_folder(arguments.policy, task="nerf_nav"),
+    policy_folder(name, task="nerf_nav") if name.startswith(SHIPPED) else Path(name),
     environment=arguments.env,
     seed=arguments.seed,
     moments=arguments.moments,
