@@ -20,6 +20,8 @@ class Settings:
   """Of the torque's deviation: efforts near larger jumps do not count for their scale."""
   effort_scale: float = 2.0
   """Share that a measured effort may be off: torque constants are guesses."""
+  effort_repeats: float = 0.03
+  """Share by which it differs between two recordings: 15 K change a magnet by 2 to 3 %."""
   duty_scale: float = 0.03
   """Share that full duty may be off the model's torque limit: both are of one data sheet."""
   tolerances: tuple[tuple[str, float], ...] = (
@@ -34,12 +36,14 @@ class Settings:
   )
   """Standard deviations of nominal constants: shares, rad (m), s."""
   servo: float = 0.2
-  """Of gain and damping where a reference shows the machine: a model guesses servos, not masses."""
+  """Of gain, limit, damping and armature where a reference shows the machine: a model guesses
+  servos, not masses."""
   repeat: tuple[tuple[str, float], ...] = (
     ("damping", 0.015),
     ("armature", 0.01),
     ("friction", 0.05),
     ("gain", 0.005),
+    ("limit", 0.005),
     ("mass", 0.005),
     ("zero", 0.0007),
     ("skew", 0.0003),
@@ -53,6 +57,7 @@ class Settings:
     ("damping", 0.05),
     ("friction", 0.15),
     ("gain", 0.015),
+    ("limit", 0.015),
     ("latency", 0.0005),
   )
   """Those that differ by more from one session to another, chosen: 3 K change a grease's viscosity

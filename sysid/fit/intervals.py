@@ -169,7 +169,9 @@ def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float
   """Returns the covariance [n, n] of a fit's values, by the gradient's scatter over blocks.
 
   H^-1 (sum over blocks of g g') H^-1, which holds where residuals go together (White 1980, in
-  blocks as Liang and Zeger 1986); blocks of different joints at the same time are added.
+  blocks as Liang and Zeger 1986); blocks of different joints at the same time are added. Means of
+  priors that a reference has left open are as any other reading: their scatter counts, by what they
+  pull.
 
   Args:
     fit: at its mode.
@@ -183,7 +185,8 @@ def covariance(fit: Fit, joints: Sequence[JointLikelihood], *, systematic: float
     weighted = 2.0 * joint.weights(joint.squares(residual)) * residual * jacobian
     scores[:, index] += np.add.reduceat(weighted, joint.starts, axis=-1).sum(axis=1).T
   inverse = np.linalg.pinv(fit.precision, rcond=1e-12)
-  prior = np.diag(fit.layout.sigma**-2.0)
+  pull = fit.layout.sigma**-2.0
+  prior = np.diag(pull) + pull * fit.layout.open * pull[:, None]
   return inverse @ (systematic**2 * scores.T @ scores + prior) @ inverse
 
 

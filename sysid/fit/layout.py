@@ -41,6 +41,10 @@ class Layout:
     self.scale = join(lambda t: t.scale)
     self.sigma = join(lambda t: t.prior or (np.inf,) * len(t.names))
     self.centre = join(lambda t: t.centre or (0.0,) * len(t.names))
+    self.open = np.zeros((at, at))
+    for term, (a, b) in zip(self.terms, spans, strict=True):
+      if term.open:
+        self.open[a:b, a:b] = term.open
     self.is_clock = np.array([n in CLOCKS for t in self.terms for n in t.names], bool)
     self.is_effect = join(lambda t: (t.freed or t.kind != CONSTANTS,) * len(t.names)).astype(bool)
 

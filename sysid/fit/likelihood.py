@@ -67,6 +67,8 @@ class JointLikelihood:
     missed = np.concatenate([plant.reduction_error(i) for i in range(len(logs))])
     unsure = np.hypot(self.stamp_noise * self.speed, missed) / self.position_noise
     self.gain = np.array([self.mask / np.sqrt(1.0 + unsure**2), self.mask][: len(self.channels)])
+    self.effort_unit: float | None = None
+    """Effort over torque in a reference: a sensor's unit stays. None where none shows it."""
     self._cut()
     self.expectation: Expectation | None = None
     self.scale = np.maximum(self.floor, 1e-12)
@@ -160,7 +162,8 @@ class JointLikelihood:
       if self.law is not None:
         channels.append(self._duties(compose(self.plant, terms, x).p))
       elif self.effort is not None:
-        channels.append(self._efforts([along for _, along in outputs]))
+        gain = float(compose(self.plant, terms, x).p[INDEX["gain"]])
+        channels.append(self._efforts([along for _, along in outputs], gain))
       rows.append(channels)
     result = np.nan_to_num(np.array(rows), nan=1e3, posinf=1e3, neginf=-1e3)
     if self.expectation is not None:
@@ -256,23 +259,54 @@ class JointLikelihood:
       law = duties(ahead + float(np.clip(by, -reach, reach)))
     return measured - law
 
-  def _efforts(self, along: Sequence[Simulated | None]) -> Array:
+  def effort_factor(self, terms: Sequence[Term], x: Array) -> float | None:
+    """Returns measured effort over a hypothesis' torque; None where efforts are not compared with
+    torques."""
+    if self.effort is None or self.law is not None or self.follows:
+      return None
+    (outputs,) = self.simulate(terms, x[None])
+    return self._softened([along for _, along in outputs])[2]
+
+  def _efforts(self, along: Sequence[Simulated | None], gain: float) -> Array:
+    """Returns measured effort minus simulated torque [N], in the readings' unit: without a
+    reference all torques larger by one factor leave the same.
+
+    Args:
+      along: runs along the readings.
+      gain: of the motor, which a current may tell (a worn brush) or not (a weak magnet).
+    """
     assert self.effort is not None
-    measured = np.concatenate(self.effort)
-    torque = np.concatenate([a.torque for a in along])  # type: ignore[union-attr]
-    jump = np.concatenate([a.jump for a in along])  # type: ignore[union-attr]
-    soft = 1.0 / np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2) * self.mask
-    left = soft * (measured - self._factor(soft * measured, soft * torque) * torque)
+    soft, torque, factor = self._softened(along, gain)
+    left = soft * (np.concatenate(self.effort) - factor * torque)
     # A current's torque lacks what the back-EMF takes.
     speed = soft * self.speed
     return left - float(left @ speed) / (float(speed @ speed) + 1e-12) * speed
 
-  def _factor(self, measured: Array, torque: Array) -> float:
-    """Returns measured over simulated effort, within what torque constants leave open."""
-    both = np.array([torque, self.speed * self.mask])
+  def _softened(
+    self, along: Sequence[Simulated | None], gain: float = 1.0
+  ) -> tuple[Array, Array, float]:
+    """Returns weights of samples [N], less where torque jumps, simulated torque [N] and measured
+    effort over it."""
+    assert self.effort is not None
+    measured = np.concatenate(self.effort)
+    torque = np.concatenate([a.torque for a in along])  # type: ignore[union-attr]
+    jump = np.concatenate([a.jump for a in along])  # type: ignore[union-attr]
+    jump = jump * self._factor(measured, torque, self.mask, gain)
+    soft = 1.0 / np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2) * self.mask
+    return soft, torque, self._factor(measured, torque, soft, gain)
+
+  def _factor(self, measured: Array, torque: Array, weights: Array, gain: float) -> float:
+    """Returns measured over simulated effort, within what torque constants leave open, or what it
+    was in a reference."""
+    measured, both = weights * measured, weights * np.array([torque, self.speed])
     scale = float(np.linalg.lstsq(both @ both.T, both @ measured, rcond=None)[0][0])
+    units: tuple[float, ...] = (1.0,)
     spread = self.settings.effort_scale
-    return float(np.clip(scale, 1.0 / (1.0 + spread), 1.0 + spread))
+    if self.effort_unit is not None:
+      units = (self.effort_unit, self.effort_unit / gain)
+      spread = self.settings.effort_repeats
+    near = [float(np.clip(scale, u / (1.0 + spread), u * (1.0 + spread))) for u in units]
+    return min(near, key=lambda factor: abs(factor - scale))
 
   def squares(self, residuals: Array) -> Array:
     """Returns mean squares of blocks [..., C, B]."""

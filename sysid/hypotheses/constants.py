@@ -22,7 +22,7 @@ _USUAL = 2.0
 them, what is later is a late command or reading, not a constant."""
 
 
-_SCALES = ("damping", "armature", "gain", "mass")
+_SCALES = ("damping", "armature", "gain", "limit", "mass")
 _FAR = 0.6  # share that a healthy machine's may be off; chosen
 
 
@@ -36,13 +36,14 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
   """
   p, tolerance = plant.declared, dict(settings.tolerances)
   if healthy:
-    tolerance |= {name: settings.servo for name in ("gain", "damping")}
+    tolerance |= {name: settings.servo for name in ("gain", "limit", "damping", "armature")}
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
   present = {
     "damping": p[INDEX["damping"]] > 0,
     "armature": p[INDEX["armature"]] > 0.1 * inertia,
     "friction": p[INDEX["friction"]] > 0,
     "gain": True,
+    "limit": healthy and plant.law is None and bool(np.isfinite(p[INDEX["highest"]])),
     "mass": True,
     "zero": plant.holds,
     "skew": True,

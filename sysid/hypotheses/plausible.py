@@ -27,11 +27,11 @@ def plausible(term: Term, plant: JointPlant) -> Term:
   """Returns a term of a hinge whose bounds lie within the registry's ranges.
 
   A machine with more torque than such a servo rubs, springs and carries more: ranges of torques, of
-  masses and of what is torque per something grow with it.
+  masses and of what is torque per something grow with it; one with less may be limited to less.
   """
   limit = plant.declared[INDEX["highest"]]
   torque = max(strongest(plant), limit if np.isfinite(limit) else 0.0)
-  larger = max(1.0, torque / _SERVO)
+  larger, smaller = max(1.0, torque / _SERVO), min(1.0, torque / _SERVO)
   low, high = list(term.low), list(term.high)
   for at, name in enumerate(term.names):
     if name in _CYCLIC or name not in {p.name for p in kind_of(term.kind).parameters}:
@@ -39,7 +39,7 @@ def plausible(term: Term, plant: JointPlant) -> Term:
     parameter = kind_of(term.kind).parameter(name)
     lowest, highest = ends(parameter)
     if parameter.unit.startswith(("N m", "kg")):
-      highest *= larger
+      lowest, highest = lowest * smaller, highest * larger
     low[at], high[at] = max(low[at], lowest), min(high[at], highest)
     high[at] = max(high[at], low[at])
   starts = dict.fromkeys(tuple(map(float, np.clip(s, low, high))) for s in term.starts)

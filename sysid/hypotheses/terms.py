@@ -54,6 +54,9 @@ class Term:
   """Whether constants may differ from those that reference logs show."""
   choices: float = 1.0
   """How many effects of this kind that predict different motions its starts were chosen from."""
+  open: tuple[tuple[float, ...], ...] = ()
+  """Covariance of the prior's means, by the fit to reference logs that they are of; empty where
+  they are known. A fit holds to them all the same: values that it finds are as open."""
 
   @property
   def name(self) -> str | None:
@@ -86,6 +89,7 @@ class Term:
       starts=((),),
       prior=(),
       centre=(),
+      open=(),
       choices=1.0,
       fixed=(*self.fixed, *values),
     )
@@ -106,6 +110,11 @@ class Term:
     if self.kind == "calibration":
       factors = {n: 1.0 + values[n] for n in self.names if n not in ("skew", "latency", "zero")}
       bounds = {n: (1.0 + a, 1.0 + b) for n, (a, b) in (intervals or {}).items() if n in factors}
+      if "limit" in factors:
+        stronger = factors.get("gain", 1.0)
+        factors["limit"] *= stronger
+        if "limit" in bounds:
+          bounds["limit"] = (stronger * bounds["limit"][0], stronger * bounds["limit"][1])
       if "gain" in factors and values.get("scales_limit", 0.0) > 0:
         servo = values.get(SERVO_GAIN, 1.0)
         factors["gain"], factors["limit"] = servo * factors["gain"], factors["gain"]
@@ -149,6 +158,9 @@ def _calibration(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
     names = (*names, "lowest", "highest", "strength")
   for name in names:
     p[I[name]] *= 1.0 + v.get("gain", 0.0)
+  if "limit" in v:  # a stronger motor has a larger limit, too: what is beside that
+    for name in ("lowest", "highest"):
+      p[I[name]] *= (1.0 + v.get("gain", 0.0)) * (1.0 + v["limit"])
   p[I["gain"]] *= v.get(SERVO_GAIN, 1.0)
   p[I["measurement_delay"]] += v.get("skew", 0.0)
   p[I["effort_delay"]] += v.get("skew", 0.0)

@@ -1,10 +1,11 @@
 """What reference logs show: constants and effects that a machine has without the fault."""
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 from nerf2real.suite.effects import kind_of
-from nerf2real.sysid.fit.layout import CONSTANTS
+from nerf2real.sysid.fit import intervals
+from nerf2real.sysid.fit.layout import CLOCKS, CONSTANTS
 from nerf2real.sysid.hypotheses.plausible import ends
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.search.evidence import Scored
@@ -14,25 +15,54 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 def known_terms(
   found: Scored, settings: Settings = SETTINGS, *, another_session: bool = False
 ) -> tuple[Term, ...]:
-  """Returns the terms of a reference's hypothesis with priors about the values found there."""
-  result = []
-  repeat = dict(settings.repeat)
-  if another_session:
-    repeat |= dict(settings.another_session)
-  for term in found.terms:
+  """Returns the terms of a reference's hypothesis with priors about the values found there.
+
+  Their means are as open as the reference leaves them: how large all torques of a machine are is
+  known by its declared constants alone.
+  """
+  result: list[Term] = []
+  spread = intervals.spread(found.fit, [found.joint])
+  for term, (start, stop) in zip(found.terms, found.fit.layout.spans, strict=True):
     values = tuple(found.fit.values(term).values())
     if term.kind == CONSTANTS:
-      sigma = tuple(repeat[n] for n in term.names)
+      sigma = tuple(differs(dict(zip(term.names, values, strict=True)), settings, another_session))
     else:
       sigma = tuple(
         settings.repeat_effect * max(abs(v), 0.3 * s)
         for v, s in zip(values, term.scale, strict=True)
       )
-    known = term.kind != CONSTANTS
+    left_open = tuple(map(tuple, spread[start:stop, start:stop].tolist()))
     result.append(
-      dataclasses.replace(term, prior=sigma, centre=values, starts=(values,), known=known)
+      dataclasses.replace(
+        term,
+        prior=sigma,
+        centre=values,
+        open=left_open,
+        starts=(values,),
+        known=term.kind != CONSTANTS,
+      )
     )
   return tuple(result)
+
+
+def differs(
+  constants: Mapping[str, float], settings: Settings, another_session: bool
+) -> list[float]:
+  """Returns the standard deviations of constants between two recordings of one machine: of shares
+  by their own size, of which the declared one is a guess.
+
+  Args:
+    constants: values by name.
+    settings: the same of declared constants.
+    another_session: whether the recordings are of two sessions.
+  """
+  repeat = dict(settings.repeat)
+  if another_session:
+    repeat |= dict(settings.another_session)
+  return [
+    repeat[name] * (1.0 if name in (*CLOCKS, "zero") else 1.0 + value)
+    for name, value in constants.items()
+  ]
 
 
 _MAY_CHANGE = ("damping", "armature", "friction")

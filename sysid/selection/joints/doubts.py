@@ -84,10 +84,13 @@ def _left(explainer: Explainer, item: Scored) -> float:
 def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   """Tells whether an effect's sizes differ from those that do nothing, by their intervals.
 
-  What healthy machines have of an effect is nothing, too, where no reference shows it. A payload's
-  mass may be open where its moment is sure.
+  What healthy machines have of an effect is nothing, too, where no reference shows it, and so is
+  what a constant differs by between two recordings where one does. A payload's mass may be open
+  where its moment is sure.
   """
   term = next(t for t in best.terms if t.name == kind)
+  if term.freed and subject.before is not None:
+    return _has_changed(subject, best, term)
   if term.freed or not term.names or kind in _MOMENTS:
     return True
   alone = subject.before is None
@@ -96,6 +99,21 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   bounds = intervals.intervals(subject.now, best.fit, term, own_latency=alone)
   return any(
     not low - own.get(n, 0.0) <= sizes[n] <= high for n, (low, high) in bounds.items() if n in sizes
+  )
+
+
+def _has_changed(subject: Subject, best: Scored, term: Term) -> bool:
+  """Tells whether a constant that may have changed did, all of its interval, by more than it
+  differs by between two recordings of one machine."""
+  before = subject.known[0]
+  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=False)
+  reach = subject.now.settings.sigmas * np.array(before.prior)
+  return any(
+    bounds[name][0] > value + most or bounds[name][1] < value - most
+    for name, value, most, free in zip(
+      term.names, before.centre, reach, np.isinf(term.prior), strict=True
+    )
+    if free
   )
 
 

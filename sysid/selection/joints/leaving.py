@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.selection.joints.baseline import differs
 from nerf2real.sysid.selection.joints.remainder import (
   grown,
   mean_left,
@@ -40,7 +41,10 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   likely = 0.5 * float(chi2.ppf(1.0 - settings.level, max(item.fit.layout.count, 1)))
   if item.prior > likely:
     return True
-  if subject.usual is not None and not subject.paired:
+  if subject.paired:
+    allowed = _of_two_recordings(subject, item)
+    return structured(subject.now, item, settings, allowed, sure=False)
+  if subject.usual is not None:
     return grown(item, subject.usual, settings.suspected, settings)
   return leaves(subject, item, settings)
 
@@ -53,16 +57,15 @@ def _of_two_recordings(subject: Subject, item: Scored) -> Array:
   was fitted before. From one session to another all do, and beside an effect as far as within one:
   the effect must explain the rest.
   """
-  now, null = subject.now, subject.explainer.null
-  differ = dict(now.settings.repeat)
-  if not subject.another_session:
-    differ = {name: differ[name] for name in now.settings.wandering}
-  elif not item.names:
-    differ |= dict(now.settings.another_session)
+  now, null, apart = subject.now, subject.explainer.null, subject.another_session
   layout, own = null.fit.layout, subject.known[0]
+  constants = dict(zip(own.names, own.centre, strict=True))
+  differ = np.array(differs(constants, now.settings, apart and not item.names))
+  if not apart:
+    differ[[name not in now.settings.wandering for name in own.names]] = np.inf
   start, stop = layout.spans[layout.terms.index(own)]
-  sigma = layout.sigma.copy() if subject.another_session else np.full_like(layout.sigma, np.inf)
-  sigma[start:stop] = [differ.get(name, np.inf) for name in own.names]
+  sigma = layout.sigma.copy() if apart else np.full_like(layout.sigma, np.inf)
+  sigma[start:stop] = differ
   return repeats(now, null, sigma)
 
 

@@ -1,7 +1,7 @@
 """What remains of a joint's residual under its best hypothesis, against what it leaves anyway."""
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
@@ -13,7 +13,12 @@ Array = np.ndarray
 
 
 def structured(
-  joint: JointLikelihood, item: Scored, settings: Settings, allowed: Array | float = 0.0
+  joint: JointLikelihood,
+  item: Scored,
+  settings: Settings,
+  allowed: Array | float = 0.0,
+  *,
+  sure: bool = True,
 ) -> bool:
   """Tells whether neighbouring readings' residuals go together in more than one block, which may
   hold a knock, by more than rounding makes them where a joint is slow. A log's first block is not
@@ -23,13 +28,17 @@ def structured(
     joint: the logs.
     item: the hypothesis.
     settings: limits.
-    allowed: mean squares [B] of what may go together besides.
+    allowed: mean squares [B] of what may go together besides, as large as it is on average.
+    sure: whether it may be as much larger as it is by chance.
   """
   certain, size = _together(joint, item.fit.residuals[0][0])
   later = np.append(False, np.diff(joint.log_of) == 0)
-  certain, size = certain[later], (size - allowed)[later]
   # Two of B blocks exceed z by chance with a probability of (B p)^2 / 2 at most.
-  rare = float(norm.isf(np.sqrt(2.0 * settings.level) / len(certain)))
+  chance = np.sqrt(2.0 * settings.level) / max(int(later.sum()), 1)
+  rare = float(norm.isf(chance))
+  certain = certain[later]
+  most = float(chi2.isf(chance, 1)) if sure else 1.0
+  size = (size - most * allowed)[later]
   step = min(quantum(log.position) for log in joint.plant.logs)
   recordings = 1 if joint.expectation is None else 2
   rounding = recordings * step**2 / 12.0

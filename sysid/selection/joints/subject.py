@@ -89,7 +89,8 @@ class Subject:
   @property
   def state(self) -> tuple[Any, ...]:
     """What is known, the hypotheses that were scored, and the residual's scale."""
-    known = self.known, self.freed, self.usual, self.paired, self.now.expectation
+    shown = self.now.expectation, self.now.effort_unit
+    known = self.known, self.freed, self.usual, self.paired, shown
     scored = self.explainer, self.explainer.null, dict(self.explainer.scored)
     scales = [(j.scale, j.independent.copy()) for j in self._judged]
     return known, scored, scales
@@ -97,7 +98,8 @@ class Subject:
   @state.setter
   def state(self, state: tuple[Any, ...]) -> None:
     known, scored, scales = state
-    self.known, self.freed, self.usual, self.paired, self.now.expectation = known
+    self.known, self.freed, self.usual, self.paired, shown = known
+    self.now.expectation, self.now.effort_unit = shown
     for joint, (scale, independent) in zip(self._judged, scales, strict=True):
       joint.scale, joint.independent = scale, independent.copy()
     self.explainer, self.explainer.null, kept = scored
@@ -161,6 +163,7 @@ def beside(subject: Subject, reductions: Sequence[Reduction]) -> Subject:
     follows=subject.now.follows,
   )
   now.ahead, now.expectation = subject.now.ahead, subject.now.expectation
+  now.effort_unit = subject.now.effort_unit
   explainer = _explainer(now, subject.before, subject.known, subject.library, subject.freed)
   return dataclasses.replace(subject, now=now, explainer=explainer)
 
@@ -187,6 +190,7 @@ def _subject(
     return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
   now.ahead = None if before.law is None else _ahead(before.law, settings)
   usual = reference_constants(before, settings)
+  now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
   known = known_terms(usual, settings, another_session=_apart(now, before))
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   freed = freed_constants(known[0])
@@ -234,6 +238,7 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   library = own_library(before.plant, alone=subject.alone)
   first = Explainer(before, own, library, settings=settings, known=[sticking(before.plant)])
   usual = conclude(before, grow(first, settings.reference_depth), subject.beyond).best
+  subject.now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
   shared = [t for t in subject.known if t.wider]
   known = known_terms(usual, settings, another_session=subject.another_session)
   subject.usual, subject.known = usual, (*known, *shared)

@@ -1,5 +1,7 @@
 """Fits recover what was put in; intervals mean what they say."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -97,6 +99,25 @@ def test_a_delay_may_hold_the_latency_that_a_machine_always_had() -> None:
   delay = found.values("command_delay")["delay"]
   low, high = _intervals(explainer, found, "command_delay")["delay"]
   assert low < delay - intervals.OWN_LATENCY < delay < high < delay + intervals.OWN_LATENCY
+
+
+def test_torques_are_known_no_better_than_a_reference_shows_their_scale() -> None:
+  """A spring is stiffer by as much as all torques may be larger."""
+  scale = 0.2
+  _, joint = joint_of(KINDS, [Effect("spring", "joint", {"stiffness": 2.0, "reference": 0.5})])
+  own = constants(joint.plant, healthy=True)
+  larger = np.isin(own.names, ("damping", "armature", "friction", "gain", "mass"))
+  known = dataclasses.replace(own, prior=(1e-5,) * len(own.names))
+  shown = tuple(map(tuple, (scale**2 * np.outer(larger, larger)).tolist()))
+  (spring,) = [t for t in candidates.library(joint.plant) if t.kind == "spring"]
+  half = []
+  for constant in (known, dataclasses.replace(known, open=shown)):
+    explainer = Explainer(joint, constant, [spring])
+    (found,) = explainer.extend(explainer.null, 1)
+    low, high = _intervals(explainer, found, "spring")["stiffness"]
+    half.append((high - low) / 2 / found.values("spring")["stiffness"])
+  assert half[0] < 0.8 * scale
+  assert np.sqrt(half[1] ** 2 - half[0] ** 2) == pytest.approx(1.96 * scale, rel=0.1)
 
 
 def test_constants_that_are_off_are_recovered() -> None:

@@ -8,7 +8,12 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.selection.joints import subject
-from nerf2real.sysid.selection.joints.baseline import changed_constants, known_terms, widened
+from nerf2real.sysid.selection.joints.baseline import (
+  changed_constants,
+  differs,
+  known_terms,
+  widened,
+)
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
 
@@ -21,18 +26,26 @@ def test_all_torques_are_not_larger_by_a_factor_that_no_motion_shows():
   assert freed["damping"] > 2.0 * tight["damping"]
 
 
-@pytest.mark.parametrize("strength, mass", [(1.3, 1.0), (1.0, 1.3)])
-def test_a_reference_tells_a_stronger_servo_from_a_heavier_arm(strength, mass):
-  """Gain and damping are larger by one factor, or the mass is: the others are as declared."""
+@pytest.mark.parametrize(
+  "strength, mass, limit", [(1.3, 1.0, 4.0), (1.0, 1.3, 4.0), (1.0, 1.0, 5.2)]
+)
+def test_a_reference_tells_the_ratios_of_torques_and_masses(strength, mass, limit):
+  """Gain and damping are larger by one factor, or the mass is, or the largest torque: the others
+  are as declared. That all torques are larger no motion shows, but tolerances do: masses are known
+  better than servos."""
   machine = PENDULUM.replace('kp="21"', f'kp="{21 * strength}"')
   machine = machine.replace('damping="1.0"', f'damping="{strength}"')
   machine = machine.replace('mass="0.5"', f'mass="{0.5 * mass}"')
+  machine = machine.replace('"-4 4"', f'"{-limit} {limit}"')
   logs = [log_of(machine, kind, duration=6.0) for kind in ("sweep", "slow", "steps")]
   plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
   usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
   values = usual.fit.values(usual.terms[0])
-  assert 1.0 + values["gain"] == pytest.approx(strength, rel=0.05)
-  assert 1.0 + values["mass"] == pytest.approx(mass, rel=0.05)
+  gain, heavier = 1.0 + values["gain"], 1.0 + values["mass"]
+  assert gain / heavier == pytest.approx(strength / mass, rel=0.03)
+  assert 4.0 * (1.0 + values["limit"]) == pytest.approx(limit / strength, rel=0.05)
+  if mass == 1.0:
+    assert gain == pytest.approx(strength, rel=0.05)
 
 
 def test_more_friction_than_a_reference_has_is_an_effect_and_less_is_a_changed_constant():
@@ -58,5 +71,14 @@ def test_constants_of_another_session_may_differ_by_more():
   usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
   same, other = (known_terms(usual, another_session=apart)[0] for apart in (False, True))
   more = {n for n, a, b in zip(same.names, same.prior, other.prior, strict=True) if a < b}
-  assert more == {"damping", "friction", "gain", "latency"}
+  assert more == {"damping", "friction", "gain", "limit", "latency"}
   assert same.centre == other.centre
+
+
+def test_constants_differ_between_recordings_by_a_share_of_their_own_size():
+  values = {"friction": 1.0, "gain": 0.0, "zero": 0.01, "latency": 0.004}
+  friction, gain, zero, latency = differs(values, SETTINGS, False)
+  repeat = dict(SETTINGS.repeat)
+  assert friction == 2.0 * repeat["friction"] and gain == repeat["gain"]
+  assert zero == repeat["zero"] and latency == repeat["latency"]
+  assert differs(values, SETTINGS, True)[0] == 2.0 * dict(SETTINGS.another_session)["friction"]

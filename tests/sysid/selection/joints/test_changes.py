@@ -369,34 +369,3 @@ def test_values_stay_within_what_is_plausible_for_the_machine(limit, amplitude):
   term = plausible(waves, _Machine(limit))
   assert term.high == pytest.approx((amplitude, 125.0, 10.0))
   assert term.starts == ((0.1, 125.0, 0.0), (0.1, 40.0, 0.0))
-
-
-@pytest.mark.parametrize(
-  "name, value, half, off",
-  [
-    ("friction", 0.33, 0.13, False),  # a healthy copy of a kind whose dry friction differs so
-    ("friction", 0.9, 0.13, True),
-    ("friction", 0.9, 0.6, False),
-    ("damping", 0.12, 0.03, True),
-    ("damping", 0.12, 0.07, False),
-  ],
-)
-def test_a_constant_is_off_by_more_than_copies_differ_by(monkeypatch, name, value, half, off):
-  term = SimpleNamespace(names=(name, "zero"), freed=False)
-  values = {name: value, "zero": 0.5}
-  best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
-  bounds = {name: (value - half, value + half), "zero": (0.4, 0.6)}
-  monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
-  judged = SimpleNamespace(before=None, now=None, beyond=3.2)
-  assert doubts.constants_off(judged, best, SETTINGS) == off
-
-
-@pytest.mark.parametrize(
-  "mass, freed, stopped", [(-0.15, True, True), (-0.14, True, False), (-0.15, False, False)]
-)
-def test_constants_that_are_stopped_by_their_range_stand_in_for_something(mass, freed, stopped):
-  names = ("mass", "latency")
-  term = SimpleNamespace(names=names, low=(-0.15, 0.0), high=(0.15, 0.01), freed=freed)
-  values = {"mass": mass, "latency": 0.0}  # no latency is not the end of a range
-  best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
-  assert doubts.pressed(best) == stopped

@@ -1,0 +1,63 @@
+"""Whether a name that is clear stands."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from nerf2real.sysid.selection.joints import doubts
+from nerf2real.sysid.settings import SETTINGS
+
+
+@pytest.mark.parametrize(
+  "name, value, half, off",
+  [
+    ("friction", 0.33, 0.13, False),  # a healthy copy of a kind whose dry friction differs so
+    ("friction", 0.9, 0.13, True),
+    ("friction", 0.9, 0.6, False),
+    ("damping", 0.12, 0.03, True),
+    ("damping", 0.12, 0.07, False),
+  ],
+)
+def test_a_constant_is_off_by_more_than_copies_differ_by(monkeypatch, name, value, half, off):
+  term = SimpleNamespace(names=(name, "zero"), freed=False)
+  values = {name: value, "zero": 0.5}
+  best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
+  bounds = {name: (value - half, value + half), "zero": (0.4, 0.6)}
+  monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
+  judged = SimpleNamespace(before=None, now=None, beyond=3.2)
+  assert doubts.constants_off(judged, best, SETTINGS) == off
+
+
+@pytest.mark.parametrize(
+  "mass, freed, stopped", [(-0.15, True, True), (-0.14, True, False), (-0.15, False, False)]
+)
+def test_constants_that_are_stopped_by_their_range_stand_in_for_something(mass, freed, stopped):
+  names = ("mass", "latency")
+  term = SimpleNamespace(names=names, low=(-0.15, 0.0), high=(0.15, 0.01), freed=freed)
+  values = {"mass": mass, "latency": 0.0}  # no latency is not the end of a range
+  best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
+  assert doubts.pressed(best) == stopped
+
+
+@pytest.mark.parametrize(
+  "value, half, something",
+  [
+    (0.92, 0.02, False),  # less friction, as another recording of the machine may have it
+    (0.6, 0.1, True),
+    (0.6, 0.35, False),
+  ],
+)
+def test_a_constant_that_changed_did_so_by_more_than_recordings_differ(
+  monkeypatch, value, half, something
+):
+  names, repeat = ("friction", "gain"), (0.05, 0.005)
+  known = SimpleNamespace(prior=repeat, centre=(0.0, 0.0))
+  freed = SimpleNamespace(
+    name="parameter_error", freed=True, names=names, prior=(float("inf"), 0.005)
+  )
+  # The gain, which is not free, is beyond what recordings differ by: the friction is judged.
+  bounds = {"friction": (value - 1.0 - half, value - 1.0 + half), "gain": (0.1, 0.2)}
+  monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
+  judged = SimpleNamespace(before=object(), now=SimpleNamespace(settings=SETTINGS), known=(known,))
+  best = SimpleNamespace(terms=[freed], fit=None)
+  assert doubts.is_something(judged, best, "parameter_error") == something
