@@ -41,10 +41,7 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   likely = 0.5 * float(chi2.ppf(1.0 - settings.level, max(item.fit.layout.count, 1)))
   if item.prior > likely:
     return True
-  if subject.paired:
-    allowed = _of_two_recordings(subject, item)
-    return structured(subject.now, item, settings, allowed, sure=False)
-  if subject.usual is not None:
+  if subject.usual is not None and not subject.paired:
     return grown(item, subject.usual, settings.suspected, settings)
   return leaves(subject, item, settings)
 

@@ -13,12 +13,7 @@ Array = np.ndarray
 
 
 def structured(
-  joint: JointLikelihood,
-  item: Scored,
-  settings: Settings,
-  allowed: Array | float = 0.0,
-  *,
-  sure: bool = True,
+  joint: JointLikelihood, item: Scored, settings: Settings, allowed: Array | float = 0.0
 ) -> bool:
   """Tells whether neighbouring readings' residuals go together in more than one block, which may
   hold a knock, by more than rounding makes them where a joint is slow. A log's first block is not
@@ -28,8 +23,8 @@ def structured(
     joint: the logs.
     item: the hypothesis.
     settings: limits.
-    allowed: mean squares [B] of what may go together besides, as large as it is on average.
-    sure: whether it may be as much larger as it is by chance.
+    allowed: mean squares [B] of what may go together besides, on average: as much larger as it is
+      by chance, too.
   """
   certain, size = _together(joint, item.fit.residuals[0][0])
   later = np.append(False, np.diff(joint.log_of) == 0)
@@ -37,8 +32,7 @@ def structured(
   chance = np.sqrt(2.0 * settings.level) / max(int(later.sum()), 1)
   rare = float(norm.isf(chance))
   certain = certain[later]
-  most = float(chi2.isf(chance, 1)) if sure else 1.0
-  size = (size - most * allowed)[later]
+  size = (size - float(chi2.isf(chance, 1)) * allowed)[later]
   step = min(quantum(log.position) for log in joint.plant.logs)
   recordings = 1 if joint.expectation is None else 2
   rounding = recordings * step**2 / 12.0
