@@ -36,8 +36,8 @@ class Settings:
   )
   """Standard deviations of nominal constants: shares, rad (m), s."""
   servo: float = 0.2
-  """Of gain, limit, damping and armature where a reference shows the machine: a model guesses
-  servos, not masses."""
+  """Of gain, limit and damping where a reference shows the machine: a model guesses servos, not
+  masses."""
   repeat: tuple[tuple[str, float], ...] = (
     ("damping", 0.015),
     ("armature", 0.01),

@@ -36,7 +36,7 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
   """
   p, tolerance = plant.declared, dict(settings.tolerances)
   if healthy:
-    tolerance |= {name: settings.servo for name in ("gain", "limit", "damping", "armature")}
+    tolerance |= {name: settings.servo for name in ("gain", "limit", "damping")}
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
   present = {
     "damping": p[INDEX["damping"]] > 0,
