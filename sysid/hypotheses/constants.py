@@ -12,9 +12,13 @@ from nerf2real.sysid.settings import SETTINGS, Settings
 
 NAME = "calibration"
 
-OWN = {"backlash": {"gap": 0.0044}}
-"""What healthy machines have of an effect that models leave out, and that is therefore not named
-without a reference: 0.25 degrees of play (data sheet of the XM430-W350)."""
+_GAP = 0.0044
+"""rad of play that healthy gears have: 0.25 degrees (data sheet of the XM430-W350)."""
+
+
+def own_size(plant: JointModel, kind: str, name: str) -> float:
+  """Returns how much of an effect's parameter is no fault: models leave it out of all machines."""
+  return _GAP if (kind, name) == ("backlash", "gap") and plant.hinge else 0.0
 
 
 _USUAL = 2.0

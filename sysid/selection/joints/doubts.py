@@ -10,7 +10,7 @@ import numpy as np
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CLOCKS
-from nerf2real.sysid.hypotheses.constants import OWN
+from nerf2real.sysid.hypotheses.constants import own_size
 from nerf2real.sysid.hypotheses.free_force import VARIABLE
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.remainder import mean_left
@@ -84,9 +84,9 @@ def _left(explainer: Explainer, item: Scored) -> float:
 def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   """Tells whether an effect's sizes differ from those that do nothing, by their intervals.
 
-  What healthy machines have of an effect is nothing, too, where no reference shows it, and so is
-  what a constant differs by between two recordings where one does. A payload's mass may be open
-  where its moment is sure.
+  What healthy machines have of an effect is nothing, too: what else is off may show it where a
+  reference did not. So is what a constant differs by between two recordings. A payload's mass may
+  be open where its moment is sure.
   """
   term = next(t for t in best.terms if t.name == kind)
   if term.freed and subject.before is not None:
@@ -95,10 +95,11 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
     return True
   alone = subject.before is None
   sizes = {p.name: p.nominal for p in kind_of(kind).parameters if not p.shape}
-  own = OWN.get(kind, {}) if alone and subject.now.plant.hinge else {}
   bounds = intervals.intervals(subject.now, best.fit, term, own_latency=alone)
   return any(
-    not low - own.get(n, 0.0) <= sizes[n] <= high for n, (low, high) in bounds.items() if n in sizes
+    not low - own_size(subject.now.plant, kind, name) <= sizes[name] <= high
+    for name, (low, high) in bounds.items()
+    if name in sizes
   )
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.selection.joints import play
 from nerf2real.sysid.selection.joints.baseline import differs
 from nerf2real.sysid.selection.joints.remainder import (
   grown,
@@ -27,7 +28,8 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   readings' noise.
   """
   if subject.paired:
-    return structured(subject.now, item, settings, _of_two_recordings(subject, item))
+    moved, beside = _of_two_recordings(subject, item), play.beside(subject.now, item)
+    return structured(subject.now, item, settings, moved, beside)
   if subject.usual is not None:
     return grown(item, subject.usual, subject.beyond, settings)
   left, noise = np.median(item.fit.held[0][0]), np.median(subject.now.noise_squares)
@@ -76,7 +78,7 @@ def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
 
   readings = now.noise_squares * (2.0 if subject.paired else 1.0)
   if subject.paired:
-    readings = readings + _of_two_recordings(subject, item)
+    readings = readings + _of_two_recordings(subject, item) + play.beside(now, item)
   anyway = np.array([np.median(readings), readings.mean()])
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])

@@ -13,7 +13,11 @@ Array = np.ndarray
 
 
 def structured(
-  joint: JointLikelihood, item: Scored, settings: Settings, allowed: Array | float = 0.0
+  joint: JointLikelihood,
+  item: Scored,
+  settings: Settings,
+  allowed: Array | float = 0.0,
+  scattered: Array | float = 0.0,
 ) -> bool:
   """Tells whether neighbouring readings' residuals go together in more than one block, which may
   hold a knock, by more than rounding makes them where a joint is slow. A log's first block is not
@@ -25,19 +29,29 @@ def structured(
     settings: limits.
     allowed: mean squares [B] of what may go together besides, on average: as much larger as it is
       by chance, too.
+    scattered: the same of what differs from block to block, so that half of a log's blocks are not
+      larger.
   """
   certain, size = _together(joint, item.fit.residuals[0][0])
   later = np.append(False, np.diff(joint.log_of) == 0)
   # Two of B blocks exceed z by chance with a probability of (B p)^2 / 2 at most.
   chance = np.sqrt(2.0 * settings.level) / max(int(later.sum()), 1)
   rare = float(norm.isf(chance))
-  certain = certain[later]
-  size = (size - float(chi2.isf(chance, 1)) * allowed)[later]
   step = min(quantum(log.position) for log in joint.plant.logs)
   recordings = 1 if joint.expectation is None else 2
-  rounding = recordings * step**2 / 12.0
-  large = size > (settings.structured * joint.position_noise) ** 2 + rounding
-  return int(np.sum((certain > rare) & large)) >= 2
+  least = (settings.structured * joint.position_noise) ** 2 + recordings * step**2 / 12.0
+  by_chance = float(chi2.isf(chance, 1))
+
+  def more(than: Array | float) -> Array:
+    return later & (certain > rare) & (size > least + than)
+
+  if int(more(by_chance * (allowed + scattered)).sum()) >= 2:
+    return True
+  of_log, judged = joint.log_of[more(by_chance * allowed + scattered)], joint.log_of[later]
+  count = int(joint.log_of[-1]) + 1
+  return bool(
+    np.any(2 * np.bincount(of_log, minlength=count) > np.bincount(judged, minlength=count))
+  )
 
 
 def repeats(joint: JointLikelihood, item: Scored, sigma: Array) -> Array:

@@ -61,3 +61,17 @@ def test_a_constant_that_changed_did_so_by_more_than_recordings_differ(
   judged = SimpleNamespace(before=object(), now=SimpleNamespace(settings=SETTINGS), known=(known,))
   best = SimpleNamespace(terms=[freed], fit=None)
   assert doubts.is_something(judged, best, "parameter_error") == something
+
+
+@pytest.mark.parametrize("reference", [None, object()])
+@pytest.mark.parametrize(
+  ("low", "hinge", "something"), [(0.0016, True, False), (0.006, True, True), (0.0016, False, True)]
+)
+def test_play_of_a_healthy_gear_is_nothing(monkeypatch, reference, low, hinge, something):
+  term = SimpleNamespace(name="backlash", names=("gap",), freed=False)
+  bounds = {"gap": (low, low + 0.002)}  # rad, or m of a slide
+  monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
+  now = SimpleNamespace(settings=SETTINGS, plant=SimpleNamespace(hinge=hinge))
+  judged = SimpleNamespace(before=reference, now=now)
+  best = SimpleNamespace(terms=[term], fit=None)
+  assert doubts.is_something(judged, best, "backlash") == something

@@ -1,0 +1,48 @@
+"""How far a healthy gear lets a joint lie beside where the same commands put it before.
+
+Where no torque presses its teeth together the output may be anywhere in the gap: an arm on a
+vertical axis, or one that hangs straight down. Which way it went depends on microradians.
+"""
+
+import numpy as np
+
+from nerf2real.sysid.fit.likelihood import JointLikelihood
+from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.constants import own_size
+from nerf2real.sysid.selection.search.evidence import Scored
+
+Array = np.ndarray
+
+_CROSSED = 0.1
+"""s in which a torque that presses takes the output through the gap; chosen: a tenth of a block."""
+
+
+def beside(joint: JointLikelihood, item: Scored) -> Array:
+  """Returns mean squares of blocks [B] by which courses of two recordings may differ in the gap.
+
+  It is no more than two draws of a place anywhere in it do, nor than twice what the reference's own
+  readings were beside its model, which holds no gap.
+
+  Args:
+    joint: the logs, with what a reference left expected of them.
+    item: a hypothesis.
+  """
+  gap = own_size(joint.plant, "backlash", "gap")
+  if joint.expectation is None or not gap:
+    return np.zeros(len(joint.starts))
+  p = compose(joint.plant, item.terms, item.fit.x).p
+  left = joint.squares(joint.expectation.under(p) * joint.gain)[0] - joint.noise_squares
+  squares = np.minimum(2.0 * np.clip(left, 0.0, None), 2.0 * gap**2 / 12.0)
+  loose = np.concatenate([_loose(joint, item, i, gap) for i in range(len(joint.plant.logs))])
+  share = np.add.reduceat(loose * joint.gain[0] ** 2, joint.starts) / joint.counts[0]
+  return squares * share
+
+
+def _loose(joint: JointLikelihood, item: Scored, index: int, gap: float) -> Array:
+  """Tells where in a log [N] no torque presses the teeth together."""
+  c = compose(joint.plant, item.terms, item.fit.x)
+  inertia, here, across, at, bias = joint.plant.at_samples(c.loads, index)
+  turned = np.nan_to_num(joint.plant.logs[index].position - at)
+  pressing = np.abs(here * np.cos(turned) + across * np.sin(turned) + bias)
+  loose: Array = 0.5 * pressing * _CROSSED**2 < gap * inertia
+  return loose
