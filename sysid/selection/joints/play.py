@@ -1,10 +1,13 @@
 """How far a healthy gear lets a joint lie beside where the same commands put it before.
 
-Where no torque presses its teeth together the output may be anywhere in the gap: an arm on a
-vertical axis, or one that hangs straight down. Which way it went depends on microradians.
+A gear's teeth stay together while the torque that they pass to the link keeps its sign. Where it
+changes, or there is none, the output may be anywhere in the gap: an arm on a vertical axis, one
+that hangs straight down, one that a step of the command throws. Which way it goes, and how it
+bounces, depends on microradians.
 """
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
@@ -14,7 +17,8 @@ from nerf2real.sysid.selection.search.evidence import Scored
 Array = np.ndarray
 
 _CROSSED = 0.1
-"""s in which a torque that presses takes the output through the gap; chosen: a tenth of a block."""
+"""s in which a torque that presses takes the output through the gap, and after which it does not
+bounce any more; chosen: a tenth of a block."""
 
 
 def beside(joint: JointLikelihood, item: Scored) -> Array:
@@ -39,10 +43,14 @@ def beside(joint: JointLikelihood, item: Scored) -> Array:
 
 
 def _loose(joint: JointLikelihood, item: Scored, index: int, gap: float) -> Array:
-  """Tells where in a log [N] no torque presses the teeth together."""
-  c = compose(joint.plant, item.terms, item.fit.x)
+  """Tells where in a log [N] no torque keeps the teeth together."""
+  c, log = compose(joint.plant, item.terms, item.fit.x), joint.plant.logs[index]
   inertia, here, across, at, bias = joint.plant.at_samples(c.loads, index)
-  turned = np.nan_to_num(joint.plant.logs[index].position - at)
-  pressing = np.abs(here * np.cos(turned) + across * np.sin(turned) + bias)
-  loose: Array = 0.5 * pressing * _CROSSED**2 < gap * inertia
+  turned = np.nan_to_num(log.position - at)
+  weight = here * np.cos(turned) + across * np.sin(turned)
+  passed = (weight + bias) / inertia + log.acceleration  # torque over the link's inertia
+  near = 2 * round(_CROSSED / float(np.median(np.diff(log.time)))) + 1
+  lowest, highest = minimum_filter1d(passed, near), maximum_filter1d(passed, near)
+  slowest = gap / (0.5 * _CROSSED**2)
+  loose: Array = (lowest < slowest) & (highest > -slowest)
   return loose
