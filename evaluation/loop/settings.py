@@ -55,8 +55,8 @@ class LoopSettings:
   """Settings of that distillation."""
   teacher: str = AUTO
   """quick, swift, steady, a walker's settings as JSON, the folder of a policy, or auto: the walker
-  that succeeds most often with the effects in the simulation, of equal ones the fastest, fitted to
-  them if all fail."""
+  that succeeds most often with the effects in the simulation, of equal ones the fastest, standing
+  taller or fitted to them if all fail."""
   actors: int = 1
   """Collectors of the distillation."""
   out: Path = Path("out/loop")

@@ -4,13 +4,14 @@ Of walkers that succeed as often the fastest teaches, as a slower one would teac
 slow.
 
 The scripted gaits were searched for on the nominal robot. Where none of them copes with what was
-identified (a load and a slope that push the same way, say), a few parameters of the best one are
-searched for in the simulation with the effects, on trials that are not the protocol's.
+identified (a load and a slope that push the same way, say), each is tried standing taller, too, as
+a straighter leg carries the same weight with less torque, and then a few parameters of the best one
+are searched for in the simulation with the effects, on trials that are not the protocol's.
 """
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,11 +31,12 @@ from nerf2real.suite.gaits.evolution import Evolution
 from nerf2real.suite.protocols import NAVIGATION
 
 WALKERS = ("quick", "steady", "swift")  # teachers that navigate
-FITTED = "teacher.json"
+ADAPTED = "teacher.json"
 _CHOICE = "teachers.json"
 _TRIALS = 9  # of each teacher; seconds of processor time each, without pictures
 _COPES = 0.85  # of its trials, from which a walker is taken as it is: at most one of nine fails
 _GENERATIONS, _POPULATION, _DRAWN = 6, 8, 6  # of the search; trials of a candidate
+_TALLER = (0.004, 0.008)  # m; with 0.012 the legs are straight
 # Parameter: width of the first round. What carries a displaced centre of mass, or treads lighter.
 _SEARCHED = {
   "shift": 0.008,
@@ -43,14 +45,15 @@ _SEARCHED = {
   "lift": 0.005,
   "spread": 0.004,
   "sway": 0.003,
+  "height": 0.003,
 }
 
 
 class Choice(NamedTuple):
   """A teacher, and how the walkers did with the effects."""
 
-  teacher: str  # a name in TEACHERS, or the file of a fitted walker
-  successes: dict[str, int]  # by walker; the fitted one's among them
+  teacher: str  # a name in TEACHERS, or the file of a walker that is none of them
+  successes: dict[str, int]  # by walker; the taller and the fitted ones' among them
   trials: int  # of each
 
 
@@ -72,18 +75,41 @@ def choose_teacher(
   folder.mkdir(parents=True, exist_ok=True)
   with _plant(scene, effects, time_limit) as plant:
     fresh = _Trials(plant, scene)
-    ranks = {name: fresh.rank(TEACHERS[name]()) for name in WALKERS}
-    teacher = max(ranks, key=lambda name: ranks[name])
-    successes = {name: rank.successes for name, rank in ranks.items()}
-    if successes[teacher] < _COPES * len(fresh.chosen):
-      fitted = fit(plant, scene, TEACHERS[teacher](), seed=seed)
-      successes["fitted"] = fresh.rank(fitted).successes
-      if successes["fitted"] > successes[teacher]:
-        write_json(folder / FITTED, fitted)
-        teacher = str((folder / FITTED).resolve())
+    walkers = {name: TEACHERS[name]() for name in WALKERS}
+    ranks = {name: fresh.rank(walker) for name, walker in walkers.items()}
+
+    def best() -> str:
+      return max(ranks, key=lambda name: ranks[name])
+
+    def copes() -> bool:
+      return ranks[best()].successes >= _COPES * len(fresh.chosen)
+
+    if not copes():
+      taller = _taller(walkers)
+      walkers |= taller
+      ranks |= {name: fresh.rank(walker) for name, walker in taller.items()}
+    if not copes():
+      fitted = fit(plant, scene, walkers[best()], seed=seed)
+      walkers["fitted"], ranks["fitted"] = fitted, fresh.rank(fitted)
+  teacher = best()
+  if teacher not in WALKERS:
+    write_json(folder / ADAPTED, walkers[teacher])
+    teacher = str((folder / ADAPTED).resolve())
+  successes = {name: rank.successes for name, rank in ranks.items()}
   found = Choice(teacher, successes, len(fresh.chosen))
   write_json(kept, found)
   return found
+
+
+def _taller(walkers: Mapping[str, WalkerSettings]) -> dict[str, WalkerSettings]:
+  """Returns the walkers with straighter knees, by name."""
+  return {
+    f"{name}, {1e3 * by:.0f} mm taller": dataclasses.replace(
+      walker, gait=dataclasses.replace(walker.gait, height=walker.gait.height + by)
+    )
+    for name, walker in walkers.items()
+    for by in _TALLER
+  }
 
 
 def fit(plant: Plant, scene: Any, start: WalkerSettings, *, seed: int) -> WalkerSettings:

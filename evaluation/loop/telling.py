@@ -27,7 +27,7 @@ from nerf2real.evaluation.loop import story as loop
 from nerf2real.evaluation.loop.comparing import Comparison, describe
 from nerf2real.evaluation.loop.naming import Named
 from nerf2real.evaluation.loop.story import Story
-from nerf2real.evaluation.loop.teachers import FITTED
+from nerf2real.evaluation.loop.teachers import ADAPTED
 from nerf2real.evaluation.loop.trials import Tally
 from nerf2real.evaluation.report import maps
 from nerf2real.suite.effects import kind_of
@@ -229,7 +229,7 @@ def _training(story: Story) -> Section:
     Figure("frames", made.frames, "", "control steps collected"),
     Figure(
       "teacher",
-      "fitted" if Path(made.teacher).name == FITTED else Path(made.teacher).name,
+      "adapted" if Path(made.teacher).name == ADAPTED else Path(made.teacher).name,
       "",
       f"walkers with the effects: {chosen}" if chosen else "",
     ),

@@ -16,8 +16,9 @@ class _Plant:
   time_limit = 20.0
 
 
-def _episodes(monkeypatch, load):
-  """Puts a rule in place of the simulation: who stands beside the load falls, sooner if further."""
+def _episodes(monkeypatch, load, least_height=0.0):
+  """Puts a rule in place of the simulation: who stands beside the load falls, sooner if further,
+  and so does whose knees are bent too much."""
   seen = []
 
   def episode(plant, scene, settings, trial, index):
@@ -25,7 +26,8 @@ def _episodes(monkeypatch, load):
     off = abs(settings.gait.shift - load)
     duration = float(np.clip(20.0 * (1 - off / 0.03), 1.0, 20.0))
     reached = 0.1 / settings.gait.stride  # s: the longer the stride, the sooner
-    return types.SimpleNamespace(success=off < 0.01, duration=reached if off < 0.01 else duration)
+    success = off < 0.01 and settings.gait.height >= least_height
+    return types.SimpleNamespace(success=success, duration=reached if success else duration)
 
   monkeypatch.setattr(teachers, "_episode", episode)
   monkeypatch.setattr(teachers, "_plant", lambda *_: _Context())
@@ -47,20 +49,35 @@ def test_a_walker_that_copes_is_taken_as_it_is(monkeypatch, tmp_path):
   strides = {name: TEACHERS[name]().gait.stride for name in teachers.WALKERS}
   assert found.teacher == max(strides, key=lambda name: strides[name])  # of equal ones the fastest
   assert len(seen) == len(teachers.WALKERS) * found.trials
-  assert not (tmp_path / teachers.FITTED).exists()
+  assert not (tmp_path / teachers.ADAPTED).exists()
 
 
 def test_where_none_copes_one_is_fitted_and_kept(monkeypatch, tmp_path):
   seen = _episodes(monkeypatch, _LOAD)
   found = teachers.choose_teacher(tmp_path, tmp_path / "effects.json", EmptyFloor(), seed=0)
   assert found.successes["fitted"] == found.trials
-  assert [found.successes[name] for name in teachers.WALKERS] == [0] * len(teachers.WALKERS)
+  assert all(count == 0 for name, count in found.successes.items() if name != "fitted")
   teacher = make_teacher(found.teacher, EmptyFloor())
   assert isinstance(teacher, WalkerTeacher)
   assert teacher._walker._gait.settings.shift == pytest.approx(_LOAD, abs=0.01)
   count = len(seen)
   assert teachers.choose_teacher(tmp_path, tmp_path, EmptyFloor(), seed=0) == found
   assert len(seen) == count  # nothing is run twice
+
+
+def test_one_that_copes_standing_taller_is_taken_without_a_fit(monkeypatch, tmp_path):
+  tallest = {name: TEACHERS[name]().gait.height for name in teachers.WALKERS}
+  least = max(tallest.values()) + 0.003
+  _episodes(monkeypatch, 0.0, least)
+  found = teachers.choose_teacher(tmp_path, tmp_path / "effects.json", EmptyFloor(), seed=0)
+  assert "fitted" not in found.successes
+  teacher = make_teacher(found.teacher, EmptyFloor())
+  assert isinstance(teacher, WalkerTeacher)
+  settings = teacher._walker._gait.settings
+  assert settings.height >= least
+  # Of those that cope the fastest.
+  strides = [TEACHERS[name]().gait.stride for name in teachers.WALKERS]
+  assert settings.stride == max(strides)
 
 
 def test_a_fit_meets_no_trial_of_the_protocol(monkeypatch):
