@@ -14,7 +14,7 @@ of 54 trials is too weak for all of them."""
 
 
 class Cooled(NamedTuple):
-  """A session that ended because a joint was too hot to begin the next trial."""
+  """A session that ended because a joint was too hot: it stopped a trial or could not begin one."""
 
   trials: int  # of the condition that were done by then
   detail: str  # which joint, and its temperature
@@ -49,7 +49,7 @@ class Session:
 
 
 def until_hot(plant: Plant, run: Callable[[], object]) -> str:
-  """Runs trials until a joint of a virtual robot is too hot to begin one; returns which, or "".
+  """Runs trials until a joint of a virtual robot is too hot; returns which, or "".
 
   A person lets a real robot cool: of it no session is begun anew.
 
@@ -59,8 +59,16 @@ def until_hot(plant: Plant, run: Callable[[], object]) -> str:
   try:
     run()
   except SafetyError:
-    stop = getattr(plant.environment, "stop", None)
-    if not hasattr(plant, "robot") or stop is None or stop.reason != Reason.TEMPERATURE:
+    hot = overheated(plant)
+    if not hot:
       raise
-    return str(stop.detail)
+    return hot
   return ""
+
+
+def overheated(plant: Plant) -> str:
+  """Returns which joint of a virtual robot was so hot that torque was switched off, or ""."""
+  stop = getattr(plant.environment, "stop", None)
+  if not hasattr(plant, "robot") or stop is None or stop.reason != Reason.TEMPERATURE:
+    return ""
+  return str(stop.detail)

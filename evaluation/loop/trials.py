@@ -18,7 +18,7 @@ from nerf2real.evaluation import episodes, runner
 from nerf2real.evaluation.episodes import Episode, Store
 from nerf2real.evaluation.loop.robot import starts
 from nerf2real.evaluation.loop.robot.starts import Walked
-from nerf2real.evaluation.loop.sessions import MOST_COOLED, Cooled, Session, until_hot
+from nerf2real.evaluation.loop.sessions import MOST_COOLED, Cooled, Session, overheated, until_hot
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.making import free_name, make_plant
@@ -27,6 +27,7 @@ from nerf2real.evaluation.policies.learned import LearnedPolicy
 from nerf2real.evaluation.policies.policy import EvaluatedPolicy, GaitPolicy, resolution
 from nerf2real.evaluation.session import choose
 from nerf2real.evaluation.settings import EvaluationSettings
+from nerf2real.real.safety.monitor import SafetyError
 from nerf2real.real.virtual.undeclared import Undeclared
 from nerf2real.suite.protocols import NAVIGATION
 from nerf2real.suite.scene import open_scene
@@ -94,8 +95,9 @@ def run(
 ) -> list[Episode]:
   """Runs the trials of a condition that the store lacks; returns all of them.
 
-  Runs on robots are recorded in the folder `trials`. Where a joint of the virtual robot is too hot
-  to begin a trial, the trials go on with a cool one.
+  Runs on robots are recorded in the folder `trials`. Where a joint of the virtual robot is so hot
+  that a trial is stopped, or cannot begin, the trials after it go on with a cool one: a trial that
+  begins a degree below the limit ends after a second, whatever the policy is.
 
   Raises:
     RuntimeError: The robot is too hot all the same, or stopped for another reason.
@@ -123,7 +125,7 @@ def run(
       report = _reporter(plant, condition, on_robot, say)
       run_all = functools.partial(runner.run_all, plant, policy, chosen, store=store, report=report)
       hot = until_hot(plant, run_all)
-    if not hot:
+    if not hot or len(found()) == len(chosen):
       return found()
     on_robot.cool(Cooled(len(found()), hot))
     if len(found()) == done:
@@ -148,6 +150,8 @@ def _reporter(
       on_robot.note(robot.clock.now() - begun)
     took = f"{episode.outcome} after {episode.duration:.1f} s"
     say(f"  {condition.name} {number}/{count}: {took}")
+    if episode.outcome == episodes.STOPPED and overheated(plant):
+      raise SafetyError(f"Torque was switched off: {overheated(plant)}.")
 
   return report
 

@@ -37,6 +37,17 @@ class _WarmingPlant(ScriptedPlant):
     return super().start(trial)
 
 
+class _StoppingPlant(_WarmingPlant):
+  """One whose heat stops the last of the trials that it begins; it could begin more."""
+
+  def start(self, trial):
+    self.time += 20.0
+    return ScriptedPlant.start(self, trial)
+
+  def stopped(self):
+    return f"{HOT.reason}: {HOT.detail}" if self.started == self.begins else ""
+
+
 def _run(folder, monkeypatch, plants, count=5):
   """Runs trials on plants one after another; returns the ages of their batteries, and lines."""
   ages, said, left = [], [], iter(plants)
@@ -76,6 +87,21 @@ def test_trials_go_on_with_a_cool_robot_and_the_same_battery(tmp_path, monkeypat
   assert session.seconds == 100.0
   assert session.cooled == [Cooled(2, "l_knee: 71 degrees C"), Cooled(3, "l_knee: 71 degrees C")]
   assert sum("a session with a cool robot begins" in line for line in said) == 2
+
+
+def test_a_trial_that_heat_stops_is_followed_by_a_cool_robot(tmp_path, monkeypatch):
+  plants = [_StoppingPlant(2), _StoppingPlant(9)]
+  settings, _, _ = _run(tmp_path, monkeypatch, plants)
+  assert [plant.started for plant in plants] == [2, 3]
+  assert trials.session(settings, CONDITION.name).cooled == [Cooled(2, HOT.detail)]
+  outcomes = [episode.outcome for episode in Store(tmp_path).episodes]
+  assert outcomes.count("stopped") == 1  # the trial itself is lost
+
+
+def test_no_robot_is_cooled_after_the_last_trial(tmp_path, monkeypatch):
+  plant = _StoppingPlant(5)
+  _, _, said = _run(tmp_path, monkeypatch, [plant])
+  assert plant.started == 5 and not any("cool" in line for line in said)
 
 
 def test_a_cool_robot_that_cannot_begin_ends_the_loop(tmp_path, monkeypatch):
