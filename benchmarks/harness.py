@@ -199,6 +199,7 @@ def finish(
   seed: int | str | None = None,
   details: Any = None,
   words: str = "",
+  within: str = "",
 ) -> None:
   """Prints figures, and writes them as the options require.
 
@@ -209,6 +210,7 @@ def finish(
     seed: Of what was random.
     details: More to keep in the JSON file.
     words: Markdown below the table.
+    within: Folder of `records/` for a topic that has no file yet.
   """
   origin = provenance(seed)
   text = f"{origin['machine']}; commit {origin['commit']}, load {origin['load']}\n\n"
@@ -225,7 +227,7 @@ def finish(
       content |= {"details": details} if details is not None else {}
       settings.out.write_text(json.dumps(content, indent=1, default=_plain) + "\n")
   if settings.write:
-    print(f"wrote {ledger.update(topic, figures, origin)}")
+    print(f"wrote {ledger.update(topic, figures, origin, within=within)}")
 
 
 def _plain(value: Any) -> Any:

@@ -2,8 +2,9 @@
 
 Runs `launch/identify.py` on every set of a folder made by `make_blind_sets.py` (made first if it is
 not there), compares the reports with answers.json, prints the table and the confusions, and keeps
-both in `benchmarks/results/analyser/`. Sets that were analysed already are not analysed again, so
-it can be stopped and run on. Seeds 100 to 199 are for development; figures are reported of others.
+both in the generator's folder of `benchmarks/results/analyser/`. Sets that were analysed already
+are not analysed again, so it can be stopped and run on. Seeds 100 to 199 are for development;
+figures are reported of others.
 """
 
 import concurrent.futures
@@ -19,11 +20,20 @@ import time
 from typing import Any, Literal
 
 from benchmarks import harness
-from benchmarks.blind_sets import scoring
+from benchmarks.blind_sets import apparatus, scoring
+from benchmarks.independent_sets import apparatus as independent
 from benchmarks.ledger.records import ROOT
+from benchmarks.servo_bench import bench
 from nerf2real.core import markdown
 
 RESULTS = ROOT / "benchmarks" / "results" / "analyser"
+FOLDERS = {"blind_sets": "first", "independent_sets": "second", "servo_bench": "third"}
+"""Folder of a generator's pages, there and in the records."""
+_PLANTS = {
+  "blind_sets": apparatus.KINDS,
+  "independent_sets": independent.KINDS,
+  "servo_bench": bench.PLANTS,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,9 +65,9 @@ class Settings:
   redo: bool = False
   """Analyse again what was analysed."""
   name: str = "identify"
-  """Of the files in benchmarks/results/analyser."""
-  results: pathlib.Path = RESULTS
-  """Folder of the table and the scores."""
+  """Topic of the records; without `identify_` the name of the table and the scores."""
+  results: pathlib.Path | None = None
+  """Folder of the table and the scores; the generator's in benchmarks/results/analyser for None."""
   write: bool = False
   """Keep the figures as records in benchmarks/results/records/."""
 
@@ -93,18 +103,27 @@ def main(settings: Settings) -> None:
   rows.sort(key=lambda row: row["set"])
   text = render(rows, answers)
   print(text)
-  settings.results.mkdir(parents=True, exist_ok=True)
-  (settings.results / f"{settings.name}.md").write_text(text)
+  part, page = folder_of(answers, settings.generator), settings.name.removeprefix("identify_")
+  folder = settings.results or RESULTS / part
+  folder.mkdir(parents=True, exist_ok=True)
+  (folder / f"{page}.md").write_text(text)
   record = {
     "sets": sorted(answers),
     "figures": [dataclasses.asdict(row) for row in scoring.table([r["score"] for r in rows])],
     "scores": [{**row, "score": dataclasses.asdict(row["score"])} for row in rows],
     "answers": {name: answers[name] for name in names},
   }
-  (settings.results / f"{settings.name}.json").write_text(json.dumps(record, indent=1) + "\n")
+  (folder / f"{page}.json").write_text(json.dumps(record, indent=1) + "\n")
   seeds = ", ".join(sorted({name.split("_")[0] for name in names}))
   options = harness.Options(write=settings.write)
-  harness.finish(settings.name, figures_of(rows), options, seed=seeds)
+  harness.finish(settings.name, figures_of(rows), options, seed=seeds, within=f"analyser/{part}")
+
+
+def folder_of(answers: dict[str, Any], generator: str) -> str:
+  """Returns the folder of the generator whose plants the sets have, `generator` if several have."""
+  plants = {answer["plant"] for answer in answers.values()}
+  makers = [name for name, kinds in _PLANTS.items() if plants <= set(kinds)]
+  return FOLDERS[generator if generator in makers or not makers else makers[0]]
 
 
 def figures_of(rows: list[dict[str, Any]]) -> dict[str, dict[str, harness.Value]]:

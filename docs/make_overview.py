@@ -1,4 +1,4 @@
-"""Draws docs/overview.jpg: what the robot sees in the built-in room, four ways (needs EGL).
+"""Draws docs/pictures/overview.jpg: the built-in room as the robot sees it, four ways (needs EGL).
 
 python docs/make_overview.py
 """
@@ -60,7 +60,7 @@ def main() -> None:
     color, depth = renderer.render(camera, unit_from_truth.apply_pose(pose))
     rows.append(np.hstack([true[index], color, pictures.depth_map(depth), parts[index]]))
   picture = np.vstack(rows)[..., ::-1]
-  target = Path(__file__).with_name("overview.jpg")
+  target = Path(__file__).parent / "pictures" / "overview.jpg"
   cv2.imwrite(str(target), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 

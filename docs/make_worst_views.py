@@ -1,4 +1,4 @@
-"""Draws docs/worst_views.jpg: held-out views as the reports of bundles show them.
+"""Draws docs/pictures/worst_views.jpg: held-out views as the reports of bundles show them.
 
 python docs/make_worst_views.py "the worst in five minutes=out/fast" "an hour=out/quality:000644"
 """
@@ -51,7 +51,7 @@ def main() -> None:
     title, _, place = argument.partition("=")
     folder, _, frame = place.partition(":")
     rows.append(_row(title, _held_out(Path(folder) / "report.html", frame)))
-  path = Path(__file__).with_name("worst_views.jpg")
+  path = Path(__file__).parent / "pictures" / "worst_views.jpg"
   cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 78])
 
 

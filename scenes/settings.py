@@ -89,7 +89,7 @@ def preset(name: str) -> SceneSettings:
   if name == "tiny":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=60),
-      # a rate for few steps, see benchmarks/results/records/field_ablation.json
+      # a rate for few steps, see benchmarks/results/records/rooms/field_ablation.json
       train=dataclasses.replace(training.preset("fast"), max_seconds=60.0, learning_rate=5e-3),
     )
   if name == "paper":

@@ -1,8 +1,8 @@
 """Keeps every published figure as a record: values, unit, command, commit, machine, date, caveats.
 
-A file of `benchmarks/results/records/` holds the list of records of one benchmark or topic. Scripts
-write there with `--write` (`benchmarks.harness`); `benchmarks/tables.py` prints the records into
-the READMEs and `docs/figures.md`.
+A file in a folder of `benchmarks/results/records/` holds the list of records of one benchmark or
+topic. Scripts write there with `--write` (`benchmarks.harness`), each topic where its file is;
+`benchmarks/tables.py` prints the records into the READMEs and `docs/figures.md`.
 """
 
 import dataclasses
@@ -141,13 +141,13 @@ def _value(content: Any) -> Value:
 
 
 def read(folder: Path = RECORDS) -> dict[str, Record]:
-  """Returns all records by id, in the order of the files.
+  """Returns all records by id, in the order of the files' names; folders do not matter.
 
   Raises:
     ValueError: A record is not complete, stands twice, or has another topic than its file.
   """
   records: dict[str, Record] = {}
-  for path in sorted(folder.glob("*.json")):
+  for path in sorted(folder.rglob("*.json"), key=lambda path: path.name):
     for content in json.loads(path.read_text()):
       record = Record.from_dict(content, source=path.name)
       if record.id in records or not record.id.startswith(f"{path.stem}."):
@@ -159,10 +159,23 @@ def read(folder: Path = RECORDS) -> dict[str, Record]:
   return records
 
 
-def write(records: list[Record], topic: str, folder: Path = RECORDS) -> Path:
-  """Writes the file of a topic; returns its path."""
-  folder.mkdir(parents=True, exist_ok=True)
-  path = folder / f"{topic}.json"
+def path_of(topic: str, folder: Path = RECORDS, within: str = "") -> Path:
+  """Returns where a topic's file is, in whichever folder; a new topic's goes into `within`.
+
+  Raises:
+    ValueError: It is in two folders.
+  """
+  found = sorted(folder.rglob(f"{topic}.json"))
+  if len(found) > 1:
+    places = ", ".join(str(path.relative_to(folder)) for path in found)
+    raise ValueError(f"Found {places}; expected one file of topic {topic!r}.")
+  return found[0] if found else folder / within / f"{topic}.json"
+
+
+def write(records: list[Record], topic: str, folder: Path = RECORDS, within: str = "") -> Path:
+  """Writes the file of a topic at its `path_of`; returns its path."""
+  path = path_of(topic, folder, within)
+  path.parent.mkdir(parents=True, exist_ok=True)
   rows = [record.to_dict() for record in records]
   path.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
   return path
@@ -174,6 +187,7 @@ def update(
   provenance: Mapping[str, Any],
   *,
   folder: Path = RECORDS,
+  within: str = "",
 ) -> Path:
   """Writes what was just measured into a topic's records.
 
@@ -185,8 +199,9 @@ def update(
     figures: Values by name of the record, without the topic.
     provenance: From `harness.provenance`.
     folder: Where the records are.
+    within: Folder in it for a topic that has no file yet.
   """
-  path = folder / f"{topic}.json"
+  path = path_of(topic, folder)
   content = json.loads(path.read_text()) if path.is_file() else []
   kept = {row["id"]: Record.from_dict(row, source=path.name) for row in content}
   fields = {field.name for field in dataclasses.fields(Record)}
@@ -205,7 +220,7 @@ def update(
       measured_again=True,
       **origin,
     )
-  return write(list(kept.values()), topic, folder)
+  return write(list(kept.values()), topic, folder, within)
 
 
 def slug(name: str) -> str:

@@ -56,7 +56,7 @@ def test_records_carry_the_gpu_s_name(monkeypatch, tmp_path):
   monkeypatch.setattr(harness, "machine", lambda: machine)
   _fake(monkeypatch, {"render": _writes({"render_30x40": {"single_ms": 1.0}})})
   kept = []
-  monkeypatch.setattr(harness.ledger, "update", lambda *arguments: kept.append(arguments))
+  monkeypatch.setattr(harness.ledger, "update", lambda *arguments, **_: kept.append(arguments))
   assert gpu.main(gpu.Settings(write=True)) == 0
   topic, figures, origin = kept[0]
   assert topic == "gpu" and list(figures) == ["nvidia_x_100_render_30x40"]

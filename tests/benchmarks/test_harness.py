@@ -75,18 +75,23 @@ def test_a_row_that_has_other_values_starts_a_table():
 def test_figures_are_written_as_json_and_as_a_record(tmp_path, monkeypatch):
   monkeypatch.setattr(sys, "argv", [str(ROOT / "benchmarks/x.py"), "--write", "--rounds", "2"])
   kept = []
-  monkeypatch.setattr(ledger, "update", lambda *arguments: kept.append(arguments))
+  monkeypatch.setattr(ledger, "update", lambda *a, **k: kept.append((*a, k)))
   options = harness.Options(write=True, out=tmp_path / "x.json")
-  harness.finish("x", {"a": {"t_ms": 2.0}}, options, seed=1)
+  harness.finish("x", {"a": {"t_ms": 2.0}}, options, seed=1, within="speed")
   content = json.loads((tmp_path / "x.json").read_text())
   assert content["figures"] == {"a": {"t_ms": 2.0}}
   assert content["command"] == "python benchmarks/x.py --rounds 2"
-  topic, figures, origin = kept[0]
-  assert topic == "x" and figures == {"a": {"t_ms": 2.0}} and origin["seed"] == 1
+  topic, figures, origin, where = kept[0]
+  assert (
+    where == {"within": "speed"}
+    and topic == "x"
+    and figures == {"a": {"t_ms": 2.0}}
+    and origin["seed"] == 1
+  )
 
 
 def test_nothing_is_recorded_unless_asked(tmp_path, monkeypatch):
-  monkeypatch.setattr(ledger, "update", lambda *_: pytest.fail("wrote a record"))
+  monkeypatch.setattr(ledger, "update", lambda *_, **__: pytest.fail("wrote a record"))
   harness.finish("x", {"a": {"t_ms": 2.0}}, harness.Options(out=tmp_path / "x.md"))
   assert "| a | 2 |" in (tmp_path / "x.md").read_text()
 

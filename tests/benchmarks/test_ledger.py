@@ -89,6 +89,23 @@ def test_a_new_measurement_keeps_the_words_and_replaces_the_rest(tmp_path):
   assert records["x.new_one"].printed == "n 3"
 
 
+def test_a_topic_is_found_and_written_in_its_folder(tmp_path):
+  ledger.write([_record("b.a")], "b", tmp_path, "first")
+  ledger.write([_record("a.a")], "a", tmp_path / "second")
+  assert list(ledger.read(tmp_path)) == ["a.a", "b.a"]  # by name, whatever the folder
+  for topic, path in {"b": "first/b.json", "c": "third/c.json"}.items():
+    written = ledger.update(topic, {"n": {"n": 1}}, ORIGIN, folder=tmp_path, within="third")
+    assert written == tmp_path / path
+  assert list(ledger.read(tmp_path)) == ["a.a", "b.a", "b.n", "c.n"]
+
+
+def test_a_topic_has_one_file(tmp_path):
+  ledger.write([_record()], "x", tmp_path / "first")
+  ledger.write([_record()], "x", tmp_path / "second")
+  with pytest.raises(ValueError, match=r"first/x\.json, second/x\.json"):
+    ledger.write([_record()], "x", tmp_path)
+
+
 def test_a_name_s_end_is_its_unit():
   units = {"median_ms": "ms", "psnr_db": "dB", "steps_per_s": "1/s", "worst_degrees": "degrees"}
   assert {name: ledger.unit_of(name) for name in units} == units

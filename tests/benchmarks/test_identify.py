@@ -1,0 +1,36 @@
+"""Pages of judged runs lie in their generator's folder, named by seed, and the index has them."""
+
+import json
+
+import pytest
+
+from benchmarks import identify
+
+
+@pytest.mark.parametrize(
+  ("plants", "folder"),
+  [
+    (("pendulum", "arm"), "first"),
+    (("arm", "slider"), "second"),
+    (("bent",), "third"),
+    (("arm",), "second"),  # both have arms: as it was asked for
+    (("other",), "second"),
+  ],
+)
+def test_plants_tell_the_folder(plants, folder):
+  answers = {f"1_{index}": {"plant": plant} for index, plant in enumerate(plants)}
+  assert identify.folder_of(answers, "independent_sets") == folder
+
+
+def test_every_page_is_where_its_sets_belong_and_in_the_index():
+  index = (identify.RESULTS / "README.md").read_text()
+  pages = [path for path in identify.RESULTS.rglob("*.md") if path.name != "README.md"]
+  assert len(pages) > 30
+  for page in pages:
+    assert f"({page.relative_to(identify.RESULTS)})" in index, page
+    scores = page.with_suffix(".json")
+    if scores.is_file():
+      content = json.loads(scores.read_text())
+      assert {name.split("_")[0] for name in content["sets"]} == {page.stem}, page
+      generator = {v: k for k, v in identify.FOLDERS.items()}[page.parent.name]
+      assert identify.folder_of(content["answers"], generator) == page.parent.name, page
