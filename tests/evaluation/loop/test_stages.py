@@ -259,12 +259,12 @@ def test_the_page_tells_the_story_in_order_and_what_was_hidden_last(tmp_path):
   assert "robot before, after 3 trials: l_knee: 71 degrees C." in page
 
 
-def test_the_page_names_a_fitted_teacher_and_no_file(tmp_path):
+def test_the_page_names_an_adapted_teacher_and_no_file(tmp_path):
   told = _story(tmp_path, ("success",) * 4)
   told = told._replace(trained=told.trained._replace(teacher=str(tmp_path / "teacher.json")))
   telling.write(tmp_path / "loop.html", told)
   page = (tmp_path / "loop.html").read_text()
-  assert ">fitted<" in page and "teacher.json" not in page
+  assert ">adapted<" in page and "teacher.json" not in page
 
 
 @pytest.mark.parametrize(

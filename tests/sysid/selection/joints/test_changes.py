@@ -268,13 +268,14 @@ def _with_ticks(nominal, tick, random):
   return dataclasses.replace(nominal, states=dataclasses.replace(nominal.states, position=position))
 
 
-@pytest.mark.parametrize(("tick", "more"), [(1e-3, False), (4e-3, True)])
+@pytest.mark.parametrize(("tick", "more"), [(1e-3, False), (8e-3, True)])
 def test_a_command_waits_for_the_firmwares_tick(tick, more):
-  """Two recordings of one machine in one session, whose commands meet other ticks."""
+  """Two recordings in one session, whose commands meet other ticks, the later one longer ones."""
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   random = np.random.default_rng(0)
-  sweep_and_slow = logs_of(PENDULUM)[:2]
-  logs, before = ([_with_ticks(log, tick, random) for log in sweep_and_slow] for _ in range(2))
+  logs, before = (
+    [_with_ticks(log, longest, random) for log in logs_of(PENDULUM)[:2]] for longest in (tick, 1e-3)
+  )
   reductions = tuple([Reduction(model, log) for log in some] for some in (logs, before))
   found = subject.prepare(
     model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
