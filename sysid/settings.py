@@ -16,8 +16,6 @@ class Settings:
   """Of the cross-validation where there is one log only."""
   window_s: float = 0.5
   """s of the windows that restart from the measured state where an actuator holds no position."""
-  jump: float = 0.5
-  """Of the torque's deviation: efforts near larger jumps do not count for their scale."""
   effort_scale: float = 2.0
   """Share that a measured effort may be off: torque constants are guesses."""
   effort_repeats: float = 0.03

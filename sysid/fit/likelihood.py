@@ -23,7 +23,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured
-from nerf2real.sysid.model.servo_law import command_jump, duty_of
+from nerf2real.sysid.model.servo_law import duty_of
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -78,10 +78,8 @@ class JointLikelihood:
   def _measure(self, left: Array) -> tuple[float, float]:
     """Returns scale and correlation time of what a servo's law leaves of the duty [N]."""
     assert self.law is not None and self.effort is not None
-    jump = np.concatenate(
-      [command_jump(self.plant, i, 2.0 * self.plant.step) for i in range(len(self.plant.logs))]
-    )
-    self.gain[1] *= 1.0 / np.sqrt(1.0 + (self.law.gain * jump / (4.0 * self.floor[1])) ** 2)
+    jump = np.concatenate([_jumps(duty) for duty in self.effort])
+    self.gain[1] *= 1.0 / np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2)
     self.counts = np.maximum(np.add.reduceat(self.gain**2, self.starts, axis=1), 1.0)
     rows = np.zeros((2, self.size))
     rows[1] = left * self.gain[1]
@@ -354,6 +352,12 @@ class JointLikelihood:
     self.independent[:] = 1.0 / np.maximum(times, times[0])
     if self._known is not None:
       self.scale[1], self.independent[1] = self._known[0], 1.0 / self._known[1]
+
+
+def _jumps(readings: Array) -> Array:
+  """Returns by how much readings [N] differ from the next or the last."""
+  step = np.abs(np.diff(readings))
+  return np.maximum(np.append(step, 0.0), np.append(0.0, step))
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

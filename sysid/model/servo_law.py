@@ -180,13 +180,6 @@ def duty_of(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0) -> A
   return torque / (value["strength"] * plant.declared[INDEX["highest"]])
 
 
-def command_jump(plant: JointPlant, index: int, within: float) -> Array:
-  """Returns by how much of full duty [N] commands jump within so many seconds of a sample."""
-  log = plant.logs[index]
-  slope = plant.declared[INDEX["input"]] / plant.declared[INDEX["highest"]]
-  return np.abs(slope * (_held(log, log.time + within) - _held(log, log.time - within)))
-
-
 def _held(log: Measured, time: Array) -> Array:
   """Returns the last command [N] at each time [N]."""
   at = np.searchsorted(log.command_time, time, side="right") - 1

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.stats import chi2
 
+from nerf2real.sysid.fit.expectation import NOISE
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.selection.joints import play
 from nerf2real.sysid.selection.joints.baseline import differs
@@ -76,7 +77,7 @@ def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
   def both(joint: JointLikelihood, squares: Array) -> Array:
     return np.array([np.median(squares), mean_left(joint, squares)])
 
-  readings = now.noise_squares * (2.0 if subject.paired else 1.0)
+  readings = now.noise_squares * (1.0 + NOISE if subject.paired else 1.0)
   if subject.paired:
     readings = readings + _of_two_recordings(subject, item) + play.beside(now, item)
   anyway = np.array([np.median(readings), readings.mean()])

@@ -9,6 +9,7 @@ bounces, depends on microradians.
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from nerf2real.sysid.fit.expectation import NOISE
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.constants import own_size
@@ -35,7 +36,7 @@ def beside(joint: JointLikelihood, item: Scored) -> Array:
   if joint.expectation is None or not gap:
     return np.zeros(len(joint.starts))
   p = compose(joint.plant, item.terms, item.fit.x).p
-  left = joint.squares(joint.expectation.under(p) * joint.gain)[0] - joint.noise_squares
+  left = joint.squares(joint.expectation.under(p) * joint.gain)[0] - NOISE * joint.noise_squares
   squares = np.minimum(2.0 * np.clip(left, 0.0, None), 2.0 * gap**2 / 12.0)
   loose = np.concatenate([_loose(joint, item, i, gap) for i in range(len(joint.plant.logs))])
   share = np.add.reduceat(loose * joint.gain[0] ** 2, joint.starts) / joint.counts[0]

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.stats import chi2, norm
 
+from nerf2real.sysid.fit.expectation import NEIGHBOURS
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model.measured import quantum
@@ -115,9 +116,13 @@ def grown(best: Scored, usual: Scored, beyond: float, settings: Settings) -> boo
 def _together(joint: JointLikelihood, residual: Array) -> tuple[Array, Array]:
   """Returns how surely neighbouring readings' residuals go together in a block, and how much [B].
 
-  Sum of products over its standard error under independence, and the mean product.
+  Sum of products over its standard error under independence, and the mean product: beyond what the
+  noise of a reference makes of what is expected of neighbours.
   """
   products = np.append(residual[1:] * residual[:-1], 0.0)
+  if joint.expectation is not None:
+    read = joint.mask * np.append(joint.mask[1:], 0.0)
+    products -= NEIGHBOURS * joint.position_noise**2 * read
   total = np.add.reduceat(products, joint.starts)
   error = np.sqrt(np.add.reduceat(products**2, joint.starts))
   return total / np.maximum(error, 1e-300), total / joint.counts[0]

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.sysid.fit.expectation import Expectation
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.selection.joints.remainder import structured
 from nerf2real.sysid.settings import SETTINGS
 
@@ -12,7 +14,9 @@ LOGS, BLOCKS, SAMPLES = 3, 14, 50
 NOISE, WANDERS = 1e-3, 2e-3  # rad
 
 
-def _accused(amplitudes: np.ndarray, noise: np.ndarray) -> bool:
+def _accused(
+  amplitudes: np.ndarray, noise: np.ndarray, wanders: float = WANDERS, expectation: Any = None
+) -> bool:
   """Tells of a course that goes together in blocks, by amplitudes [B], beside noise [N]."""
   waves = np.tile(np.sqrt(2.0) * np.sin(np.linspace(0, 2 * np.pi, SAMPLES)), LOGS * BLOCKS)
   rows = (np.repeat(amplitudes, SAMPLES) * waves + noise)[None]
@@ -23,10 +27,11 @@ def _accused(amplitudes: np.ndarray, noise: np.ndarray) -> bool:
     log_of=np.repeat(np.arange(LOGS), BLOCKS),
     plant=SimpleNamespace(logs=[log]),
     position_noise=NOISE,
-    expectation=None,
+    expectation=expectation,
+    mask=np.ones(LOGS * BLOCKS * SAMPLES),
   )
   item: Any = SimpleNamespace(fit=SimpleNamespace(residuals=[rows]))
-  return structured(joint, item, SETTINGS, WANDERS**2)
+  return structured(joint, item, SETTINGS, wanders**2)
 
 
 def test_a_machine_that_wanders_as_machines_do_is_seldom_accused() -> None:
@@ -46,3 +51,16 @@ def test_one_that_differs_by_more_in_a_few_blocks_is() -> None:
   assert _accused(amplitudes, noise)
   amplitudes[20] = 0.0  # one block may hold a knock
   assert not _accused(amplitudes, noise)
+
+
+def test_the_noise_of_a_reference_is_no_misfit_of_a_machine() -> None:
+  """It is smoothed where it is expected, so that that of neighbours goes together."""
+  random, count = np.random.default_rng(0), LOGS * BLOCKS * SAMPLES
+  nothing, stamps = np.zeros(LOGS * BLOCKS), np.arange(count, dtype=float)
+  log: Any = SimpleNamespace(time=stamps)
+  p, accused = np.zeros(len(INDEX)), 0
+  for _ in range(200):
+    reference = Expectation([log], [(stamps, NOISE * random.normal(size=(1, count)))], p)
+    noise = NOISE * random.normal(size=count) - reference.under(p)[0]
+    accused += _accused(nothing, noise, 0.0, reference)
+  assert accused <= 200 * SETTINGS.level
