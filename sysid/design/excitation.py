@@ -134,7 +134,7 @@ def readings(plant: JointModel, terms: Sequence[Term], x: Array, command: Array)
   weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
   count = int(_DURATION / plant.step) + 100
   fields = [np.full(count, mean) for mean in (*np.mean(around[:3], axis=1), 0.0)]
-  out = np.zeros((4, len(TIMES)))
+  out = np.zeros((3, len(TIMES)))
   kernel.simulate(  # type: ignore[call-arg]
     kernel.record(p),
     plant.step,
@@ -153,6 +153,5 @@ def readings(plant: JointModel, terms: Sequence[Term], x: Array, command: Array)
     out[0],
     out[1],
     out[2],
-    out[3],
   )
-  return Simulated(out[0], out[2], out[3])
+  return Simulated(out[0], out[2])

@@ -67,6 +67,9 @@ class JointLikelihood:
     missed = np.concatenate([plant.reduction_error(i) for i in range(len(logs))])
     unsure = np.hypot(self.stamp_noise * self.speed, missed) / self.position_noise
     self.gain = np.array([self.mask / np.sqrt(1.0 + unsure**2), self.mask][: len(self.channels)])
+    if self.effort is not None:  # a reading near a jump depends on microseconds
+      jump = np.concatenate([_jumps(effort) for effort in self.effort])
+      self.gain[1] /= np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2)
     self.effort_unit: float | None = None
     """Effort over torque in a reference: a sensor's unit stays. None where none shows it."""
     self._cut()
@@ -78,9 +81,6 @@ class JointLikelihood:
   def _measure(self, left: Array) -> tuple[float, float]:
     """Returns scale and correlation time of what a servo's law leaves of the duty [N]."""
     assert self.law is not None and self.effort is not None
-    jump = np.concatenate([_jumps(duty) for duty in self.effort])
-    self.gain[1] *= 1.0 / np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2)
-    self.counts = np.maximum(np.add.reduceat(self.gain**2, self.starts, axis=1), 1.0)
     rows = np.zeros((2, self.size))
     rows[1] = left * self.gain[1]
     squares = self.squares(rows)[1]
@@ -263,7 +263,7 @@ class JointLikelihood:
     if self.effort is None or self.law is not None or self.follows:
       return None
     (outputs,) = self.simulate(terms, x[None])
-    return self._softened([along for _, along in outputs])[2]
+    return self._compared([along for _, along in outputs])[1]
 
   def _efforts(self, along: Sequence[Simulated | None], gain: float) -> Array:
     """Returns measured effort minus simulated torque [N], in the readings' unit: without a
@@ -274,29 +274,21 @@ class JointLikelihood:
       gain: of the motor, which a current may tell (a worn brush) or not (a weak magnet).
     """
     assert self.effort is not None
-    soft, torque, factor = self._softened(along, gain)
-    left = soft * (np.concatenate(self.effort) - factor * torque)
+    torque, factor = self._compared(along, gain)
+    left = np.concatenate(self.effort) - factor * torque
     # A current's torque lacks what the back-EMF takes.
-    speed = soft * self.speed
-    return left - float(left @ speed) / (float(speed @ speed) + 1e-12) * speed
+    seen = self.gain[1] ** 2 * self.speed
+    return left - float(left @ seen) / (float(seen @ self.speed) + 1e-12) * self.speed
 
-  def _softened(
-    self, along: Sequence[Simulated | None], gain: float = 1.0
-  ) -> tuple[Array, Array, float]:
-    """Returns weights of samples [N], less where torque jumps, simulated torque [N] and measured
-    effort over it."""
+  def _compared(self, along: Sequence[Simulated | None], gain: float = 1.0) -> tuple[Array, float]:
+    """Returns simulated torque [N] and measured effort over it: within what torque constants leave
+    open, or what it was in a reference."""
     assert self.effort is not None
-    measured = np.concatenate(self.effort)
     torque = np.concatenate([a.torque for a in along])  # type: ignore[union-attr]
-    jump = np.concatenate([a.jump for a in along])  # type: ignore[union-attr]
-    jump = jump * self._factor(measured, torque, self.mask, gain)
-    soft = 1.0 / np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2) * self.mask
-    return soft, torque, self._factor(measured, torque, soft, gain)
-
-  def _factor(self, measured: Array, torque: Array, weights: Array, gain: float) -> float:
-    """Returns measured over simulated effort, within what torque constants leave open, or what it
-    was in a reference."""
-    measured, both = weights * measured, weights * np.array([torque, self.speed])
+    measured, both = (
+      self.gain[1] * np.concatenate(self.effort),
+      self.gain[1] * np.array([torque, self.speed]),
+    )
     scale = float(np.linalg.lstsq(both @ both.T, both @ measured, rcond=None)[0][0])
     units: tuple[float, ...] = (1.0,)
     spread = self.settings.effort_scale
@@ -304,7 +296,7 @@ class JointLikelihood:
       units = (self.effort_unit, self.effort_unit / gain)
       spread = self.settings.effort_repeats
     near = [float(np.clip(scale, u / (1.0 + spread), u * (1.0 + spread))) for u in units]
-    return min(near, key=lambda factor: abs(factor - scale))
+    return torque, min(near, key=lambda factor: abs(factor - scale))
 
   def squares(self, residuals: Array) -> Array:
     """Returns mean squares of blocks [..., C, B]."""

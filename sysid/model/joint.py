@@ -48,7 +48,6 @@ class Simulated(NamedTuple):
 
   position: Array
   torque: Array
-  jump: Array
 
 
 class JointModel(JointPlant):
@@ -180,6 +179,6 @@ class JointModel(JointPlant):
 
     def simulated() -> Simulated:
       out = self._run(p, index, forces, table, readings)
-      return Simulated(out.position, out.torque, out.jump)
+      return Simulated(out.position, out.torque)
 
     return simulated

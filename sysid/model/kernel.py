@@ -159,7 +159,6 @@ def simulate(
   out_position: Array,
   out_velocity: Array,
   out_torque: Array,
-  out_jump: Array,
 ) -> None:
   """Simulates one log and writes position, velocity and actuator torque at the samples [S].
 
@@ -184,8 +183,6 @@ def simulate(
     out_position: [S], written.
     out_velocity: [S], written.
     out_torque: [S], written.
-    out_jump: [S], written: how much the torque jumps within two steps of the sample; a reading
-      there depends on microseconds.
   """
   slope, constant, per_q, per_v = p.input, p.constant, p.position, p.velocity
   lowest, highest = p.lowest, p.highest
@@ -241,7 +238,6 @@ def simulate(
     heat = 0.0
     torque = 0.0
     acceleration = 0.0
-    jump = 0.0
     told = 0.0
     gap_offset = 0.0
     motor_speed = v
@@ -290,18 +286,13 @@ def simulate(
         torque += share * (other - torque)
       told_before = told
       told = torque / untold
-      coming = 0.0
-      if pointer + 1 < command_time.size and command_time[pointer + 1] < reach + 3.0 * step:
-        coming = abs(strength * slope * (command[pointer + 1] - command[pointer]))
       # Torque between steps is interpolated: a jump would make errors jump with latencies.
       while e < end:
         x = (sample_time[e] * true_time - late_effort - time) * rate_of_steps + 1.0
         if x > 1.0:
           break
         out_torque[e] = told if n == 0 else told_before + max(x, 0.0) * (told - told_before)
-        out_jump[e] = max(jump, abs(told - told_before), coming)
         e += 1
-      jump = abs(told - told_before)
       demand = gravity_cos[i]
       if hinge:
         demand = demand * cosine + gravity_sin[i] * sine

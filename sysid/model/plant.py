@@ -38,8 +38,6 @@ class Output(NamedTuple):
   """[N]."""
   torque: Array
   """[N] the actuator's."""
-  jump: Array
-  """[N] how much the torque jumps within two steps of the sample."""
 
 
 def declared_parameters(model: mujoco.MjModel, joint: str) -> Array:
@@ -168,7 +166,7 @@ class JointPlant:
     readings: Array | None = None,
   ) -> Output:
     log, windows = self.logs[index], self.windows[index]
-    out = np.zeros((4, len(log.time)))
+    out = np.zeros((3, len(log.time)))
     weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
     kernel.simulate(  # type: ignore
       kernel.record(p),
@@ -188,9 +186,8 @@ class JointPlant:
       out[0],
       out[1],
       out[2],
-      out[3],
     )
-    return Output(out[0], out[1], out[2], out[3])
+    return Output(out[0], out[1], out[2])
 
 
 def turning(fields: Sequence[Array], hinge: bool) -> tuple[Array, Array, Array, Array]:
