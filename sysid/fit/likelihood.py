@@ -23,7 +23,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured
-from nerf2real.sysid.model.servo_law import duty_of
+from nerf2real.sysid.model.servo_law import command_jump, duty_of
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -67,9 +67,8 @@ class JointLikelihood:
     missed = np.concatenate([plant.reduction_error(i) for i in range(len(logs))])
     unsure = np.hypot(self.stamp_noise * self.speed, missed) / self.position_noise
     self.gain = np.array([self.mask / np.sqrt(1.0 + unsure**2), self.mask][: len(self.channels)])
-    if self.effort is not None:  # a reading near a jump depends on microseconds
-      jump = np.concatenate([_jumps(effort) for effort in self.effort])
-      self.gain[1] /= np.sqrt(1.0 + (jump / (4.0 * self.floor[1])) ** 2)
+    if self.effort is not None:
+      self.gain[1] /= np.sqrt(1.0 + (self._jumps() / (4.0 * self.floor[1])) ** 2)
     self.effort_unit: float | None = None
     """Effort over torque in a reference: a sensor's unit stays. None where none shows it."""
     self._cut()
@@ -77,6 +76,21 @@ class JointLikelihood:
     self.scale = np.maximum(self.floor, 1e-12)
     self.independent = np.ones(len(self.channels))
     self._known = None if plant.law is None else self._measure(plant.law[1])
+
+  def _jumps(self) -> Array:
+    """Returns by how much efforts [N] jump near a sample: there they depend on microseconds. It is
+    where commands jump that the servo's law hears, or where efforts do from reading to reading."""
+    assert self.effort is not None
+    plant, within = self.plant, 2.0 * self.plant.step
+    if self.law is not None:
+      jumps = [
+        self.law.gain * command_jump(plant, i, within, delay=self.law.delay)
+        for i in range(len(plant.logs))
+      ]
+    else:
+      steps = [np.pad(np.abs(np.diff(effort)), 1) for effort in self.effort]
+      jumps = [np.maximum(step[1:], step[:-1]) for step in steps]
+    return np.concatenate(jumps)
 
   def _measure(self, left: Array) -> tuple[float, float]:
     """Returns scale and correlation time of what a servo's law leaves of the duty [N]."""
@@ -344,12 +358,6 @@ class JointLikelihood:
     self.independent[:] = 1.0 / np.maximum(times, times[0])
     if self._known is not None:
       self.scale[1], self.independent[1] = self._known[0], 1.0 / self._known[1]
-
-
-def _jumps(readings: Array) -> Array:
-  """Returns by how much readings [N] differ from the next or the last."""
-  step = np.abs(np.diff(readings))
-  return np.maximum(np.append(step, 0.0), np.append(0.0, step))
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

@@ -180,6 +180,15 @@ def duty_of(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0) -> A
   return torque / (value["strength"] * plant.declared[INDEX["highest"]])
 
 
+def command_jump(plant: JointPlant, index: int, within: float, *, delay: float = 0.0) -> Array:
+  """Returns by how much of full duty [N] commands jump within so many seconds of a sample, heard
+  after a delay."""
+  log = plant.logs[index]
+  heard = log.time - delay
+  slope = plant.declared[INDEX["input"]] / plant.declared[INDEX["highest"]]
+  return np.abs(slope * (_held(log, heard + within) - _held(log, heard - within)))
+
+
 def _held(log: Measured, time: Array) -> Array:
   """Returns the last command [N] at each time [N]."""
   at = np.searchsorted(log.command_time, time, side="right") - 1
