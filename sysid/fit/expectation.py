@@ -18,6 +18,9 @@ from nerf2real.sysid.model.measured import Measured
 Array = np.ndarray
 
 _REACH = 5  # readings on either side that count: the next has less than 1e-5 of the weight
+_NEAR = (
+  2.5  # periods within which a parabola needs three readings: at the ends they are 0, 1 and 2 away
+)
 _FINE = 8  # times to a period, between which a parabola's values are interpolated
 NOISE = 27.0 / (32.0 * np.sqrt(np.pi))
 """Of the readings' mean square that is in what is expected: squares of the kernel of fourth order
@@ -65,21 +68,29 @@ class Expectation:
 def _smoothed(at: Array, rows: Array) -> tuple[Array, Array]:
   """Returns times [F] and values there [C, F] of parabolas that fit rows [C, S] about each.
 
+  Where fewer than three readings are near, as where some were lost, a value is interpolated.
+
   Args:
     at: stamps of the readings [S], s, increasing.
     rows: the readings.
   """
+  if len(at) < 2 * _REACH:
+    return at, rows
   period = float(np.median(np.diff(at)))
   when = np.linspace(at[0], at[-1], max(2, _FINE * round((at[-1] - at[0]) / period)))
-  nearest = np.clip(np.searchsorted(at, when), _REACH, max(len(at) - _REACH, _REACH))
-  near = np.clip(nearest[:, None] + np.arange(-_REACH, _REACH), 0, len(at) - 1)
+  values = np.array([np.interp(when, at, row) for row in rows])
+  nearest = np.clip(np.searchsorted(at, when), _REACH, len(at) - _REACH)
+  near = nearest[:, None] + np.arange(-_REACH, _REACH)
   apart = (at[near] - when[:, None]) / period
+  enough = np.sort(np.abs(apart), axis=1)[:, 2] < _NEAR
+  near, apart = near[enough], apart[enough]
   weights = np.exp(-0.5 * apart**2)
   moments = [np.sum(weights * apart**k, axis=1) for k in range(5)]
   normal = np.stack([np.stack(moments[k : k + 3], axis=1) for k in range(3)], axis=1)
-  beta = np.linalg.solve(normal, np.broadcast_to(np.eye(3)[:, :1], (len(when), 3, 1)))[..., 0]
+  beta = np.linalg.solve(normal, np.broadcast_to(np.eye(3)[:, :1], (len(near), 3, 1)))[..., 0]
   weights = weights * (beta[:, :1] + beta[:, 1:2] * apart + beta[:, 2:] * apart**2)
-  return when, np.sum(rows[:, near] * weights, axis=2)
+  values[:, enough] = np.sum(rows[:, near] * weights, axis=2)
+  return when, values
 
 
 _CLOCKS = ("clock_rate", "measurement_delay", "command_delay")
