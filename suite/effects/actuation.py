@@ -13,7 +13,32 @@ from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 from nerf2real.suite.sensors.delays import StepRing
 
-_WARMED, _STRENGTH_OF_HEAT = map(laws.over, (laws.warmed, laws.strength_of_heat))
+_WARMED, _STRENGTH_OF_HEAT, _DRAWN = map(
+  laws.over, (laws.warmed, laws.strength_of_heat, laws.drawn)
+)
+
+
+class _Torque:
+  """Torques of the last step at the joints that actuators drive, and what of them is the current's.
+
+  A motor's torque at a duty falls with its speed by its back-EMF, which servos' models have in the
+  joint's damping: the torque less it is the current's.
+  """
+
+  def __init__(self, binding: Binding):
+    """Notes gear and damping, which must have been written by then."""
+    self._gear, self._joint = binding.gear, binding.actuator_joint
+    damping = binding.model.dof_damping[binding.dofs]
+    self._damping = np.where(self._joint >= 0, np.append(damping, 0.0)[self._joint], 0.0)
+
+  def at_joints(self, binding: Binding) -> Array:
+    """Returns the actuators' torques [U] N m."""
+    return binding.last_force * self._gear
+
+  def of_current(self, binding: Binding) -> Array:
+    """Returns them less damping times speed [U] N m."""
+    speed = np.append(binding.velocity, 0.0)[self._joint]
+    return self.at_joints(binding) - self._damping * speed
 
 
 class CommandDelay(Operator):
@@ -110,16 +135,18 @@ class ThermalDerating(Operator):
   """The actuator heats with the square of its torque and weakens as it does.
 
   dT/dt = heating * torque^2 - T / time_constant, with T the rise above the start; its strength is
-  1 - derating * T, at least 0.1.
+  1 - derating * T, at least 0.1. With `back_emf` the torque is the current's: i^2 R heats.
   """
 
   def bind(self, binding: Binding) -> None:
     parameters = self.per_actuator(binding)
     step = binding.timestep
-    self._heating = parameters["heating"] * step * binding.gear**2
+    self._heating = parameters["heating"] * step
     self._cooling = 1 - step / np.maximum(parameters["time_constant"], step)
     self._derating = parameters["derating"]
     self._scales_limit = parameters["scales_limit"] > 0
+    self._back_emf = parameters["back_emf"] > 0
+    self._torque = _Torque(binding)
     self.temperature_rise = np.zeros(binding.model.nu)
     """K, [U]."""
 
@@ -127,8 +154,10 @@ class ThermalDerating(Operator):
     self.temperature_rise[:] = 0.0
 
   def step(self, binding: Binding) -> None:
-    rise = self.temperature_rise
-    _WARMED(rise, binding.last_force, self._heating, self._cooling, rise)
+    rise, torque = self.temperature_rise, self._torque.at_joints(binding)
+    if self._back_emf.any():
+      torque = np.where(self._back_emf, self._torque.of_current(binding), torque)
+    _WARMED(rise, torque, self._heating, self._cooling, rise)
     strength = _STRENGTH_OF_HEAT(rise, self._derating)
     binding.strength *= strength
     if self._scales_limit.any():
@@ -138,8 +167,9 @@ class ThermalDerating(Operator):
 class SupplySag(Operator):
   """All actuators weaken together as the supply's voltage falls under load and with time.
 
-  Strength is 1 - droop * (sum of |torque|) - fade * time, at least 0.1; the torques are those of
-  the last step.
+  Strength is 1 - droop * load - fade * time, at least 0.1; the load is the sum of |torque| of the
+  last step. With `back_emf` an actuator with a limit adds what its bridge takes from the supply,
+  the current's torque times the duty, torque over limit: negative where it gives back.
   """
 
   def bind(self, binding: Binding) -> None:
@@ -148,11 +178,22 @@ class SupplySag(Operator):
     self._droop = self.value(self.effects[0], "droop")
     self._fade = self.value(self.effects[0], "fade")
     self._scales_limit = self.value(self.effects[0], "scales_limit") > 0
-    self._gear = np.abs(binding.gear)
+    self._torque = _Torque(binding)
+    limit = np.abs(binding.model.actuator_forcerange[:, 1] * binding.gear)
+    limited = binding.model.actuator_forcelimited.astype(bool)
+    back_emf = self.value(self.effects[0], "back_emf") > 0
+    self._limit = np.where(limited & back_emf, limit, np.inf)
+    self._by_current = np.isfinite(self._limit)
 
   def step(self, binding: Binding) -> None:
-    load = float(np.abs(binding.last_force) @ self._gear)
-    strength = laws.strength_of_supply(load, binding.data.time, self._droop, self._fade)
+    torque = self._torque.at_joints(binding)
+    drawn = np.abs(torque)
+    if self._by_current.any():
+      by_current = _DRAWN(torque, self._torque.of_current(binding), self._limit)
+      drawn = np.where(self._by_current, by_current, drawn)
+    strength = laws.strength_of_supply(
+      float(drawn.sum()), binding.data.time, self._droop, self._fade
+    )
     binding.strength *= strength
     if self._scales_limit:
       binding.limit *= strength
@@ -166,6 +207,9 @@ def _choice(name: str, doc: str) -> Parameter:
 
 
 _SCALES_LIMIT = _choice("scales_limit", "1 if the actuator's limits weaken with it, 0 if they stay")
+_BACK_EMF = _choice(
+  "back_emf", "1 if the joint's damping is a motor's back-EMF, which takes from the current, else 0"
+)
 
 
 KINDS = (
@@ -221,6 +265,7 @@ KINDS = (
       Parameter("time_constant", "s", 300.0, 20.0, 1000.0, "of cooling", minimum=1e-3, shape=True),
       Parameter("derating", "1/K", 0.004, 0.001, 0.02, "loss per kelvin", minimum=0.0, shape=True),
       _SCALES_LIMIT,
+      _BACK_EMF,
     ),
     ThermalDerating,
   ),
@@ -230,9 +275,10 @@ KINDS = (
     "none",
     "actuator",
     (
-      Parameter("droop", "1/(N m)", 0.0, 0.0, 0.1, "loss per total torque", minimum=0.0),
-      Parameter("fade", "1/s", 0.0, 0.0, 0.01, "loss per second", minimum=0.0),
+      Parameter("droop", "1/(N m)", 0.0, 0.0, 0.2, "loss per total torque", minimum=0.0),
+      Parameter("fade", "1/s", 0.0, 0.0, 0.03, "loss per second", minimum=0.0),
       _SCALES_LIMIT,
+      _BACK_EMF,
     ),
     SupplySag,
   ),

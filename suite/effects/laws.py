@@ -98,11 +98,23 @@ def strength_of_heat(rise: float, derating: float) -> float:
 
 
 @law
+def drawn(torque: float, of_current: float, limit: float) -> float:
+  """Returns what an actuator's bridge takes from the supply, as torque: duty times current.
+
+  Args:
+    torque: at the duty, N m.
+    of_current: that less what back-EMF takes, N m.
+    limit: torque at full duty, N m.
+  """
+  return of_current * torque / limit
+
+
+@law
 def strength_of_supply(load: float, time: float, droop: float, fade: float) -> float:
   """Returns the strength of actuators under a supply: 1 - droop load - fade time.
 
   Args:
-    load: sum of the actuators' |torque|, N m.
+    load: sum of the actuators' |torque|, or of what they draw, N m.
     time: s since the start.
     droop: 1/(N m).
     fade: 1/s.

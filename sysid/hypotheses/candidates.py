@@ -107,9 +107,9 @@ def library(plant: JointPlant) -> list[Term]:
       joint,
       ("heating", "time_constant"),
       (0.0, 3.0),
-      (60.0, 1000.0),
-      (1.0, 30.0),
-      ((1.0, 60.0), (5.0, 10.0)),
+      (60.0 / torque**2, 1000.0),
+      (1.0 / torque**2, 30.0),
+      ((1.0 / torque**2, 60.0), (5.0 / torque**2, 10.0)),
       fixed=(("derating", 0.004),),
     ),
     Term(
@@ -177,7 +177,16 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
     for scales in ((0, 1) if limited else (0,))
     for tells in ((1, 0) if told else (1,))
   ]
-  if limited and term.kind == "motor_gain" and plant.declared[INDEX["damping"]] > 0:
+  damped = plant.declared[INDEX["damping"]] > 0
+  if damped and (term.kind == "thermal_derating" or (limited and term.kind == "supply_sag")):
+    # What heats a motor and what its bridge draws is current, of which back-EMF takes.
+    forms = [
+      dataclasses.replace(form, fixed=(*form.fixed, ("back_emf", float(current))))
+      for form in forms
+      for current in (0, 1)
+      if not current or dict(form.fixed)["scales_limit"] == limited
+    ]
+  if limited and damped and term.kind == "motor_gain":
     # A weak motor: its back-EMF, part of the joint's damping, falls with its torque.
     forms.append(dataclasses.replace(term, fixed=(*forms[-1].fixed, ("scales_damping", 1.0))))
   if term.kind == "motor_gain" and plant.declared[INDEX["velocity"]] != 0:

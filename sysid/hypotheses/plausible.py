@@ -16,6 +16,9 @@ _CYCLIC = ("phase",)
 _SERVO = 2.5
 """N m; stall torque of the OP3's MX-28 (Robotis), of whose kind the registry's ranges are."""
 
+_PER_TORQUE = {"1/(N m)": 1, "K/(s N^2 m^2)": 2}
+"""Units by the power of torque that they are per."""
+
 
 def ends(parameter: Parameter) -> tuple[float, float]:
   """Returns the least and the largest value that a parameter is looked for at."""
@@ -27,7 +30,8 @@ def plausible(term: Term, plant: JointPlant) -> Term:
   """Returns a term of a hinge whose bounds lie within the registry's ranges.
 
   A machine with more torque than such a servo rubs, springs and carries more: ranges of torques, of
-  masses and of what is torque per something grow with it; one with less may be limited to less.
+  masses and of what is torque per something grow with it; one with less may be limited to less, and
+  has more of what is something per torque. Of heat only heating times derating shows.
   """
   limit = plant.declared[INDEX["highest"]]
   torque = max(strongest(plant), limit if np.isfinite(limit) else 0.0)
@@ -40,6 +44,9 @@ def plausible(term: Term, plant: JointPlant) -> Term:
     lowest, highest = ends(parameter)
     if parameter.unit.startswith(("N m", "kg")):
       lowest, highest = lowest * smaller, highest * larger
+    highest /= smaller ** _PER_TORQUE.get(parameter.unit, 0)
+    if name == "heating":
+      highest *= kind_of(term.kind).parameter("derating").high / dict(term.fixed)["derating"]
     low[at], high[at] = max(low[at], lowest), min(high[at], highest)
     high[at] = max(high[at], low[at])
   starts = dict.fromkeys(tuple(map(float, np.clip(s, low, high))) for s in term.starts)

@@ -217,6 +217,7 @@ def _weakening(name: str, slots: tuple[str, ...]):
       p[I[slot]] = v[slot]
     p[I[f"{name}_scales_limit"]] = v.get("scales_limit", 0.0)
     p[I[f"{name}_tells"]] = v.get("effort_tells", 1.0)
+    p[I[f"{name}_back_emf"]] = v.get("back_emf", 0.0)
 
   return apply
 

@@ -44,16 +44,17 @@ NAMES = (
   *("load_kind",),
   # MuJoCo's friction constraint: R of its row, and the rate at which it takes speed away
   *("softness", "stopping_rate"),
-  # of heat: whether the actuator saturates earlier too, and whether its measured effort tells
-  *("heat_scales_limit", "heat_tells"),
+  # of heat: whether the actuator saturates earlier too, whether its measured effort tells, and
+  # whether the joint's damping, a motor's back-EMF, takes from the current that heats
+  *("heat_scales_limit", "heat_tells", "heat_back_emf"),
   # load friction: its square, and how much larger it is at rest
   *("load_square", "load_at_rest", "load_velocity"),
   # where the teeth of a gear with play meet
   *("tooth_stiffness", "tooth_damping", "friction_on_link"),
   # how far the state follows the readings: share of a difference, and speed per difference
   *("follow", "follow_speed"),
-  # the same of the supply as of heat
-  *("sag_scales_limit", "sag_tells"),
+  # the same of the supply as of heat, whose load is then duty times current
+  *("sag_scales_limit", "sag_tells", "sag_back_emf"),
   # torque at a duty over the declared: nothing here needs it, what is told of the duty does
   "strength",
   # s by which the other joints' readings, which prescribe the surroundings, are late
@@ -196,11 +197,13 @@ def simulate(
   amplitude, periods, phase = p.amplitude, p.periods, p.phase
   softness, stopping_rate = p.softness, p.stopping_rate
   heat_limits, heat_tells = p.heat_scales_limit > 0.5, p.heat_tells > 0.5
+  heat_damping = damping if p.heat_back_emf > 0.5 else 0.0
   load_kind, load_share, load_square = p.load_kind, p.load_coefficient, p.load_square
   load_at_rest, load_velocity = p.load_at_rest, p.load_velocity
   tooth_stiffness, tooth_damping = p.tooth_stiffness, p.tooth_damping
   friction_on_link = p.friction_on_link
   follow, follow_speed = p.follow, p.follow_speed
+  sag_by_current = p.sag_back_emf > 0.5 and highest < math.inf
   sag_limits, sag_tells = p.sag_scales_limit > 0.5, p.sag_tells > 0.5
   learned = weights.size > 0
   samples = sample_time.size
@@ -270,12 +273,13 @@ def simulate(
       before = torque  # of the last step
       inner, outer, untold = gain, 1.0, 1.0  # strength before the limits and after; not in efforts
       if heating > 0.0:
-        heat = laws.warmed(heat, before, heating * step, keep_cool)
+        heat = laws.warmed(heat, before - heat_damping * v, heating * step, keep_cool)
         weaker = laws.strength_of_heat(heat, derating)
         inner, outer = (inner, outer * weaker) if heat_limits else (inner * weaker, outer)
         untold *= 1.0 if heat_tells else weaker
       if droop > 0.0 or fade != 0.0:
-        weaker = laws.strength_of_supply(abs(before) + load[i], time, droop, fade)
+        own = laws.drawn(before, before - damping * v, highest) if sag_by_current else abs(before)
+        weaker = laws.strength_of_supply(own + load[i], time, droop, fade)
         inner, outer = (inner, outer * weaker) if sag_limits else (inner * weaker, outer)
         untold *= 1.0 if sag_tells else weaker
       strength = inner * outer

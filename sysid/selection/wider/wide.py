@@ -132,6 +132,8 @@ def hypotheses(
   for subject in subjects:
     plant = subject.now.plant
     terms = [plausible(t, plant) if plant.hinge else t for t in library(plant) if t.kind in WHOLE]
+    # What the other joints' bridges draw was not measured: of a supply they share torque counts.
+    terms = [t for t in terms if not dict(t.fixed).get("back_emf")]
     late = [_of_machine(t) for t in subject.library if t.kind in LATE]
     if len(late) == 1:  # a joint alone that holds no position does not tell these apart
       late.append(twin(late[0]))
