@@ -9,6 +9,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.registry import KINDS
 from nerf2real.sysid.hypotheses import force_law
 from nerf2real.sysid.hypotheses.terms import Term
@@ -180,18 +181,34 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   damped = plant.declared[INDEX["damping"]] > 0
   if damped and (term.kind == "thermal_derating" or (limited and term.kind == "supply_sag")):
     # What heats a motor and what its bridge draws is current, of which back-EMF takes.
-    forms = [
-      dataclasses.replace(form, fixed=(*form.fixed, ("back_emf", float(current))))
-      for form in forms
-      for current in (0, 1)
-      if not current or dict(form.fixed)["scales_limit"] == limited
+    of_current = [
+      _of_current(plant, form) for form in forms if dict(form.fixed)["scales_limit"] == limited
     ]
+    forms = [dataclasses.replace(f, fixed=(*f.fixed, ("back_emf", 0.0))) for f in forms]
+    forms += of_current
   if limited and damped and term.kind == "motor_gain":
     # A weak motor: its back-EMF, part of the joint's damping, falls with its torque.
     forms.append(dataclasses.replace(term, fixed=(*forms[-1].fixed, ("scales_damping", 1.0))))
   if term.kind == "motor_gain" and plant.declared[INDEX["velocity"]] != 0:
     forms.append(dataclasses.replace(term, fixed=(*term.fixed, ("position_alone", 1.0))))
   return forms
+
+
+def _of_current(plant: JointPlant, term: Term) -> Term:
+  """Returns a form of heat or supply by current, which begins where as much is lost as by torque."""
+  torque, current = plant.declared_torque(), plant.declared_torque(of_current=True)
+  if term.kind == "supply_sag":
+    by_torque, by_current = torque, laws.drawn(torque, current, plant.declared[INDEX["highest"]])
+  else:
+    by_torque, by_current = torque**2, current**2
+  more = float(by_torque.mean() / max(by_current.mean(), 1e-12))
+  return dataclasses.replace(
+    term,
+    high=(more * term.high[0], *term.high[1:]),
+    scale=(more * term.scale[0], *term.scale[1:]),
+    starts=tuple((more * size, *rest) for size, *rest in term.starts),
+    fixed=(*term.fixed, ("back_emf", 1.0)),
+  )
 
 
 def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:

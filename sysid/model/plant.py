@@ -149,13 +149,15 @@ class JointPlant:
     limited = bool(np.isfinite(self.declared[kernel.INDEX["highest"]]))
     return self.holds and limited and all(log.duty is not None for log in self.logs)
 
-  def declared_torque(self) -> Array:
-    """Returns the size of the declared actuator's torque over all logs [N]."""
+  def declared_torque(self, *, of_current: bool = False) -> Array:
+    """Returns the size of the declared actuator's torque over all logs [N], or of what of it is
+    the current's, where the joint's damping is back-EMF."""
     outputs = [
       self._run(self.declared, i, turning(self._nominal[i], self.hinge), None)
       for i in range(len(self.logs))
     ]
-    return np.abs(np.concatenate([o.torque for o in outputs]))
+    damping = self.declared[kernel.INDEX["damping"]] if of_current else 0.0
+    return np.abs(np.concatenate([o.torque - damping * o.velocity for o in outputs]))
 
   def _run(
     self,
