@@ -195,7 +195,7 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
 
 
 def _of_current(plant: JointPlant, term: Term) -> Term:
-  """Returns a form of heat or supply by current, which begins where as much is lost as by torque."""
+  """Returns a form of heat or supply by current that begins where as much is lost as by torque."""
   torque, current = plant.declared_torque(), plant.declared_torque(of_current=True)
   if term.kind == "supply_sag":
     by_torque, by_current = torque, laws.drawn(torque, current, plant.declared[INDEX["highest"]])
