@@ -9,7 +9,6 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.registry import KINDS
 from nerf2real.sysid.hypotheses import force_law
 from nerf2real.sysid.hypotheses.terms import Term
@@ -197,11 +196,10 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
 def _of_current(plant: JointPlant, term: Term) -> Term:
   """Returns a form of heat or supply by current that begins where as much is lost as by torque."""
   torque, current = plant.declared_torque(), plant.declared_torque(of_current=True)
-  if term.kind == "supply_sag":
-    by_torque, by_current = torque, laws.drawn(torque, current, plant.declared[INDEX["highest"]])
+  if term.kind == "supply_sag":  # duty times current, as torque
+    more = plant.declared[INDEX["highest"]] * torque.mean() / max(np.mean(torque * current), 1e-12)
   else:
-    by_torque, by_current = torque**2, current**2
-  more = float(by_torque.mean() / max(by_current.mean(), 1e-12))
+    more = np.mean(torque**2) / max(np.mean(current**2), 1e-12)
   return dataclasses.replace(
     term,
     high=(more * term.high[0], *term.high[1:]),
