@@ -13,16 +13,14 @@ from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 from nerf2real.suite.sensors.delays import StepRing
 
-_WARMED, _STRENGTH_OF_HEAT, _DRAWN = map(
-  laws.over, (laws.warmed, laws.strength_of_heat, laws.drawn)
-)
+_WARMED, _STRENGTH_OF_HEAT = map(laws.over, (laws.warmed, laws.strength_of_heat))
 
 
 class _Torque:
-  """Torques of the last step at the joints that actuators drive, and what of them is the current's.
+  """Torques of the last step at the joints that actuators drive, and what back-EMF takes of them.
 
   A motor's torque at a duty falls with its speed by its back-EMF, which servos' models have in the
-  joint's damping: the torque less it is the current's.
+  joint's damping: the torque less that is the current's.
   """
 
   def __init__(self, binding: Binding):
@@ -35,10 +33,9 @@ class _Torque:
     """Returns the actuators' torques [U] N m."""
     return binding.last_force * self._gear
 
-  def of_current(self, binding: Binding) -> Array:
-    """Returns them less damping times speed [U] N m."""
-    speed = np.append(binding.velocity, 0.0)[self._joint]
-    return self.at_joints(binding) - self._damping * speed
+  def of_back_emf(self, binding: Binding) -> Array:
+    """Returns damping times speed [U] N m."""
+    return self._damping * np.append(binding.velocity, 0.0)[self._joint]
 
 
 class CommandDelay(Operator):
@@ -156,7 +153,7 @@ class ThermalDerating(Operator):
   def step(self, binding: Binding) -> None:
     rise, torque = self.temperature_rise, self._torque.at_joints(binding)
     if self._back_emf.any():
-      torque = np.where(self._back_emf, self._torque.of_current(binding), torque)
+      torque = torque - np.where(self._back_emf, self._torque.of_back_emf(binding), 0.0)
     _WARMED(rise, torque, self._heating, self._cooling, rise)
     strength = _STRENGTH_OF_HEAT(rise, self._derating)
     binding.strength *= strength
@@ -168,8 +165,8 @@ class SupplySag(Operator):
   """All actuators weaken together as the supply's voltage falls under load and with time.
 
   Strength is 1 - droop * load - fade * time, at least 0.1; the load is the sum of |torque| of the
-  last step. With `back_emf` an actuator with a limit adds what its bridge takes from the supply,
-  the current's torque times the duty, torque over limit: negative where it gives back.
+  last step. With `back_emf` an actuator with a limit, its torque at full duty, adds what its bridge
+  draws in its place, duty times current, negative where it gives back.
   """
 
   def bind(self, binding: Binding) -> None:
@@ -180,20 +177,27 @@ class SupplySag(Operator):
     self._scales_limit = self.value(self.effects[0], "scales_limit") > 0
     self._torque = _Torque(binding)
     limit = np.abs(binding.model.actuator_forcerange[:, 1] * binding.gear)
-    limited = binding.model.actuator_forcelimited.astype(bool)
-    back_emf = self.value(self.effects[0], "back_emf") > 0
-    self._limit = np.where(limited & back_emf, limit, np.inf)
-    self._by_current = np.isfinite(self._limit)
+    bridges = binding.model.actuator_forcelimited.astype(bool) & (
+      self.value(self.effects[0], "back_emf") > 0
+    )
+    self._per_limit = np.where(bridges, 1.0 / np.maximum(limit, 1e-9), 0.0)
+    self._others = ~bridges
+    self.reset()
+
+  def reset(self) -> None:
+    self._strength = 1.0
 
   def step(self, binding: Binding) -> None:
-    torque = self._torque.at_joints(binding)
-    drawn = np.abs(torque)
-    if self._by_current.any():
-      by_current = _DRAWN(torque, self._torque.of_current(binding), self._limit)
-      drawn = np.where(self._by_current, by_current, drawn)
-    strength = laws.strength_of_supply(
-      float(drawn.sum()), binding.data.time, self._droop, self._fade
-    )
+    torque, time = self._torque.at_joints(binding), binding.data.time
+    load = float(np.abs(torque[self._others]).sum())
+    if self._others.all():
+      strength = laws.strength_of_supply(load, time, self._droop, self._fade)
+    else:
+      full = torque / self._strength
+      duty = full * self._per_limit
+      drawn, spared = float(duty @ full), float(duty @ self._torque.of_back_emf(binding))
+      strength = laws.strength_of_source(drawn, spared, load, time, self._droop, self._fade)
+    self._strength = strength
     binding.strength *= strength
     if self._scales_limit:
       binding.limit *= strength
@@ -275,7 +279,7 @@ KINDS = (
     "none",
     "actuator",
     (
-      Parameter("droop", "1/(N m)", 0.0, 0.0, 0.2, "loss per total torque", minimum=0.0),
+      Parameter("droop", "1/(N m)", 0.0, 0.0, 0.4, "loss per total torque", minimum=0.0),
       Parameter("fade", "1/s", 0.0, 0.0, 0.03, "loss per second", minimum=0.0),
       _SCALES_LIMIT,
       _BACK_EMF,

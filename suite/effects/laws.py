@@ -98,25 +98,34 @@ def strength_of_heat(rise: float, derating: float) -> float:
 
 
 @law
-def drawn(torque: float, of_current: float, limit: float) -> float:
-  """Returns what an actuator's bridge takes from the supply, as torque: duty times current.
-
-  Args:
-    torque: at the duty, N m.
-    of_current: that less what back-EMF takes, N m.
-    limit: torque at full duty, N m.
-  """
-  return of_current * torque / limit
-
-
-@law
 def strength_of_supply(load: float, time: float, droop: float, fade: float) -> float:
   """Returns the strength of actuators under a supply: 1 - droop load - fade time.
 
   Args:
-    load: sum of the actuators' |torque|, or of what they draw, N m.
+    load: sum of the actuators' |torque|, N m.
     time: s since the start.
     droop: 1/(N m).
     fade: 1/s.
   """
   return max(1.0 - droop * load - fade * time, LEAST_STRENGTH)
+
+
+@law
+def strength_of_source(
+  drawn: float, spared: float, load: float, time: float, droop: float, fade: float
+) -> float:
+  """Returns the voltage of a source with a resistance, over that without load.
+
+  Bridges draw duty times current, and the current is the voltage's less what back-EMF takes:
+  s = 1 - droop (s drawn - spared) - droop load - fade time, solved for s.
+
+  Args:
+    drawn: sum of duty times torque at the full voltage, N m.
+    spared: sum of duty times the torque that back-EMF takes, N m.
+    load: of others, N m.
+    time: s since the start.
+    droop: 1/(N m).
+    fade: 1/s.
+  """
+  strength = (1.0 + droop * (spared - load) - fade * time) / (1.0 + droop * drawn)
+  return max(strength, LEAST_STRENGTH)

@@ -239,6 +239,7 @@ def simulate(
         high_index = middle - 1
     pointer = low_index
     heat = 0.0
+    supply = 1.0
     torque = 0.0
     acceleration = 0.0
     told = 0.0
@@ -278,8 +279,15 @@ def simulate(
         inner, outer = (inner, outer * weaker) if heat_limits else (inner * weaker, outer)
         untold *= 1.0 if heat_tells else weaker
       if droop > 0.0 or fade != 0.0:
-        own = laws.drawn(before, before - damping * v, highest) if sag_by_current else abs(before)
-        weaker = laws.strength_of_supply(own + load[i], time, droop, fade)
+        if sag_by_current:
+          full = before / supply
+          duty = full / highest
+          weaker = laws.strength_of_source(
+            duty * full, duty * damping * v, load[i], time, droop, fade
+          )
+        else:
+          weaker = laws.strength_of_supply(abs(before) + load[i], time, droop, fade)
+        supply = weaker
         inner, outer = (inner, outer * weaker) if sag_limits else (inner * weaker, outer)
         untold *= 1.0 if sag_tells else weaker
       strength = inner * outer
