@@ -65,7 +65,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   lacking = more_at_first or leaves(subject, explainer.null, settings)
   lacking |= clear(found.best, explainer.null) > subject.beyond
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
-  if before is not None and usual is not None and not subject.paired:
+  if before is not None and usual is not None:
     something = [k for k in something if is_new(subject, found.best, k)]
   named = () if pressed(found.best) else tuple(k for k in found.named if k in something)
   anyway, left = remaining(subject, found.best)
