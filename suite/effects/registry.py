@@ -1,6 +1,7 @@
 """Every kind of effect, in the order in which they are put into a model."""
 
-from nerf2real.suite.effects import (
+from nerf2real.suite.effects.effect import Kind
+from nerf2real.suite.effects.kinds import (
   actuation,
   backlash,
   camera,
@@ -10,7 +11,6 @@ from nerf2real.suite.effects import (
   passive,
   residual,
 )
-from nerf2real.suite.effects.effect import Kind
 
 # Order: constants first (errors of declared ones before additions; a gain that scales the damping
 # before a friction that reads it), then forces and strength; backlash after all that changes the

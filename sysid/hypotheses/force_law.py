@@ -5,7 +5,8 @@ Shapes: P places along the position, V along the velocity.
 
 import numpy as np
 
-from nerf2real.suite.effects import Kind, kind_of, laws
+from nerf2real.suite.effects import Kind, kind_of
+from nerf2real.suite.effects.kinds import laws
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import Table
 from nerf2real.sysid.model.plant import JointPlant

@@ -16,7 +16,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.plant import JointPlant
 
 FORMS = (0, 1, 2, 3, 4)
-"""Which torque L loads the gear: `suite.effects.friction.LoadFriction`."""
+"""Which torque L loads the gear: `suite.effects.kinds.friction.LoadFriction`."""
 REPLACED = ("load_friction", "stribeck_friction", "supply_sag")
 """Kinds that imitate parts of it: strength that falls with torque is like friction that grows."""
 

@@ -134,7 +134,8 @@ class Term:
     return units[-1] if slide else units[0]
 
 
-_STIFF = 1e-3 / 0.999  # as suite.effects.friction: impedance 0.999 where an effect adds friction
+# as in suite.effects.kinds.friction: impedance 0.999 where an effect adds friction
+_STIFF = 1e-3 / 0.999
 
 
 def _stick(plant: JointPlant, p: Array) -> None:

@@ -23,8 +23,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from nerf2real.suite.effects import gear_train, laws
-from nerf2real.suite.effects.backlash import LINK_SHARE, ROTOR_WITHOUT_ARMATURE
+from nerf2real.suite.effects.kinds import gear_train, laws
+from nerf2real.suite.effects.kinds.backlash import LINK_SHARE, ROTOR_WITHOUT_ARMATURE
 from nerf2real.sysid.model.kernel_cache import discard_stale
 
 Array = np.ndarray

@@ -18,7 +18,8 @@ import math
 import mujoco
 import numpy as np
 
-from nerf2real.suite.effects import Effect, backlash
+from nerf2real.suite.effects import Effect
+from nerf2real.suite.effects.kinds import backlash
 from nerf2real.suite.effects.registry import kind_of
 
 KINDS = (
@@ -42,7 +43,7 @@ _NO_INPUT = 16  # mjINPUT_NONE, mjtype.h
 # The law's bristle damping is 0: MuJoCo integrates it as if it were inertia, step times damping.
 _RATE = 0.6
 _LEAST = 1e-3  # Coulomb friction over breakaway where a joint has none: the law divides by it
-_IMPEDANCE = 0.999  # of stiff constraints, as in `suite.effects.friction`
+_IMPEDANCE = 0.999  # of stiff constraints, as in `suite.effects.kinds.friction`
 
 
 def holds(spec: mujoco.MjSpec, effect: Effect) -> bool:

@@ -8,7 +8,7 @@ that is missing. Shapes: N samples.
 
 import numpy as np
 
-from nerf2real.suite.effects import laws
+from nerf2real.suite.effects.kinds import laws
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.signatures import TorqueResidual
 from nerf2real.sysid.hypotheses.composition import compose

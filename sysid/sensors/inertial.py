@@ -1,7 +1,7 @@
 """The IMU: what its readings say beyond the model's sensors along the measured motion.
 
 The joints are moved as they were measured; MuJoCo's own sensors give what an ideal IMU would read.
-What it does read is taken to be, as `suite.effects.measurement` has it,
+What it does read is taken to be, as `suite.effects.kinds.measurement` has it,
 
     lag(scale R' truth + bias, delay)
 

@@ -4,9 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.suite.effects import Effect, EffectStack, laws
+from nerf2real.suite.effects import Effect, EffectStack
 from nerf2real.suite.effects.effect import Parameter
-from nerf2real.suite.effects.force_law import force_kind
+from nerf2real.suite.effects.kinds import laws
+from nerf2real.suite.effects.kinds.force_law import force_kind
 from nerf2real.suite.effects.registry import KINDS
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood

@@ -15,9 +15,9 @@ analyser tabulates it; dry friction is none of these.
 
 from collections.abc import Callable, Sequence
 
-from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Kind, Operator, Parameter
+from nerf2real.suite.effects.kinds import laws
 
 
 class ForceLaw(Operator):

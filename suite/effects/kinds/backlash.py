@@ -14,9 +14,9 @@ link (its output gear), so that a light link stays regular.
 import mujoco
 import numpy as np
 
-from nerf2real.suite.effects import gear_train
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects.kinds import gear_train
 
 LINK_SHARE = 0.02  # of the armature, ours
 ROTOR_WITHOUT_ARMATURE = 0.05  # of the joint's inertia, ours, for a model that declares none

@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 
-from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects.kinds import laws
 from nerf2real.suite.sensors.delays import StepRing
 
 _WARMED, _STRENGTH_OF_HEAT = map(laws.over, (laws.warmed, laws.strength_of_heat))

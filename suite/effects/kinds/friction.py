@@ -9,9 +9,9 @@ which divides the creep by 100; `solimpfriction="0.999 0.999"` says the same in 
 
 import numpy as np
 
-from nerf2real.suite.effects import laws
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
+from nerf2real.suite.effects.kinds import laws
 
 _IMPEDANCE = 0.999  # ours, see above
 _STRIBECK, _LOAD_FRICTION, _GEAR_LOAD = map(

@@ -1,0 +1,1 @@
+"""Kinds of effect by where they act, and their laws."""
