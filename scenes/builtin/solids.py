@@ -106,7 +106,11 @@ def distance(solids: Iterable[Solid], points: np.ndarray, *, limit: float = np.i
   points = np.asarray(points, np.float64).reshape(-1, 3)
   best = np.full(len(points), limit)
   near_first = sorted(solids, key=lambda solid: -solid.bounding_radius)
+  low, high = points.min(0, initial=np.inf), points.max(0, initial=-np.inf)
   for solid in near_first:
+    outside = np.maximum(np.maximum(low - solid.position, solid.position - high), 0)
+    if np.linalg.norm(outside) - solid.bounding_radius >= limit:
+      continue  # none of the points is near enough
     reach = np.linalg.norm(points - solid.position, axis=-1) - solid.bounding_radius
     todo = reach < best
     if todo.any():
