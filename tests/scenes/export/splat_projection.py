@@ -1,5 +1,7 @@
 """Projection of splats in JAX, whose derivatives are the oracle of the written ones."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -17,6 +19,7 @@ def axes(rotations):
   return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
+@jax.jit
 def project(rows, starts, spacing, eye: Eye) -> Projected:
   """The responses of splats that lie before the camera, by the inverse of their axes."""
   positions = starts + spacing[:, None] * rows[:, :3]
@@ -41,11 +44,13 @@ def project(rows, starts, spacing, eye: Eye) -> Projected:
   return Projected(centres, conics, bends, jax.nn.sigmoid(rows[:, 10]), rows[:, 11:])
 
 
+@jax.jit
 def pull(rows, starts, spacing, eye: Eye, slopes: Projected):
   """Derivatives [N, 14] of a loss by the packed parameters, of those by the responses."""
   return jax.vjp(lambda r: project(r, starts, spacing, eye), rows)[1](slopes)[0]
 
 
+@functools.partial(jax.jit, static_argnames=("width", "height"))
 def render(rows, starts, spacing, eye: Eye, *, width: int, height: int):
   """The picture [H, W, 3] by its definition: every splat's nearest point to every ray, sorted."""
   positions = starts + spacing[:, None] * rows[:, :3]
