@@ -18,8 +18,8 @@ PICTURES, PERIOD = 16, 0.2
 
 def pose_at(time):
   """A walk through a room that turns as it goes: world from camera."""
-  turn = Rotation.from_euler("y", 25 * time, degrees=True)
-  return turn, np.array([0.6 * np.sin(0.8 * time), 0.05 * np.sin(3 * time), 0.5 * time])
+  turn = Rotation.from_rotvec(np.multiply.outer(np.radians(25) * time, [0.0, 1.0, 0.0]))
+  return turn, np.stack([0.6 * np.sin(0.8 * time), 0.05 * np.sin(3 * time), 0.5 * time], -1)
 
 
 def filmed(readout, *, noise=0.0, seed=0):
@@ -33,23 +33,20 @@ def filmed(readout, *, noise=0.0, seed=0):
     name, time = f"{number:02d}.png", number * PERIOD
     times[name] = time
     turn, place = pose_at(time)
-    seen = []
-    for k, point in enumerate(points):
-      instant = 0.0
-      for _ in range(6):
-        turned, moved = pose_at(time + instant * readout)
-        local = turned.inv().apply(point - moved)
-        if local[2] < 0.3:
-          break
-        pixel = CAMERA.project(local)
-        instant = np.clip(pixel[1] / CAMERA.height - 0.5, -0.5, 0.5)
-      if local[2] > 0.3 and (pixel > 0).all() and (pixel < [640, 360]).all():
-        seen.append((k, pixel + noise * rng.standard_normal(2)))
+    instants, ahead = np.zeros(len(points)), np.ones(len(points), bool)
+    for _ in range(6):
+      turned, moved = pose_at(time + instants * readout)
+      local = turned.inv().apply(points - moved)
+      ahead &= local[:, 2] > 0.3
+      pixels = CAMERA.project(np.where(ahead[:, None], local, 1.0))
+      instants = np.clip(pixels[:, 1] / CAMERA.height - 0.5, -0.5, 0.5)
+    seen = np.flatnonzero(ahead & (pixels > 0).all(1) & (pixels < [640, 360]).all(1))
+    pixels = pixels[seen] + noise * rng.standard_normal((len(seen), 2))
     matrix = np.hstack([turn.inv().as_matrix(), -turn.inv().apply(place)[:, None]])
     image = pycolmap.Image(name=name, camera_id=1, image_id=number + 1)
-    image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for _, pixel in seen])
+    image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
-    for row, (k, _) in enumerate(seen):
+    for row, k in enumerate(seen):
       tracks[k].add_element(number + 1, row)
   for point, track in zip(points, tracks, strict=True):
     if track.length() >= 3:
