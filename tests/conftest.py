@@ -1,8 +1,11 @@
 """Set-up of all tests: MuJoCo draws through EGL where there is no screen, as on a server; BLAS has
-one thread, as in the commands, since tests run side by side."""
+one thread, as in the commands, since tests run side by side; what JAX compiled is kept until the
+session ends, for all its processes."""
 
 import os
+import shutil
 import signal
+import tempfile
 
 from hypothesis import settings
 
@@ -16,6 +19,18 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 if "DISPLAY" not in os.environ:
   os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported, so before anything else
 
+# Read when jax is imported. Workers and what tests start inherit it; nothing outlives the session.
+_compiled = None
+if "PYTEST_XDIST_WORKER" not in os.environ:
+  _compiled = tempfile.mkdtemp(prefix="compiled-")
+  os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled
+  os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
 # The first example of a test may wait for imports, compilers or other programs of the machine.
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
+
+
+def pytest_unconfigure():
+  if _compiled is not None:
+    shutil.rmtree(_compiled, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Compile quickly: these tests compile much and compute little."""
+"""Compile quickly: these tests, and the processes they start, compile much and compute little."""
 
 import jax
 import pytest
@@ -8,5 +8,7 @@ import pytest
 def _compile_quickly():
   before = jax.config.read("jax_disable_most_optimizations")
   jax.config.update("jax_disable_most_optimizations", True)
-  yield
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    yield
   jax.config.update("jax_disable_most_optimizations", before)
