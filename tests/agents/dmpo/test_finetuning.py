@@ -1,5 +1,7 @@
 """From a student: the critic's warm-up, the KL to the student, burn-in, features of an encoder."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from tests.agents.dmpo.test_learning import CONFIG, LAYOUT, _batch, _same
 
 STATE_LAYOUT = Layout(None, None, ("s",), (3,), (), (), 2)
 DRAWN = config.override(CONFIG, {"student_kl": 0.5, "critic_warmup": 2})
+PICTURES = config.override(CONFIG, {"n_step": 1, "augmentation.enabled": False})
 
 
 def _begun(settings=DRAWN, layout=STATE_LAYOUT, seed=0):
@@ -29,22 +32,24 @@ def _begun(settings=DRAWN, layout=STATE_LAYOUT, seed=0):
   return functions, state._replace(policy=moved, target_policy=jax.tree.map(jnp.copy, moved))
 
 
+@functools.partial(jax.jit, static_argnames=("layout", "settings"))
+def _jitted_gradient(trained, targets, batch, student, *, layout, settings):
+  """Of the parameters that are trained; compiled once for each kind of batch."""
+  return jax.grad(objective.total_loss, has_aux=True)(
+    trained,
+    *targets,
+    batch=batch,
+    key=jax.random.key(1),
+    config=settings,
+    layout=layout,
+    student=student,
+  )[0]
+
+
 def _gradient(state, batch, *, student, layout=STATE_LAYOUT, settings=DRAWN):
   trained = (state.policy, state.critic, state.duals, state.belief)
-  return jax.jit(
-    jax.grad(
-      lambda trained, batch: objective.total_loss(
-        trained,
-        state.target_policy,
-        state.target_critic,
-        batch=batch,
-        key=jax.random.key(1),
-        config=settings,
-        layout=layout,
-        student=student,
-      )[0]
-    )
-  )(trained, batch)
+  targets = (state.target_policy, state.target_critic)
+  return _jitted_gradient(trained, targets, batch, student, layout=layout, settings=settings)
 
 
 def test_only_the_critic_moves_while_it_warms_up():
@@ -67,15 +72,17 @@ def test_the_warm_up_does_what_the_whole_update_does_to_the_critic():
   _, state = _begun()
   batch = _batch(STATE_LAYOUT, 0, 6)
   whole = _gradient(state, batch | {"student_weight": np.float32(0.0)}, student={})[1]
-  alone = jax.grad(
-    lambda critic: objective.critic_objective(
-      critic,
-      state.target_policy,
-      state.target_critic,
-      batch=batch,
-      key=jax.random.key(1),
-      config=DRAWN,
-    )[0]
+  alone = jax.jit(
+    jax.grad(
+      lambda critic: objective.critic_objective(
+        critic,
+        state.target_policy,
+        state.target_critic,
+        batch=batch,
+        key=jax.random.key(1),
+        config=DRAWN,
+      )[0]
+    )
   )(state.critic)
   jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), whole, alone)
 
@@ -165,8 +172,7 @@ def test_the_student_is_the_policy_that_the_run_began_with_and_is_rescaled_with_
 
 def test_what_lies_in_the_burn_in_counts_for_nothing():
   """Other actions and rewards there change no gradient; the pictures reach the LSTM alone."""
-  settings = config.override(CONFIG, {"n_step": 1})
-  state = jax.jit(learning.make_learning(settings, LAYOUT).init)(jax.random.key(0))
+  state = jax.jit(learning.make_learning(PICTURES, LAYOUT).init)(jax.random.key(0))
   batch = _batch(LAYOUT, 4, 6)
   batch["last"] = np.full(4, 5, np.int32)
   batch["burn_in"] = np.full(4, 3, np.int32)
@@ -175,7 +181,7 @@ def test_what_lies_in_the_burn_in_counts_for_nothing():
   other["privileged"][:, 0] += 7.0
 
   def gradient(batch):
-    return _gradient(state, batch, student={}, layout=LAYOUT, settings=settings)
+    return _gradient(state, batch, student={}, layout=LAYOUT, settings=PICTURES)
 
   def same(a, b):
     np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
@@ -205,9 +211,7 @@ def test_no_gradient_reaches_back_into_the_burn_in():
 
 
 def test_features_of_a_frozen_encoder_stand_for_the_pictures():
-  settings = config.override(
-    CONFIG, {"frozen_encoder": True, "feature_copies": 3, "augmentation.enabled": False}
-  )
+  settings = config.override(PICTURES, {"frozen_encoder": True, "feature_copies": 3})
   state = jax.jit(learning.make_learning(settings, LAYOUT).init)(jax.random.key(0))
   encoder = FrozenEncoder(state.policy, settings, length=6, seed=0)
   batch = _batch(LAYOUT, 4, 6)
@@ -215,7 +219,7 @@ def test_features_of_a_frozen_encoder_stand_for_the_pictures():
   assert stored.shape == (4, 6, 3, 5) and stored.dtype == np.float16
   features = {name: a for name, a in batch.items() if name != "image"} | {"features": stored}
   by_features = _gradient(state, features, student={}, layout=LAYOUT, settings=settings)
-  by_pictures = _gradient(state, batch, student={}, layout=LAYOUT, settings=settings)
+  by_pictures = _gradient(state, batch, student={}, layout=LAYOUT, settings=PICTURES)
   assert not any(x.any() for x in jax.tree.leaves(by_features[0]["resnet"]))
   for name in ("lstm", "mlp", "mean"):
     jax.tree.map(
@@ -227,13 +231,7 @@ def test_features_of_a_frozen_encoder_stand_for_the_pictures():
 
 def test_outputs_of_a_frozen_lstm_stand_for_pictures_and_states():
   settings = config.override(
-    CONFIG,
-    {
-      "frozen_encoder": True,
-      "frozen_memory": True,
-      "feature_copies": 2,
-      "augmentation.enabled": False,
-    },
+    PICTURES, {"frozen_encoder": True, "frozen_memory": True, "feature_copies": 2}
   )
   state = jax.jit(learning.make_learning(settings, LAYOUT).init)(jax.random.key(0))
   encoder = FrozenEncoder(state.policy, settings, length=4, seed=0)  # 4 and 2 frames
@@ -246,7 +244,7 @@ def test_outputs_of_a_frozen_lstm_stand_for_pictures_and_states():
   assert stored.shape == (4, 6, 2, 4) and {name for w in whole for name in w} == {"embedding"}
   embedded = {name: a for name, a in batch.items() if name not in names} | {"embedding": stored}
   by_memory = _gradient(state, embedded, student={}, layout=LAYOUT, settings=settings)
-  by_pictures = _gradient(state, batch, student={}, layout=LAYOUT, settings=settings)
+  by_pictures = _gradient(state, batch, student={}, layout=LAYOUT, settings=PICTURES)
   for name in ("resnet", "lstm"):
     assert not any(x.any() for x in jax.tree.leaves(by_memory[0][name])), name
   jax.tree.map(

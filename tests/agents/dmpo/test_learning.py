@@ -1,5 +1,7 @@
 """The update: what moves, what does not, padding, and a problem with a known answer."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,6 +73,20 @@ def _same(a, b):
   return all(jax.tree.leaves(jax.tree.map(lambda x, y: bool((x == y).all()), a, b)))
 
 
+@functools.partial(jax.jit, static_argnames="layout")
+def _jitted_gradients(parameters, batch, *, layout):
+  return jax.grad(objective.total_loss, (0, 1, 2), has_aux=True)(
+    *parameters, batch=batch, key=jax.random.key(1), config=CONFIG, layout=layout
+  )[0]
+
+
+def _gradients(state, batch, layout):
+  """Of what is trained, the target policy and the target critic."""
+  trained = (state.policy, state.critic, state.duals, state.belief)
+  parameters = (trained, state.target_policy, state.target_critic)
+  return _jitted_gradients(parameters, batch, layout=layout)
+
+
 def test_targets_are_copied_at_their_periods(vision):
   states, _ = vision
   assert _same(states[1].target_policy, states[0].policy)
@@ -103,25 +119,13 @@ def test_padding_has_no_influence():
     for name in ("state", "action", "reward", "discount"):
       rubbish[name][b, last + 1 :] = 7.0
 
-  @jax.jit
-  def gradients(batch):
-    trained = (state.policy, state.critic, state.duals, state.belief)
-    return jax.grad(objective.total_loss, (0, 1, 2), has_aux=True)(
-      trained,
-      state.target_policy,
-      state.target_critic,
-      batch=batch,
-      key=jax.random.key(1),
-      config=CONFIG,
-      layout=layout,
-    )[0]
-
+  found = _gradients(state, batch, layout)
   jax.tree.map(
     lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8),
-    gradients(batch),
-    gradients(rubbish),
+    found,
+    _gradients(state, rubbish, layout),
   )
-  of_targets = gradients(batch)[1:]
+  of_targets = found[1:]
   assert all(not x.any() for x in jax.tree.leaves(of_targets))  # nothing reaches the targets
 
 
@@ -144,21 +148,9 @@ def test_a_terminal_observation_reaches_no_gradient_of_the_policy():
   for b, last in enumerate(batch["last"]):
     other["state"][b, last] = 5.0
 
-  @jax.jit
-  def gradient(batch):
-    trained = (state.policy, state.critic, state.duals, state.belief)
-    return jax.grad(objective.total_loss, has_aux=True)(
-      trained,
-      state.target_policy,
-      state.target_critic,
-      batch=batch,
-      key=jax.random.key(1),
-      config=CONFIG,
-      layout=layout,
-    )[0]
-
   same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8)  # noqa: E731
-  jax.tree.map(same, gradient(batch), gradient(other))
+  of_trained = [_gradients(state, b, layout)[0] for b in (batch, other)]
+  jax.tree.map(same, *of_trained)
 
 
 def test_the_first_policy_stands():
