@@ -4,6 +4,7 @@ Textures are uint8 [H, W, 3]. Power-law noise gives structure at every scale, as
 features for SIFT from near and far, and little energy at the finest scale, so that nothing aliases.
 """
 
+import functools
 import itertools
 
 import cv2
@@ -19,15 +20,20 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], *, slope=1.0, stretc
     slope: Exponent of the amplitude spectrum; larger is smoother.
     stretch: Length of the structures along y and x (wood grain: one large, one small).
   """
+  spectrum = np.fft.rfft2(rng.standard_normal(shape)) * _amplitude(shape, slope, stretch)
+  picture = np.fft.irfft2(spectrum, s=shape)
+  return (picture - picture.mean()) / picture.std()
+
+
+@functools.lru_cache(maxsize=16)
+def _amplitude(shape: tuple[int, int], slope: float, stretch: tuple[float, float]) -> np.ndarray:
+  """Returns the spectrum of `noise` [H, W // 2 + 1], kept for the textures of one size."""
   height, width = shape
   fy = np.fft.fftfreq(height)[:, None] * stretch[0]
   fx = np.fft.rfftfreq(width)[None] * stretch[1]
   radius = np.sqrt(fy * fy + fx * fx)
   radius[0, 0] = np.inf
-  amplitude = radius**-slope * np.exp(-((radius / (0.22 * max(stretch))) ** 2))
-  spectrum = np.fft.rfft2(rng.standard_normal(shape)) * amplitude
-  picture = np.fft.irfft2(spectrum, s=shape)
-  return (picture - picture.mean()) / picture.std()
+  return radius**-slope * np.exp(-((radius / (0.22 * max(stretch))) ** 2))
 
 
 def to_uint8(picture: np.ndarray) -> np.ndarray:
@@ -63,8 +69,11 @@ def planks(
       right = left + int(rng.uniform(0.7, 1.3) * mean_length * width)
       a, b = max(left, 0), min(right, width)
       if b > a:
-        board = np.roll(source, tuple(rng.integers(0, [height, width])), (0, 1))
-        board = board[top:bottom, a:b] * rng.uniform(0.78, 1.12) * rng.uniform(0.96, 1.04, 3)
+        down, along = rng.integers(0, [height, width])
+        board = source[
+          np.ix_(np.arange(top - down, bottom - down), np.arange(a - along, b - along))
+        ]
+        board = board * rng.uniform(0.78, 1.12) * rng.uniform(0.96, 1.04, 3)
         for _ in range(rng.poisson(3.0)):
           _knot(board, rng)
         picture[top:bottom, a:b] = board
