@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.suite.effects.registry import KINDS
-from nerf2real.sysid.hypotheses import force_law
+from nerf2real.sysid.hypotheses import force_law, measured_supply
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.plant import JointPlant
@@ -128,6 +128,7 @@ def library(plant: JointPlant) -> list[Term]:
   ]
   weaker = {"motor_gain", "supply_sag", "thermal_derating"}
   terms = [v for t in terms for v in (_weakenings(plant, t) if t.kind in weaker else [t])]
+  terms = [measured_supply.bounded(plant, t) if t.kind == "supply_sag" else t for t in terms]
   if plant.holds:
     terms.append(_one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, _DELAYS[:-1]))
     terms.append(_play(plant, encoder_on_motor=True))
