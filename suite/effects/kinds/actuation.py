@@ -27,7 +27,7 @@ class _Torque:
     """Notes gear and damping, which must have been written by then."""
     self._gear, self._joint = binding.gear, binding.actuator_joint
     damping = binding.model.dof_damping[binding.dofs]
-    self._damping = np.where(self._joint >= 0, np.append(damping, 0.0)[self._joint], 0.0)
+    self._damping = np.append(damping, 0.0)[self._joint]  # of joint -1 none
 
   def at_joints(self, binding: Binding) -> Array:
     """Returns the actuators' torques [U] N m."""
