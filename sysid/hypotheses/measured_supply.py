@@ -6,13 +6,14 @@ import numpy as np
 
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.model.measured import Measured
 from nerf2real.sysid.model.plant import JointPlant
 
 Array = np.ndarray
 
-_MISSED = 4.0
-"""Times the fall of a voltage that its readings tell, chosen: of a thin cable's, read at a tenth of
-the rate of the positions, they tell four tenths."""
+_SLACK = 2.0
+"""Times the fall that the voltage tells, chosen: a servo may draw half of what the declared one
+does."""
 _LEAST = 1e-3  # of what was plausible
 
 
@@ -21,36 +22,37 @@ def bounded(plant: JointPlant, term: Term) -> Term:
 
   Where a log has no voltage, or other actuators load the supply, too, it is as it was. The bound is
   a multiple of a regression of voltage on time and on the load of the declared servo at the
-  measured motion: single readings scatter.
+  measured motion, when the voltage was read: single readings scatter, and are fewer than others.
   """
-  volts = [log.voltage for log in plant.logs if log.voltage is not None]
-  if len(volts) < len(plant.logs) or plant.model.nu > 1:
+  read = [r.log.battery for r in plant.reductions if r.log.battery is not None]
+  if len(read) < len(plant.logs) or plant.model.nu > 1:
     return term
-  volt, time, speed = (
-    np.concatenate(rows)
-    for rows in (volts, [log.time for log in plant.logs], [log.velocity for log in plant.logs])
-  )
-  torque, left = _asked_torque(plant), volt / np.quantile(volt, 0.98)
+  rows = [
+    np.stack([series.value, series.stamp, *_at(plant, log, series.stamp)])
+    for series, log in zip(read, plant.logs, strict=True)
+  ]
+  volt, time, torque, taken = np.concatenate(rows, axis=1)
+  left = volt / np.quantile(volt, 0.98)
   load = np.abs(torque) * left
   if dict(term.fixed).get("back_emf"):
-    taken = plant.declared[INDEX["damping"]] * speed
     load = torque * (torque * left - taken) / plant.declared[INDEX["highest"]]
-  rows = np.stack([np.ones(len(time)), -load, -time], -1)
-  full, *lost = np.linalg.lstsq(rows, volt, rcond=None)[0]
+  columns = np.stack([np.ones(len(time)), -load, -time], -1)
+  full, *lost = np.linalg.lstsq(columns, volt, rcond=None)[0]
   high = tuple(
-    min(most, max(_MISSED * float(told / full), _LEAST * most))
+    min(most, max(_SLACK * float(told / full), _LEAST * most))
     for most, told in zip(term.high, lost, strict=True)
   )
   starts = tuple(tuple(map(min, start, high)) for start in term.starts)
   return dataclasses.replace(term, high=high, starts=starts)
 
 
-def _asked_torque(plant: JointPlant) -> Array:
-  """Returns the declared servo's torque at what was commanded and measured, of all logs [N m]."""
-  p, asked = plant.declared, []
-  for log in plant.logs:
-    at = np.searchsorted(log.command_time, log.time, side="right") - 1
-    torque = p[INDEX["input"]] * log.command[np.maximum(at, 0)] + p[INDEX["constant"]]
-    torque += p[INDEX["position"]] * log.position + p[INDEX["velocity"]] * log.velocity
-    asked.append(np.clip(torque, p[INDEX["lowest"]], p[INDEX["highest"]]))
-  return np.concatenate(asked)
+def _at(plant: JointPlant, log: Measured, stamp: Array) -> tuple[Array, Array]:
+  """Returns the declared servo's torque at what was commanded and measured, and what the joint's
+  damping takes, both at stamps [N m]."""
+  p = plant.declared
+  at = np.searchsorted(log.command_time, log.time, side="right") - 1
+  torque = p[INDEX["input"]] * log.command[np.maximum(at, 0)] + p[INDEX["constant"]]
+  torque += p[INDEX["position"]] * log.position + p[INDEX["velocity"]] * log.velocity
+  torque = np.clip(torque, p[INDEX["lowest"]], p[INDEX["highest"]])
+  taken = p[INDEX["damping"]] * log.velocity
+  return np.interp(stamp, log.time, torque), np.interp(stamp, log.time, taken)

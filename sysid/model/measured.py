@@ -35,8 +35,6 @@ class Measured:
   command: Array
   valid: Array
   """[N] bool: False for repeated (stale) readings."""
-  voltage: Array | None
-  """[N] V."""
   temperature: Array | None
   """[N] degrees Celsius."""
   duty: Array | None
@@ -59,7 +57,6 @@ def measured(log: Log, motion: Motion, joint: str) -> Measured:
   duty = None
   if log.pwm is not None and log.pwm.effort is not None and joint in log.pwm.joints:
     duty = np.interp(states.stamp, log.pwm.stamp, log.pwm.effort[:, log.pwm.column(joint)])
-  battery = log.battery
   return Measured(
     name=log.name,
     time=states.stamp,
@@ -70,7 +67,6 @@ def measured(log: Log, motion: Motion, joint: str) -> Measured:
     command_time=np.ascontiguousarray(command_time),
     command=np.ascontiguousarray(command),
     valid=fresh(states.stamp, position, motion.velocity[:, column]),
-    voltage=None if battery is None else np.interp(states.stamp, battery.stamp, battery.value),
     temperature=None if series is None else np.interp(states.stamp, series.stamp, series.value),
     duty=duty,
   )

@@ -6,25 +6,25 @@ import mujoco
 import numpy as np
 import pytest
 
+from nerf2real.core.robot_logs.reading import ScalarSeries
 from nerf2real.sysid.hypotheses.candidates import library
-from nerf2real.sysid.hypotheses.measured_supply import _asked_torque
 from nerf2real.sysid.model.joint import JointModel
 from tests.sysid.synthetic import PENDULUM, log_of
 
 
 def _supplies(voltage):
-  """The forms of a supply's sag that are searched for, beside what they are without a voltage."""
+  """The forms of a supply's sag that are searched for, and what they are without a voltage."""
   model = mujoco.MjModel.from_xml_string(PENDULUM)
-  plant = JointModel(model, "joint", [log_of(PENDULUM, kind) for kind in ("sweep", "steps")])
-  open_ones = [t for t in library(plant) if t.kind == "supply_sag"]
-  torque = np.abs(_asked_torque(plant))
-  first = len(plant.logs[0].time)
-  loads = torque[:first], torque[first:]
-  plant.logs = [
-    dataclasses.replace(log, voltage=voltage(log.time, load))
-    for log, load in zip(plant.logs, loads, strict=True)
-  ]
-  return [t for t in library(plant) if t.kind == "supply_sag"], open_ones
+  logs = [log_of(PENDULUM, kind) for kind in ("sweep", "steps")]
+  plain = JointModel(model, "joint", logs)
+  torque, read = plain.declared_torque(), []
+  for log in logs:  # every tenth reading of the motion has one of the voltage
+    stamp = log.states.stamp
+    load, torque = torque[: len(stamp)], torque[len(stamp) :]
+    series = ScalarSeries(stamp[::10], stamp[::10], voltage(stamp, load)[::10])
+    read.append(dataclasses.replace(log, battery=series))
+  found = [library(plant) for plant in (JointModel(model, "joint", read), plain)]
+  return tuple([t for t in terms if t.kind == "supply_sag"] for terms in found)
 
 
 def test_a_steady_voltage_leaves_no_sag():
