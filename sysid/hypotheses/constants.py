@@ -28,6 +28,7 @@ them, what is later is a late command or reading, not a constant."""
 
 _SCALES = ("damping", "armature", "gain", "limit", "mass")
 _FAR = 0.6  # share that a healthy machine's may be off; chosen
+_ROUGH = 4.0  # share by which its dry friction may be more than declared; chosen
 
 
 def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool = False) -> Term:
@@ -62,6 +63,9 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
     for n, s in zip(names, sigma, strict=True)
   )
   low = tuple(0.0 if n == "latency" else -b for n, b in zip(names, limit, strict=True))
+  # What a reference rubs more than declared is the machine's own, however much it is.
+  rough = {"friction": _ROUGH} if healthy else {}
+  high = tuple(rough.get(n, b) for n, b in zip(names, limit, strict=True))
   zeros = (0.0,) * len(names)
   scale = tuple(0.005 if n in ("skew", "latency") else t for n, t in zip(names, sigma, strict=True))
   fixed: tuple[tuple[str, float], ...] = ()
@@ -70,7 +74,7 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
     fixed = (("scales_limit", 1.0),)
     if plant.law[0].is_off(settings.duty_scale):
       fixed = (*fixed, (SERVO_GAIN, plant.law[0].gain))
-  return Term(NAME, plant.joint, names, low, limit, scale, (zeros,), sigma, zeros, fixed)
+  return Term(NAME, plant.joint, names, low, high, scale, (zeros,), sigma, zeros, fixed)
 
 
 def tolerant(own: Term, values: Mapping[str, float]) -> Term:

@@ -135,6 +135,7 @@ def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
     blocks.append(Table(_HEADER, rows))
     chart = charts.intervals("95 % intervals", bounds)
     blocks += [chart] if chart is not None else []
+    blocks.append(Notes(_choices(content["effects"])))
   if nearest:
     blocks += [Heading("In the extended model, but not claimed"), Table(_HEADER, nearest)]
   usual, _ = _parameters(content["in_reference"])
@@ -158,8 +159,7 @@ def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
     evidence = effect["evidence"]
     gain = evidence.get("held_out_gain_nats", evidence.get("gain_nats", ""))
     for name, value in effect["parameters"].items():
-      choice = value["low"] is None and not kind_of(effect["kind"]).parameter(name).fitted
-      if choice or isinstance(value["value"], list):
+      if _is_choice(effect, name) or isinstance(value["value"], list):
         continue
       known = None not in (value["value"], value["low"], value["high"])
       interval = f"{value['low']:.4g} to {value['high']:.4g}" if known else ""
@@ -171,6 +171,23 @@ def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
     if not effect["parameters"]:
       rows.append([effect["kind"], where, "a table over position and speed", "", "", "", ""])
   return rows, bounds
+
+
+def _is_choice(effect: dict[str, Any], name: str) -> bool:
+  """Tells whether a parameter chooses between models, so that its row would be no figure."""
+  unsure = effect["parameters"][name]["low"] is None
+  return unsure and not kind_of(effect["kind"]).parameter(name).fitted
+
+
+def _choices(effects: Sequence[dict[str, Any]]) -> list[str]:
+  """Returns which of its models an effect has, a sentence each that is on."""
+  said = []
+  for effect in effects:
+    chosen = [n for n, v in effect["parameters"].items() if v["value"] == 1.0]
+    for name in (n for n in chosen if _is_choice(effect, n)):
+      meaning = kind_of(effect["kind"]).parameter(name).doc
+      said.append(f"{effect['kind']} ({_place(effect)}) has {name}: {meaning}.")
+  return said
 
 
 def _number(value: Any) -> str:

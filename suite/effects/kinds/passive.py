@@ -95,8 +95,13 @@ class GravityTilt(Operator):
       binding.model.opt.gravity[:] = turn @ binding.model.opt.gravity
 
 
-def _factor(name: str, doc: str) -> Parameter:
-  return Parameter(name, "1", 1.0, 0.5, 2.0, doc, minimum=0.0)
+def _factor(name: str, doc: str, *, high: float = 2.0) -> Parameter:
+  return Parameter(name, "1", 1.0, 0.5, high, doc, minimum=0.0)
+
+
+_OTHER_GEAR = 4.0
+"""Times an armature: it grows with the square of the gear's ratio, by 2.8 from 212.6 to 353.5
+(XM430-W210 and -W350, Robotis), and its rotor is a guess."""
 
 
 KINDS = (
@@ -107,7 +112,7 @@ KINDS = (
     "model",
     (
       _factor("damping", "true over declared joint damping"),
-      _factor("armature", "true over declared armature"),
+      _factor("armature", "true over declared armature", high=_OTHER_GEAR),
       _factor("friction", "true over declared dry friction"),
       _factor("gain", "true over declared actuator gain and bias"),
       _factor("limit", "true over declared limits of the actuator's force"),

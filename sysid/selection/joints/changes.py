@@ -61,7 +61,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
-  found = conclude(now, ranked, subject.beyond, now.squares(as_it_was)[0])
+  found = conclude(now, ranked, subject.thresholds, now.squares(as_it_was)[0])
   lacking = more_at_first or leaves(subject, explainer.null, settings)
   lacking |= clear(found.best, explainer.null) > subject.beyond
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]

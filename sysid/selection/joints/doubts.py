@@ -127,7 +127,9 @@ def pressed(best: Scored) -> bool:
   values = np.array(list(best.fit.values(term).values()))
   low, high = np.array(term.low), np.array(term.high)
   near = np.minimum(values - low, high - values) < _AT_END * (high - low)
-  return any(n for n, name in zip(near, term.names, strict=True) if name not in (*CLOCKS, "zero"))
+  changed = np.isinf(term.prior)  # beside a reference; the others are as they were there
+  near &= changed if changed.any() else ~np.isin(term.names, (*CLOCKS, "zero"))
+  return bool(near.any())
 
 
 def is_new(subject: Subject, best: Scored, kind: str) -> bool:

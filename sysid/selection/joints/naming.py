@@ -2,11 +2,13 @@
 
 One rule, one level of significance: an effect of the best hypothesis is named where every tried
 hypothesis without it is clearly worse (paired differences of left-out likelihood, `clearness`), at
-the family-wise level of all effects tried. Where a hypothesis
-without it predicts the same motion, these logs cannot tell the two apart; both are said.
+the family-wise level of all effects tried; beside a clearer one, of all pairs of them, and so on:
+among so many more is one sooner that fits what no hypothesis holds. Where a hypothesis without it
+predicts the same motion, these logs cannot tell the two apart; both are said.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -35,7 +37,7 @@ class Name:
   clear: float
   """Standard errors by which the best hypothesis is better than any that lacks it."""
   certain: bool
-  """Whether that is beyond the threshold."""
+  """Whether that is beyond the threshold, and no log is predicted clearly worse."""
   confounded: tuple[Scored, ...]
   """Hypotheses with another effect in its place that predict the same; one without any says that it
   is needless."""
@@ -60,15 +62,24 @@ class Explanation:
     return tuple(n.kind for n in self.names if n.certain)
 
 
-def threshold(tried: int, settings: Settings = SETTINGS) -> float:
-  """Returns the standard errors that one of so many effects must be clear by."""
-  return float(norm.isf(settings.level / max(tried, 1)))
+def thresholds(kinds: int, joints: int = 1, settings: Settings = SETTINGS) -> tuple[float, ...]:
+  """Returns the standard errors that effects of a joint must be clear by, the clearest first.
+
+  The n-th is found among all sets of n kinds (Bonferroni).
+
+  Args:
+    kinds: that are tried, at least as many as a joint may have.
+    joints: of the machine, which share the level.
+    settings: level, and the most effects of a joint.
+  """
+  sets = [math.comb(kinds, n + 1) for n in range(settings.depth)]
+  return tuple(float(norm.isf(settings.level / max(n * joints, 1))) for n in sets)
 
 
 def conclude(
   joint: JointLikelihood,
   ranked: Sequence[Scored],
-  beyond: float,
+  beyond: Sequence[float],
   without: Array | None = None,
 ) -> Explanation:
   """Returns the best hypothesis and what of it is certain.
@@ -76,7 +87,7 @@ def conclude(
   Args:
     joint: the logs.
     ranked: tried hypotheses, the one without effects among them.
-    beyond: standard errors that count as clear.
+    beyond: standard errors that count as clear, of one effect, of a second and so on.
     without: mean squares [B] that the baseline leaves as it was; those of the fitted one for None.
   """
   bare = best = max(of_size(ranked, 0), key=lambda s: s.evidence)
@@ -85,13 +96,17 @@ def conclude(
     if same:
       top = max(same, key=lambda s: s.evidence)
       idle = [s for s in ranked if s.neutral and s.names < top.names]
-      if all(clear(top, s) > beyond for s in (best, *idle)):
+      if all(clear(top, s) > beyond[size - 1] for s in (best, *idle)):
         best = top
-  best = _usual(joint, best, ranked, beyond)
-  names = tuple(_name(joint, best, kind, ranked, beyond) for kind in sorted(best.names))
+  last = beyond[max(len(best.names), 1) - 1]
+  best = _usual(joint, best, ranked, last)
+  names = [_name(joint, best, kind, ranked, last) for kind in sorted(best.names)]
+  clearest = sorted(names, key=lambda n: -n.clear)
+  certain = {n.kind for n, z in zip(clearest, beyond, strict=False) if n.certain and n.clear >= z}
+  names = [dataclasses.replace(n, certain=n.kind in certain) for n in names]
   left = best.fit.held[0][0]
   share = _share(left, bare.fit.held[0][0] if without is None else without)
-  return Explanation(best, names, left, *share)
+  return Explanation(best, tuple(names), left, *share)
 
 
 def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
@@ -118,8 +133,7 @@ def _name(
   told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
-  certain = least >= beyond and carries_over(joint, best, plain)
-  return Name(kind, least, certain, alike)
+  return Name(kind, least, carries_over(joint, best, plain), alike)
 
 
 def _with_instead(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:

@@ -27,7 +27,7 @@ from nerf2real.sysid.selection.joints.baseline import (
   known_terms,
   widened,
 )
-from nerf2real.sysid.selection.joints.naming import conclude, threshold
+from nerf2real.sysid.selection.joints.naming import conclude, thresholds
 from nerf2real.sysid.selection.joints.remainder import structured
 from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.selection.search.explain import Explainer
@@ -55,8 +55,8 @@ class Subject:
   freed: Term
   """The constants, wider."""
   explainer: Explainer
-  beyond: float
-  """Standard errors that count as clear."""
+  thresholds: tuple[float, ...]
+  """Standard errors that count as clear, of one effect, of a second beside it and so on."""
   alone: bool
   """Whether the machine has no other joint, so that effects of the machine are its own."""
   before: JointLikelihood | None = None
@@ -65,6 +65,11 @@ class Subject:
   """The reference's best hypothesis."""
   paired: bool = False
   """Whether every log was driven by the same commands as a reference."""
+
+  @property
+  def beyond(self) -> float:
+    """Standard errors that count as clear of one effect."""
+    return self.thresholds[0]
 
   @property
   def another_session(self) -> bool:
@@ -135,8 +140,8 @@ def prepare(
   now = _likelihood(model, joint, logs, reductions[0], settings)
   before = _likelihood(model, joint, reference, reductions[1], settings) if reference else None
   library = own_library(now.plant, alone=tried == 1)
-  beyond = threshold(len({t.kind for t in library} | set(WHOLE)) * tried, settings)
-  found = _subject(now, before, library, beyond, alone=tried == 1)
+  sure = thresholds(len({t.kind for t in library} | set(WHOLE)), tried, settings)
+  found = _subject(now, before, library, sure, alone=tried == 1)
   apart = not (found.paired or before is None or _tells(before))
   return following(found) if apart or not now.plant.holds else found
 
@@ -148,7 +153,7 @@ def following(subject: Subject) -> Subject:
     for j in (subject.now, subject.before)
   )
   assert now is not None
-  return _subject(now, before, subject.library, subject.beyond, alone=subject.alone)
+  return _subject(now, before, subject.library, subject.thresholds, alone=subject.alone)
 
 
 def beside(subject: Subject, reductions: Sequence[Reduction]) -> Subject:
@@ -178,7 +183,7 @@ def _subject(
   now: JointLikelihood,
   before: JointLikelihood | None,
   library: list[Term],
-  beyond: float,
+  sure: tuple[float, ...],
   *,
   alone: bool,
 ) -> Subject:
@@ -187,7 +192,7 @@ def _subject(
     own = constants(now.plant, settings)
     freed = widened(own)
     explainer = _explainer(now, None, (own,), library, freed)
-    return Subject(joint, now, (own,), library, freed, explainer, beyond, alone)
+    return Subject(joint, now, (own,), library, freed, explainer, sure, alone)
   now.ahead = None if before.law is None else _ahead(before.law, settings)
   usual = reference_constants(before, settings)
   now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
@@ -195,7 +200,7 @@ def _subject(
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   freed = freed_constants(known[0])
   explainer = _explainer(now, before, known, library, freed)
-  return Subject(joint, now, known, library, freed, explainer, beyond, alone, before, usual, paired)
+  return Subject(joint, now, known, library, freed, explainer, sure, alone, before, usual, paired)
 
 
 def _apart(now: JointLikelihood, before: JointLikelihood) -> bool:
@@ -237,7 +242,7 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   own = subject.usual.terms[0]
   library = own_library(before.plant, alone=subject.alone)
   first = Explainer(before, own, library, settings=settings, known=[sticking(before.plant)])
-  usual = conclude(before, grow(first, settings.reference_depth), subject.beyond).best
+  usual = conclude(before, grow(first, settings.reference_depth), subject.thresholds).best
   subject.now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
   shared = [t for t in subject.known if t.wider]
   known = known_terms(usual, settings, another_session=subject.another_session)

@@ -11,7 +11,8 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.selection.analysis import analyse
-from nerf2real.sysid.selection.joints import changes
+from nerf2real.sysid.selection.joints import changes, subject
+from tests.sysid.selection.joints.test_changes import KINDS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
 
 _PLAY = {"gap": 0.03, "stiffness": 800.0, "damping": 0.3, "encoder_on_motor": 0.0}
@@ -55,8 +56,18 @@ def test_stale_readings_are_not_followed() -> None:
   assert np.abs(got - want)[1:].max() < 5 * COUNT  # and not the steps of stale readings
 
 
-def test_play_is_named_with_its_gap() -> None:
-  model = mujoco.MjModel.from_xml_string(PENDULUM)
+@pytest.fixture
+def model(monkeypatch):
+  """The pendulum, and a library that a test has the time for."""
+  kinds = (*KINDS, "backlash")
+  library = subject.own_library
+  monkeypatch.setattr(
+    subject, "own_library", lambda *a, **k: [t for t in library(*a, **k) if t.kind in kinds]
+  )
+  return mujoco.MjModel.from_xml_string(PENDULUM)
+
+
+def test_play_is_named_with_its_gap(model) -> None:
   found = analyse(model, logs_of(PENDULUM, [Effect("backlash", "joint", _PLAY)], duration=6.0))
   assert found.verdict == "effects"
   (row,) = found.effects
@@ -65,8 +76,7 @@ def test_play_is_named_with_its_gap() -> None:
   assert gap["value"] == pytest.approx(_PLAY["gap"], rel=0.15)  # courses do not repeat
 
 
-def test_what_is_no_play_is_not_judged_by_following() -> None:
-  model = mujoco.MjModel.from_xml_string(PENDULUM)
+def test_what_is_no_play_is_not_judged_by_following(model) -> None:
   late = Effect("command_delay", "joint", {"delay": 0.03})
   found = analyse(model, logs_of(PENDULUM, [late], duration=6.0))
   assert not found.joints[0].likelihood.follows

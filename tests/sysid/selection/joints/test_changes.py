@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.layout import Fit, Layout
@@ -18,10 +19,11 @@ from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.joints import doubts, leaving, naming, remainder, subject
 from nerf2real.sysid.selection.search import rivals
-from nerf2real.sysid.selection.search.evidence import Scored
+from nerf2real.sysid.selection.search.evidence import Scored, clear
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
 
+BEYOND = (3.0, 3.0, 3.0)  # standard errors that count as clear
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
 
 
@@ -78,14 +80,14 @@ def test_a_name_needs_all_that_lack_it_to_be_clearly_worse():
   right = _scored(("a",), noise + random.normal(0, 0.1, 30))
   worse = _scored(("b",), noise - 1.0 + random.normal(0, 0.1, 30), prediction=10.0)
   as_good = _scored(("c",), noise - 0.001 + random.normal(0, 0.1, 30), prediction=10.0)
-  assert naming.conclude(_Joint, [null, right, worse], 3.0).named == ("a",)
-  assert naming.conclude(_Joint, [null, right, worse, as_good], 3.0).named == ()
+  assert naming.conclude(_Joint, [null, right, worse], BEYOND).named == ("a",)
+  assert naming.conclude(_Joint, [null, right, worse, as_good], BEYOND).named == ()
 
 
 def test_a_rival_that_predicts_the_same_is_said_beside_the_name():
   null = _scored((), np.linspace(-4, -3, 30))
   right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
-  (name,) = naming.conclude(_Joint, [null, right, twin], 3.0).names
+  (name,) = naming.conclude(_Joint, [null, right, twin], BEYOND).names
   assert name.certain
   assert [sorted(s.names) for s in name.confounded] == [["b"]]
 
@@ -98,25 +100,34 @@ def test_a_rival_that_is_ahead_by_what_it_has_besides_holds_nothing_against_a_na
   with_a, with_b = (_scored((k, "c"), ahead, prediction=8.0) for k in "ab")
   alone = _scored(("c",), np.linspace(-4, -3, 30), prediction=3.0)
   ranked = [null, right, with_b, alone]
-  assert naming.conclude(_Joint, ranked, 3.0).named == ()  # b with c is another motion
-  (name,) = naming.conclude(_Joint, [*ranked, with_a], 3.0).names
+  assert naming.conclude(_Joint, ranked, BEYOND).named == ()  # b with c is another motion
+  (name,) = naming.conclude(_Joint, [*ranked, with_a], BEYOND).names
   assert name.kind == "a" and name.certain
   assert [sorted(s.names) for s in name.confounded] == [["b", "c"]]
   other = _scored(("a", "c"), ahead, prediction=12.0)
-  assert naming.conclude(_Joint, [*ranked, other], 3.0).named == ()
+  assert naming.conclude(_Joint, [*ranked, other], BEYOND).named == ()
 
 
 def test_an_effect_without_which_the_same_is_predicted_is_needless():
   null = _scored((), np.linspace(-4, -3, 30))
   both = _scored(("a", "b"), np.linspace(0, 0.1, 30))
   plain = _scored(("a",), np.linspace(0, 0.1, 30) - 0.05 * (-1.0) ** np.arange(30))
-  (a, b) = naming.conclude(_Joint, [null, both], 3.0).names  # without its rival it would stand
+  (a, b) = naming.conclude(_Joint, [null, both], BEYOND).names  # without its rival it would stand
   assert (a.certain, b.certain) == (True, True)
-  names = {
-    n.kind: n for n in (naming._name(_Joint, both, k, [null, both, plain], 3.0) for k in "ab")
-  }
-  assert names["a"].certain and not names["b"].certain
-  assert names["b"].confounded == ()
+  a, b = (naming._name(_Joint, both, k, [null, both, plain], 3.0) for k in "ab")
+  assert a.clear > 3.0 > b.clear
+  assert b.confounded == ()
+
+
+def test_an_effect_beside_a_clearer_one_must_be_clear_of_all_pairs_that_were_tried():
+  null = _scored((), np.linspace(-4, -3, 30))
+  both = _scored(("a", "b"), np.linspace(0, 0.1, 30))
+  plain = _scored(("a",), np.linspace(0, 0.1, 30) - 0.3 - 0.5 * (-1.0) ** np.arange(30), 10.0)
+  behind = clear(both, plain)
+  one, two, _ = naming.thresholds(20)
+  assert one < behind < two, behind
+  assert naming.conclude(_Joint, [null, both, plain], (one,) * 3).named == ("a", "b")
+  assert naming.conclude(_Joint, [null, both, plain], (one, two, two)).named == ("a",)
 
 
 def test_constants_that_are_strained_may_hide_an_effect():
@@ -137,10 +148,10 @@ def test_a_name_that_makes_one_motion_clearly_worse_does_not_stand():
   random = np.random.default_rng(0)
   noise = random.normal(0, 0.3, 30)
   null, split = _scored((), np.zeros(30)), _scored(("a",), np.repeat([4.0, 4.0, -0.8], 10) + noise)
-  (name,) = naming.conclude(_Joint, [null, split], 3.0).names
+  (name,) = naming.conclude(_Joint, [null, split], BEYOND).names
   assert name.clear > 3.0 and not name.certain
   inert = _scored(("a",), np.repeat([4.0, 4.0, 0.0], 10) + noise)
-  assert naming.conclude(_Joint, [null, inert], 3.0).named == ("a",)
+  assert naming.conclude(_Joint, [null, inert], BEYOND).named == ("a",)
 
 
 def test_constants_that_are_strained_do_not_hold_a_motion_against_a_name(monkeypatch):
@@ -157,8 +168,8 @@ def test_a_twin_with_more_beside_it_is_no_rival():
   right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
   more = _scored(("b", "c"), np.linspace(0, 0.11, 30), prediction=10.0)
   other = _scored(("c", "d"), np.linspace(0, 0.11, 30), prediction=10.0)
-  assert naming.conclude(_Joint, [null, right, twin, more], 3.0).named == ("a",)
-  assert naming.conclude(_Joint, [null, right, twin, more, other], 3.0).named == ()
+  assert naming.conclude(_Joint, [null, right, twin, more], BEYOND).named == ("a",)
+  assert naming.conclude(_Joint, [null, right, twin, more, other], BEYOND).named == ()
 
 
 def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):
@@ -173,8 +184,10 @@ def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch)
 
 
 def test_the_threshold_grows_with_what_was_tried():
-  assert naming.threshold(1) == pytest.approx(1.645, abs=1e-3)  # 5 %
-  assert naming.threshold(400) > naming.threshold(20) > 2.8
+  assert naming.thresholds(1)[0] == pytest.approx(1.645, abs=1e-3)  # 5 %
+  assert naming.thresholds(20, 20)[0] > naming.thresholds(20)[0] > 2.8
+  of_sets = [norm.isf(SETTINGS.level / n) for n in (20, 190, 1140)]
+  assert naming.thresholds(20) == pytest.approx(of_sets)
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +224,7 @@ def test_what_changed_is_named_with_its_size(found):
   (row,) = result.effects
   assert (row["kind"], row["joint"]) == ("command_delay", "joint")
   assert row["parameters"]["delay"]["value"] == pytest.approx(0.02, abs=0.002)
-  assert row["evidence"]["clear_by_standard_errors"] > naming.threshold(len(KINDS))
+  assert row["evidence"]["clear_by_standard_errors"] > naming.thresholds(len(KINDS))[0]
 
 
 def test_the_report_lists_what_was_there_before(found):

@@ -33,10 +33,26 @@ def test_a_constant_is_off_by_more_than_copies_differ_by(monkeypatch, name, valu
 )
 def test_constants_that_are_stopped_by_their_range_stand_in_for_something(mass, freed, stopped):
   names = ("mass", "latency")
-  term = SimpleNamespace(names=names, low=(-0.15, 0.0), high=(0.15, 0.01), freed=freed)
+  limits = {"low": (-0.15, 0.0), "high": (0.15, 0.01), "prior": (0.03, 0.002)}
+  term = SimpleNamespace(names=names, freed=freed, **limits)
   values = {"mass": mass, "latency": 0.0}  # no latency is not the end of a range
   best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
   assert doubts.pressed(best) == stopped
+
+
+def test_beside_a_reference_only_what_may_have_changed_is_stopped():
+  """Dry friction of four times the declared one was the machine's before."""
+  term = SimpleNamespace(
+    names=("friction", "armature"),
+    freed=True,
+    low=(-0.9, -0.7),
+    high=(4.0, 2.0),
+    prior=(0.25, float("inf")),
+  )
+  for armature, stopped in ((1.5, False), (2.0, True)):
+    values = {"friction": 4.0, "armature": armature}
+    fit = SimpleNamespace(values=lambda _, values=values: values)
+    assert doubts.pressed(SimpleNamespace(terms=[term], fit=fit)) == stopped
 
 
 @pytest.mark.parametrize(
