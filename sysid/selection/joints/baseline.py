@@ -69,12 +69,7 @@ _MAY_CHANGE = ("damping", "armature", "friction")
 _ADDED_TO = ("damping", "friction")
 """Constants that effects add to (viscous and dry friction): more of them is such an effect, so that
 the constant itself has changed only where it is less."""
-_FACTORS = (
-  0.7,
-  1.4,
-  1.9,
-  3.0,
-)  # of a changed constant where searches start, chosen: within its range
+_FACTORS = (0.7, 1.4, 1.9, 3.0)  # of a changed constant where searches start, chosen
 
 
 def freed_constants(known: Term) -> Term:
