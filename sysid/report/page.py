@@ -69,11 +69,13 @@ def page(
     referred: whether there were reference logs.
   """
   items = found.found
+  subject = found.least_explained.subject
+  several = min(max(len(item.named) for item in items), len(subject.thresholds))
   content = {**content, **{k: together(content[k]) for k in ("effects", "in_reference")}}
   sections = [
     summary.section(
       content,
-      beyond=found.least_explained.subject.beyond,
+      beyond=subject.thresholds[max(several, 1) - 1],  # of the least clear
       unit=residual_plots.unit_of(found.least_explained),
       shown=capability.sentence(shown),
       referred=referred,
@@ -185,8 +187,9 @@ def _choices(effects: Sequence[dict[str, Any]]) -> list[str]:
   for effect in effects:
     chosen = [n for n, v in effect["parameters"].items() if v["value"] == 1.0]
     for name in (n for n in chosen if _is_choice(effect, n)):
-      meaning = kind_of(effect["kind"]).parameter(name).doc
-      said.append(f"{effect['kind']} ({_place(effect)}) has {name}: {meaning}.")
+      meaning = kind_of(effect["kind"]).parameter(name).doc  # "1 if it is so, else 0"
+      so = meaning.removeprefix("1 if ").rpartition(", ")[0] or meaning
+      said.append(f"{effect['kind']} ({_place(effect)}), {name}: {so}.")
   return said
 
 

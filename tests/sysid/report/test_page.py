@@ -18,6 +18,4 @@ def test_a_choice_between_models_is_said_in_words_and_is_no_row(back_emf, said):
   assert [row[2] for row in rows] == ["heating"] and len(bounds) == 1
   sentences = page._choices([_derating(back_emf)])
   assert len(sentences) == said
-  assert all(
-    "(knee) has back_emf: " in sentence and "current" in sentence for sentence in sentences
-  )
+  assert all(text.endswith("motor's back-EMF, which takes from the current.") for text in sentences)

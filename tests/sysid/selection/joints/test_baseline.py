@@ -48,6 +48,16 @@ def test_a_reference_tells_the_ratios_of_torques_and_masses(strength, mass, limi
     assert gain == pytest.approx(strength, rel=0.05)
 
 
+def test_a_machine_may_rub_far_more_than_declared_where_a_reference_shows_it():
+  plant = JointModel(
+    mujoco.MjModel.from_xml_string(PENDULUM), "joint", [log_of(PENDULUM, "sweep", duration=3.0)]
+  )
+  alone, beside = (constants(plant, healthy=healthy) for healthy in (False, True))
+  at = alone.names.index("friction"), beside.names.index("friction")
+  assert alone.high[at[0]] < 1.0 and beside.high[at[1]] == 4.0
+  assert alone.low[at[0]] == beside.low[at[1]] > -1.0
+
+
 def test_more_friction_than_a_reference_has_is_an_effect_and_less_is_a_changed_constant():
   logs = [log_of(PENDULUM, kind, duration=5.0) for kind in ("sweep", "slow")]
   plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)

@@ -115,7 +115,7 @@ def test_an_effect_without_which_the_same_is_predicted_is_needless():
   (a, b) = naming.conclude(_Joint, [null, both], BEYOND).names  # without its rival it would stand
   assert (a.certain, b.certain) == (True, True)
   a, b = (naming._name(_Joint, both, k, [null, both, plain], 3.0) for k in "ab")
-  assert a.clear > 3.0 > b.clear
+  assert a.certain and a.clear > 3.0 > b.clear
   assert b.confounded == ()
 
 
