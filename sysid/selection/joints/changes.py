@@ -24,11 +24,14 @@ from nerf2real.sysid.selection.joints.subject import Subject, following
 from nerf2real.sysid.selection.search.elaboration import elaborated
 from nerf2real.sysid.selection.search.evidence import UNREPEATED, clear
 from nerf2real.sysid.selection.search.growth import grow
+from nerf2real.sysid.selection.search.rivals import with_anothers
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 _REST = 0.1
 """Of the squares that all joints leave: less is left to joints that are not elaborated, chosen (5 %
 of the error)."""
+
+_AHEAD = 3  # rivals of an effect whose further effects are tried beside it, chosen
 
 
 def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
@@ -61,7 +64,12 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
   else:
     ranked = explainer.constants_alone()
-  found = conclude(now, ranked, subject.thresholds, now.squares(as_it_was)[0])
+  baseline = now.squares(as_it_was)[0]
+  found = conclude(now, ranked, subject.thresholds, baseline)
+  ahead = [s for n in found.names for s in n.ahead[:_AHEAD]]
+  if with_anothers(explainer, found.best, ahead):
+    ranked = explainer.ranked()
+    found = conclude(now, ranked, subject.thresholds, baseline)
   lacking = more_at_first or leaves(subject, explainer.null, settings)
   lacking |= clear(found.best, explainer.null) > subject.beyond
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]

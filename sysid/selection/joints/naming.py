@@ -1,8 +1,9 @@
 """Which effects of a joint are named: those that no hypothesis without them does as well as.
 
 One rule, one level of significance: an effect of the best hypothesis is named where every tried
-hypothesis without it is clearly worse (paired differences of left-out likelihood, `clearness`), at
-the family-wise level of all effects tried; beside a clearer one, of all pairs of them, and so on:
+hypothesis without it is clearly worse (paired differences of left-out likelihood, `clearness`) than
+the best one, or than itself with the effect in the place of one of its own, at the family-wise
+level of all effects tried; beside a clearer one, of all pairs of them, and so on:
 among so many more is one sooner that fits what no hypothesis holds. Where a hypothesis without it
 predicts the same motion, these logs cannot tell the two apart; both are said.
 """
@@ -35,12 +36,14 @@ class Name:
 
   kind: str
   clear: float
-  """Standard errors by which the best hypothesis is better than any that lacks it."""
+  """Standard errors by which hypotheses with it are better than any that lacks it."""
   certain: bool
   """Whether that is beyond the threshold, and no log is predicted clearly worse."""
   confounded: tuple[Scored, ...]
   """Hypotheses with another effect in its place that predict the same; one without any says that it
   is needless."""
+  ahead: tuple[Scored, ...] = ()
+  """Hypotheses with more effects that lack it and are not clearly worse, the likeliest first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +125,7 @@ def _name(
   joint: JointLikelihood, best: Scored, kind: str, ranked: Sequence[Scored], beyond: float
 ) -> Name:
   rivals = [s for s in ranked if kind not in s.names and not s.beside_force]
-  behind = [(clear(best, s), s) for s in rivals]
+  behind = [(max(clear(t, s) for t in (best, *_with_instead(s, kind, ranked))), s) for s in rivals]
   near = [s for z, s in behind if z < beyond]
   alike = tuple(
     s
@@ -133,7 +136,9 @@ def _name(
   told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)
-  return Name(kind, least, carries_over(joint, best, plain), alike)
+  more = [s for s in near if len(s.names) > len(best.names)]
+  more.sort(key=lambda s: -s.evidence)
+  return Name(kind, least, carries_over(joint, best, plain), alike, tuple(more))
 
 
 def _with_instead(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:

@@ -80,6 +80,19 @@ def _scaled(parent: Scored, term: Term) -> list[Array]:
   return list(np.hstack([parent.fit.x * np.where(torques, factors, 1.0), factors]))
 
 
+def _moved(terms: Sequence[Term], starts: Array) -> Array:
+  """Returns starts [S, n], and where an encoder's zero and cogging are among the effects those with
+  its phase moved by the zero: either was found over positions as they were read."""
+  at = {(t.kind, n): i for i, (t, n) in enumerate((t, n) for t in terms for n in t.names)}
+  zero = at.get(("encoder_offset", "offset"))
+  if zero is None or ("cogging", "phase") not in at:
+    return starts
+  moved, phase = starts.copy(), at["cogging", "phase"]
+  turned = moved[:, phase] + moved[:, at["cogging", "periods"]] * moved[:, zero]
+  moved[:, phase] = np.angle(np.exp(1j * turned))
+  return np.vstack([starts, moved])
+
+
 class Explainer:
   """Fits and scores hypotheses of one joint, and those that have one effect more."""
 
@@ -147,10 +160,18 @@ class Explainer:
     nats = self.joint.loglik(self.joint.squares(item.fit.residuals[0]))
     return item.prior - float(nats.sum())
 
-  def extend(self, parent: Scored, keep: int) -> list[Scored]:
-    """Returns the best hypotheses that add one effect to a parent, fitted to the end."""
+  def extend(self, parent: Scored, keep: int, only: str | None = None) -> list[Scored]:
+    """Returns the best hypotheses that add one effect to a parent, fitted to the end.
+
+    Args:
+      parent: the hypothesis.
+      keep: of how many kinds.
+      only: the one kind that is tried; None for all.
+    """
     tried: list[tuple[Fitter, tuple[Term, ...], Fit]] = []
     for terms, starts, stale, fresh in self._candidates(parent):
+      if only is not None and only not in kinds_of(terms):
+        continue
       fitter = Fitter([self.joint], Layout([terms]))
       fits = [
         fitter.fit(
@@ -223,6 +244,7 @@ class Explainer:
       blank = np.zeros((len(term.names), *known.shape[1:]))
       own = [np.concatenate([x, s]) for s in term.starts]
       begin = np.array([*own, *_handed_over(parent, term), *_scaled(parent, term)])
+      begin = _moved((*parent.terms, term), begin)
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 

@@ -29,6 +29,27 @@ def lacking(explainer: Explainer, item: Scored, kind: str) -> Scored:
   return explainer.scored[kept]
 
 
+def with_anothers(explainer: Explainer, best: Scored, rivals: Sequence[Scored]) -> bool:
+  """Scores the best hypothesis with each effect that rivals have besides.
+
+  A rival that lacks one of its effects may be ahead by another, which says nothing of the first.
+
+  Args:
+    explainer: scores what has not been scored.
+    best: the hypothesis.
+    rivals: of its effects.
+
+  Returns:
+    Whether any had not been scored.
+  """
+  scored = {s.names for s in explainer.scored.values() if not (s.neutral or s.beside_force)}
+  others = {kind for rival in rivals for kind in rival.names - best.names}
+  wanted = [kind for kind in sorted(others) if best.names | {kind} not in scored]
+  for kind in wanted:
+    explainer.extend(best, 1, only=kind)
+  return bool(wanted)
+
+
 def _alike(given: Sequence[Term], wanted: Sequence[Term]) -> list[Term]:
   """Returns the given terms that are of the wanted ones' kinds and fitted there, in their order."""
   by_kind = {t.kind: t for t in given}

@@ -108,6 +108,22 @@ def test_a_rival_that_is_ahead_by_what_it_has_besides_holds_nothing_against_a_na
   assert naming.conclude(_Joint, [*ranked, other], BEYOND).named == ()
 
 
+def test_a_rival_that_is_clearly_worse_than_itself_with_the_effect_instead_is_beaten():
+  """b with c is better than a alone, by c: a with c is clearly better than b with c."""
+  random = np.random.default_rng(0)
+  noise = random.normal(0, 0.1, 30)
+  null, right = _scored((), noise - 3.0), _scored(("a",), noise)
+  uneven = 0.3 * (-1.0) ** np.arange(30) + 0.01
+  ahead = _scored(("b", "c"), noise + uneven, prediction=8.0)
+  better = _scored(("a", "c"), noise + 1.0 + random.normal(0, 0.1, 30), prediction=12.0)
+  assert naming.conclude(_Joint, [null, right, ahead], BEYOND).named == ()
+  (name,) = naming.conclude(_Joint, [null, right, ahead], BEYOND).names
+  assert name.ahead == (ahead,)
+  beyond = (3.0, 1e3, 1e3)  # c is never clear beside a
+  (name,) = naming.conclude(_Joint, [null, right, ahead, better], beyond).names
+  assert name.certain and name.confounded == ()
+
+
 def test_an_effect_without_which_the_same_is_predicted_is_needless():
   null = _scored((), np.linspace(-4, -3, 30))
   both = _scored(("a", "b"), np.linspace(0, 0.1, 30))

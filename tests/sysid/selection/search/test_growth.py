@@ -13,7 +13,7 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.selection.search import explain, growth
+from nerf2real.sysid.selection.search import explain, growth, rivals
 from nerf2real.sysid.selection.search.explain import Explainer
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import PENDULUM, log_of
@@ -68,6 +68,36 @@ def test_an_effect_that_was_chosen_too_early_is_exchanged(explainer):
 def test_one_effect_is_exchanged_for_none(explainer):
   single = _of(explainer, "viscous_friction")
   assert growth._exchanged(explainer, single) is single
+
+
+def test_what_a_rival_has_besides_is_tried_beside_the_best_hypothesis(explainer):
+  """A delay and friction, beside a gain: the gain with each of them tells what it is worth."""
+  best = _of(explainer, "motor_gain")
+  rival = _of(explainer, "command_delay", "coulomb_friction")
+  both = [{"motor_gain", kind} for kind in rival.names]
+  for terms in [terms for terms, s in explainer.scored.items() if s.names in both]:
+    del explainer.scored[terms]
+  assert rivals.with_anothers(explainer, best, [rival])
+  late, rubbing = (
+    next(s for s in explainer.scored.values() if s.names == {"motor_gain", kind})
+    for kind in ("command_delay", "coulomb_friction")
+  )
+  assert rubbing.evidence > max(best.evidence, late.evidence)  # friction is there, a delay is not
+  assert not rivals.with_anothers(explainer, best, [rival])  # all are scored
+
+
+def test_cogging_begins_where_a_shifted_zero_has_moved_it(explainer):
+  plant = explainer.joint.plant
+  wave = candidates.cogging(plant, [(0.01, 20.0, 1.0)])
+  zero = next(t for t in candidates.library(plant) if t.kind == "encoder_offset")
+  starts = np.array([[0.01, 20.0, 1.0, 0.15], [0.01, 20.0, 1.0, 0.0]])
+  begun = explain._moved((wave, zero), starts)
+  assert begun[:2] == pytest.approx(starts)
+  assert begun[2:] == pytest.approx(np.array([[0.01, 20.0, 4.0 - 2 * np.pi, 0.15], starts[1]]))
+  read = np.linspace(-1.0, 1.0, 50)  # the encoder reads the zero more than the joint is at
+  assert np.sin(20.0 * (read - 0.15) + begun[2, 2]) == pytest.approx(np.sin(20.0 * read + 1.0))
+  alone = starts[:, :3]
+  assert explain._moved((wave,), alone) is alone
 
 
 def test_a_late_command_is_near_one_of_the_starts(explainer):
