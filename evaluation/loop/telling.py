@@ -39,7 +39,7 @@ _SIDE_BY_SIDE = (
   "By the clock, of each stage. Where trials under different conditions ran side by side the total "
   "is more than the whole took."
 )
-_ENOUGH = "1,500 or more; 500 on a machine with other work brought nothing back"
+_ENOUGH = "3,000 or more; 1,400 on a machine with other work brought nothing back"
 
 
 _LEAD = (
