@@ -22,11 +22,13 @@ class Step:
 
   factor: float  # of the sizes that were given; 0: nothing hidden
   effects: tuple[str, ...]
-  tally: Tally
+  tally: Tally  # of the trials that began
+  ended: str = ""  # why no further trial began
 
 
 def find_severity(settings: LoopSettings, say: Say) -> list[Step]:
-  """Runs the trials with the hidden effects at growing sizes until success falls by `LOSS`.
+  """Runs the trials with the hidden effects at growing sizes until success falls by `LOSS`, or the
+  robot itself gives up: it falls as it stands up, or its own limits switch torque off.
 
   Writes severity.json.
 
@@ -48,13 +50,26 @@ def find_severity(settings: LoopSettings, say: Say) -> list[Step]:
     altered = tuple(effect.scaled(factor) for effect in hidden) if factor else ()
     name = f"severity {factor:g}"
     condition = Condition(name=name, policy=policy, altered=altered)
-    found = tally(name, trials.run(settings, condition, scene, store, say))
-    steps.append(Step(factor, tuple(str(effect) for effect in altered), found))
-    say(f"{factor:g} times: {found}")
-    if steps[0].tally.share - found.share >= LOSS:
+    ended = ""
+    try:
+      found = trials.run(settings, condition, scene, store, say)
+    except RuntimeError as error:
+      if not factor:
+        raise
+      label, ended = trials.plant_label(settings, condition), str(error)
+      found = [e for e in store.episodes if e.setting.plant_id == label]
+    step = Step(factor, tuple(str(effect) for effect in altered), tally(name, found), ended)
+    steps.append(step)
+    say(f"{factor:g} times: {_success(step)}")
+    if ended or steps[0].tally.share - step.tally.share >= LOSS:
       break
   write_json(settings.out / "severity.json", [to_plain(step) for step in steps])
   return steps
+
+
+def _success(step: Step) -> str:
+  begun = str(step.tally) if step.tally.trials else "no trial"
+  return f"{begun}, then none begins" if step.ended else begun
 
 
 def as_text(steps: list[Step]) -> str:
@@ -63,12 +78,14 @@ def as_text(steps: list[Step]) -> str:
     (
       f"{step.factor:g}",
       ", ".join(step.effects) or "nothing",
-      step.tally,
+      _success(step),
       ", ".join(f"{n} {name}" for name, n in step.tally.outcomes.items() if n),
     )
     for step in steps
   ]
   table = markdown.table(("times", "hidden", "success", "how the trials ended"), rows)
+  if steps[-1].ended:
+    return f"{table}\n\nThe robot itself gives up at the last size: {steps[-1].ended}\n"
   lost = steps[0].tally.share - steps[-1].tally.share
   end = "falls" if lost >= LOSS else "does not fall"
   return (

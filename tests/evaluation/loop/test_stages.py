@@ -14,6 +14,7 @@ from nerf2real.evaluation.loop.robot import machines
 from nerf2real.evaluation.loop.sessions import Cooled
 from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
 from nerf2real.evaluation.loop.trials import Condition
+from nerf2real.real.safety.monitor import SafetyError
 from nerf2real.real.virtual import undeclared
 from nerf2real.suite.effects import Effect, write_effects
 from tests.evaluation.fakes import episode
@@ -311,3 +312,25 @@ def test_severity_stops_where_success_has_fallen(tmp_path, monkeypatch):
   assert "Success falls by 30 points: by 40 at the last size." in text
   with pytest.raises(ValueError, match="0 hidden effects, expected"):
     severity.find_severity(dataclasses.replace(settings, hidden=()), print)
+
+
+def test_severity_ends_where_the_robot_itself_gives_up(tmp_path, monkeypatch):
+  def run(settings, condition, scene, store, say):
+    if condition.altered:
+      label = trials.plant_label(settings, condition)
+      begun = episode("success", index=0)
+      kept = dataclasses.replace(begun.setting, plant_id=label)
+      store.add(dataclasses.replace(begun, setting=kept))
+      raise SafetyError("Torque was switched off: low voltage (9.9 V).")
+    return [episode("success", index=i) for i in range(2)]
+
+  monkeypatch.setattr(trials, "run", run)
+  settings = _settings(tmp_path, hidden=("supply_course:2.3",))
+  steps = severity.find_severity(settings, lambda text: None)
+  assert [(step.factor, step.tally.trials) for step in steps] == [(0.0, 2), (1.0, 1)]
+  text = severity.as_text(steps)
+  assert "100 % (1 of 1; 2 to 100 %), then none begins" in text
+  assert "gives up at the last size: Torque was switched off: low voltage (9.9 V)." in text
+  monkeypatch.setattr(trials, "run", lambda *_: (_ for _ in ()).throw(SafetyError("no robot")))
+  with pytest.raises(SafetyError, match="no robot"):  # with nothing hidden: it is none of this
+    severity.find_severity(settings, lambda text: None)
