@@ -146,7 +146,8 @@ def newness(subject: Subject, best: Scored, term: Term, held: Term) -> tuple[Arr
   these values than where both have it: nats of the blocks of all logs, and what priors cost.
 
   Declared constants that are far off may do in the reference what undoes the effect; the logs have
-  the same constants, but for what recordings of one machine differ by.
+  the same constants, but for what recordings of one machine differ by. They may be better there for
+  another reason: then the reference without the effect is taken at the same constants, too.
 
   Args:
     subject: the joint, with a reference.
@@ -159,13 +160,24 @@ def newness(subject: Subject, best: Scored, term: Term, held: Term) -> tuple[Arr
   kept = [(t, usual.fit.values(t)) for t in usual.terms if t.kind != term.kind]
   x = np.array([v for _, values in kept for v in values.values()])
   theirs = scored_on(before, (*[t for t, _ in kept], held), x, iterations=3)
-  constants = tuple(theirs.fit.values(theirs.terms[0]).values())
-  instead = dataclasses.replace(best.terms[0], centre=constants, starts=(constants,))
-  terms = (instead, *[held if t is term else t for t in best.terms[1:]])
+  constants = np.array(list(theirs.fit.values(theirs.terms[0]).values()))
+  terms = (_about(best.terms[0], constants), *[held if t is term else t for t in best.terms[1:]])
   values = [v for t in terms[1:] if t is not held for v in best.fit.values(t).values()]
   ours = scored_on(subject.now, terms, np.array([*constants, *values]), iterations=3)
-  gains = np.concatenate([usual.nats - theirs.nats, best.nats - ours.nats])
-  return gains, usual.prior - theirs.prior + best.prior - ours.prior
+  own = np.array(list(ours.fit.values(terms[0]).values()))
+  constants = np.where(np.isinf(best.terms[0].prior), constants, own)
+  terms = (_about(subject.known[0], constants), *usual.terms[1:])
+  values = [v for t in terms[1:] for v in usual.fit.values(t).values()]
+  without = scored_on(before, terms, np.array([*constants, *values]), iterations=3)
+  alone = max(((usual, best), (without, ours)), key=lambda pair: sum(s.evidence for s in pair))
+  gains = np.concatenate([a.nats - b.nats for a, b in zip(alone, (theirs, ours), strict=True)])
+  return gains, sum(s.prior for s in alone) - theirs.prior - ours.prior
+
+
+def _about(constants: Term, values: Array) -> Term:
+  """Returns constants that differ from values as recordings of one machine do."""
+  centre = tuple(map(float, values))
+  return dataclasses.replace(constants, centre=centre, starts=(centre,))
 
 
 def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:

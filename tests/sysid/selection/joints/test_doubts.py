@@ -2,8 +2,11 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from nerf2real.sysid.fit.layout import CONSTANTS
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints import doubts
 from nerf2real.sysid.settings import SETTINGS
 
@@ -91,3 +94,30 @@ def test_play_of_a_healthy_gear_is_nothing(monkeypatch, reference, low, hinge, s
   judged = SimpleNamespace(before=reference, now=now)
   best = SimpleNamespace(terms=[term], fit=None)
   assert doubts.is_something(judged, best, "backlash") == something
+
+
+@pytest.mark.parametrize("without, new", [(-0.1, True), (-5.0, False)])
+def test_what_constants_are_better_for_otherwise_says_nothing_of_an_effect(
+  monkeypatch, without, new
+):
+  """Logs are a nat a block better at the constants of a reference that has the effect, too: what
+  the reference says at the same constants counts, unless it is itself far better with the effect.
+  """
+
+  def scored(nats, *terms):
+    fit = SimpleNamespace(values=lambda term: {"gain": 0.1} if term.names else {})
+    return SimpleNamespace(
+      nats=np.full(30, nats), prior=0.0, evidence=30 * nats, terms=terms, fit=fit
+    )
+
+  own = Term(CONSTANTS, "joint", ("gain",), (-1.0,), (1.0,), (0.1,), ((0.0,),), prior=(0.02,))
+  effect = Term("stribeck_friction", "joint", (), (), (), (), ((),))
+  judged = SimpleNamespace(before="before", now="now", known=(own,), usual=scored(0.0, own))
+  given = iter([scored(-1.0, own), scored(-2.0, own), scored(without, own)])
+  asked = []
+  monkeypatch.setattr(
+    doubts, "scored_on", lambda joint, *_, **__: asked.append(joint) or next(given)
+  )
+  gains, prior = doubts.newness(judged, scored(-3.1, own, effect), effect, effect)
+  assert asked == ["before", "now", "before"]
+  assert doubts.more_likely(gains, prior, 0.05) == new
