@@ -10,6 +10,7 @@ from nerf2real.evaluation.loop import trials
 from nerf2real.evaluation.loop.robot import machines
 from nerf2real.evaluation.loop.settings import LoopSettings, claim, policy_folder
 from nerf2real.evaluation.loop.trials import Condition, Say, Tally, tally
+from nerf2real.real.safety.monitor import SafetyError
 from nerf2real.suite.scene import open_scene
 
 FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0)
@@ -53,7 +54,7 @@ def find_severity(settings: LoopSettings, say: Say) -> list[Step]:
     ended = ""
     try:
       found = trials.run(settings, condition, scene, store, say)
-    except RuntimeError as error:
+    except SafetyError as error:
       if not factor:
         raise
       label, ended = trials.plant_label(settings, condition), str(error)

@@ -100,7 +100,7 @@ def run(
   begins a degree below the limit ends after a second, whatever the policy is.
 
   Raises:
-    RuntimeError: The robot is too hot all the same, or stopped for another reason.
+    SafetyError: The robot is too hot all the same, or stopped for another reason.
   """
   simulated = condition.simulated and settings.simulated is not None
   count = settings.simulated if simulated else settings.trials
@@ -131,7 +131,7 @@ def run(
     if len(found()) == done:
       break
     say(f"  {condition.name}: {hot}: a session with a cool robot begins")
-  raise RuntimeError(
+  raise SafetyError(
     f"{condition.name}: found {hot} before trial {len(found()) + 1} of {len(chosen)}, expected a "
     f"robot that begins it (a cool one was taken {len(on_robot.cooled)} times): what is hidden is "
     "too much for it."
