@@ -142,11 +142,21 @@ def _output(*command: str) -> str:
 
 
 def command_line() -> str:
-  """Returns this command as it is typed in the root, without --write."""
+  """Returns this command as it is typed in the root, without --write: no record names a machine's
+  folders, so that of a path elsewhere its last two parts stay."""
   script = Path(sys.argv[0]).resolve()
   name = script.relative_to(ROOT) if script.is_relative_to(ROOT) else script.name
-  words = [word for word in sys.argv[1:] if word != "--write"]
+  words = [_portable(word) for word in sys.argv[1:] if word != "--write"]
   return shlex.join(["python", str(name), *words])
+
+
+def _portable(word: str) -> str:
+  option, equals, value = word.rpartition("=")
+  path = Path(value)
+  if not path.is_absolute():
+    return word
+  path = path.relative_to(ROOT) if path.is_relative_to(ROOT) else Path(*path.parts[1:][-2:])
+  return f"{option}{equals}{path}"
 
 
 def versions() -> dict[str, str]:

@@ -152,3 +152,24 @@ def test_a_script_s_command_loses_other_and_gains_out(tmp_path):
   assert (
     compare.own_command(words, tmp_path) == "benchmarks/simulation/env.py --rounds 2 --out {out}"
   )
+
+
+def test_a_record_s_command_names_no_folder_of_a_machine(monkeypatch):
+  words = [f"--sets={ROOT}/out/x", "--out", "/home/somebody/project/out/y", "--write", "--seed=7"]
+  monkeypatch.setattr(sys, "argv", [str(ROOT / "benchmarks" / "identify.py"), *words])
+  assert harness.command_line() == (
+    "python benchmarks/identify.py --sets=out/x --out out/y --seed=7"
+  )
+
+
+def test_no_tracked_text_names_a_machine_s_folders():
+  found = subprocess.run(
+    ["git", "grep", "-lE", "/(work|root)/[a-z]+/", "--", "*.json", "*.md"],
+    cwd=ROOT,
+    capture_output=True,
+    text=True,
+    check=False,
+  )
+  if found.returncode > 1:
+    pytest.skip("not a git checkout")
+  assert found.stdout.split() == []

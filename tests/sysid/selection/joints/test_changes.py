@@ -6,10 +6,8 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
@@ -19,11 +17,9 @@ from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.joints import doubts, leaving, naming, remainder, subject
 from nerf2real.sysid.selection.search import rivals
-from nerf2real.sysid.selection.search.evidence import Scored, clear
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
 
-BEYOND = (3.0, 3.0, 3.0)  # standard errors that count as clear
 KINDS = ("command_delay", "viscous_friction", "coulomb_friction", "payload")
 
 
@@ -33,117 +29,6 @@ def few(plant, **_):
 
 
 BEFORE = [Effect("coulomb_friction", "joint", {"torque": 0.15})]
-
-
-class _Joint:
-  """A joint whose predictions are given."""
-
-  class settings:
-    alike = 0.5
-    level = 0.05
-
-  scale = np.array([1.0])
-  log_of = np.repeat([0, 1, 2], 10)
-
-  @staticmethod
-  def squares(residuals):
-    return residuals.reshape(1, -1, 10).var(axis=2)
-
-  independent = np.array([0.1])
-  counts = np.full((1, 30), 10.0)
-
-  @classmethod
-  def alike(cls, apart):
-    return JointLikelihood.alike(cls, apart)
-
-  @classmethod
-  def told_apart(cls, apart):
-    return JointLikelihood.told_apart(cls, apart)
-
-
-def _scored(kinds, nats, prediction=None):
-  """Returns a hypothesis; those with an effect predict another motion than the one without."""
-  prediction = (5.0 if kinds else 0.0) if prediction is None else prediction
-  layout = Layout([()])
-  residuals = [np.tile([1.0, -1.0], 150)[None] * prediction]
-  fit = Fit(layout, np.zeros(0), 0.0, residuals, np.zeros((1, 0, 0)), np.zeros((1, 0)), [])
-  fit.held = [np.exp(-np.asarray(nats))[None]]
-  item = Scored(_Joint, (), fit, np.asarray(nats, float))
-  item.__class__ = type("Named", (Scored,), {"names": frozenset(kinds)})
-  return item
-
-
-def test_a_name_needs_all_that_lack_it_to_be_clearly_worse():
-  random = np.random.default_rng(0)
-  noise = random.normal(0, 0.1, 30)
-  null = _scored((), noise - 3.0)
-  right = _scored(("a",), noise + random.normal(0, 0.1, 30))
-  worse = _scored(("b",), noise - 1.0 + random.normal(0, 0.1, 30), prediction=10.0)
-  as_good = _scored(("c",), noise - 0.001 + random.normal(0, 0.1, 30), prediction=10.0)
-  assert naming.conclude(_Joint, [null, right, worse], BEYOND).named == ("a",)
-  assert naming.conclude(_Joint, [null, right, worse, as_good], BEYOND).named == ()
-
-
-def test_a_rival_that_predicts_the_same_is_said_beside_the_name():
-  null = _scored((), np.linspace(-4, -3, 30))
-  right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
-  (name,) = naming.conclude(_Joint, [null, right, twin], BEYOND).names
-  assert name.certain
-  assert [sorted(s.names) for s in name.confounded] == [["b"]]
-
-
-def test_a_rival_that_is_ahead_by_what_it_has_besides_holds_nothing_against_a_name():
-  """a and b predict the same beside c, which is not clearly better; b alone was not found."""
-  null = _scored((), np.linspace(-4, -3, 30))
-  right = _scored(("a",), np.linspace(0, 0.1, 30))
-  ahead = np.linspace(0, 0.1, 30) + 0.3 * (-1.0) ** np.arange(30) + 0.01
-  with_a, with_b = (_scored((k, "c"), ahead, prediction=8.0) for k in "ab")
-  alone = _scored(("c",), np.linspace(-4, -3, 30), prediction=3.0)
-  ranked = [null, right, with_b, alone]
-  assert naming.conclude(_Joint, ranked, BEYOND).named == ()  # b with c is another motion
-  (name,) = naming.conclude(_Joint, [*ranked, with_a], BEYOND).names
-  assert name.kind == "a" and name.certain
-  assert [sorted(s.names) for s in name.confounded] == [["b", "c"]]
-  other = _scored(("a", "c"), ahead, prediction=12.0)
-  assert naming.conclude(_Joint, [*ranked, other], BEYOND).named == ()
-
-
-def test_a_rival_that_is_clearly_worse_than_itself_with_the_effect_instead_is_beaten():
-  """b with c is better than a alone, by c: a with c is clearly better than b with c."""
-  random = np.random.default_rng(0)
-  noise = random.normal(0, 0.1, 30)
-  null, right = _scored((), noise - 3.0), _scored(("a",), noise)
-  uneven = 0.3 * (-1.0) ** np.arange(30) + 0.01
-  ahead = _scored(("b", "c"), noise + uneven, prediction=8.0)
-  better = _scored(("a", "c"), noise + 1.0 + random.normal(0, 0.1, 30), prediction=12.0)
-  assert naming.conclude(_Joint, [null, right, ahead], BEYOND).named == ()
-  (name,) = naming.conclude(_Joint, [null, right, ahead], BEYOND).names
-  assert name.ahead == (ahead,)
-  beyond = (3.0, 1e3, 1e3)  # c is never clear beside a
-  (name,) = naming.conclude(_Joint, [null, right, ahead, better], beyond).names
-  assert name.certain and name.confounded == ()
-
-
-def test_an_effect_without_which_the_same_is_predicted_is_needless():
-  null = _scored((), np.linspace(-4, -3, 30))
-  both = _scored(("a", "b"), np.linspace(0, 0.1, 30))
-  plain = _scored(("a",), np.linspace(0, 0.1, 30) - 0.05 * (-1.0) ** np.arange(30))
-  (a, b) = naming.conclude(_Joint, [null, both], BEYOND).names  # without its rival it would stand
-  assert (a.certain, b.certain) == (True, True)
-  a, b = (naming._name(_Joint, both, k, [null, both, plain], 3.0) for k in "ab")
-  assert a.certain and a.clear > 3.0 > b.clear
-  assert b.confounded == ()
-
-
-def test_an_effect_beside_a_clearer_one_must_be_clear_of_all_pairs_that_were_tried():
-  null = _scored((), np.linspace(-4, -3, 30))
-  both = _scored(("a", "b"), np.linspace(0, 0.1, 30))
-  plain = _scored(("a",), np.linspace(0, 0.1, 30) - 0.3 - 0.5 * (-1.0) ** np.arange(30), 10.0)
-  behind = clear(both, plain)
-  one, two, _ = naming.thresholds(20)
-  assert one < behind < two, behind
-  assert naming.conclude(_Joint, [null, both, plain], (one,) * 3).named == ("a", "b")
-  assert naming.conclude(_Joint, [null, both, plain], (one, two, two)).named == ("a",)
 
 
 def test_constants_that_are_strained_may_hide_an_effect():
@@ -158,52 +43,6 @@ def test_constants_that_are_strained_may_hide_an_effect():
     patch.setattr(leaving, "leaves", left)
     assert not leaving.may_leave(judged, item(5.0), SETTINGS)
     assert leaving.may_leave(judged, item(9.0), SETTINGS)  # 5 % of chi square with 7 degrees: 7.03
-
-
-def test_a_name_that_makes_one_motion_clearly_worse_does_not_stand():
-  random = np.random.default_rng(0)
-  noise = random.normal(0, 0.3, 30)
-  null, split = _scored((), np.zeros(30)), _scored(("a",), np.repeat([4.0, 4.0, -0.8], 10) + noise)
-  (name,) = naming.conclude(_Joint, [null, split], BEYOND).names
-  assert name.clear > 3.0 and not name.certain
-  inert = _scored(("a",), np.repeat([4.0, 4.0, 0.0], 10) + noise)
-  assert naming.conclude(_Joint, [null, inert], BEYOND).named == ("a",)
-
-
-def test_constants_that_are_strained_do_not_hold_a_motion_against_a_name(monkeypatch):
-  """One motion is 0.8 nats a block worse; the other hypothesis' priors cost 2 nats a block."""
-  null, split = _scored((), np.zeros(30)), _scored(("a",), np.repeat([4.0, 4.0, -0.8], 10))
-  assert not naming.carries_over(_Joint, split, null)
-  priors = {id(null): 60.0, id(split): 0.0}
-  monkeypatch.setattr(Scored, "prior", property(lambda item: priors[id(item)]))
-  assert naming.carries_over(_Joint, split, null)
-
-
-def test_a_twin_with_more_beside_it_is_no_rival():
-  null = _scored((), np.linspace(-4, -3, 30))
-  right, twin = _scored(("a",), np.linspace(0, 0.1, 30)), _scored(("b",), np.linspace(0, 0.09, 30))
-  more = _scored(("b", "c"), np.linspace(0, 0.11, 30), prediction=10.0)
-  other = _scored(("c", "d"), np.linspace(0, 0.11, 30), prediction=10.0)
-  assert naming.conclude(_Joint, [null, right, twin, more], BEYOND).named == ("a",)
-  assert naming.conclude(_Joint, [null, right, twin, more, other], BEYOND).named == ()
-
-
-def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):
-  load, shift, spring = (
-    SimpleNamespace(names=frozenset([kind]), neutral=False, beside_force=False)
-    for kind in ("payload", "encoder_offset", "spring")
-  )
-  monkeypatch.setattr(naming, "_same", lambda *_: True)
-  monkeypatch.setattr(naming, "clear", lambda *_: 0.0)
-  assert naming._usual(None, load, [load, spring, shift], 3.0) is shift
-  assert naming._usual(None, spring, [load, spring], 3.0) is load
-
-
-def test_the_threshold_grows_with_what_was_tried():
-  assert naming.thresholds(1)[0] == pytest.approx(1.645, abs=1e-3)  # 5 %
-  assert naming.thresholds(20, 20)[0] > naming.thresholds(20)[0] > 2.8
-  of_sets = [norm.isf(SETTINGS.level / n) for n in (20, 190, 1140)]
-  assert naming.thresholds(20) == pytest.approx(of_sets)
 
 
 @pytest.fixture(scope="module")
