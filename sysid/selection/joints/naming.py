@@ -40,8 +40,8 @@ class Name:
   certain: bool
   """Whether that is beyond the threshold, and no log is predicted clearly worse."""
   confounded: tuple[Scored, ...]
-  """Hypotheses with another effect in its place that predict the same; one without any says that it
-  is needless."""
+  """Hypotheses with another effect in its place that predict the same, the ones of fewest effects;
+  one without any says that it is needless."""
   ahead: tuple[Scored, ...] = ()
   """Hypotheses with more effects that lack it and are not clearly worse, the likeliest first."""
 
@@ -133,6 +133,7 @@ def _name(
     if not s.names < best.names
     and (_same(joint, best, s) or any(_same(joint, s, t) for t in _with_instead(s, kind, ranked)))
   )
+  alike = tuple(a for a in alike if not any(_holds(a, b) for b in alike))
   told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
   least = min(told, default=float("inf"))
   plain = max((s for s in rivals if s.names < best.names), key=lambda s: s.evidence)

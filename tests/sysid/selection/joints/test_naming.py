@@ -152,6 +152,9 @@ def test_a_twin_with_more_beside_it_is_no_rival():
   other = _scored(("c", "d"), np.linspace(0, 0.11, 30), prediction=10.0)
   assert naming.conclude(_Joint, [null, right, twin, more], BEYOND).named == ("a",)
   assert naming.conclude(_Joint, [null, right, twin, more, other], BEYOND).named == ()
+  alike = _scored(("b", "c"), np.linspace(0, 0.08, 30))
+  (name,) = naming.conclude(_Joint, [null, right, twin, alike], BEYOND).names
+  assert name.confounded == (twin,)
 
 
 def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):
