@@ -21,18 +21,23 @@ from typing import Any, Literal
 
 from benchmarks import harness
 from benchmarks.blind_sets import apparatus, scoring
+from benchmarks.drive_axes import plants as axes
 from benchmarks.independent_sets import apparatus as independent
 from benchmarks.ledger.records import ROOT
 from benchmarks.servo_bench import bench
 from nerf2real.core import markdown
 
 RESULTS = ROOT / "benchmarks" / "results" / "analyser"
-FOLDERS = {"blind_sets": "first", "independent_sets": "second", "servo_bench": "third"}
+FOLDERS = {
+  **{"blind_sets": "first", "independent_sets": "second", "servo_bench": "third"},
+  "drive_axes": "fourth",
+}
 """Folder of a generator's pages, there and in the records."""
 _PLANTS = {
   "blind_sets": apparatus.KINDS,
   "independent_sets": independent.KINDS,
   "servo_bench": bench.PLANTS,
+  "drive_axes": axes.PLANTS,
 }
 
 
@@ -48,7 +53,7 @@ class Settings:
   """Seed of the sets where they must be made."""
   count: int = 72
   """Number of sets where they must be made."""
-  generator: Literal["blind_sets", "independent_sets", "servo_bench"] = "blind_sets"
+  generator: Literal["blind_sets", "independent_sets", "servo_bench", "drive_axes"] = "blind_sets"
   """Which package makes them."""
   references: bool = True
   """Give the analyser the reference logs that a set has."""

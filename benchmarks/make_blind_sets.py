@@ -1,10 +1,11 @@
 """Makes blind sets: `python benchmarks/make_blind_sets.py --out out/blind --seed 0 --count 20`.
 
 Each set is a folder with the declared `model.xml`, three logs to identify from and two held out;
-`answers.json` beside them holds what each machine has that its model lacks. Three generators that
+`answers.json` beside them holds what each machine has that its model lacks. Four generators that
 share no code with each other or with the analyser: `blind_sets`; `independent_sets`, which has one
-log held out and always three of the healthy machine; `servo_bench`, one servo with an arm, which
-has those three, too. The same seed gives the same logs.
+log held out and always three of the healthy machine; `servo_bench`, one servo with an arm, and
+`drive_axes`, axes under cascaded control, which have those three, too. The same seed gives the
+same logs.
 """
 
 import contextlib
@@ -18,6 +19,7 @@ from typing import Any, Literal
 
 from benchmarks import harness
 from benchmarks.blind_sets import sets
+from benchmarks.drive_axes import sets as drive_sets
 from benchmarks.independent_sets import sets as independent_sets
 from benchmarks.servo_bench import sets as servo_sets
 
@@ -25,10 +27,14 @@ GENERATORS: dict[str, Callable[..., Any]] = {
   "blind_sets": sets.make_set,
   "independent_sets": independent_sets.make_set,
   "servo_bench": servo_sets.make_set,
+  "drive_axes": drive_sets.make_set,
 }
 
-WITH_REFERENCES = ("independent_sets", "servo_bench")
+WITH_REFERENCES = ("independent_sets", "servo_bench", "drive_axes")
 """Generators whose sets always have logs of the healthy machine."""
+
+WITH_DAYS = ("servo_bench", "drive_axes")
+"""Generators whose references are of the same day or of another."""
 
 HALF_HEALTHY = (
   *("healthy", "single", "healthy", "pair", "healthy"),
@@ -49,21 +55,21 @@ class Settings:
   """Number of sets."""
   first: int = 0
   """Index of the first set; a set depends on seed and index alone."""
-  generator: Literal["blind_sets", "independent_sets", "servo_bench"] = "blind_sets"
+  generator: Literal["blind_sets", "independent_sets", "servo_bench", "drive_axes"] = "blind_sets"
   """Which package makes them."""
   mix: Literal["single", "pair", "outside", "healthy", "all", "half"] = "all"
   """What the machines have: one effect, two, one that no library has, none, or all of these, drawn
   (all) or in turn with every second machine healthy (half)."""
   plants: tuple[str, ...] = ()
   """Kinds of apparatus: of pendulum, arm, op3; of slider, arm, wheel; of hanging, bent, level,
-  turntable; empty: all."""
+  turntable; of lift, swing, planar; empty: all."""
   kinds: tuple[str, ...] = ()
   """Kinds of effect to draw from; empty: all."""
   reference: bool = False
-  """Also write reference_*.mcap: the same machine without the effects; `independent_sets` and
-  `servo_bench` always do."""
+  """Also write reference_*.mcap: the same machine without the effects; all but `blind_sets`
+  always do."""
   same_day: bool = False
-  """References of the same day, so that only noise is another (`servo_bench`; of
+  """References of the same day, so that only noise is another (`servo_bench`, `drive_axes`; of
   `independent_sets` they always are)."""
   processes: int = 1
   """Sets made at the same time."""
@@ -71,8 +77,8 @@ class Settings:
 
 def main(settings: Settings) -> None:
   """Writes sets that are not there yet and answers.json."""
-  if settings.same_day and settings.generator != "servo_bench":
-    raise ValueError(f"--same-day is of servo_bench, found --generator {settings.generator}.")
+  if settings.same_day and settings.generator not in WITH_DAYS:
+    raise ValueError(f"--same-day is of {WITH_DAYS}, found --generator {settings.generator}.")
   settings.out.mkdir(parents=True, exist_ok=True)
   path = settings.out / "answers.json"
   answers = json.loads(path.read_text()) if path.is_file() else {}

@@ -1,0 +1,1 @@
+"""Axes under cascaded drive control: the fourth generator of blind sets."""
