@@ -69,7 +69,7 @@ def _on_host(name: str, low: float, high: float, parameter: str, *, signed: bool
 
 
 def _coulomb(a, reach, size, shape):
-  torque = a["limit"] * _between(0.02, 0.2, size)
+  torque = a["limit"] * _between(0.02, 0.35, size)
   return {"more_dry": torque}, {"torque": torque}
 
 
@@ -79,19 +79,19 @@ def _viscous(a, reach, size, shape):
 
 
 def _stribeck(a, reach, size, shape):
-  breakaway = a["limit"] * _between(0.03, 0.25, size)
-  velocity = reach.speed * _between(0.03, 0.15, shape[0])
+  breakaway = a["limit"] * _between(0.05, 0.5, size)
+  velocity = reach.speed * _between(0.05, 0.25, shape[0])
   values = {"more_breakaway": breakaway, "more_fall": velocity}
   return values, {"breakaway": breakaway, "velocity": velocity}
 
 
 def _of_load(a, reach, size, shape):
-  share = _between(0.06, 0.4, size)
+  share = _between(0.08, 0.5, size)
   return {"of_load": a["of_load"] + share}, {"coefficient": share}
 
 
 def _asymmetric(a, reach, size, shape):
-  torques = a["limit"] * _between(0.03, 0.22, size) * np.array([1.0, _between(0.1, 0.5, shape[0])])
+  torques = a["limit"] * _between(0.03, 0.4, size) * np.array([1.0, _between(0.1, 0.5, shape[0])])
   positive, negative = torques if shape[1] < 0.5 else torques[::-1]
   values = {"more_dry": 0.5 * (positive + negative), "offset": 0.5 * (negative - positive)}
   return values, {"positive": float(positive), "negative": float(negative)}
@@ -128,7 +128,7 @@ def _spring(a, reach, size, shape):
 
 
 def _cogging(a, reach, size, shape):
-  amplitude = a["limit"] * _between(0.02, 0.15, size)
+  amplitude = a["limit"] * _between(0.02, 0.25, size)
   waves = _between(4.0, 25.0, shape[0]) / reach.amplitude
   phase = math.pi * (2.0 * shape[1] - 1.0)
   values = {"cogging": amplitude, "cogging_waves": waves, "cogging_phase": phase}
@@ -142,7 +142,7 @@ def _rotor(a, reach, size, shape):
 
 def _payload(machine: Machine, host: Host, joint: int, size: float, shape: Array) -> Broken:
   links = machine.links
-  mass = links.mass[joint] * _between(0.06, 0.6, size)
+  mass = links.mass[joint] * _between(0.08, 0.8, size)
   reach = 0.0 if machine.plant == "lift" else links.length[joint] * (0.5 + 0.5 * shape[0])
   load, at = links.load.copy(), links.reach.copy()
   load[joint], at[joint] = mass, reach
@@ -224,7 +224,7 @@ LIBRARY = {
   "load_friction": Kind(_on_axis(_of_load), group="dry"),
   "asymmetric_friction": Kind(_on_axis(_asymmetric), group="dry"),
   "quadratic_drag": Kind(_on_axis(_drag), group="damped"),
-  "backlash": Kind(_on_axis(_play), group="play"),
+  "backlash": Kind(_on_axis(_play), HINGED, group="play"),
   "motor_gain": Kind(_on_axis(_gain), group="strength"),
   "torque_limit": Kind(_on_axis(_limit), group="strength"),
   "payload": Kind(_payload, group="mass"),

@@ -92,7 +92,7 @@ def on_paper(plant: str, random: Random) -> Machine:
   set_values = {
     "position_gain": loop[0],
     "speed_gain": speed_gain,
-    "integral_time": u(1.0, 2.5),
+    "integral_time": u(1.5, 3.0) * (2.0 if plant == "lift" else 1.0),
     "leak": u(0.3, 0.7),
     "most_speed": [1.5 * r.speed for r in reach],
     "most_slope": [6.0 * a for a in acceleration],
