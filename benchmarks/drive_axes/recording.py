@@ -64,11 +64,10 @@ def draw_host(random: Random) -> Host:
   )
 
 
-def lateness(machine: Machine, host: Host) -> float:
-  """Returns the usual time [s] from a command to a reading of what it did: the bus, half a run of
-  the drive, its filter's and its current's lag, which a pure delay imitates."""
-  drive = 0.5 * host.per_tick * simulation.STEP
-  return host.latency + host.age + drive + float(np.mean(machine.axes.lag))
+def lateness(host: Host) -> float:
+  """Returns the usual time [s] from a command to a reading of what it did: the bus and half a run
+  of the drive. Lags within the loops do not delay slow motions: position follows by 1 / Kp."""
+  return host.latency + host.age + 0.5 * host.per_tick * simulation.STEP
 
 
 def command_times(host: Host, duration: float) -> Array:

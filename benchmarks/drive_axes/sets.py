@@ -145,7 +145,7 @@ def draw_scene(plant: str, random: Random, seed: tuple[int, ...], *, same_day: b
       commands[f"{part}_{name}"] = np.stack(goals, 1)
   scene = Scene(machine, copy, paper, host, commands, seed, {}, {})
   healthy = {name: record(scene, machine, host, name) for name in commands if name[:4] == "held"}
-  late, true = recording.lateness(machine, host), plants.declared(machine)
+  late, true = recording.lateness(host), plants.declared(machine)
   right = {
     name: following.follow(true, log.sent, log.commands, log.time, late)
     for name, log in healthy.items()
