@@ -65,6 +65,8 @@ class Settings:
   """s that one analysis may take; longer is a failure."""
   processor_seconds: int | None = None
   """s of processor time that one analysis may use; more is a failure. No limit for None."""
+  pool: tuple[str, ...] = ()
+  """Analyse nothing: put kept pages' scores together, such as `third/9115 fourth/7501`."""
   done_only: bool = False
   """Analyse nothing: score what was analysed so far."""
   redo: bool = False
@@ -79,6 +81,9 @@ class Settings:
 
 def main(settings: Settings) -> None:
   """Makes sets if needed, analyses them, prints and keeps the table."""
+  if settings.pool:
+    _pool(settings)
+    return
   if not (settings.sets / "answers.json").is_file():
     _run(
       [
@@ -122,6 +127,24 @@ def main(settings: Settings) -> None:
   seeds = ", ".join(sorted({name.split("_")[0] for name in names}))
   options = harness.Options(write=settings.write)
   harness.finish(settings.name, figures_of(rows), options, seed=seeds, within=f"analyser/{part}")
+
+
+def _pool(settings: Settings) -> None:
+  """Prints and keeps the table of several runs together."""
+  rows: list[dict[str, Any]] = []
+  for page in settings.pool:
+    path = RESULTS / f"{page}.json"
+    if not path.is_file():
+      raise ValueError(f"Found no {path}, expected pages such as fourth/7501 after --pool.")
+    rows += json.loads(path.read_text())["scores"]
+  rows = [row | {"score": scoring.Score(**row["score"])} for row in rows]
+  text = render(rows, {row["set"]: {} for row in rows})
+  print(text)
+  folder = settings.results or RESULTS
+  (folder / f"{settings.name.removeprefix('identify_')}.md").write_text(text)
+  seeds = ", ".join(page.split("/")[-1] for page in settings.pool)
+  options = harness.Options(write=settings.write)
+  harness.finish(settings.name, figures_of(rows), options, seed=seeds, within="analyser")
 
 
 def folder_of(answers: dict[str, Any], generator: str) -> str:

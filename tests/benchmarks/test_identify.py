@@ -34,3 +34,16 @@ def test_every_page_is_where_its_sets_belong_and_in_the_index():
       assert {name.split("_")[0] for name in content["sets"]} == {page.stem}, page
       generator = {v: k for k, v in identify.FOLDERS.items()}[page.parent.name]
       assert identify.folder_of(content["answers"], generator) == page.parent.name, page
+
+
+def test_runs_are_put_together(tmp_path):
+  """Cases add up over pages, and every set is in the list."""
+  pages = ("second/8315", "third/9115")
+  kept = [json.loads((identify.RESULTS / f"{page}.json").read_text()) for page in pages]
+  healthy = sum(row["score"]["mix"] == "healthy" for page in kept for row in page["scores"])
+  identify.main(identify.Settings(pool=pages, results=tmp_path, name="identify_both"))
+  text = (tmp_path / "both.md").read_text()
+  assert f"| healthy: accused | 0 % (0 to 31 %) | {healthy} |" in text
+  assert all(f"| {name} " in text for page in kept for name in page["sets"])
+  with pytest.raises(ValueError, match=r"Found no .*third/1\.json"):
+    identify.main(identify.Settings(pool=("third/1",), results=tmp_path))
