@@ -51,15 +51,21 @@ def alternatives(found: Identified) -> list[dict[str, Any]]:
       "kinds": sorted(other.names),
       "kind": "+".join(sorted(other.names)),
       "joint": item.joint,
-      "confounded": bool(item.named) and any(other is c for c in item.confounded),
+      "confounded": other.names in {c.names for c in item.confounded},
       "parameters": {
         k: {n: round(v, 5) for n, v in other.values(k).items()} for k in sorted(other.names)
       },
       "evidence": _evidence(item, other),
     }
     for item in found.found
-    for other in item.alternatives[:_LISTED]
+    for other in _listed(item)
   ]
+
+
+def _listed(item: Changed) -> list[Scored]:
+  """Returns the likeliest hypotheses, first those that predict what the named one does."""
+  twins = {c.names for c in item.confounded}
+  return sorted(item.alternatives, key=lambda other: other.names not in twins)[:_LISTED]
 
 
 def _evidence(item: Changed, other: Scored) -> dict[str, Any]:

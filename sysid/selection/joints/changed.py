@@ -81,8 +81,12 @@ class Changed:
 
   @property
   def confounded(self) -> list[Scored]:
-    """Hypotheses without a named effect that predict the same."""
-    alike = {id(s): s for n in self.found.names for s in n.confounded if s.names}
+    """The smallest hypotheses without a named effect that predict the same."""
+    alike = {}
+    for name in self.found.names:
+      twins = [s for s in name.confounded if s.names and name.kind in self.named]
+      least = min((len(s.names) for s in twins), default=0)
+      alike |= {id(s): s for s in twins if len(s.names) == least}
     return list(alike.values())
 
   @property

@@ -9,6 +9,7 @@ from scipy.stats import norm
 from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.selection.joints import naming
+from nerf2real.sysid.selection.joints.changed import Changed
 from nerf2real.sysid.selection.search.evidence import Scored, clear
 from nerf2real.sysid.settings import SETTINGS
 
@@ -155,6 +156,16 @@ def test_a_twin_with_more_beside_it_is_no_rival():
   alike = _scored(("b", "c"), np.linspace(0, 0.08, 30))
   (name,) = naming.conclude(_Joint, [null, right, twin, alike], BEYOND).names
   assert name.confounded == (twin,)
+
+
+def test_what_else_predicts_the_same_is_said_of_claimed_names_by_the_fewest_effects():
+  few, more, other = (_scored(kinds, [0.0] * 30) for kinds in (("c",), ("c", "d"), ("a", "e")))
+  names = [
+    naming.Name("a", 9.0, True, (more, few)),
+    naming.Name("b", 9.0, True, (other,)),  # certain, and in the reference, too
+  ]
+  said = Changed.confounded.fget(SimpleNamespace(found=SimpleNamespace(names=names), named=("a",)))
+  assert said == [few]
 
 
 def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):
