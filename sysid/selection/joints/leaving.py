@@ -29,7 +29,7 @@ def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   readings' noise.
   """
   if subject.paired:
-    moved, beside = _of_two_recordings(subject, item), play.beside(subject.now, item)
+    moved, beside = _of_two_recordings(subject), play.beside(subject.now, item)
     return structured(subject.now, item, settings, moved, beside)
   if subject.usual is not None:
     return grown(item, subject.usual, subject.beyond, settings)
@@ -49,23 +49,16 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   return leaves(subject, item, settings)
 
 
-def _of_two_recordings(subject: Subject, item: Scored) -> Array:
-  """Returns the mean squares of blocks [B] by which a machine's constants, as far as they differ
-  between its reference and its logs, move its course.
-
-  In one session those that wander within a recording, too: what one value for all of it explains
-  was fitted before. From one session to another all do, and beside an effect as far as within one:
-  the effect must explain the rest.
-  """
-  now, null, apart = subject.now, subject.explainer.null, subject.another_session
-  layout, own = null.fit.layout, subject.known[0]
-  constants = dict(zip(own.names, own.centre, strict=True))
-  differ = np.array(differs(constants, now.settings, apart and not item.names))
-  if not apart:
-    differ[[name not in now.settings.wandering for name in own.names]] = np.inf
-  start, stop = layout.spans[layout.terms.index(own)]
-  sigma = layout.sigma.copy() if apart else np.full_like(layout.sigma, np.inf)
-  sigma[start:stop] = differ
+def _of_two_recordings(subject: Subject) -> Array:
+  """Returns the mean squares of blocks [B] by which a machine's constants move its course, as far
+  as they differ within a recording: what one value for all of it explains was fitted before, also
+  where constants are those of another session."""
+  now, null, own = subject.now, subject.explainer.null, subject.known[0]
+  layout = null.fit.layout
+  differ = np.array(differs(dict(zip(own.names, own.centre, strict=True)), now.settings, False))
+  differ[[name not in now.settings.wandering for name in own.names]] = np.inf
+  sigma = np.full_like(layout.sigma, np.inf)
+  sigma[slice(*layout.spans[layout.terms.index(own)])] = differ
   return repeats(now, null, sigma)
 
 
@@ -79,7 +72,7 @@ def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
 
   readings = now.noise_squares * (1.0 + NOISE if subject.paired else 1.0)
   if subject.paired:
-    readings = readings + _of_two_recordings(subject, item) + play.beside(now, item)
+    readings = readings + _of_two_recordings(subject) + play.beside(now, item)
   anyway = np.array([np.median(readings), readings.mean()])
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])

@@ -107,14 +107,17 @@ def test_a_rotor_of_twice_the_inertia_since_the_reference_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize(
-  ("torque", "days", "more"), [(0.03, 0, True), (0.03, 3, False), (0.2, 3, True)]
+  ("torque", "rougher", "days", "more"),
+  [(0.03, 1.0, 0, True), (0.03, 1.0, 3, True), (0.0, 1.2, 3, False)],
 )
-def test_a_machine_of_another_session_differs_as_its_constants_do(torque, days, more):
-  """A wave of torque over position that no constant makes, since references of the same motions."""
+def test_a_machine_of_another_session_differs_as_its_constants_do(torque, rougher, days, more):
+  """A wave of torque over position, which no constant makes, or more dry friction, which one does,
+  since references of the same motions: only the first remains when constants are fitted."""
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   wave = Effect("cogging", "joint", {"amplitude": torque, "periods": 8.0, "phase": 0.0})
   before = [dataclasses.replace(log, start_ns=-days * 86_400 * 10**9) for log in logs_of(PENDULUM)]
-  logs = logs_of(PENDULUM, [wave])
+  friction = f'frictionloss="{0.03 * rougher}"'
+  logs = logs_of(PENDULUM.replace('frictionloss="0.03"', friction), [wave] if torque else [])
   reductions = tuple([Reduction(model, log) for log in some] for some in (logs, before))
   found = subject.prepare(
     model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
