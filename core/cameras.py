@@ -129,13 +129,16 @@ class Camera:
       d = radial + 2 * y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x
       residual = self.distort(ideal) - target
       determinant = a * d - b * b
-      ideal = ideal - np.stack(
+      step = np.stack(
         [
           (d * residual[..., 0] - b * residual[..., 1]) / determinant,
           (a * residual[..., 1] - b * residual[..., 0]) / determinant,
         ],
         axis=-1,
       )
+      if not step.any():  # as at once without distortion: all further steps are zero, too
+        break
+      ideal = ideal - step
     return ideal
 
   def project(self, points: np.ndarray) -> np.ndarray:
