@@ -7,6 +7,7 @@ import pytest
 from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.engine.trainer import FusedTrainer
 from nerf2real.scenes.field.field import Field, FieldSettings
+from nerf2real.scenes.field.occupancy import OccupancySettings, build
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.quality import image_quality
 from tests.scenes import box_views
@@ -30,12 +31,13 @@ REFERENCE = dataclasses.replace(
   batch_rays=256,
   proposal_samples=24,
   final_samples=16,
-  proposal_levels=2,
+  proposal_levels=1,  # few levels: XLA compiles the step in less time
   proposal_log2_table_size=8,
   proposal_finest_resolution=32,
   max_steps=60,
-  field=FieldSettings(levels=4, log2_table_size=10, growth=1.5),
+  field=FieldSettings(levels=2, log2_table_size=10, growth=2.0),
 )
+SHORT = dataclasses.replace(FAST, max_steps=90, occupancy_start=24, occupancy_sweep_steps=64)
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +50,23 @@ def trained(views):
   return train.train(views, FAST)
 
 
-def test_fused_training_reproduces_views_it_has_not_seen(trained):
-  field, report = trained
+@pytest.fixture(scope="module")
+def short(views):
+  return train.train(views, SHORT)
+
+
+def _renderer(field):
+  return Renderer(field, occupancy=build(field, settings=OccupancySettings(cells=64)))
+
+
+@pytest.fixture(scope="module")
+def renderer(trained):
+  return _renderer(trained[0])
+
+
+def test_fused_training_reproduces_views_it_has_not_seen(trained, renderer):
+  _, report = trained
   held_out = box_views.make_views(3, width=64, height=48, seed=100)
-  renderer = Renderer(field)
   figures = []
   for index in range(3):
     picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
@@ -69,14 +84,14 @@ def test_fused_training_reproduces_views_it_has_not_seen(trained):
   assert report.samples > report.rays > 300 and report.samples_per_second > 0
 
 
-def test_same_seed_gives_the_same_field(views, trained):
-  again, _ = train.train(views, FAST)
-  for name, value in trained[0].params.items():
+def test_same_seed_gives_the_same_field(views, short):
+  again, _ = train.train(views, SHORT)
+  for name, value in short[0].params.items():
     np.testing.assert_array_equal(again.params[name], value)
 
 
 def test_interrupted_training_ends_where_the_uninterrupted_one_does(
-  views, trained, tmp_path, monkeypatch
+  views, short, tmp_path, monkeypatch
 ):
   monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
   seen = []
@@ -88,11 +103,11 @@ def test_interrupted_training_ends_where_the_uninterrupted_one_does(
 
   monkeypatch.setattr(train, "_RECORD_SECONDS", 0.0)
   with pytest.raises(KeyboardInterrupt):
-    train.train(views, FAST, progress=interrupt, checkpoint_dir=tmp_path)
-  field, report = train.train(views, FAST, checkpoint_dir=tmp_path)
-  assert report.resumed_at_step is not None and 100 < report.resumed_at_step < 130
-  assert report.steps == 300
-  for name, value in trained[0].params.items():
+    train.train(views, SHORT, progress=interrupt, checkpoint_dir=tmp_path)
+  field, report = train.train(views, SHORT, checkpoint_dir=tmp_path)
+  assert report.resumed_at_step is not None and 30 < report.resumed_at_step < 39
+  assert report.steps == 90
+  for name, value in short[0].params.items():
     np.testing.assert_array_equal(field.params[name], value)
 
 
@@ -160,17 +175,16 @@ def test_a_run_that_ends_while_it_writes_a_checkpoint_goes_on_from_the_one_befor
   assert report.resumed_at_step == 3 and report.steps == 6
 
 
-def test_known_points_make_the_geometry_better(trained):
+def test_known_points_make_the_geometry_better(renderer):
   """With as many steps, the field with anchors comes nearer to the walls."""
   anchored = box_views.make_views(60, width=64, height=48, anchors=40)
   field, _ = train.train(anchored, dataclasses.replace(FAST, max_steps=300))
   held_out = box_views.make_views(4, width=64, height=48, seed=100)
   errors = []
-  for candidate in (trained[0], field):
-    renderer = Renderer(candidate)
+  for candidate in (renderer, _renderer(field)):
     off = []
     for index in range(4):
-      _, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
+      _, depth = candidate.render(held_out.camera, held_out.world_from_camera[index])
       origin, directions = held_out.rays(index)
       norms = np.linalg.norm(held_out.camera.rays(), axis=-1)
       off.append(np.abs(depth - box_views.wall_distance(origin, directions) / norms))

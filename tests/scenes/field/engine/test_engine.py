@@ -28,6 +28,7 @@ from nerf2real.scenes.field.engine.engine import Engine
 from nerf2real.scenes.field.engine.rays import march
 from nerf2real.scenes.field.engine.trainer import FusedTrainer
 from nerf2real.scenes.field.field import Field, FieldSettings, init_params, query, query_density
+from nerf2real.scenes.field.occupancy import OccupancySettings, build
 from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.quality import image_quality
@@ -63,12 +64,17 @@ FAST = TrainSettings(
 SEED, BUDGET = 5, 300
 
 
+@functools.cache
+def _initial_params():
+  return init_params(jax.random.PRNGKey(0), SETTINGS.field)
+
+
 def _rough_field(pixel_angle=0.05):
   """A field with parameters far from their initial values, so that every term matters."""
   rng = np.random.default_rng(0)
   params = {
     name: np.array(value + rng.normal(size=value.shape) * (0.3 if name == "table" else 0.1), "f4")
-    for name, value in init_params(jax.random.PRNGKey(0), SETTINGS.field).items()
+    for name, value in _initial_params().items()
   }
   return Field(SETTINGS.field, params, pixel_angle)
 
@@ -194,6 +200,16 @@ def test_phases_have_the_gradient_of_chunks(monkeypatch, with_empty):
     assert error < 1e-5, (name, error)
 
 
+@jax.jit
+def _empty_space_gradient(params, points, variances, factor):
+  """Gradient of factor * mean of log(1 + density), compiled once for all tests."""
+
+  def loss(params):
+    return factor * jnp.log1p(query_density(SETTINGS.field, params, points, variances)).mean()
+
+  return jax.grad(loss)(params)
+
+
 @pytest.mark.parametrize("phased", [False, True])
 def test_empty_space_has_the_gradient_of_its_density(monkeypatch, backward, phased):
   """The difference that empty cells make, against autodiff of weight * log(1 + density)."""
@@ -212,11 +228,8 @@ def test_empty_space_has_the_gradient_of_its_density(monkeypatch, backward, phas
   variances = np.exp2((extents - 1) * 20)[:, None].repeat(3, axis=1)
   assert 1e-6 < variances.min() < 2e-6 and 5e-3 < variances.max() < 1e-2
 
-  def loss(params):
-    density = query_density(SETTINGS.field, params, points, variances)
-    return figures[0] * SETTINGS.empty_weight * jnp.log1p(density).mean()
-
-  expected = jax.jit(jax.grad(loss))(_rough_field().params)
+  factor = figures[0] * SETTINGS.empty_weight
+  expected = _empty_space_gradient(_rough_field().params, points, variances, factor)
   for name in ("table", "base_w1", "base_b1", "base_w2", "base_b2"):
     change = gradient[name] - without[name]
     error = np.linalg.norm(change - expected[name]) / np.linalg.norm(expected[name])
@@ -243,7 +256,8 @@ def test_densities_agree_with_the_field():
   positions = (rng.normal(size=(3000, 3)) * 1.5).astype(np.float32)
   found = Engine(field.settings, field.params, Device()).densities(positions, sigma=0.01)
   variances = np.full((3000, 3), 1e-4, np.float32)
-  expected = query_density(field.settings, field.params, positions, variances)
+  reference = jax.jit(functools.partial(query_density, field.settings))
+  expected = reference(field.params, positions, variances)
   np.testing.assert_allclose(found, expected, rtol=2e-4)
 
 
@@ -321,7 +335,8 @@ def _train(views, steps=FAST.max_steps, **options):
 @pytest.mark.parametrize("phased", [False, True])
 def test_training_reproduces_views_it_has_not_seen(views, phased):
   held_out = box_views.make_views(3, width=64, height=48, seed=100)
-  renderer = Renderer(_train(views, phased=phased).field())
+  field = _train(views, phased=phased).field()
+  renderer = Renderer(field, occupancy=build(field, settings=OccupancySettings(cells=64)))
   figures = []
   for index in range(3):
     picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
