@@ -1,5 +1,7 @@
 """The IMU's effects against readings of a swinging rod, from the formulas of rigid-body motion."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -39,29 +41,47 @@ def _ideal(t, still):
   # In the frame of the swing: rod along -z, swing about y.
   force = np.stack([-LENGTH * a[0] - 9.81 * sin, 0 * sin, LENGTH * v[0] ** 2 + 9.81 * cos], axis=1)
   rate = np.stack([0 * sin, v[0], v[1]], axis=1)
-  back = Rotation.from_euler("z", -q[1])
+  back = Rotation.from_euler("z", -q[1][:, None])
   return np.hstack([back.apply(rate), back.apply(force)])
 
 
-def _log(path, *, seed=0, still=False, tilt=(0, 0, 0), scale=(1, 1), bias=(0,) * 6, late=0.0):
-  random = np.random.default_rng(seed)
-  turn = Rotation.from_rotvec(tilt).inv()
-  with open_log(path) as log:
-    for n in range(1000):
-      t = n * 0.01
-      q = np.round(_angles(np.array([t]), still)[0][:, 0] / 0.001534) * 0.001534
-      stamp = START + n * 10_000_000
-      for topic in (messages.COMMANDS, messages.STATES):
-        log.write(messages.joint_state(stamp, topic, ("swing", "turn"), position=q))
-      ideal = _ideal(np.array([t + 0.002 - late]), still)[0]
-      seen = np.concatenate([turn.apply(ideal[:3]) * scale[0], turn.apply(ideal[3:]) * scale[1]])
-      seen = seen + bias + random.normal(0, 1, 6) * [*(0.003,) * 3, *(0.05,) * 3]
-      log.write(messages.imu(stamp + 2_000_000, seen[:3], seen[3:]))
-  return read_log(path)
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+  """Logs of the rod in motion and at rest, read from files: their IMU reads zeros."""
+  found = {}
+  for still in (False, True):
+    path = tmp_path_factory.mktemp("logs") / "rod.mcap"
+    with open_log(path) as log:
+      for n in range(1000):
+        q = np.round(_angles(np.array([n * 0.01]), still)[0][:, 0] / 0.001534) * 0.001534
+        stamp = START + n * 10_000_000
+        for topic in (messages.COMMANDS, messages.STATES):
+          log.write(messages.joint_state(stamp, topic, ("swing", "turn"), position=q))
+        log.write(messages.imu(stamp + 2_000_000, np.zeros(3), np.zeros(3)))
+    found[still] = read_log(path)
+  return found
 
 
-def _found(tmp_path, **effects):
-  logs = [_log(tmp_path / f"{i}.mcap", seed=i, **effects) for i in range(2)]
+@pytest.fixture
+def made(recorded):
+  """Makes a log of the rod whose IMU has effects and noise."""
+
+  def make(*, seed=0, still=False, tilt=(0, 0, 0), scale=(1, 1), bias=(0,) * 6, late=0.0):
+    log, turn = recorded[still], Rotation.from_rotvec(tilt).inv()
+    ideal = _ideal(np.arange(1000) * 0.01 + 0.002 - late, still)
+    seen = np.hstack([turn.apply(ideal[:, :3]) * scale[0], turn.apply(ideal[:, 3:]) * scale[1]])
+    noise = np.random.default_rng(seed).normal(0, 1, (1000, 6)) * [*(0.003,) * 3, *(0.05,) * 3]
+    seen = seen + bias + noise
+    imu = dataclasses.replace(
+      log.imu, angular_velocity=seen[:, :3], linear_acceleration=seen[:, 3:]
+    )
+    return dataclasses.replace(log, imu=imu)
+
+  return make
+
+
+def _found(made, **effects):
+  logs = [made(seed=i, **effects) for i in range(2)]
   return inertial.find(mujoco.MjModel.from_xml_string(MODEL), logs)
 
 
@@ -76,8 +96,8 @@ def _found(tmp_path, **effects):
     ({"late": 0.03}, "imu_lag", {"delay": 0.03}),
   ],
 )
-def test_an_effect_is_named_with_its_size(effects, kind, values, tmp_path):
-  found = _found(tmp_path, **effects)
+def test_an_effect_is_named_with_its_size(effects, kind, values, made):
+  found = _found(made, **effects)
   assert [e.kind for e in found.effects] == [kind]
   for name, value in values.items():
     unit = found.rows[0]["parameters"][name]["unit"]
@@ -86,37 +106,37 @@ def test_an_effect_is_named_with_its_size(effects, kind, values, tmp_path):
   assert found.after < 0.9 * found.before
 
 
-def test_an_ideal_imu_is_not_accused(tmp_path):
-  assert _found(tmp_path).effects == []
+def test_an_ideal_imu_is_not_accused(made):
+  assert _found(made).effects == []
 
 
-def test_two_effects_are_both_named(tmp_path):
-  found = _found(tmp_path, late=0.02, bias=(0, 0.03, 0, 0, 0, 0))
+def test_two_effects_are_both_named(made):
+  found = _found(made, late=0.02, bias=(0, 0.03, 0, 0, 0, 0))
   assert {e.kind for e in found.effects} == {"imu_lag", "imu_bias"}
 
 
-def test_of_an_imu_at_rest_tilt_and_bias_are_not_told_apart(tmp_path):
-  found = _found(tmp_path, still=True, bias=(0, 0, 0, 0.6, 0, 0))
+def test_of_an_imu_at_rest_tilt_and_bias_are_not_told_apart(made):
+  found = _found(made, still=True, bias=(0, 0, 0, 0.6, 0, 0))
   assert found.effects == []
   assert {a["kind"] for a in found.alternatives} >= {"imu_tilt", "imu_bias"}
 
 
-def test_an_imu_on_a_body_that_stands_still_has_a_zero_of_its_gyroscope(tmp_path):
+def test_an_imu_on_a_body_that_stands_still_has_a_zero_of_its_gyroscope(made):
   base = '<body><geom size=".1" mass="1"/><site name="imu"/><body>'
   fixed = MODEL.replace('<site name="imu" pos="0 0 -0.3"/>', "").replace(
     "<worldbody><body>", f"<worldbody>{base}"
   )
   fixed = fixed.replace("</body></body></worldbody>", "</body></body></body></worldbody>")
   bias = (0.02, 0, 0, 0, 0, 0)
-  log = _log(tmp_path / "a.mcap", still=True, bias=bias)
+  log = made(still=True, bias=bias)
   found = inertial.find(mujoco.MjModel.from_xml_string(fixed), [log])
   assert [e.kind for e in found.effects] == ["imu_bias"]
   assert set(found.effects[0].parameters) == {"gyroscope_x", "gyroscope_y", "gyroscope_z"}
   assert found.effects[0].parameters["gyroscope_x"] == pytest.approx(0.02, abs=1e-3)
 
 
-def test_without_an_imu_nothing_is_said(tmp_path):
-  log = _log(tmp_path / "a.mcap")
+def test_without_an_imu_nothing_is_said(made):
+  log = made()
   bare = MODEL[: MODEL.index("<sensor>")] + "</mujoco>"
   assert inertial.find(mujoco.MjModel.from_xml_string(bare), [log]) is None
 
@@ -140,14 +160,14 @@ def test_healthy_imus_are_not_accused(seeds):
   assert listed <= max(1, len(seeds) // 10)
 
 
-def test_an_imu_s_own_bias_is_the_reference_s_too_and_gravity_that_turned_is_no_tilt(tmp_path):
+def test_an_imu_s_own_bias_is_the_reference_s_too_and_gravity_that_turned_is_no_tilt(made):
   model = mujoco.MjModel.from_xml_string(MODEL)
   own = {"bias": (0.02, 0, -0.01, 0, 0, 0)}
-  before = [_log(tmp_path / "before.mcap", seed=5, **own)]
-  now = [_log(tmp_path / "now.mcap", seed=6, **own)]
+  before = [made(seed=5, **own)]
+  now = [made(seed=6, **own)]
   found = sensing.find(model, now, before).parts["imu"]
   assert found.rows == [] and [r["kind"] for r in found.in_reference] == ["imu_bias"]
-  later = [_log(tmp_path / "later.mcap", seed=7, bias=(0.02, 0, 0.03, 0, 0, 0))]
+  later = [made(seed=7, bias=(0.02, 0, 0.03, 0, 0, 0))]
   (row,) = sensing.find(model, later, before).parts["imu"].rows
   assert row["kind"] == "imu_bias"
   leaning = sensing._leaning(model, {"x": 0.05, "y": 0.0})
