@@ -1,5 +1,8 @@
 """Friction under weight and slip, against a biped that treads on a floor of other contacts."""
 
+import copy
+import functools
+
 import mujoco
 import numpy as np
 import pytest
@@ -20,6 +23,11 @@ HEAVY = Effect("payload", "l_el_link", {"mass": 0.4, "x": 0.0, "y": 0.07, "z": 0
 
 
 def _model(*, true=False):
+  return copy.copy(_compiled(true))  # effects change the model that they are bound to
+
+
+@functools.cache
+def _compiled(true):
   spec = mujoco.MjSpec.from_string(OP3().mjcf_model.to_xml_string())
   spec.body(constants.TORSO_LINK).add_freejoint()
   spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
