@@ -6,6 +6,7 @@ import pytest
 
 from nerf2real import real
 from nerf2real.real.loop.settings import RobotSettings
+from nerf2real.real.safety.monitor import SafetySettings
 from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.real.virtual.robot import VirtualRobot
 
@@ -40,8 +41,9 @@ def robot():
 
 @pytest.fixture
 def quick():
-  """Settings whose waits are short."""
-  return RobotSettings(settle_time=0.9, grip_time=0.1)
+  """Settings whose waits and slow moves are short."""
+  safety = SafetySettings(slow_speed=2.0)
+  return RobotSettings(settle_time=0.9, grip_time=0.1, safety=safety)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 from nerf2real import real, suite
 from nerf2real.real.loop.motion import SUPPORTED_POSE
 from nerf2real.real.loop.settings import RobotSettings
+from nerf2real.real.safety.monitor import SafetySettings
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
 from nerf2real.suite.tasks.state import standing_posture
@@ -127,11 +128,11 @@ def test_a_slow_policy_is_counted_and_not_made_up_for(robot, load):
   assert environment.timing.summary()["observation to goal"]["max"] > 0.06
 
 
-def test_start_and_end_are_slow_and_held(robot, load):
+def test_start_and_end_are_slow_and_held(robot, quick, load):
   robot.body.data.qpos[robot.body._qpos] = 0.0  # the limbs hang otherwise
   held = []
   robot.operator._hold = lambda flag: (held.append(flag), robot.hold(flag))
-  environment = load()
+  environment = load(settings=dataclasses.replace(quick, safety=SafetySettings()))
   start = None
   goals = []
   body = robot.body
