@@ -2,7 +2,6 @@
 
 import functools
 import os
-import signal
 import time
 
 import pytest
@@ -10,32 +9,14 @@ import pytest
 from nerf2real.evaluation import session, side_by_side
 from nerf2real.evaluation.episodes import Store
 from nerf2real.evaluation.settings import EvaluationSettings
-
-
-def _number_and_process(number, say):
-  say(f"number {number}")
-  return number, os.getpid()
-
-
-def _fail(say):
-  say("about to fail")
-  raise ValueError("no such plant")
-
-
-def _die(say):
-  os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _write_late(path, say):
-  time.sleep(20)
-  path.touch()
+from tests.evaluation import side_by_side_functions as functions
 
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_results_come_in_order_and_lines_arrive(processes):
   lines = []
-  functions = [functools.partial(_number_and_process, n) for n in range(3)]
-  found = side_by_side.run(functions, processes=processes, say=lines.append)
+  work = [functools.partial(functions.number_and_process, n) for n in range(3)]
+  found = side_by_side.run(work, processes=processes, say=lines.append)
   assert [number for number, _ in found] == [0, 1, 2]
   assert sorted(lines) == ["number 0", "number 1", "number 2"]
   others = {process for _, process in found} - {os.getpid()}
@@ -44,16 +25,16 @@ def test_results_come_in_order_and_lines_arrive(processes):
 
 def test_an_error_is_raised_and_ends_the_others(tmp_path):
   lines, begun = [], time.monotonic()
-  functions = [_fail, functools.partial(_write_late, tmp_path / "late")]
+  work = [functions.fail, functools.partial(functions.write_late, tmp_path / "late")]
   with pytest.raises(ValueError, match="no such plant"):
-    side_by_side.run(functions, processes=2, say=lines.append)
+    side_by_side.run(work, processes=2, say=lines.append)
   assert lines == ["about to fail"]
   assert time.monotonic() - begun < 20 and not (tmp_path / "late").exists()
 
 
 def test_a_process_that_was_killed_is_one_line():
   with pytest.raises(RuntimeError, match=r"ended with status -9 .* --processes"):
-    side_by_side.run([_die, _die], processes=2, say=print)
+    side_by_side.run([functions.die, functions.die], processes=2, say=print)
 
 
 def test_trials_that_are_shared_come_out_as_in_one_process(tmp_path):
