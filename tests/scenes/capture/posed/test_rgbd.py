@@ -20,6 +20,7 @@ from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.reading import read_capture
+from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.stages import radiance_field
@@ -35,19 +36,26 @@ from tests.scenes.capture.posed.sequences import (
   pictures,
 )
 
+FEW = LocaliseSettings(features=FeatureSettings(few_num_features=1000))
 
-def test_a_tum_sequence_gives_poses_and_depth(tum, tmp_path):
+
+@pytest.fixture(scope="module")
+def capture(tum, tmp_path_factory):
+  """The recording, read once; its pictures lie in the folder of the first."""
+  return read_capture(tum, tmp_path_factory.mktemp("capture") / "images", settings=SETTINGS)
+
+
+def test_a_tum_sequence_gives_poses_and_depth(tum, capture, tmp_path):
   assert source_kind(tum) == "rgbd"
-  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
   check(capture)
   keyframes.save(capture, tmp_path)
-  again = keyframes.load(tmp_path, tmp_path / "images")
+  again = keyframes.load(tmp_path, capture.images[0].parent)
   np.testing.assert_allclose(again.known.sightings, capture.known.sightings)
 
 
-def test_depth_of_another_clock_has_poses_of_its_own(tum, tmp_path):
+def test_depth_of_another_clock_has_poses_of_its_own(tum, capture, tmp_path):
   """Its list says that it came 4 ms later, an eighth of the way to the next pose."""
-  check_motion(read_capture(tum, tmp_path / "images", settings=SETTINGS))
+  check_motion(capture)
   joint = copied(tum, tmp_path / "tum")
   rows = [
     f"{100 + k / 30:.4f} rgb/{k:03d}.png {100 + k / 30:.4f} depth/{k:03d}.png" for k in range(16)
@@ -102,8 +110,7 @@ def test_transforms_with_depth_give_points(tmp_path):
   check(read_capture(tmp_path, tmp_path / "images", settings=SETTINGS))
 
 
-def test_measured_depth_comes_at_the_size_of_the_pictures(tum, tmp_path):
-  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+def test_measured_depth_comes_at_the_size_of_the_pictures(capture, tmp_path):
   known = capture.known
   camera = known.camera.resized(80, 60)
   depth = depth_pictures.measured_depth(known.depth_files[3], known.depth_unit, camera)
@@ -119,15 +126,15 @@ def test_measured_depth_comes_at_the_size_of_the_pictures(tum, tmp_path):
   assert not depth_pictures.measured_depth(tmp_path / "nothing.png", 1e-3, camera).any()
 
 
-def test_measured_depth_stands_for_the_fields(tum, tmp_path):
-  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
+def test_measured_depth_stands_for_the_fields(capture, tmp_path):
   first, *others = capture.known.depth_files
   gap = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
   gap[:120] = 0
   cv2.imwrite(str(tmp_path / "gap.png"), gap)
   known = dataclasses.replace(capture.known, depth_files=(tmp_path / "gap.png", *others))
   capture = dataclasses.replace(capture, known=known)
-  found = localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
+  images = capture.images[0].parent
+  found = localise(images, tmp_path / "poses", known=capture.known, settings=FEW)
 
   def made(value):
     return Made(value, StageResult(tmp_path, "key", "made", 0.0, cached=False))
@@ -148,9 +155,9 @@ def test_measured_depth_stands_for_the_fields(tum, tmp_path):
     assert np.percentile(off, 90) < 0.03
 
 
-def test_known_poses_and_depth_keep_the_scale(tum, tmp_path):
-  capture = read_capture(tum, tmp_path / "images", settings=SETTINGS)
-  found = localise(tmp_path / "images", tmp_path / "poses", known=capture.known)
+def test_known_poses_and_depth_keep_the_scale(capture, tmp_path):
+  images = capture.images[0].parent
+  found = localise(images, tmp_path / "poses", known=capture.known, settings=FEW)
   assert found.registered_fraction == 1.0 and "rgbd" in found.strategy
   metres = found.unit_from_source.inverse()
   assert off_the_planes(metres.apply(found.points)).max() < 0.006
@@ -206,7 +213,7 @@ def test_metric_poses_are_adjusted_to_the_pictures(tum, tmp_path):
       tmp_path / "images",
       tmp_path / name,
       known=capture.known,
-      settings=LocaliseSettings(refine_known=refine_known),
+      settings=dataclasses.replace(FEW, refine_known=refine_known),
       progress=lambda fraction, _: told.append(fraction),
     )
 
