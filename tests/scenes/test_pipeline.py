@@ -67,12 +67,16 @@ def settings():
   return dataclasses.replace(
     base,
     train=dataclasses.replace(
-      train_preset("fast"), field=field, max_steps=150, max_seconds=None, batch_samples=1 << 15
+      train_preset("fast"), field=field, max_steps=150, max_seconds=None, batch_samples=1 << 14
     ),
     align=dataclasses.replace(base.align, camera_height=1.0),
-    depth_width=120,
+    depth_width=80,
+    mesh=MeshSettings(voxel=0.08, truncation=0.24),
     collision=contact.CollisionSettings(
-      voxel=0.1, truncation=0.25, parts=decomposition.ConvexSettings(tolerance=0.2, max_parts=60)
+      voxel=0.1,
+      truncation=0.25,
+      top=1.0,
+      parts=decomposition.ConvexSettings(tolerance=0.3, max_parts=100),
     ),
   )
 
@@ -122,7 +126,9 @@ def _stamps(folder):
 def test_changed_settings_repeat_only_their_stage(scene, source, settings, tmp_path):
   out = tmp_path / "room"
   shutil.copytree(scene.folder, out)
-  coarser = dataclasses.replace(settings, mesh=MeshSettings(visual_faces=3000))
+  coarser = dataclasses.replace(
+    settings, mesh=dataclasses.replace(settings.mesh, visual_faces=3000)
+  )
   pipeline.make_scene(source, out, settings=coarser, show_progress=False)
   before, after = _stamps(scene.folder), _stamps(out)
   assert before.keys() == after.keys()
