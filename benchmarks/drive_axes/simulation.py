@@ -4,6 +4,8 @@ A joint is a rotor (at the joint's side of its ratio) that drives its link throu
 drive closes position on the link's encoder and speed on the motor's:
   v* = Kp (goal - reading), limited in size and slope;
   I' = (v* - w) / Ti - I / leak;  torque = Kv (v* - w + I), limited; the current follows as a lag.
+
+Compiled anew in every process: a compiler's cache would not see changes of the laws in other files.
 """
 
 import math
@@ -80,7 +82,7 @@ class Axes(NamedTuple):
   slosh_damping: Array  # share of critical
 
 
-@numba.njit(cache=True)
+@numba.njit
 def simulate(
   axes: Axes, of: mechanics.Coefficients, goals: Array, noise: Array, per_tick: int, lead: float
 ) -> Array:
