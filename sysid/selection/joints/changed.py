@@ -82,7 +82,7 @@ class Changed:
   @property
   def confounded(self) -> list[Scored]:
     """The smallest hypotheses without a named effect that predict the same."""
-    alike = {}
+    alike: dict[int, Scored] = {}
     for name in self.found.names:
       twins = [s for s in name.confounded if s.names and name.kind in self.named]
       least = min((len(s.names) for s in twins), default=0)
