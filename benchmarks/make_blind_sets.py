@@ -2,8 +2,8 @@
 
 Each set is a folder with the declared `model.xml`, three logs to identify from and two held out;
 `answers.json` beside them holds what each machine has that its model lacks. Four generators that
-share no code with each other or with the analyser: `blind_sets`; `independent_sets`, which has one
-log held out and always three of the healthy machine; `servo_bench`, one servo with an arm, and
+share no equations with each other or with the analyser: `blind_sets`; `independent_sets`, which has
+one log held out and always three of the healthy machine; `servo_bench`, one servo with an arm, and
 `drive_axes`, axes under cascaded control, which have those three, too. The same seed gives the
 same logs.
 """

@@ -11,15 +11,11 @@ from benchmarks.drive_axes import following, motions, plants, recording
 from benchmarks.drive_axes.effects import LIBRARY, OUTSIDE, Broken, Kind
 from benchmarks.drive_axes.plants import Machine
 from benchmarks.drive_axes.recording import Host, Recording
+from benchmarks.servo_bench.sets import LEAST_RATIO, MIXES, Truth
 
 Array = np.ndarray
 Random = np.random.Generator
 
-MIXES = {"single": 0.5, "pair": 0.2, "outside": 0.15, "healthy": 0.15}
-"""Shares in the mix `all`."""
-LEAST_RATIO = 2.5
-"""Held-out error over the healthy machine's, both with true constants, that is clearly seen: as
-the third generator asks."""
 LEAST_CHANGE = {"lift": 1e-3, "swing": 3e-3, "planar": 3e-3}
 """m or rad, RMS of what an effect changes in the held-out readings."""
 _ATTEMPTS = 25
@@ -30,14 +26,6 @@ _DAYS = 3
 """Since the references, where they are of another day."""
 _STREAM = 41059
 """Sets these draws apart from another generator's of the same seed."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Truth:
-  """What a set holds."""
-
-  answer: dict[str, Any]
-  """Its entry in answers.json."""
 
 
 @dataclasses.dataclass(frozen=True)
