@@ -34,12 +34,12 @@ class Arguments(training.TrainingSettings):
   max_env_steps: int | None = None
   """Frames collected at most [steps]; the preset's if not given."""
   preset: str | None = None
-  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push; adapt, nerf_nav_on, or,
-  for ball pushing, ball_push_on to train a policy on, room to train it on in another room (all with
-  --init-from); or tiny to try the machinery; "nerf_nav" if not given."""
+  """Settings of the distillation: nerf_nav, nerf_nav_60x80, ball_push; adapt, nerf_nav_on,
+  nerf_nav_faster or, for ball pushing, ball_push_on to train a policy on, room to train it on in
+  another room (all with --init-from); or tiny to try the machinery; "nerf_nav" if not given."""
   teacher: str | None = None
-  """quick, swift, steady, ball, a walker's settings as JSON, or an exported policy's folder; the
-  preset's if not given."""
+  """quick, swift, brisk, steady, ball, a walker's settings as JSON, or an exported policy's folder;
+  the preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
   relabel: Path | None = None

@@ -34,14 +34,14 @@ class Arguments:
   listen: str = DEFAULT_ENDPOINT
   """Where to listen, such as tcp/0.0.0.0:7447."""
   preset: str = "nerf_nav"
-  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push; adapt, nerf_nav_on, or, for ball
-  pushing, ball_push_on to train a policy on, room to do so in another room; or tiny to try the
-  machinery."""
+  """Settings to start from: nerf_nav, nerf_nav_60x80, ball_push; adapt, nerf_nav_on,
+  nerf_nav_faster or, for ball pushing, ball_push_on to train a policy on, room to do so in another
+  room; or tiny to try the machinery."""
   env: str | None = None
   """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
   teacher: str | None = None
-  """quick, swift, steady, ball, a walker's settings as JSON, or an exported policy's folder; the
-  preset's if not given."""
+  """quick, swift, brisk, steady, ball, a walker's settings as JSON, or an exported policy's folder;
+  the preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
   view_scenes: tuple[Path, ...] = ()

@@ -19,7 +19,9 @@ def discard_refuted(found: Identified, settings: Settings) -> None:
 
   One part at a time, of those that the machine is better off without the one that is least certain,
   until all that are left help. A part is an effect that is claimed, or all else that a joint's fit
-  brings along. Courses that do not repeat refute nothing: joints that are judged by following stay.
+  brings along. Where courses do not repeat, windows that begin anew at the readings are compared:
+  they refute what a fit brings along (a torque's scale, say, that no joint shows alone), but no
+  claim of a joint that is judged by following, for they begin without knowing where its play lies.
 
   Args:
     found: of a machine of several joints; changed.
@@ -29,7 +31,14 @@ def discard_refuted(found: Identified, settings: Settings) -> None:
     return
 
   def left_by(effects: Sequence[Effect]) -> float:
-    return error(found.model, found.logs, effects, clocks=found.clocks, window_s=settings.window_s)
+    return error(
+      found.model,
+      found.logs,
+      effects,
+      clocks=found.clocks,
+      window_s=settings.window_s,
+      restart=bool(found.followed),
+    )
 
   while True:
     whole, refuted = left_by([*found.calibration, *found.objects]), []
@@ -47,11 +56,12 @@ def discard_refuted(found: Identified, settings: Settings) -> None:
 
 def _parts(found: Identified) -> list[list[Effect]]:
   """Returns the effects that may be taken out: every claimed one, and each joint's others."""
-  stay = [j.joint for j in found.joints if j.likelihood.follows]
+  followed = [j.joint for j in found.followed]
   parts: dict[object, list[Effect]] = {}
   for effect in (*found.calibration, *found.objects):
-    if effect.target not in stay:
-      parts.setdefault(id(effect) if _rows(found, effect) else effect.target, []).append(effect)
+    claimed = bool(_rows(found, effect))
+    if not (claimed and effect.target in followed):
+      parts.setdefault(id(effect) if claimed else effect.target, []).append(effect)
   return list(parts.values())
 
 

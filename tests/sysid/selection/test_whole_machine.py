@@ -58,8 +58,16 @@ def test_what_is_not_claimed_of_a_joint_is_taken_out_together() -> None:
   assert [j.verdict for j in found.joints] == ["effects", "effects"]
 
 
+def test_windows_refute_what_is_not_claimed_where_courses_do_not_repeat() -> None:
+  found = _found(follows=True)
+  found.effects = found.effects[:1]
+  discard_refuted(found, SETTINGS)
+  assert found.objects == [_TRUE]
+  assert [j.verdict for j in found.joints] == ["effects", "effects"]
+
+
 @pytest.mark.parametrize("single", [True, False])
-def test_one_joint_and_courses_that_do_not_repeat_refute_nothing(single: bool) -> None:
+def test_one_joint_and_courses_that_do_not_repeat_refute_no_claim(single: bool) -> None:
   found = _found(follows=not single)
   if single:
     found.joints = found.joints[:1]
