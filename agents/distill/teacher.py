@@ -141,7 +141,8 @@ def _brisk() -> WalkerSettings:
   Searched for from `swift` by `benchmarks/learning/faster_walker.py`: the way to what was found is
   taken by 60 %, as all of it falls in 4 of 27 walks with strong motors on a slippery floor, and
   this in 3; `swift` in none. With nominal and weak motors neither falls, and this needs a
-  twentieth and a tenth less time.
+  twentieth and a tenth less time. Figures, and what its students came to:
+  benchmarks/results/policies/navigation.md.
   """
   gait = GaitSettings(
     stop_time=0.3181,
