@@ -1,7 +1,8 @@
 """Checks everything that has a GPU version, on a machine that has a GPU, in under ten minutes.
 
   render   the renderer on CUDA against the CPU's pictures, one at a time and in batches
-  field    training of the radiance field in JAX at preset "paper": steps/s, held-out PSNR
+  fused    training of the radiance field with the fused kernels at preset "fast": steps/s, PSNR
+  field    the same in JAX at preset "paper"
   learner  updates/s of the agent at the paper's batch, 30x40 and 60x80 pictures
 
 Each check is a process of its own with a time limit: one that fails or hangs loses no other's
@@ -30,7 +31,8 @@ from benchmarks.ledger.records import ROOT, Value
 
 Figures = dict[str, dict[str, Value]]
 SIZES = ((30, 40), (60, 80))  # picture sizes [H, W] of the policies
-LIMITS = {"render": 120.0, "field": 290.0, "learner": 170.0}  # s, together under ten minutes
+# Names of the checks and their limits [s], together under ten minutes.
+LIMITS = {"render": 110.0, "fused": 120.0, "field": 180.0, "learner": 170.0}
 _LEAST_AGREEMENT_DB = 40.0  # of the device's picture with the CPU's: 2.6 of 255 levels RMS
 _TINY_FIELD = {"levels": 2, "log2_table_size": 10, "width": 16}
 _TINY_AGENT = ("batch_size=2", "trajectory_length=4", "n_step=2", "num_samples=2")
@@ -44,11 +46,13 @@ class Settings(harness.Options):
   """cpu rehearses the checks where there is no GPU."""
   tiny: bool = False
   """Small sizes: whether the checks run, not how fast."""
-  only: tuple[Literal["render", "field", "learner"], ...] = ()
+  only: tuple[Literal["render", "fused", "field", "learner"], ...] = ()
   """Checks to run; empty: all."""
   limit: float | None = None
   """Time limit of every check [s], if not its own."""
-  check: Literal["render", "field"] | None = None
+  seconds: float = 60.0
+  """Training time of a field [s]."""
+  check: Literal["render", "fused", "field"] | None = None
   """Run this check in this process and write its figures to --out; used by the command itself."""
 
 
@@ -112,6 +116,17 @@ def _render_batch(renderer: Any, camera: Any, poses: Any, _: int) -> None:
   renderer.render_batch(camera, poses)
 
 
+def check_fused(settings: Settings) -> Figures:
+  """Trains a field with the fused kernels at preset "fast" on keyframes of the built-in room."""
+  from benchmarks.rooms import field
+
+  chosen = field.Settings(preset="fast", engine="fused", seconds=settings.seconds, keyframes=120)
+  if settings.tiny:
+    chosen = dataclasses.replace(chosen, seconds=2.0, keyframes=16, width=80)
+  changes = {"device": settings.device}
+  return {"field_fast": field.train(chosen, changes=changes, device=settings.device)}
+
+
 def check_field(settings: Settings) -> Figures:
   """Trains a field in JAX at preset "paper" on keyframes of the built-in room."""
   import jax
@@ -121,7 +136,7 @@ def check_field(settings: Settings) -> Figures:
   if settings.device == "cuda" and jax.default_backend() != "gpu":
     raise RuntimeError(f"JAX found {jax.default_backend()}, expected a GPU: install the extra gpu.")
   changes: dict[str, Any] = {}
-  chosen = field.Settings(preset="paper", seconds=150.0, keyframes=120)
+  chosen = field.Settings(preset="paper", seconds=settings.seconds, keyframes=120)
   if settings.tiny:
     changes = {"field": _TINY_FIELD, "batch_rays": 64, "max_steps": 3}
     chosen = field.Settings(preset="paper", seconds=5.0, keyframes=16, width=80)
@@ -130,14 +145,15 @@ def check_field(settings: Settings) -> Figures:
 
 def commands(settings: Settings, out: Path) -> dict[str, list[str]]:
   """Returns the command of every check, which writes its figures to out/NAME.json."""
-  chosen = ["--device", settings.device, *(["--tiny"] if settings.tiny else [])]
+  chosen = ["--device", settings.device, "--seconds", str(settings.seconds)]
+  chosen += ["--tiny"] if settings.tiny else []
   found = {
     name: [__file__, "--check", name, *chosen, "--out", str(out / f"{name}.json")]
-    for name in ("render", "field")
+    for name in ("render", "fused", "field")
   }
   sizes = [f"{height}x{width}" for height, width in SIZES[: 1 if settings.tiny else None]]
   changes = [word for change in _TINY_AGENT for word in ("--set", change)] if settings.tiny else []
-  seconds = "0.1" if settings.tiny else "30"
+  seconds = "0.1" if settings.tiny else "15"
   script = str(ROOT / "benchmarks" / "learning" / "learner.py")
   found["learner"] = [script, "--seconds", seconds, *changes]
   found["learner"] += ["--out", str(out / "learner.json"), "--pictures", *sizes]
@@ -173,7 +189,8 @@ def run_check(name: str, command: list[str], out: Path, *, limit: float, device:
 def main(settings: Settings) -> int:
   """Runs all checks; returns 1 if one failed."""
   if settings.check is not None:
-    figures = {"render": check_render, "field": check_field}[settings.check](settings)
+    checks = {"render": check_render, "fused": check_fused, "field": check_field}
+    figures = checks[settings.check](settings)
     harness.finish("gpu", figures, settings, seed=0)
     return 0
   machine = harness.machine()

@@ -68,11 +68,11 @@ def test_the_limits_leave_it_under_ten_minutes():
 
 
 def test_the_chosen_checks_run_with_their_sizes(tmp_path):
-  settings = gpu.Settings(device="cpu", tiny=True, only=("render", "learner"))
+  settings = gpu.Settings(device="cpu", tiny=True, seconds=5.0, only=("render", "learner"))
   commands = gpu.commands(settings, tmp_path)
   assert list(commands) == ["render", "learner"]
   assert commands["render"][1:] == [
-    *("--check", "render", "--device", "cpu", "--tiny"),
+    *("--check", "render", "--device", "cpu", "--seconds", "5.0", "--tiny"),
     *("--out", str(tmp_path / "render.json")),
   ]
   assert commands["learner"][-1] == "30x40" and "batch_size=2" in commands["learner"]
@@ -88,6 +88,8 @@ def test_all_checks_run_on_a_cpu(tmp_path, capsys):
   assert render["largest_difference_levels"] == 0 and render["batch_of_2_a_picture_ms"] > 0
   trained = next(values for name, values in figures.items() if "field_paper" in name)
   assert trained["steps"] == 3 and trained["held_out_psnr_db"] > 0
+  fused = next(values for name, values in figures.items() if "field_fast" in name)
+  assert fused["steps"] > 3 and fused["held_out_psnr_db"] > 0
   assert any("learner_paper_30x40" in name for name in figures)
 
 
