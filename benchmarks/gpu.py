@@ -212,7 +212,7 @@ def main(settings: Settings) -> int:
         failed[name] = str(error)
         print(f"{name}: FAILED: {error}", flush=True)
   words = "; ".join(f"{name} failed: {error}" for name, error in failed.items())
-  harness.finish("gpu", everything, settings, seed=0, words=words)
+  harness.finish("gpu", everything, settings, seed=0, words=words, within="speed")
   return 1 if failed else 0
 
 
