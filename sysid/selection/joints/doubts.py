@@ -45,9 +45,10 @@ def supported(
   What is named may then be a part of that: half of a soft stop is a spring. A kind must explain
   more squares than remain, both of fits to all logs: left-out blocks are predicted with effects
   that were fitted without them beside constants that were fitted to all, which is for the
-  hypothesis that lacks the effect. One that is a force over one variable stands unless a force of
-  any form over that variable does clearly better; any other where hypotheses with a force of any
-  form over both are clearly worse without it.
+  hypothesis that lacks the effect. Where constants could stand in for a kind only by being off by
+  more than they are, it is left out with all else as it is beside it. One that is a force over one
+  variable stands unless a force of any form over that variable does clearly better; any other
+  where hypotheses with a force of any form over both are clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
@@ -61,7 +62,10 @@ def supported(
   left = _left(explainer, best)
   for kind in named:
     without = rivals.lacking(explainer, best, kind)
-    explained = _left(explainer, without) - left
+    strained = without.is_strained(explainer.settings.level)
+    explained = (
+      _left_bare(explainer, best, kind) if strained else _left(explainer, without)
+    ) - left
     if explained <= left - anyway or kind not in forced:
       stands = explained > left - anyway
     elif kind in VARIABLE:
@@ -79,6 +83,19 @@ def _left(explainer: Explainer, item: Scored) -> float:
   """Returns the mean square that a hypothesis leaves where it is fitted to all logs."""
   joint = explainer.joint
   return mean_left(joint, joint.squares(item.fit.residuals[0])[0])
+
+
+def _left_bare(explainer: Explainer, item: Scored, kind: str) -> float:
+  """Returns the mean square that a hypothesis leaves without one of its effects and with all else
+  as it was fitted beside it; freed constants are then those that are known."""
+  joint, known = explainer.joint, {t.kind: t for t in explainer.base}
+  terms, x = [], []
+  for term in item.terms:
+    kept = known.get(term.kind) if term.name == kind else term
+    if kept is not None:
+      terms.append(kept)
+      x += list(item.fit.values(term).values() if kept is term else kept.centre)
+  return mean_left(joint, joint.squares(joint.residuals(terms, np.array(x)[None])[0])[0])
 
 
 def is_something(subject: Subject, best: Scored, kind: str) -> bool:

@@ -1,7 +1,6 @@
 """What a joint leaves under a hypothesis, against what the machine leaves anyway."""
 
 import numpy as np
-from scipy.stats import chi2
 
 from nerf2real.sysid.fit.expectation import NOISE
 from nerf2real.sysid.fit.likelihood import JointLikelihood
@@ -41,8 +40,7 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   """Tells whether a hypothesis may leave more than the machine does anyway: effects are tried then,
   and names must be clear by themselves. What constants take to be off by more than they are
   between recordings, or copies, they may take from an effect."""
-  likely = 0.5 * float(chi2.ppf(1.0 - settings.level, max(item.fit.layout.count, 1)))
-  if item.prior > likely:
+  if item.is_strained(settings.level):
     return True
   if subject.usual is not None and not subject.paired:
     return grown(item, subject.usual, settings.suspected, settings)

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.stats import norm, rankdata
+from scipy.stats import chi2, norm, rankdata
 from scipy.stats import t as student
 
 from nerf2real.sysid.fit.layout import Fit
@@ -60,6 +60,12 @@ class Scored:
     sigma, centre = self.fit.layout.sigma, self.fit.layout.centre
     chosen = float(np.sum(np.log([t.choices for t in self.terms])))
     return 0.5 * float(np.sum(((self.fit.x - centre) / sigma) ** 2)) + chosen
+
+  def is_strained(self, level: float) -> bool:
+    """Tells whether values are further from their priors' centres than by chance at that level:
+    what they take they may take from an effect that the hypothesis lacks."""
+    likely = 0.5 * float(chi2.ppf(1.0 - level, max(self.fit.layout.count, 1)))
+    return self.prior > likely
 
 
 def kinds_of(terms: Sequence[Term]) -> frozenset[str]:

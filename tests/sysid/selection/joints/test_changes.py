@@ -31,18 +31,25 @@ def few(plant, **_):
 BEFORE = [Effect("coulomb_friction", "joint", {"torque": 0.15})]
 
 
-def test_constants_that_are_strained_may_hide_an_effect():
-  def item(prior):
-    return SimpleNamespace(prior=prior, fit=SimpleNamespace(layout=SimpleNamespace(count=7)))
+def _leaving(square, strained=False):
+  fit = SimpleNamespace(residuals=[np.full((1, 20), np.sqrt(square))])
+  return SimpleNamespace(fit=fit, is_strained=lambda _: strained)
 
+
+def _explainer():
+  joint = SimpleNamespace(log_of=np.zeros(20), squares=np.square)
+  return SimpleNamespace(joint=joint, settings=SETTINGS)
+
+
+def test_constants_that_are_strained_may_hide_an_effect():
   def left(*_):
     return False
 
   judged = SimpleNamespace(usual=None, paired=False)
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(leaving, "leaves", left)
-    assert not leaving.may_leave(judged, item(5.0), SETTINGS)
-    assert leaving.may_leave(judged, item(9.0), SETTINGS)  # 5 % of chi square with 7 degrees: 7.03
+    assert not leaving.may_leave(judged, _leaving(1.0, strained=False), SETTINGS)
+    assert leaving.may_leave(judged, _leaving(1.0, strained=True), SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -165,32 +172,37 @@ def test_a_misfit_in_few_blocks_remains():
   assert remainder.mean_left(joint, blocks) > SETTINGS.more**2 > np.median(blocks)
 
 
-@pytest.mark.parametrize(("without", "stands"), [(1.3, ()), (2.5, ("cogging",))])
-def test_where_more_remains_a_name_explains_more_than_it_leaves(monkeypatch, without, stands):
-  def leaving(square):
-    return SimpleNamespace(fit=SimpleNamespace(residuals=[np.full((1, 20), np.sqrt(square))]))
-
-  monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(without))
+@pytest.mark.parametrize(
+  ("without", "strained", "bare", "stands"),
+  [
+    (1.3, False, 2.5, ()),
+    (2.5, False, 1.3, ("cogging",)),
+    (1.3, True, 2.5, ("cogging",)),  # constants that are off by more than they are stand in for it
+    (1.3, True, 1.8, ()),
+  ],
+)
+def test_where_more_remains_a_name_explains_more_than_it_leaves(
+  monkeypatch, without, strained, bare, stands
+):
+  monkeypatch.setattr(rivals, "lacking", lambda *_: _leaving(without, strained))
+  monkeypatch.setattr(doubts, "_left_bare", lambda *_: bare)
   monkeypatch.setattr(rivals, "with_force", lambda *_: None)
   monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)  # no force does better
-  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20), squares=np.square))
+  explainer = _explainer()
   found = doubts.supported(
-    explainer, leaving(1.0), ("cogging",), 3.0, anyway=0.1, forced=["cogging"]
+    explainer, _leaving(1.0), ("cogging",), 3.0, anyway=0.1, forced=["cogging"]
   )
   assert found == stands
 
 
 def test_each_of_several_names_is_tried_beside_a_force(monkeypatch):
-  def leaving(square):
-    return SimpleNamespace(fit=SimpleNamespace(residuals=[np.full((1, 20), np.sqrt(square))]))
-
   tried = []
-  monkeypatch.setattr(rivals, "lacking", lambda *_: leaving(9.0))
+  monkeypatch.setattr(rivals, "lacking", lambda *_: _leaving(9.0))
   monkeypatch.setattr(rivals, "with_force", lambda _, item, *__: tried.append(item))
   monkeypatch.setattr(doubts, "clear", lambda *_: 0.0)
-  explainer = SimpleNamespace(joint=SimpleNamespace(log_of=np.zeros(20), squares=np.square))
+  explainer = _explainer()
   kinds = ("payload", "backlash")
-  found = doubts.supported(explainer, leaving(1.0), kinds, 3.0, anyway=0.1, forced=kinds)
+  found = doubts.supported(explainer, _leaving(1.0), kinds, 3.0, anyway=0.1, forced=kinds)
   assert found == () and len(tried) == 4
 
 

@@ -43,6 +43,27 @@ def test_constants_that_are_stopped_by_their_range_stand_in_for_something(mass, 
   assert doubts.pressed(best) == stopped
 
 
+def test_without_an_effect_all_else_stays_as_it_was_fitted_beside_it():
+  known = SimpleNamespace(kind=CONSTANTS, name=None, names=("gain",), centre=(0.1,))
+  freed = SimpleNamespace(kind=CONSTANTS, name="parameter_error", names=("gain",))
+  friction = SimpleNamespace(kind="friction", name="friction", names=("torque",))
+  values = {"parameter_error": {"gain": 0.4}, "friction": {"torque": 3.0}}
+  item = SimpleNamespace(
+    terms=(freed, friction), fit=SimpleNamespace(values=lambda term: values[term.name])
+  )
+  asked = []
+
+  def residuals(terms, xs):
+    asked.append((terms, xs.tolist()))
+    return np.ones((1, 1, 6))
+
+  joint = SimpleNamespace(residuals=residuals, squares=np.square, log_of=np.zeros(6))
+  explainer = SimpleNamespace(joint=joint, base=(known,))
+  assert doubts._left_bare(explainer, item, "friction") == 1.0
+  assert doubts._left_bare(explainer, item, "parameter_error") == 1.0
+  assert asked == [([freed], [[0.4]]), ([known, friction], [[0.1, 3.0]])]
+
+
 def test_beside_a_reference_only_what_may_have_changed_is_stopped():
   """Dry friction of four times the declared one was the machine's before."""
   term = SimpleNamespace(

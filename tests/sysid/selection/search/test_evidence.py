@@ -1,16 +1,29 @@
 """How clear a difference of two hypotheses is: tests of the same blocks, and all together."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from nerf2real.sysid.selection.search.evidence import (
+  Scored,
   by_pattern,
   clearness,
   combined,
   more_likely,
   standardised,
 )
+
+
+def test_values_are_strained_where_they_are_further_off_than_by_chance():
+  def scored(sigmas):
+    layout = SimpleNamespace(sigma=np.ones(7), centre=np.zeros(7), count=7)
+    fit = SimpleNamespace(x=np.full(7, sigmas / np.sqrt(7)), layout=layout)
+    return Scored(None, (), fit, np.zeros(3))
+
+  assert not scored(3.7).is_strained(0.05)
+  assert scored(3.8).is_strained(0.05)  # 5 % of chi square with 7 degrees: 3.75 squared
 
 
 def test_few_blocks_tell_what_a_log_holds_and_one_does_not():
