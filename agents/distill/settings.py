@@ -215,8 +215,9 @@ def nerf_nav_faster() -> DistillSettings:
 
   What it sees and where it believes to be are right already, and the encoder may have learned from
   reconstructions that are not at hand any more; all of the time goes into the walk. For pictures of
-  60x80: `--env "suite:nerf_nav?image_size=60x80"`. Students of 42 minutes on half a core, and of 5.5
-  minutes on a GPU, were not better in all that was asked (benchmarks/results/policies/not_shipped.md).
+  60x80: `--env "suite:nerf_nav?image_size=60x80"`. Students of 42 minutes on half a core, and of
+  some 5 minutes on a GPU, were not better in all that was asked
+  (benchmarks/results/policies/not_shipped.md).
   """
   return dataclasses.replace(
     adapt(),
