@@ -1,8 +1,9 @@
 """One joint of a model along measured logs, as the compiled kernel simulates it: in open loop from
 the commands, or with its state pulled to the readings.
 
-What masses and gravity add is linear and kept on the step grid, so that a hypothesis costs a sum of
-arrays, not a pass over the model. Shapes: N samples of a log, T grid points, P kernel parameters.
+What masses and gravity add is linear and kept on the step grid as the kernel takes it, so that a
+hypothesis costs a product, not a pass over the model. Shapes: N samples of a log, T grid points, P
+kernel parameters, K parts of a basis.
 """
 
 import functools
@@ -15,7 +16,7 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
-from nerf2real.sysid.model.plant import JointPlant, turning
+from nerf2real.sysid.model.plant import JointPlant, turned_back, turning
 from nerf2real.sysid.model.reduction import Reduction, Surroundings
 from nerf2real.sysid.model.servo_law import ServoLaw, servo_law
 
@@ -27,7 +28,6 @@ FOLLOWED_S = 0.02
 
 
 _NEAR = 0.1  # s on either side of a sample over which an error is averaged; chosen
-_CHANGED = (0, 1, 2, 4)  # rows of the fields that loads change; of the others is the position
 _KEPT = 2  # sets of loads of a log whose fields are kept: a fit's and that of a difference to it
 
 
@@ -64,18 +64,18 @@ class JointModel(JointPlant):
   ):
     super().__init__(model, joint, logs, reductions=reductions, window_s=window_s)
     self._bases: dict[str, list[Array]] = {}
-    self._fields = [np.array(fields) for fields in self._nominal]  # inertia, here, across, at, bias
-    self._turned: dict[int, dict[tuple, tuple[Array, ...]]] = {}
+    self._unloaded = [np.array(turning(fields, self.hinge)) for fields in self._nominal]
+    self._loaded: dict[int, dict[tuple, tuple[Array, ...]]] = {}
     periods = np.concatenate([np.diff(log.time) for log in self.logs])
     period = max(float(np.median(periods)), 1e-6)
     share = 1.0 - float(np.exp(-period / FOLLOWED_S))
     self._follow = share, share**2 / (2.0 - share) / period  # Benedict and Bordner 1962
 
   def basis(self, key: str) -> list[Array]:
-    """Returns the parts [K, 4, T] of a basis, one array a log: inertia, here, across, bias."""
+    """Returns the parts [K, 4, T] of a basis, one array a log, in the rows of `forces`."""
     if key not in self._bases:
       if key == "mass":
-        self._bases[key] = [f[None, list(_CHANGED)] for f in self._fields]
+        self._bases[key] = [fields[None] for fields in self._unloaded]
       elif key == "gravity":
         self._bases[key] = self._parts([r.gravity(self.joint) for r in self.reductions])
       else:
@@ -84,7 +84,10 @@ class JointModel(JointPlant):
     return self._bases[key]
 
   def _parts(self, logs: Sequence[Sequence[Surroundings]]) -> list[Array]:
-    return [np.array([[p.inertia, p.here, p.across, p.bias] for p in parts]) for parts in logs]
+    return [
+      np.array([turning((p.inertia, p.here, p.across, at, p.bias), self.hinge) for p in parts])
+      for parts, (_, _, _, at, _) in zip(logs, self._nominal, strict=True)
+    ]
 
   @functools.cached_property
   def law(self) -> tuple[ServoLaw, Array] | None:
@@ -113,31 +116,26 @@ class JointModel(JointPlant):
     before = self.model.opt.gravity
     return Load("gravity", matrix_from_rotvec([x, y, 0.0]) @ before - before)
 
-  def fields(self, loads: Sequence[Load], index: int) -> Array:
-    """Returns a log's inertia, gravity here and across, its position, and bias [5, T]."""
-    fields = self._fields[index]
-    if loads:
-      fields = fields.copy()
-      for load in loads:
-        for factor, part in zip(load.factors, self.basis(load.key)[index], strict=True):
-          for row, change in zip(_CHANGED, part, strict=True):
-            fields[row] += factor * change
-    return fields
-
   def forces(self, loads: Sequence[Load], index: int) -> tuple[Array, ...]:
-    """Returns the same fields as the kernel takes them; those of the last loads are kept."""
+    """Returns what a log's joint feels as the kernel takes it, each [T]: inertia, gravity's torque
+    at position 0 and a quarter turn further, and bias. Those of the last loads are kept."""
     key = tuple((load.key, load.factors.tobytes()) for load in loads)
-    kept = self._turned.setdefault(index, {})
+    kept = self._loaded.setdefault(index, {})
     if key not in kept:
       while len(kept) >= _KEPT:
         kept.pop(next(iter(kept)), None)
-      kept[key] = turning(list(self.fields(loads, index)), self.hinge)
+      changes = [np.tensordot(load.factors, self.basis(load.key)[index], 1) for load in loads]
+      kept[key] = tuple(sum(changes, self._unloaded[index]))
     return kept[key]
 
   def at_samples(self, loads: Sequence[Load], index: int) -> Array:
-    """Returns the same fields at the samples [5, N]."""
+    """Returns inertia, gravity's torque here and a quarter turn further, the position where that
+    is, and bias, at the samples [5, N]."""
+    inertia, zero, quarter, bias = self.forces(loads, index)
+    at = self._nominal[index][3]
+    here, across = turned_back(zero, quarter, at) if self.hinge else (zero, quarter)
     grid, time = self._grids[index], self.logs[index].time
-    return np.array([np.interp(time, grid, field) for field in self.fields(loads, index)])
+    return np.array([np.interp(time, grid, row) for row in (inertia, here, across, at, bias)])
 
   def run(
     self,

@@ -206,6 +206,12 @@ def turning(fields: Sequence[Array], hinge: bool) -> tuple[Array, Array, Array, 
   return inertia, here * cosine - across * sine, here * sine + across * cosine, bias
 
 
+def turned_back(zero: Array, quarter: Array, at: Array) -> tuple[Array, Array]:
+  """Returns gravity's torque [T] at positions `at` and a quarter turn further, from `turning`'s."""
+  cosine, sine = np.cos(at), np.sin(at)
+  return zero * cosine + quarter * sine, quarter * cosine - zero * sine
+
+
 def _other_load(log: Log, joint: str, time: Array) -> Array:
   """Returns the sum of the other joints' |effort| [N] where efforts were measured, else zeros."""
   if log.states.effort is None or len(log.states.joints) == 1:
