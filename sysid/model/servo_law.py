@@ -33,6 +33,12 @@ _BANDS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Dead bands that are tried, in steps of the position's reading."""
 _FEWEST = 50  # samples of a line
 
+ASKED = [
+  *(INDEX[name] for name in ("command_delay", "measurement_delay", "effort_delay", "clock_rate")),
+  *(INDEX[name] for name in ("input", "constant", "position", "velocity")),
+]
+"""Kernel parameters by which the torque is that a law asks for."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ServoLaw:
@@ -168,6 +174,12 @@ def duty_of(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0) -> A
     index: of the log.
     ahead: s by which the positions that the duty is of are later than those read with it.
   """
+  return duty_for(plant, p, asked_torque(plant, p, index, ahead=ahead))
+
+
+def asked_torque(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0) -> Array:
+  """Returns the torque [N] that a law of gain 1 asks for, without limits: `duty_of`'s arguments. Of
+  the parameters `ASKED` alone matter."""
   value = dict(zip(NAMES, p, strict=True))
   log, rate = plant.logs[index], 1.0 + value["clock_rate"]
   true = log.time / rate - value["effort_delay"]
@@ -175,9 +187,14 @@ def duty_of(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0) -> A
   stamp = (true + value["measurement_delay"] + ahead) * rate
   read, speed = (np.interp(stamp, log.time, row) for row in (log.position, log.velocity))
   torque = value["input"] * command + value["constant"]
-  torque = torque + value["position"] * read + value["velocity"] * speed
-  torque = np.clip(value["gain"] * torque, value["lowest"], value["highest"])
-  return torque / (value["strength"] * plant.declared[INDEX["highest"]])
+  return torque + value["position"] * read + value["velocity"] * speed
+
+
+def duty_for(plant: JointPlant, p: Array, torque: Array) -> Array:
+  """Returns the duty [N] of kernel parameters [P] for a torque [N] that a law of gain 1 asks for."""
+  value = dict(zip(NAMES, p, strict=True))
+  limited = np.clip(value["gain"] * torque, value["lowest"], value["highest"])
+  return limited / (value["strength"] * plant.declared[INDEX["highest"]])
 
 
 def command_jump(plant: JointPlant, index: int, within: float, *, delay: float = 0.0) -> Array:
