@@ -191,7 +191,7 @@ def asked_torque(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0)
 
 
 def duty_for(plant: JointPlant, p: Array, torque: Array) -> Array:
-  """Returns the duty [N] of kernel parameters [P] for a torque [N] that a law of gain 1 asks for."""
+  """Returns the duty [N] of kernel parameters [P] for a torque [N] asked for by `asked_torque`."""
   value = dict(zip(NAMES, p, strict=True))
   limited = np.clip(value["gain"] * torque, value["lowest"], value["highest"])
   return limited / (value["strength"] * plant.declared[INDEX["highest"]])
