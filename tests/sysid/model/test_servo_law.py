@@ -15,7 +15,8 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import SERVO_GAIN
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.servo_law import duty_of, servo_law
+from nerf2real.sysid.model.kernel import INDEX, NAMES
+from nerf2real.sysid.model.servo_law import ASKED, asked_torque, duty_of, servo_law
 from tests.sysid.synthetic import PENDULUM, log_of
 
 STEP = 1.0 / 885  # of the PWM's counts
@@ -153,3 +154,12 @@ def test_a_weaker_motor_changes_no_duty():
   before = duty_of(plant, p, 0)
   term.apply(plant, p, np.array([0.7]))
   np.testing.assert_allclose(duty_of(plant, p, 0), before)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_law_asks_for_is_that_of_the_parameters_it_is_kept_by(name):
+  plant = plant_of()
+  before, p = asked_torque(plant, plant.declared, 0), plant.declared.copy()
+  p[INDEX[name]] += 0.013
+  differs = not np.array_equal(asked_torque(plant, p, 0), before)
+  assert differs == (INDEX[name] in ASKED)
