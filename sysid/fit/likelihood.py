@@ -23,14 +23,13 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured
-from nerf2real.sysid.model.servo_law import ASKED, asked_torque, command_jump, duty_for
+from nerf2real.sysid.model.servo_law import Asked, command_jump, duty_for
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
 
 _NOTHING = np.zeros(0)
-_KEPT = 4  # torques that a law asks for: of a fit's place, of differences to it, further ahead
 _RARE = 0.025  # share of recordings whose latency is later than what is allowed, as many earlier
 
 
@@ -51,7 +50,7 @@ class JointLikelihood:
     self.position_noise, self.stamp_noise = timing(plant)
     logs = plant.logs
     self.effort: list[Array] | None = None
-    self._asked: dict[tuple[bytes, float], Array] = {}
+    self._asked = Asked(plant)
     self.law = None if plant.law is None else plant.law[0]
     self.ahead: tuple[float, float] | None = None
     """Interval of the s that positions were ahead of duties in a reference: what is more now is a
@@ -257,7 +256,7 @@ class JointLikelihood:
     measured = np.concatenate(self.effort)
 
     def duties(ahead: float) -> Array:
-      return duty_for(self.plant, p, self._asked_torque(p, ahead))
+      return duty_for(self.plant, p, self._asked.torque(p, ahead))
 
     law = duties(ahead)
     free = self.gain[1] ** 2 * (np.abs(law) < self.settings.saturated * np.abs(law).max())
@@ -272,18 +271,6 @@ class JointLikelihood:
       by = float(free * further @ (measured - law)) / max(float(free * further @ further), 1e-12)
       law = duties(ahead + float(np.clip(by, -reach, reach)))
     return measured - law
-
-  def _asked_torque(self, p: Array, ahead: float) -> Array:
-    """Returns the torque [N] that the servo's law asks for in all logs. The last few are kept: of
-    the differences that a fit takes most leave it as it is."""
-    key, logs = (p[ASKED].tobytes(), ahead), range(len(self.plant.logs))
-    torque = self._asked.pop(key, None)
-    if torque is None:
-      torque = np.concatenate([asked_torque(self.plant, p, i, ahead=ahead) for i in logs])
-    self._asked[key] = torque
-    if len(self._asked) > _KEPT:
-      self._asked.pop(next(iter(self._asked)))
-    return torque
 
   def effort_factor(self, terms: Sequence[Term], x: Array) -> float | None:
     """Returns measured effort over a hypothesis' torque; None where efforts are not compared with

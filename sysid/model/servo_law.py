@@ -32,6 +32,7 @@ its best delay a second round goes, which a held command's plateau must not leav
 _BANDS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Dead bands that are tried, in steps of the position's reading."""
 _FEWEST = 50  # samples of a line
+_KEPT = 4  # torques: of a fit's place, of differences to it, further ahead
 
 ASKED = [
   *(INDEX[name] for name in ("command_delay", "measurement_delay", "effort_delay", "clock_rate")),
@@ -188,6 +189,26 @@ def asked_torque(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0)
   read, speed = (np.interp(stamp, log.time, row) for row in (log.position, log.velocity))
   torque = value["input"] * command + value["constant"]
   return torque + value["position"] * read + value["velocity"] * speed
+
+
+class Asked:
+  """What `asked_torque` returns for all logs of a joint; the last few are kept: of the differences
+  that a fit takes most leave it as it is."""
+
+  def __init__(self, plant: JointPlant):
+    self._plant = plant
+    self._kept: dict[tuple[bytes, float], Array] = {}
+
+  def torque(self, p: Array, ahead: float) -> Array:
+    """Returns the torque [N] of kernel parameters [P]; `ahead` as of `duty_of`."""
+    key, logs = (p[ASKED].tobytes(), ahead), range(len(self._plant.logs))
+    torque = self._kept.pop(key, None)
+    if torque is None:
+      torque = np.concatenate([asked_torque(self._plant, p, i, ahead=ahead) for i in logs])
+    self._kept[key] = torque
+    if len(self._kept) > _KEPT:
+      self._kept.pop(next(iter(self._kept)))
+    return torque
 
 
 def duty_for(plant: JointPlant, p: Array, torque: Array) -> Array:

@@ -16,7 +16,7 @@ from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import SERVO_GAIN
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX, NAMES
-from nerf2real.sysid.model.servo_law import ASKED, asked_torque, duty_of, servo_law
+from nerf2real.sysid.model.servo_law import ASKED, Asked, asked_torque, duty_of, servo_law
 from tests.sysid.synthetic import PENDULUM, log_of
 
 STEP = 1.0 / 885  # of the PWM's counts
@@ -163,3 +163,13 @@ def test_what_a_law_asks_for_is_that_of_the_parameters_it_is_kept_by(name):
   p[INDEX[name]] += 0.013
   differs = not np.array_equal(asked_torque(plant, p, 0), before)
   assert differs == (INDEX[name] in ASKED)
+
+
+def test_what_is_kept_is_what_is_computed_afresh():
+  plant = plant_of()
+  asked, p = Asked(plant), plant.declared.copy()
+  for delay in (0.0, 0.01, 0.02, 0.03, 0.04, 0.0, 0.04):  # more than are kept, and some again
+    p[INDEX["command_delay"]] = delay
+    for ahead in (0.0, 0.002):
+      fresh = [asked_torque(plant, p, i, ahead=ahead) for i in range(len(plant.logs))]
+      np.testing.assert_array_equal(asked.torque(p, ahead), np.concatenate(fresh))
