@@ -6,7 +6,8 @@ pose from the embedding, and the teacher's command from the MLP's last layer; wh
 two more: its place from one picture, and from the MLP's last layer. The belief is the
 agent's own and is exported.
 
-Shape letters: B streams, T steps, N pictures, F features, U embedding, S proprioception.
+Shape letters: B streams, T steps, N pictures, F features, U embedding, S proprioception,
+M units of the MLP's last layer.
 """
 
 from typing import Any, NamedTuple
@@ -34,6 +35,7 @@ class StudentOutput(NamedTuple):
   command: jax.Array  # [B, T, 2]
   ball: jax.Array | None  # target of the ball [B, T, 2], where there is one
   embedding: jax.Array  # [B, T, U]
+  hidden: jax.Array  # the MLP's last layer [B, T, M]
   state: LstmState  # after the last step [B, U]
 
 
@@ -113,6 +115,7 @@ def unroll(
     command=networks.linear(policy["heads"]["command"], hidden),
     ball=networks.linear(policy["heads"]["ball"], hidden) if "ball" in policy["heads"] else None,
     embedding=embedding,
+    hidden=hidden,
     state=last,
   )
 

@@ -9,6 +9,7 @@ from nerf2real.agents.distill import settings as stages
 from nerf2real.agents.distill.dataset import Dataset, Streams
 from nerf2real.agents.distill.learning import student
 from nerf2real.agents.distill.learning.features import FeatureCache
+from nerf2real.agents.distill.learning.heads import with_fitted_heads
 from nerf2real.agents.distill.learning.updates import make_updates, standardised
 from nerf2real.agents.distill.learning.validation import validate
 from nerf2real.agents.distill.schedule import cosine
@@ -59,7 +60,8 @@ class Trainer:
     return student.served_parameters(self.state.student, self.state.scales)
 
   def standardise(self) -> None:
-    """Measures the scaling of inputs and labels on the frames that are not held out."""
+    """Measures the scaling of inputs and labels on the frames that are not held out; fits the heads
+    that a policy to begin with does not have."""
     frames = self._training_frames()
     self.state = standardised(
       self.state,
@@ -69,6 +71,8 @@ class Trainer:
       min_spread=self._settings.min_action_spread,
       keep_policy=bool(self._settings.init_from),
     )
+    if self._settings.init_from:
+      self.state = with_fitted_heads(self.state, self._updates, data=self._data, cache=self._cache)
 
   def begin_stage(self, kind: str) -> None:
     """Begins a stage: new streams through the episodes, and features of the present encoder."""

@@ -44,6 +44,7 @@ class Updates(NamedTuple):
   policy: Callable[..., tuple[TrainingState, LstmState, Metrics]]
   end_to_end: Callable[..., tuple[TrainingState, LstmState, Metrics]]
   features: Callable[..., jax.Array]
+  inner: Callable[..., student.StudentOutput]
   predict: Callable[..., Metrics]
 
 
@@ -150,17 +151,20 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
       x = augmentation.augment(key, segments, config.augmentation).reshape(x.shape)
     return student.encode(params, x, config.network).astype(jnp.float16)
 
-  def predict(state: TrainingState, batch: Mapping[str, jax.Array]) -> Metrics:
-    """Pose errors and action error of whole episodes [B, T], by frame."""
-    params = state.student
-    single = student.predict_pose(params["encoder"], batch["features"])
-    found = student.unroll(
-      params["policy"],
+  def inner(state: TrainingState, batch: Mapping[str, jax.Array]) -> student.StudentOutput:
+    """All that a student computes for whole episodes [B, T]."""
+    return student.unroll(
+      state.student["policy"],
       features=batch["features"],
       state=scaling.apply(state.scales, "state", batch["state"]),
       begins=batch["begins"],
       initial=student.initial_state(batch["state"].shape[0], config.network),
     )
+
+  def predict(state: TrainingState, batch: Mapping[str, jax.Array]) -> Metrics:
+    """Pose errors and action error of whole episodes [B, T], by frame."""
+    single = student.predict_pose(state.student["encoder"], batch["features"])
+    found = inner(state, batch)
     result = {"action_error": jnp.mean(jnp.abs(found.action - batch["label"]), axis=-1)}
     pose = losses.camera_pose(batch["pose"], batch.get("ball"))
     for name, predicted in (("picture", single), ("recurrent", found.pose)):
@@ -174,6 +178,7 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
     policy=jax.jit(policy, donate_argnums=0),
     end_to_end=jax.jit(end_to_end, donate_argnums=0),
     features=jax.jit(features),
+    inner=jax.jit(inner),
     predict=jax.jit(predict),
   )
 
