@@ -26,6 +26,9 @@ STICKING = "sticking"
 MuJoCo's own lets it creep."""
 
 
+WEAK = "motor_gain"
+"""The kind that is a joint's strength, or the supply's where all actuators have it."""
+
 SERVO_GAIN = "servo_gain"
 """Fixed parameter of constants: gain of the servo's law over the declared one, by the duty log."""
 

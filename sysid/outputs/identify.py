@@ -27,7 +27,7 @@ from nerf2real.sysid.drift import stored
 from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.outputs.details import claimed_effects, details_of
 from nerf2real.sysid.outputs.errors import errors, floor
-from nerf2real.sysid.outputs.notes import another_session, of_one, spread
+from nerf2real.sysid.outputs.notes import another_session, of_one, spread, supply
 from nerf2real.sysid.outputs.rivals import alternatives, next_motion, residual_at
 from nerf2real.sysid.report import capability, samples, servo
 from nerf2real.sysid.report import page as report
@@ -141,6 +141,7 @@ def _identify(
     "next_excitation": next_motion(found, shown),
     "notes": [
       *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
+      *supply(logs, reference),
       *(note for item in found.found for note in another_session(item)),
       *sensed.notes,
     ],

@@ -1,7 +1,11 @@
 """Sentences of a report that follow from what was found."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.selection.joints.changed import Changed
 from nerf2real.sysid.settings import SETTINGS
 
@@ -23,6 +27,23 @@ def another_session(item: Changed) -> list[str]:
     f"The reference of {item.joint} is of another session, and a machine's constants differ from"
     f" one to the next (friction by {100 * friction:.0f} %): differences no larger than that makes"
     " are taken for nothing. A reference of the same hour shows smaller ones."
+  ]
+
+
+def supply(logs: Sequence[Log], reference: Sequence[Log]) -> list[str]:
+  """Returns a sentence on a supply whose readings differ from a reference's by more than machines'
+  strength does within a session; none where either was not measured."""
+  volts = [
+    [log.battery.value for log in part if log.battery is not None] for part in (logs, reference)
+  ]
+  if len(volts[0]) < len(logs) or len(volts[1]) < max(1, len(reference)):
+    return []
+  now, before = (float(np.median(np.concatenate(part))) for part in volts)
+  if abs(now / before - 1.0) <= SETTINGS.sigmas * dict(SETTINGS.repeat)["gain"]:
+    return []
+  return [
+    f"The supply's readings are {now:.1f} V in the median, {before:.1f} V in the reference"
+    f" ({100 * now / before:.0f} %): what servos give at a duty goes with it."
   ]
 
 

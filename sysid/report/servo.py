@@ -35,9 +35,11 @@ def apart(effects: list[Effect], claimed: list[dict[str, Any]]) -> list[Effect]:
   """Returns effects with the gains that are claimed as effects of their own, not as constants.
 
   A joint has one effect of a kind: where its torque at a duty is off, too, which is a gain that
-  scales the limit, the duty's gain stays among the constants.
+  scales the limit, the duty's gain stays among the constants. So it does beside one of all joints.
   """
   weak = {effect.target for effect in effects if effect.kind == KIND}
+  if None in weak:
+    return list(effects)
   gains = {row["joint"]: row["parameters"]["gain"] for row in claimed if row["joint"] not in weak}
   result: list[Effect] = []
   for effect in effects:

@@ -17,7 +17,7 @@ from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import claims, whole_machine
-from nerf2real.sysid.selection.findings import Identified, Zero
+from nerf2real.sysid.selection.findings import Identified, Zero, beside_machine
 from nerf2real.sysid.selection.joints import changes
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.joints.naming import Name
@@ -227,6 +227,7 @@ def _write_down(result: Identified, item: Changed) -> None:
       result.nearest.append(row)
       continue
     effect, row = claims.effect(item, term, _evidence(item, names.get(term.kind)))
+    effect = beside_machine(effect, best.terms)
     if term.kind == "encoder_offset":
       offset += float(effect.parameters["offset"])  # type: ignore[arg-type]
     else:

@@ -1,6 +1,7 @@
 """What an identification found, before it is written down."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -10,7 +11,7 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import free_force
-from nerf2real.sysid.hypotheses.terms import FREE
+from nerf2real.sysid.hypotheses.terms import FREE, WEAK, Term
 from nerf2real.sysid.model.simulation import Clocks, Member
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.search.evidence import Scored
@@ -34,10 +35,29 @@ def effects_of(joint: str, item: Scored, *, offset: float = 0.0) -> tuple[list[E
     elif term.kind == "encoder_offset":
       offset += values["offset"]
     elif term.names:
-      effects.append(term.effect(x))
+      effects.append(beside_machine(term.effect(x), item.terms))
   if offset:
     effects.append(Effect("encoder_offset", joint, {"offset": offset}))
   return effects, clocks
+
+
+def beside_machine(effect: Effect, terms: Sequence[Term]) -> Effect:
+  """Returns a joint's strength times what the whole machine has beside it, as it is written down:
+  of two effects of a kind the one that names the joint counts there.
+
+  Args:
+    effect: of a joint; one of another kind stays.
+    terms: of the joint's hypothesis.
+  """
+  factors = [dict(t.fixed)["gain"] for t in terms if t.wider and t.kind == WEAK == effect.kind]
+  if not factors:
+    return effect
+  factor = float(np.prod(factors))
+  gain = factor * float(effect.parameters["gain"])  # type: ignore[arg-type]
+  bounds = dict(effect.intervals)
+  if "gain" in bounds:
+    bounds["gain"] = factor * bounds["gain"][0], factor * bounds["gain"][1]
+  return dataclasses.replace(effect.replace(gain=gain), intervals=bounds)
 
 
 class Zero(NamedTuple):

@@ -52,11 +52,11 @@ def _of_two_recordings(subject: Subject) -> Array:
   as they differ within a recording: what one value for all of it explains was fitted before, also
   where constants are those of another session."""
   now, null, own = subject.now, subject.explainer.null, subject.known[0]
-  layout = null.fit.layout
+  layout = null.fit.layout  # its constants come first, which may be freed
   differ = np.array(differs(dict(zip(own.names, own.centre, strict=True)), now.settings, False))
   differ[[name not in now.settings.wandering for name in own.names]] = np.inf
   sigma = np.full_like(layout.sigma, np.inf)
-  sigma[slice(*layout.spans[layout.terms.index(own)])] = differ
+  sigma[slice(*layout.spans[0])] = differ
   return repeats(now, null, sigma)
 
 

@@ -9,7 +9,7 @@ from nerf2real.sysid.fit import rough
 from nerf2real.sysid.fit.layout import CONSTANTS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import WEAK, Term
 from nerf2real.sysid.selection.search.evidence import UNREPEATED, Scored, kinds_of
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -65,7 +65,7 @@ def _handed_over(parent: Scored, term: Term) -> list[Array]:
 def _scaled(parent: Scored, term: Term) -> list[Array]:
   """Returns where a parent's fit is with all torques of its effects larger by each start of a gain:
   that makes about the same motion, and single steps do not lead from one to the other."""
-  if term.kind != "motor_gain":
+  if term.kind != WEAK:
     return []
   torques = np.array(
     [
@@ -212,7 +212,8 @@ class Explainer:
   def _candidates(self, parent: Scored):
     """Yields terms, starts [S, n], a Jacobian to take over and which values are new [n]."""
     known, x = parent.fit.jacobian[0], parent.fit.x
-    old = [t.kind for t in parent.terms]
+    # A weak joint is weak beside a low supply, which all have: their factors multiply.
+    old = [t.kind for t in parent.terms if not (t.wider and t.kind == WEAK)]
     at = 0
     # An effect that references show may be larger, or of another form.
     for position, term in enumerate(parent.terms):

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import WEAK, Term
 from nerf2real.sysid.selection.joints.changes import Changed, may_leave
 from nerf2real.sysid.selection.joints.doubts import newness
 from nerf2real.sysid.selection.joints.naming import USUAL
@@ -192,7 +192,7 @@ def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool)
   others_behind = [(mine - w.evidence()).clear for w in items if w not in alike]
   clear = min([mine.clear, *others_behind, *([] if best.term.kind in certain else [behind])])
   reach = _reach(best)
-  nothing = _is_nothing(best.term, best.x, reach, own_latency=own_latency)
+  nothing = _is_nothing(best, reach, own_latency=own_latency)
   if clear < beyond or behind < 0.0 or nothing or not _is_new(best):
     return None
   origin = best.members[most]
@@ -201,11 +201,22 @@ def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool)
   return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total, or_alone, twins)
 
 
-def _is_nothing(term: Term, x: Array, reach: tuple[Array, Array], *, own_latency: bool) -> bool:
-  """Tells whether an effect has sizes only, whose intervals hold the values that do nothing."""
+def _is_nothing(item: Wide, reach: tuple[Array, Array], *, own_latency: bool) -> bool:
+  """Tells whether an effect has sizes only, whose intervals hold the values that do nothing, or are
+  as near to them as two recordings of one machine differ in strength."""
+  term = item.term
   sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
-  bounds = intervals.around(term, x, *reach, own_latency=own_latency)
-  return all(n in sizes and low <= sizes[n] <= high for n, (low, high) in bounds.items())
+  bounds = intervals.around(term, item.x, *reach, own_latency=own_latency)
+  differs = max(_repeated(m) for m in item.members) if term.kind == WEAK else 0.0
+  return all(
+    n in sizes and low - differs <= sizes[n] <= high + differs for n, (low, high) in bounds.items()
+  )
+
+
+def _repeated(member: Subject) -> float:
+  """Returns the share by which a joint's strength may differ between two recordings."""
+  own = member.known[0]
+  return member.now.settings.sigmas * own.prior[own.names.index("gain")]
 
 
 def _is_new(item: Wide) -> bool:

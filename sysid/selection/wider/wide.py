@@ -19,7 +19,8 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import WEAK, Term
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.point_mass import carrying
 from nerf2real.sysid.selection.joints.subject import WHOLE, Subject
 from nerf2real.sysid.selection.search.evidence import Scored, clearness
@@ -137,7 +138,7 @@ def hypotheses(
     late = [_of_machine(t) for t in subject.library if t.kind in LATE]
     if len(late) == 1:  # a joint alone that holds no position does not tell these apart
       late.append(twin(late[0]))
-    for term in (*terms, *late):
+    for term in (*terms, *late, *_of_supply(subject)):
       known = machine.get((term.kind, term.fixed))
       if known is None or term.scale < known.scale:  # of the joint that bears most
         machine[term.kind, term.fixed] = term
@@ -158,6 +159,26 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
 def _of_machine(term: Term) -> Term:
   """Returns a late command or reading of a joint as one of all joints."""
   return dataclasses.replace(term, target=None, fixed=(*term.fixed, *_OF_ALL.get(term.kind, ())))
+
+
+_VOLTAGES = (0.5, 0.7, 0.85, 0.95, 1.05, 1.2)  # of the reference's where searches start, chosen
+
+
+def _of_supply(subject: Subject) -> list[Term]:
+  """Returns the strength of all actuators at another voltage than a reference's.
+
+  Torque at a duty goes with the voltage, and so does the largest; back-EMF takes what it took. What
+  is declared of strength is a guess for each kind of actuator: without a reference none is shared.
+  """
+  if subject.before is None:
+    return []
+  limited = np.isfinite(subject.now.plant.declared[INDEX["highest"]])
+  form = {"scales_limit": float(limited), "effort_tells": 1.0}
+  return [
+    dataclasses.replace(t, target=None, starts=tuple((v,) for v in _VOLTAGES))
+    for t in subject.library
+    if t.kind == WEAK and dict(t.fixed) == form
+  ]
 
 
 def twin(term: Term) -> Term:

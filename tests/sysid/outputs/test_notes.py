@@ -2,9 +2,10 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from nerf2real.sysid.outputs.notes import another_session
+from nerf2real.sysid.outputs.notes import another_session, supply
 
 
 @pytest.mark.parametrize(
@@ -16,3 +17,16 @@ def test_a_reference_of_another_session_is_said(paired, apart, said):
   notes = another_session(SimpleNamespace(joint="knee", subject=subject))  # type: ignore[arg-type]
   assert len(notes) == said
   assert all("reference of knee" in note and "friction by 15 %" in note for note in notes)
+
+
+def _logs(*volts):
+  values = [None if v is None else SimpleNamespace(value=np.array([v, v, v - 1.0])) for v in volts]
+  return [SimpleNamespace(battery=value) for value in values]
+
+
+def test_another_voltage_than_the_reference_s_is_said():
+  (said,) = supply(_logs(11.2, 11.4), _logs(12.0))
+  assert "11.2 V in the median, 12.0 V in the reference (93 %)" in said
+  assert not supply(_logs(12.0), _logs(12.1))  # machines' strength differs by as much
+  assert not supply(_logs(11.2, None), _logs(12.0))
+  assert not supply(_logs(11.2), _logs(None)) and not supply(_logs(11.2), [])

@@ -72,10 +72,11 @@ def test_the_file_holds_the_gain_apart_from_the_torque_at_a_duty():
   assert (gain.kind, gain.parameters["gain"]) == ("motor_gain", value)
 
 
-def test_a_motor_that_is_weak_besides_keeps_one_effect_and_the_product():
+@pytest.mark.parametrize("place", ["joint", None])
+def test_a_motor_that_is_weak_besides_keeps_one_effect_and_the_product(place):
   claimed, _ = servo.rows(found_of(reference=False, gain=0.5))
   constant = Effect("parameter_error", "joint", {"gain": 0.51, "limit": 1.02})
-  weak = Effect("motor_gain", "joint", {"gain": 0.4, "scales_limit": 1.0})
+  weak = Effect("motor_gain", place, {"gain": 0.4, "scales_limit": 1.0})
   assert servo.apart([constant, weak], claimed) == [constant, weak]
 
 

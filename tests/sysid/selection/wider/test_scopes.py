@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.selection import analysis
+from nerf2real.sysid.selection import analysis, findings
 from nerf2real.sysid.selection.joints import subject
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.wider import scopes, wide
@@ -207,3 +208,65 @@ def test_a_shared_name_stands_beside_a_free_force_where_more_remains(monkeypatch
   found = SimpleNamespace(best=best)
   item = SimpleNamespace(subject=joint, joint="elbow", found=found, more_remains=more_remains)
   assert scopes.needless([shared], [item]) == ([shared] if more_remains else [])
+
+
+LOW = Effect("motor_gain", None, {"gain": 0.93, "scales_limit": 1.0})
+
+
+@pytest.fixture
+def weakened(model, monkeypatch):
+  """The arm, beside whose few effects strength is looked for."""
+
+  def with_strength(plant, **_):
+    strength = [t for t in candidates.library(plant) if t.kind == "motor_gain"]
+    return [*few(plant), *strength]
+
+  monkeypatch.setattr(subject, "own_library", with_strength)
+  return model
+
+
+@pytest.mark.parametrize("first", [0, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_low_supply_is_one_effect_of_the_machine(weakened, first):
+  """Beside references with the same commands, and beside others."""
+  found = analysis.analyse(weakened, _logs([LOW]), _logs([], seed=first))
+  assert [(e["kind"], e["joint"]) for e in found.effects] == [("motor_gain", None)]
+  gain = found.effects[0]["parameters"]["gain"]
+  assert gain["low"] <= 0.93 <= gain["high"] < 1.0
+  assert {(e.kind, e.target) for e in found.objects if e.kind == "motor_gain"} == {
+    ("motor_gain", None)
+  }
+
+
+@pytest.mark.parametrize("gain", [0.992, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_a_supply_as_low_as_two_recordings_differ_is_none(weakened, gain):
+  low = dataclasses.replace(LOW, parameters=LOW.parameters | {"gain": gain})
+  found = analysis.analyse(weakened, _logs([low]), _logs([]))
+  assert found.verdict == "none" and not found.effects
+
+
+def test_one_weak_servo_is_no_low_supply(weakened):
+  weak = Effect("motor_gain", "elbow", {"gain": 0.6, "scales_limit": 1.0})
+  found = analysis.analyse(weakened, _logs([weak]), _logs([]))
+  assert [(e["kind"], e["joint"]) for e in found.effects] == [("motor_gain", "elbow")]
+
+
+def test_a_weak_joint_is_weak_beside_a_low_supply(weakened):
+  """Factors multiply: the joint's own is tried, and written as what counts there in the suite."""
+  low = Term("motor_gain", None, ("gain",), (0.05,), (3.0,), (0.1,), ((0.9,),))
+  logs = _logs([])
+  reductions = (
+    [Reduction(weakened, log) for log in logs],
+    [Reduction(weakened, log) for log in logs],
+  )
+  joint = subject.prepare(
+    weakened, "elbow", logs, logs, reductions=reductions, tried=2, settings=SETTINGS
+  )
+  joint.take(dataclasses.replace(low.held_at(np.array([0.9])), known=True))
+  tried = [t for terms, *_ in joint.explainer._candidates(joint.explainer.null) for t in terms]
+  own = next(t for t in tried if t.kind == "motor_gain" and t.names)
+  bounds = {"gain": (0.4, 0.6)}
+  found = findings.beside_machine(own.effect(np.array([0.5]), bounds), joint.known)
+  assert found.parameters["gain"] == pytest.approx(0.45)
+  assert found.intervals["gain"] == pytest.approx((0.36, 0.54))
+  other = Effect("viscous_friction", "elbow", {"coefficient": 0.5})
+  assert findings.beside_machine(other, joint.known) is other
