@@ -111,9 +111,10 @@ def five_numbers(story: Story) -> list[Figure]:
     )
     for name, meaning, good in wanted
   ]
-  value = _NOTHING if share is None else f"{100 * share:.0f} %"
-  if share is None and loop.HEALTHY in tallies:
-    value = "nothing was lost"
+  value = "nothing was lost" if loop.HEALTHY in tallies else _NOTHING
+  if share is not None:  # of how few it is says what a share is worth
+    count = round(loop.lost(tallies) * tallies[loop.BEFORE].trials)
+    value = f"{100 * share:.0f} % of {count} trial{'s' if count > 1 else ''}"
   back = "after less before, of what was lost"
   return [*figures, Figure("lost success that came back", value, "", back, "100 %")]
 

@@ -228,7 +228,7 @@ def test_five_numbers_and_what_came_back(tmp_path):
   assert story.recovered(told) == pytest.approx(2 / 3)
   figures = telling.five_numbers(told)
   assert len(figures) == 5
-  assert figures[1].value.startswith("0 % (0 of 4") and figures[-1].value == "67 %"
+  assert figures[1].value.startswith("0 % (0 of 4") and figures[-1].value == "67 % of 3 trials"
   text = telling.as_text(told)
   assert "hidden: command_delay:0.045; named: command_delay: delay 0.044 s (0.04 to 0.05)" in text
   summary = story.summary(told)
