@@ -254,7 +254,7 @@ def test_surroundings_of_a_payload_are_those_of_a_heavier_model() -> None:
 def test_pairs_move_the_joint_as_mujoco_does() -> None:
   # A kind may use what another one changes: the torque that acts, the friction, the strength.
   model = mujoco.MjModel.from_xml_string(PENDULUM)
-  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=1.0)
+  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=2.0)
   plant = JointModel(model, "joint", [log])
   cases = [*{case[0]: case for case in reversed(CASES)}.values()]  # the first of a kind
   cases.append(("backlash", {"gap": 0.01, "encoder_on_motor": 1.0}, 2e-3))

@@ -25,7 +25,7 @@ PAYLOAD = Effect("payload", "lower", {"mass": 0.25, "x": 0.0, "y": 0.02, "z": -0
 
 def _logs(effects, seed=0, xml=ARM):
   return [
-    log_of(xml, kind, effects, duration=4.0, seed=seed + i)
+    log_of(xml, kind, effects, duration=5.0, seed=seed + i)
     for i, kind in enumerate(("sweep", "slow", "steps"))
   ]
 
