@@ -29,9 +29,9 @@ def agent_of(folder: Path) -> DmpoConfig:
 def begin_with(state: TrainingState, arrays: Mapping[str, np.ndarray]) -> TrainingState:
   """Returns a fresh state whose networks are those of an exported policy.
 
-  The heads that only training has, and the optimisers, stay fresh (`heads` fits the former to the
-  first episodes). The policy is one for
-  observations as they are; `learning.standardised` with `keep_policy` rewrites its first layer.
+  The optimisers stay fresh, and the heads that only training has, which `heads` fits to the first
+  episodes. The policy is one for observations as they are; `learning.standardised` with
+  `keep_policy` rewrites its first layer.
 
   Args:
     state: a state that has seen no update.

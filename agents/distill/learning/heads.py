@@ -21,9 +21,8 @@ from nerf2real.agents.dmpo.networks import Params
 Array = np.ndarray
 
 _TOGETHER = 8  # episodes that go through the network at once
-_RIDGE = (
-  1e-3  # of the inputs' mean square: they are nearly dependent, frames of few episodes; chosen
-)
+_RIDGE = 1e-3
+"""Of the inputs' mean square, chosen: in the frames of few episodes they are nearly dependent."""
 
 
 def with_fitted_heads(
