@@ -19,11 +19,11 @@ demo: install
 	  --viewer
 	@echo "open out/$(PRESET)/report.html"
 
-# the closed loop on a weak knee at reduced size: 7 trials, motions of 6 s, 5 minutes of training by
-# the walker that copes best with that knee, as searching for a better one takes minutes
+# the closed loop on a weak knee at reduced size: 7 trials, motions of 6 s, 10 minutes of training by
+# a walker that copes with that knee, as searching for one takes minutes
 loop: install
 	$(BIN)/python launch/close_loop.py --robot virtual --hidden motor_gain@l_knee:0.15 \
-	  --policy shipped --trials 7 --seconds 6 --minutes 5 --teacher steady --out out/make_loop
+	  --policy shipped --trials 7 --seconds 6 --minutes 10 --teacher tall --out out/make_loop
 	@echo "open out/make_loop/loop.html"
 
 test: install lint

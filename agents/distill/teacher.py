@@ -76,6 +76,13 @@ def _steady() -> WalkerSettings:
   return WalkerSettings(gait=GaitSettings(), steering=SteeringSettings(head_tilt=_HEAD_TILT))
 
 
+def _tall() -> WalkerSettings:
+  """The steady walker with straighter knees, which need less torque to carry the same weight."""
+  steady = _steady()
+  height = steady.gait.height + 0.008
+  return dataclasses.replace(steady, gait=dataclasses.replace(steady.gait, height=height))
+
+
 def _quick() -> WalkerSettings:
   """Longer steps and larger turns, searched for by CMA-ES over gait and steering (README)."""
   gait = GaitSettings(
@@ -183,6 +190,7 @@ def _ball() -> WalkerSettings:
 
 TEACHERS = {
   "steady": _steady,
+  "tall": _tall,
   "quick": _quick,
   "swift": _swift,
   "brisk": _brisk,

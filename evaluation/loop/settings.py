@@ -54,9 +54,9 @@ class LoopSettings:
   preset: str = "adapt"
   """Settings of that distillation."""
   teacher: str = AUTO
-  """quick, swift, steady, a walker's settings as JSON, the folder of a policy, or auto: the walker
-  that succeeds most often with the effects in the simulation, of equal ones the fastest, standing
-  taller or fitted to them if all fail."""
+  """quick, swift, steady, tall, a walker's settings as JSON, the folder of a policy, or auto: the
+  walker that succeeds most often with the effects in the simulation, of equal ones the fastest,
+  standing taller or fitted to them if all fail."""
   actors: int = 1
   """Collectors of the distillation."""
   out: Path = Path("out/loop")

@@ -85,8 +85,9 @@ def test_a_label_says_the_command_and_stays_within_the_actions(environment):
     assert label.action.shape == (20,) and np.abs(label.action).max() <= 1
 
 
-def test_the_quick_teacher_walks_under_noise(environment):
-  teacher = teachers.make_teacher("quick", environment.task.scene)
+@pytest.mark.parametrize("name", ["quick", "tall"])
+def test_a_teacher_walks_under_noise(environment, name):
+  teacher = teachers.make_teacher(name, environment.task.scene)
   assert _walk(environment, teacher, noise=0.05, steps=200) == 200
 
 
@@ -120,5 +121,5 @@ def test_an_exported_policy_is_a_teacher_without_commands(tmp_path):
 
 
 def test_an_unknown_teacher_is_refused():
-  with pytest.raises(ValueError, match="Unknown teacher 'slow': expected one of steady, quick"):
+  with pytest.raises(ValueError, match="Unknown teacher 'slow': expected one of steady, tall, quick"):
     teachers.make_teacher("slow", None)
