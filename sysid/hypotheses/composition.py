@@ -1,5 +1,6 @@
 """From the terms of a hypothesis to the kernel's parameters and loads of one joint."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,6 +12,8 @@ from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.model.joint import JointModel, Load, Table
 
 Array = np.ndarray
+
+_PLACES = {kind: place for place, kind in enumerate(KINDS)}
 
 
 class Composed(NamedTuple):
@@ -25,11 +28,12 @@ class Composed(NamedTuple):
 
 
 def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
-  """Returns terms with values x [n] composed."""
-  p, loads, at, table, forces = plant.declared.copy(), [], 0, None, []
-  for term in terms:
-    part = x[at : at + len(term.names)]
-    at += len(term.names)
+  """Returns terms with values x [n] composed, applied in the order in which the suite binds them."""
+  p, loads, table, forces = plant.declared.copy(), [], None, []
+  ends = np.cumsum([len(term.names) for term in terms])
+  for index in _order(tuple(term.kind for term in terms)):
+    term = terms[index]
+    part = x[ends[index] - len(term.names) : ends[index]]
     term.apply(plant, p, part)
     values = dict(zip(term.names, map(float, part), strict=True)) | dict(term.fixed)
     if term.kind in KINDS and KINDS[term.kind].law is not None:
@@ -47,3 +51,9 @@ def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
   for term, values in forces:  # over the places of a free force, where there is one
     table = force_law.add(plant, term, values, table)
   return Composed(p, loads, table)
+
+
+@functools.cache
+def _order(kinds: tuple[str, ...]) -> tuple[int, ...]:
+  """Returns which term is applied when: constants first, then kinds as the suite has them."""
+  return tuple(sorted(range(len(kinds)), key=lambda index: _PLACES.get(kinds[index], -1)))

@@ -14,6 +14,7 @@ from nerf2real.sysid.hypotheses.free_force import effect, free_force
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
@@ -258,19 +259,43 @@ def test_pairs_move_the_joint_as_mujoco_does() -> None:
   plant = JointModel(model, "joint", [log])
   cases = [*{case[0]: case for case in reversed(CASES)}.values()]  # the first of a kind
   cases.append(("backlash", {"gap": 0.01, "encoder_on_motor": 1.0}, 2e-3))
-  weaker = {"motor_gain", "supply_sag", "thermal_derating"}  # one flag tells what their limits do
   wrong = []
   for first, second in itertools.combinations(cases, 2):
-    kinds = {first[0], second[0]}
-    if len(kinds) == 1 or kinds <= weaker:
+    if _share_a_place(first[0], second[0]):
       continue
     values = [*first[1].values(), *second[1].values()]
     terms, effects = zip(*(_case(kind, v) for kind, v, _ in (first, second)), strict=True)
     got = _position(plant, terms, values)
     want = evaluation.simulate(model, log, list(effects))[:, 0]
     if float(np.sqrt(np.mean((got - want) ** 2))) > 4e-3:
-      wrong.append(kinds)
+      wrong.append((first[0], second[0]))
   assert not wrong
+
+
+def _share_a_place(first: str, second: str) -> bool:
+  """Tells whether the kernel holds one of two kinds at a time, or one flag of both's limits."""
+  return first == second or {first, second} <= {"motor_gain", "supply_sag", "thermal_derating"}
+
+
+def test_terms_are_composed_alike_in_any_order() -> None:
+  log = log_of(PENDULUM, "sweep", rounding=0.0, duration=1.0)
+  plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", [log])
+  weak = ("motor_gain", {"gain": 0.2, "scales_limit": 1.0, "scales_damping": 1.0}, 0.0)
+  rough = ("viscous_friction", {"coefficient": 0.1}, 0.0)
+  for first, second in itertools.combinations([weak, rough, *CASES], 2):
+    if _share_a_place(first[0], second[0]):
+      continue
+    pair = [(_case(kind, values)[0], [*values.values()]) for kind, values, _ in (first, second)]
+    one, other = (
+      compose(plant, [term for term, _ in order], np.concatenate([x for _, x in order])).p
+      for order in (pair, pair[::-1])
+    )
+    np.testing.assert_array_equal(one, other, err_msg=f"{first[0]}, {second[0]}")
+  # A weak motor's damping is its own; what rubs besides is not its.
+  values = np.array([*weak[1].values(), *rough[1].values()])
+  composed = compose(plant, [_case(*case[:2])[0] for case in (weak, rough)], values)
+  declared = plant.declared[INDEX["damping"]]
+  assert composed.p[INDEX["damping"]] == pytest.approx(0.2 * declared + 0.1)
 
 
 def _case(kind: str, values: dict) -> tuple[Term, Effect]:
