@@ -3,8 +3,8 @@
   python benchmarks/rooms/mappers.py --work out/mappers --count 1000
 
 Features and matches are found once, in the first run, and are the same for all mappers unless one
-leaves so many keyframes out that more pairs are matched for it. A run that is cut short goes on from
-them.
+leaves so many keyframes out that more pairs are matched for it. A run that is cut short goes on
+from them.
 """
 
 import dataclasses

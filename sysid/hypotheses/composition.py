@@ -28,7 +28,7 @@ class Composed(NamedTuple):
 
 
 def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
-  """Returns terms with values x [n] composed, applied in the order in which the suite binds them."""
+  """Returns terms with values x [n] composed, applied in the order of the suite's effects."""
   p, loads, table, forces = plant.declared.copy(), [], None, []
   ends = np.cumsum([len(term.names) for term in terms])
   for index in _order(tuple(term.kind for term in terms)):
