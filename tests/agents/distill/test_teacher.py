@@ -121,5 +121,7 @@ def test_an_exported_policy_is_a_teacher_without_commands(tmp_path):
 
 
 def test_an_unknown_teacher_is_refused():
-  with pytest.raises(ValueError, match="Unknown teacher 'slow': expected one of steady, tall, quick"):
+  with pytest.raises(
+    ValueError, match="Unknown teacher 'slow': expected one of steady, tall, quick"
+  ):
     teachers.make_teacher("slow", None)
