@@ -78,7 +78,9 @@ def settings_of(arguments: Arguments) -> "SceneSettings":
 
   settings = preset(arguments.preset)
   if arguments.keyframes is not None:
-    taken = dataclasses.replace(settings.capture, num_keyframes=arguments.keyframes)
+    taken = dataclasses.replace(
+      settings.capture, num_keyframes=arguments.keyframes, most_keyframes=None
+    )
     settings = dataclasses.replace(settings, capture=taken)
   if arguments.train_seconds is not None:
     training = dataclasses.replace(settings.train, max_seconds=arguments.train_seconds)

@@ -40,7 +40,8 @@ class SceneSettings:
   held_out_every: int = 8
   """Every so many keyframes one is kept from training. Mip-NeRF 360's convention."""
   depth_width: int = 320
-  """Width of the depth pictures that geometry is made from [pixel]."""
+  """Width of the depth pictures that geometry is made from [pixel]; twice as wide ones show thin
+  things, such as shelves and a lamp's pole, and take four times as long."""
   align: AlignSettings = AlignSettings()
   """World frame."""
   marker_side: float | None = None
@@ -79,7 +80,9 @@ def preset(name: str) -> SceneSettings:
       "paper" the paper's tables.
   """
   if name in ("fast", "quality"):
-    return SceneSettings(train=training.preset(name))
+    return SceneSettings(
+      capture=CaptureSettings(most_keyframes=300), train=training.preset(name), depth_width=640
+    )
   if name == "demo":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=110),

@@ -5,12 +5,18 @@ enough); all runs get the same steps and seed.
 
   python benchmarks/rooms/field_ablation.py --scene out/living --steps 2500
   python benchmarks/rooms/field_ablation.py --scene out/living --change falloff near_gradient
+  python benchmarks/rooms/field_ablation.py --scene out/living --passers 0.3
+
+With --passers something stands in a share of the pictures that are trained on, elsewhere in each.
+Geometry is judged by localised points of the held-out views: how far the field's surface lies from
+them along their sight lines, as a share of their distance.
 """
 
 import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 
 from benchmarks import harness
@@ -27,6 +33,8 @@ from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.stages.cache import Made, StageResult
 from nerf2real.scenes.stages.pictures import PosedPictures
 
+_PASSER = 0.16, 0.7  # width and height of what stands there, of the picture's
+_PATCHES = 8  # of colour, along the picture's sides
 Part = Literal[
   "falloff", "near_gradient", "points", "distortion", "blur", "rate", "padding", "table"
 ]
@@ -52,6 +60,8 @@ class Settings(harness.Options):
   """Training steps of each run."""
   change: tuple[Part, ...] = ("falloff", "near_gradient")
   """Parts of the training that are changed, one a run; the first run changes nothing."""
+  passers: float = 0.0
+  """Share of the pictures trained on in which something stands that others do not show."""
   width: int = 640
   """Width at which held-out views are scored [pixel]."""
   seed: int = 0
@@ -81,6 +91,35 @@ def without_falloff(views: Views) -> Views:
   return dataclasses.replace(views, exposure=flat)
 
 
+def with_passers(views: Views, share: float, seed: int) -> Views:
+  """Returns the pictures with a coloured upright ellipse, as of a person, in a share of them."""
+  rng = np.random.default_rng(seed)
+  images = views.images.copy()
+  height, width = images.shape[1:3]
+  for index in np.flatnonzero(rng.random(len(images)) < share):
+    mask = np.zeros((height, width), np.uint8)
+    centre = int(width * rng.random()), int(height * rng.uniform(0.4, 0.7))
+    axes = int(_PASSER[0] * width / 2), int(_PASSER[1] * height / 2)
+    cv2.ellipse(mask, centre, axes, 0, 0, 360, 1, -1)
+    clothes = rng.integers(0, 256, (_PATCHES, _PATCHES, 3), np.uint8)
+    images[index][mask > 0] = cv2.resize(clothes, (width, height))[mask > 0]
+  return dataclasses.replace(views, images=images)
+
+
+def point_errors(renderer: Renderer, held: Views) -> np.ndarray:
+  """Distances of the field's surface from localised points, by those points' distance [A]."""
+  errors = []
+  for index in range(len(held)):
+    mine = held.anchors[held.anchors[:, 0] == index]
+    if not len(mine):
+      continue
+    _, depth = renderer.render(held.camera, held.world_from_camera[index])
+    column, row = mine[:, 1:3].astype(int).T
+    along = np.linalg.norm(held.camera.rays(), axis=-1)[row, column] * depth[row, column]
+    errors.append(np.abs(along / mine[:, 3] - 1))
+  return np.concatenate(errors)
+
+
 def small_db(renderer: Renderer, held: Views, height: int, width: int) -> float:
   """Mean PSNR [dB] of held-out views at a policy's size."""
   scores = [held_out.compare(renderer, held, i, height, width).psnr_db for i in range(len(held))]
@@ -94,10 +133,13 @@ def main(settings: Settings) -> None:
   for part in ("", *settings.change):
     views = without_falloff(everything) if part == "falloff" else everything
     training, held = views.split(SceneSettings().held_out_every)
+    training = training.evened()
+    if settings.passers:
+      training = with_passers(training, settings.passers, settings.seed)
     chosen = dataclasses.replace(
       train.preset("fast"), max_steps=settings.steps, max_seconds=None, **CHANGES.get(part, {})
     )
-    field, report = train.train(training.evened(), chosen, seed=settings.seed)
+    field, report = train.train(training, chosen, seed=settings.seed)
     renderer = Renderer(field, threads=num_threads())
     height = round(held.camera.height * settings.width / held.camera.width)
     scores = [
@@ -107,6 +149,8 @@ def main(settings: Settings) -> None:
       "psnr_db": float(np.mean([score.psnr_db for score in scores])),
       "ssim": float(np.mean([score.ssim for score in scores])),
       **{f"psnr_{h}x{w}_db": small_db(renderer, held, h, w) for h, w in held_out.ROBOT_SIZES},
+      "points_off_median": float(np.median(off := point_errors(renderer, held))),
+      "points_off_95": float(np.percentile(off, 95)),
       "samples_per_ray": report.samples / report.rays,
       "training_s": report.seconds,
     }

@@ -17,6 +17,8 @@ class CaptureSettings:
 
   num_keyframes: int = 150
   """Parts of the capture; the sharpest frame of each is kept."""
+  most_keyframes: int | None = None
+  """Parts of a long video, which has two a second up to these; `num_keyframes` if None."""
   max_size: int = 1920
   """Long side of a keyframe; larger pictures are reduced [pixel]."""
   jpeg_quality: int = 95

@@ -29,6 +29,8 @@ from nerf2real.scenes.capture.posed.colmap_model import read_colmap
 from nerf2real.scenes.capture.posed.rgbd import read_rgbd
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 
+_KEYFRAME_RATE = 2.0  # of a long video [1/s]; chosen: 150 of the shipped film of 70 s
+
 
 def read_capture(
   source: Path,
@@ -64,6 +66,12 @@ def read_capture(
   return dataclasses.replace(capture, folder=folder, images=images)
 
 
+def keyframe_count(settings: CaptureSettings, duration: float) -> int:
+  """Returns how many keyframes a video of a length [s] gets."""
+  most = max(settings.most_keyframes or 0, settings.num_keyframes)
+  return min(max(settings.num_keyframes, round(_KEYFRAME_RATE * duration)), most)
+
+
 def _read_video(
   source: Path, folder: Path, settings: CaptureSettings, progress: Progress
 ) -> Capture:
@@ -81,7 +89,7 @@ def _read_video(
     )
   frames = sharpest_frames(
     source,
-    settings.num_keyframes,
+    keyframe_count(settings, info.duration),
     max_size=settings.max_size,
     info=info,
     warnings=warnings,

@@ -51,6 +51,14 @@ def test_keeps_the_sharpest_frame_of_each_part(frames, tmp_path, codec, suffix):
   assert all(path.is_file() for path in result.images)
 
 
+@pytest.mark.parametrize(("most", "kept"), [(None, 3), (4, 4), (12, 5)])
+def test_a_long_film_has_more_keyframes(frames, tmp_path, most, kept):
+  path = tmp_path / "film.mp4"  # of 2.4 s
+  synthetic.write_video(path, frames, codec="libx264")
+  settings = CaptureSettings(num_keyframes=3, most_keyframes=most, min_images=3)
+  assert len(read_capture(path, tmp_path / "keyframes", settings=settings).images) == kept
+
+
 @pytest.mark.parametrize("rotation", [90, 180, -90])
 def test_rotation_metadata_is_honoured(frames, tmp_path, rotation):
   path = tmp_path / "film.mp4"
