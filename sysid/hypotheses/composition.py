@@ -13,8 +13,6 @@ from nerf2real.sysid.model.joint import JointModel, Load, Table
 
 Array = np.ndarray
 
-_PLACES = {kind: place for place, kind in enumerate(KINDS)}
-
 
 class Composed(NamedTuple):
   """A hypothesis with its values, as the kernel takes it."""
@@ -56,4 +54,5 @@ def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
 @functools.cache
 def _order(kinds: tuple[str, ...]) -> tuple[int, ...]:
   """Returns which term is applied when: constants first, then kinds as the suite has them."""
-  return tuple(sorted(range(len(kinds)), key=lambda index: _PLACES.get(kinds[index], -1)))
+  places = {kind: place for place, kind in enumerate(KINDS)}
+  return tuple(sorted(range(len(kinds)), key=lambda index: places.get(kinds[index], -1)))
