@@ -29,7 +29,7 @@ from nerf2real.scenes.capture.posed.colmap_model import read_colmap
 from nerf2real.scenes.capture.posed.rgbd import read_rgbd
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 
-_KEYFRAME_RATE = 2.0  # of a long video [1/s]; chosen: 150 of the shipped film of 70 s
+_KEYFRAME_RATE = 2.0  # of a long video [1/s]; chosen: about that of the shipped film, 150 in 70 s
 
 
 def read_capture(
