@@ -38,8 +38,8 @@ class Arguments(training.TrainingSettings):
   nerf_nav_faster or, for ball pushing, ball_push_on to train a policy on, room to train it on in
   another room (all with --init-from); or tiny to try the machinery; "nerf_nav" if not given."""
   teacher: str | None = None
-  """quick, swift, brisk, steady, tall, ball, a walker's settings as JSON, or an exported policy's
-  folder; the preset's if not given."""
+  """quick, swift, brisk, nimble, steady, tall, ball, a walker's settings as JSON, or an exported
+  policy's folder; the preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
   relabel: Path | None = None

@@ -40,8 +40,8 @@ class Arguments:
   env: str | None = None
   """Where, such as "suite:nerf_nav?scene=out/room"; the preset's if not given."""
   teacher: str | None = None
-  """quick, swift, brisk, steady, tall, ball, a walker's settings as JSON, or an exported policy's
-  folder; the preset's if not given."""
+  """quick, swift, brisk, nimble, steady, tall, ball, a walker's settings as JSON, or an exported
+  policy's folder; the preset's if not given."""
   init_from: Path | None = None
   """Folder of an exported policy that the student begins with; its networks are taken along."""
   view_scenes: tuple[Path, ...] = ()
