@@ -9,8 +9,9 @@ from collections.abc import Callable, Mapping
 
 from nerf2real.agents.dmpo.config import AugmentationConfig, DmpoConfig, NetworkConfig
 
-ENCODER, POLICY, END_TO_END = "encoder", "policy", "end_to_end"
-STAGES = (ENCODER, POLICY, END_TO_END)
+ENCODER, POLICY, WALK, END_TO_END = "encoder", "policy", "walk", "end_to_end"
+STAGES = (ENCODER, POLICY, WALK, END_TO_END)
+OF_FEATURES = (POLICY, WALK)  # stages that train on cached features; their students may act
 SETTINGS = "settings.json"  # in a run's folder
 KIND = "distillation"  # of run, in the learner's description
 
@@ -20,8 +21,9 @@ class Stage:
   """A part of the training."""
 
   kind: str
-  """"encoder": pictures to poses, single frames; "policy": LSTM and MLP on cached features of the
-  frozen encoder; "end_to_end": everything on recurrent unrolls."""
+  """"encoder": pictures to poses, single frames; "policy": LSTM, MLP and belief on cached features
+  of the frozen encoder; "walk": the MLP alone, LSTM and belief are frozen, too; "end_to_end":
+  everything on recurrent unrolls."""
   share: float
   """Of the run's time."""
 
@@ -211,18 +213,17 @@ def nerf_nav_on() -> DistillSettings:
 
 
 def nerf_nav_faster() -> DistillSettings:
-  """Navigation: a student that walks already learns a faster teacher's walk; its encoder stays.
+  """Navigation: a student that walks already learns a faster teacher's walk, and only that.
 
-  What it sees and where it believes to be are right already, and the encoder may have learned from
-  reconstructions that are not at hand any more; all of the time goes into the walk. For pictures of
-  60x80: `--env "suite:nerf_nav?image_size=60x80"`. Students of 42 minutes on half a core, and of
-  some 5 minutes on a GPU, were not better in all that was asked
-  (benchmarks/results/policies/not_shipped.md).
+  What it sees and where it believes to be are right already; encoder and memory stay as they are.
+  Students whose LSTM was fitted anew to the few frames of such a run knew their place less well,
+  above all in its first seconds (benchmarks/results/policies/navigation.md). For pictures of 60x80:
+  `--env "suite:nerf_nav?image_size=60x80"`.
   """
   return dataclasses.replace(
     adapt(),
-    teacher="brisk",
-    stages=(Stage(kind=POLICY, share=1.0),),
+    teacher="nimble",
+    stages=(Stage(kind=WALK, share=1.0),),
     max_frames=250_000,  # of 60x80 16 kB each in memory
   )
 

@@ -56,6 +56,7 @@ GAIT = {
   "stride": 0.006,
   "backset": 0.003,
   "lean": 0.012,
+  "tilt": 0.006,
   "lead": 0.003,
   "pitch_gain": 0.02,
   "roll_gain": 0.03,
@@ -145,7 +146,7 @@ def walk(scene: str, settings: WalkerSettings, trials: Sequence[tuple[int, Trial
 def search(settings: Settings, pool: concurrent.futures.Executor) -> WalkerSettings:
   """Returns where the search stands when its time is over; written after every generation."""
   begin = time.monotonic()
-  start = _start(settings.start)
+  start = start_of(settings.start)
   listed = other_trials([trial for _, trial in plants.trials(NAVIGATION)])
   rng = np.random.default_rng(settings.seed)
   count = len(GAIT) + len(STEERING)
@@ -174,7 +175,8 @@ def search(settings: Settings, pool: concurrent.futures.Executor) -> WalkerSetti
   return walker_at(start, evolution.mean)
 
 
-def _start(name: str) -> WalkerSettings:
+def start_of(name: str) -> WalkerSettings:
+  """Returns a walker by its name, or from its JSON."""
   if name in TEACHERS:
     return TEACHERS[name]()
   return read_json(name, WalkerSettings)
@@ -195,7 +197,7 @@ def main(settings: Settings) -> None:
   context = multiprocessing.get_context("spawn")
   with concurrent.futures.ProcessPoolExecutor(settings.processes, context) as pool:
     settings.found.parent.mkdir(parents=True, exist_ok=True)
-    walkers = {settings.start: _start(settings.start), "found": search(settings, pool)}
+    walkers = {settings.start: start_of(settings.start), "found": search(settings, pool)}
     listed = other_trials([trial for _, trial in plants.trials(NAVIGATION)])
     spread = [listed[i] for i in np.linspace(0, len(listed) - 1, settings.trials).astype(int)]
     jobs = [(name, world) for name in walkers for world in range(len(tuning.WORLDS))]

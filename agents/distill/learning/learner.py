@@ -224,12 +224,12 @@ class Learner:
       done += 1
       # They do not fit while the encoder learns, nor until the policy has learned its features.
       self._is_fit = kind == stages.END_TO_END or (
-        kind == stages.POLICY and done >= self._settings.settling
+        kind in stages.OF_FEATURES and done >= self._settings.settling
       )
       if self._is_fit:
         self._begin_serving()
       self._housekeeping(kind)
-    if kind == stages.POLICY and not self._stop.is_set():  # it has learned what a short one can
+    if kind in stages.OF_FEATURES and not self._stop.is_set():  # it learned what a short one can
       self._is_fit = True
       self._begin_serving()
     self._save()

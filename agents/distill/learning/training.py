@@ -77,7 +77,7 @@ class Trainer:
   def begin_stage(self, kind: str) -> None:
     """Begins a stage: new streams through the episodes, and features of the present encoder."""
     settings = self._settings
-    if kind == stages.POLICY:
+    if kind in stages.OF_FEATURES:
       self._cache.clear()
     count = settings.end_to_end_streams if kind == stages.END_TO_END else settings.streams
     self._kind = kind
@@ -119,7 +119,7 @@ class Trainer:
 
   def _update_unrolls(self, within: float) -> Metrics:
     assert self._streams is not None
-    settings, cached = self._settings, self._kind == stages.POLICY
+    settings, cached = self._settings, self._kind in stages.OF_FEATURES
     if cached:
       with self._times.stage("features"):
         self._cache.extend(self.state.student["encoder"])
@@ -134,7 +134,7 @@ class Trainer:
       else:
         batch["image"] = self._data.arrays["image"][unroll.frames]
     with self._times.stage("update"):
-      update = self._updates.policy if cached else self._updates.end_to_end
+      update = getattr(self._updates, self._kind)
       rate = settings.learning_rate if cached else settings.end_to_end_learning_rate
       self.state, self._carried, metrics = update(
         self.state, batch, self._carried, rate * cosine(within)

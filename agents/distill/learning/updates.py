@@ -1,10 +1,11 @@
-"""The updates of a student: encoder, policy on cached features, and end to end; jitted functions.
+"""The updates of a student: encoder, policy and walk on cached features, end to end; all jitted.
 
 Shape letters: N pictures, B streams, T steps of an unroll, F features, U units of the LSTM, C
 augmented copies.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -42,6 +43,7 @@ class Updates(NamedTuple):
   init: Callable[[jax.Array], TrainingState]
   encoder: Callable[..., tuple[TrainingState, Metrics]]
   policy: Callable[..., tuple[TrainingState, LstmState, Metrics]]
+  walk: Callable[..., tuple[TrainingState, LstmState, Metrics]]
   end_to_end: Callable[..., tuple[TrainingState, LstmState, Metrics]]
   features: Callable[..., jax.Array]
   inner: Callable[..., student.StudentOutput]
@@ -56,7 +58,7 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
     layout: the environment's layout.
 
   `encoder(state, batch, rate)` takes single frames of `image`, `pose` and, where there is a ball,
-  `ball`; `policy(state, batch, carried, rate)` and
+  `ball`; `policy(state, batch, carried, rate)`, `walk(...)` and
   `end_to_end(...)` take unrolls of `state`, `label`, `command`, `pose`, `goal_distance`, `begins`
   and of `features` or `image`, and the LSTM's state before them. Training states are donated.
   """
@@ -112,9 +114,16 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
     ), metrics
 
   def policy(
-    state: TrainingState, batch: Mapping[str, jax.Array], carried: LstmState, rate: jax.Array
+    state: TrainingState,
+    batch: Mapping[str, jax.Array],
+    carried: LstmState,
+    rate: jax.Array,
+    *,
+    keeps_memory: bool = False,
   ) -> tuple[TrainingState, LstmState, Metrics]:
     def loss(params: dict[str, Params]):
+      if keeps_memory:
+        params = _with_frozen_memory(params)
       return unroll_loss(params, state, batch, batch["features"], carried, settings)
 
     params = _without_encoder(state.student)
@@ -176,6 +185,7 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
     init=init,
     encoder=jax.jit(encoder, donate_argnums=0),
     policy=jax.jit(policy, donate_argnums=0),
+    walk=jax.jit(functools.partial(policy, keeps_memory=True), donate_argnums=0),
     end_to_end=jax.jit(end_to_end, donate_argnums=0),
     features=jax.jit(features),
     inner=jax.jit(inner),
@@ -278,6 +288,12 @@ def unroll_loss(
 
 def _without_encoder(params: dict[str, Params]) -> dict[str, Params]:
   return {name: params[name] for name in ("policy", "belief")}
+
+
+def _with_frozen_memory(params: dict[str, Params]) -> dict[str, Params]:
+  """Returns the same parameters, of which no gradient reaches LSTM and belief."""
+  frozen = jax.lax.stop_gradient((params["policy"]["lstm"], params["belief"]))
+  return {"policy": params["policy"] | {"lstm": frozen[0]}, "belief": frozen[1]}
 
 
 def _scaled(images: jax.Array) -> jax.Array:

@@ -125,7 +125,7 @@ def test_a_fresh_student_does_what_the_teacher_does_on_average():
   assert set(state.scales) == {"state"}
 
 
-@pytest.mark.parametrize("kind", ["encoder", "policy", "end_to_end"])
+@pytest.mark.parametrize("kind", ["encoder", "policy", "walk", "end_to_end"])
 def test_updates_lower_the_loss_and_reach_their_own_parameters(kind):
   updates, state = make_state()
   before = jax.device_get(state.student)
@@ -138,7 +138,7 @@ def test_updates_lower_the_loss_and_reach_their_own_parameters(kind):
       flat = {name: batch[name].reshape(-1, *batch[name].shape[2:]) for name in ("image", "pose")}
       state, metrics = updates.encoder(state, flat, 3e-3)
     else:
-      inputs = {k: v for k, v in batch.items() if k != ("image", "features")[kind != "policy"]}
+      inputs = {k: v for k, v in batch.items() if k != ("image", "features")[kind == "end_to_end"]}
       state, _, metrics = getattr(updates, kind)(state, inputs, carried, 3e-3)
     values.append(float(metrics["loss_encoder" if kind == "encoder" else "loss_action"]))
   assert np.mean(values[-10:]) < 0.8 * np.mean(values[:5])
@@ -150,5 +150,13 @@ def test_updates_lower_the_loss_and_reach_their_own_parameters(kind):
     )
     for name in before
   }
-  expected = {"encoder": {"encoder"}, "policy": {"policy", "belief"}, "end_to_end": set(before)}
+  expected = {
+    "encoder": {"encoder"},
+    "policy": {"policy", "belief"},
+    "walk": {"policy"},
+    "end_to_end": set(before),
+  }
   assert {name for name, did in moved.items() if did} == expected[kind]
+  if kind == "walk":
+    lstm = jax.tree.leaves(before["policy"]["lstm"]), jax.tree.leaves(after["policy"]["lstm"])
+    assert all(np.array_equal(a, b) for a, b in zip(*lstm, strict=True))
