@@ -6,8 +6,10 @@ enough); all runs get the same steps and seed.
   python benchmarks/rooms/field_ablation.py --scene out/living --steps 2500
   python benchmarks/rooms/field_ablation.py --scene out/living --change falloff near_gradient
   python benchmarks/rooms/field_ablation.py --scene out/living --passers 0.3
+  python benchmarks/rooms/field_ablation.py --scene out/living --waiting 0.3
 
-With --passers something stands in a share of the pictures that are trained on, elsewhere in each.
+With --passers something stands in a share of the pictures that are trained on, elsewhere in each;
+with --waiting somebody waits at one place in the room in as many, one after another, and leaves.
 Geometry is judged by localised points of the held-out views: how far the field's surface lies from
 them along their sight lines, as a share of their distance.
 """
@@ -35,6 +37,7 @@ from nerf2real.scenes.stages.pictures import PosedPictures
 
 _PASSER = 0.16, 0.7  # width and height of what stands there, of the picture's
 _PATCHES = 8  # of colour, along the picture's sides
+_WAITING = 0.18, 0.75  # half widths of who waits, of the median distance of localised points
 Part = Literal[
   "falloff", "near_gradient", "points", "distortion", "blur", "rate", "padding", "table"
 ]
@@ -62,6 +65,8 @@ class Settings(harness.Options):
   """Parts of the training that are changed, one a run; the first run changes nothing."""
   passers: float = 0.0
   """Share of the pictures trained on in which something stands that others do not show."""
+  waiting: float = 0.0
+  """Share of the pictures trained on, one after another, while somebody stands at one place."""
   width: int = 640
   """Width at which held-out views are scored [pixel]."""
   seed: int = 0
@@ -106,6 +111,40 @@ def with_passers(views: Views, share: float, seed: int) -> Views:
   return dataclasses.replace(views, images=images)
 
 
+def with_waiting(views: Views, share: float, seed: int) -> Views:
+  """Returns the pictures with a coloured ellipse about one place, in a share of them in a row.
+
+  The place is that of a localised point about as far from a picture in the middle of the row as
+  half of such points are; nothing hides who stands there.
+  """
+  rng = np.random.default_rng(seed)
+  images = views.images.copy()
+  height, width = images.shape[1:3]
+  count = round(share * len(images))
+  first = int(rng.integers(len(images) - count + 1))
+  middle = first + count // 2
+  far = np.median(views.anchors[:, 3])
+  seen = views.anchors[np.abs(views.anchors[:, 0] - middle) <= 1]
+  index, column, row, distance = seen[np.argmin(np.abs(seen[:, 3] - far))]
+  ray = np.linalg.inv(views.camera.matrix) @ [column, row, 1.0]
+  pose = views.world_from_camera[int(index)]
+  place = pose[:3, :3] @ (distance * ray / np.linalg.norm(ray)) + pose[:3, 3]
+  clothes = cv2.resize(rng.integers(0, 256, (_PATCHES, _PATCHES, 3), np.uint8), (width, height))
+  for picture in range(first, first + count):
+    pose = views.world_from_camera[picture]
+    at = views.camera.matrix @ (pose[:3, :3].T @ (place - pose[:3, 3]))
+    if at[2] <= 0:
+      continue
+    axes = [max(1, int(half * far * views.camera.matrix[0, 0] / at[2])) for half in _WAITING]
+    centre = at[:2] / at[2]
+    if np.abs(centre).max() > 10 * width:
+      continue
+    mask = np.zeros((height, width), np.uint8)
+    cv2.ellipse(mask, (int(centre[0]), int(centre[1])), tuple(axes), 0, 0, 360, 1, -1)
+    images[picture][mask > 0] = clothes[mask > 0]
+  return dataclasses.replace(views, images=images)
+
+
 def point_errors(renderer: Renderer, held: Views) -> np.ndarray:
   """Distances of the field's surface from localised points, by those points' distance [A]."""
   errors = []
@@ -136,6 +175,8 @@ def main(settings: Settings) -> None:
     training = training.evened()
     if settings.passers:
       training = with_passers(training, settings.passers, settings.seed)
+    if settings.waiting:
+      training = with_waiting(training, settings.waiting, settings.seed)
     chosen = dataclasses.replace(
       train.preset("fast"), max_steps=settings.steps, max_seconds=None, **CHANGES.get(part, {})
     )
