@@ -27,7 +27,7 @@ harness.one_thread()
 
 import numpy as np
 
-from benchmarks.learning.faster_walker import GAIT, start_of, walker_at
+from benchmarks.learning.faster_walker import GAIT, STEERING, start_of, walker_at
 from nerf2real.agents.distill.teacher import WalkerSettings
 from nerf2real.core.serialization import write_json
 from nerf2real.suite.environment import Environment
@@ -103,7 +103,6 @@ def walk(
   deviation = rng.uniform(0.0, noise)
   timestep = environment.reset()
   gait.reset()
-  state = environment.task.state
   yaws, places = [0.0], [np.zeros(2)]
   while not timestep.last():
     observation = timestep.observation
@@ -151,7 +150,7 @@ def search(settings: Settings, pool: concurrent.futures.Executor) -> WalkerSetti
   """Returns where the search stands when its time is over; written after every generation."""
   begin = time.monotonic()
   start = start_of(settings.walkers[0])
-  still = np.zeros(3)  # of the steering, which an empty floor does not ask for
+  still = np.zeros(len(STEERING))  # of the steering, which an empty floor does not ask for
   evolution = Evolution(np.zeros(len(GAIT)), settings.width, settings.population, settings.seed)
   generation, seed = 0, settings.seed
   while time.monotonic() - begin < 60 * settings.minutes:

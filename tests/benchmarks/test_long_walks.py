@@ -1,10 +1,13 @@
 """What long walks count as worth, and that a walk is measured as it went."""
 
+import concurrent.futures
+
 import pytest
 
 from benchmarks.learning import long_walks
-from benchmarks.learning.long_walks import COMMANDS, Walk, worth
-from nerf2real.agents.distill.teacher import TEACHERS
+from benchmarks.learning.long_walks import COMMANDS, Settings, Walk, worth
+from nerf2real.agents.distill.teacher import TEACHERS, WalkerSettings
+from nerf2real.core.serialization import read_json
 
 
 @pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
@@ -28,3 +31,15 @@ def test_a_walk_goes_as_commanded_and_noise_disturbs_it() -> None:
   assert not ahead.fell and ahead.speed > 0.1 > abs(ahead.turn)
   assert turned.turn > 0.5 and turned.speed < ahead.speed
   assert noisy != ahead
+
+
+def test_a_search_moves_the_gait_alone_and_writes_where_it_stands(tmp_path) -> None:
+  found = tmp_path / "walker.json"
+  settings = Settings(
+    walkers=("brisk",), minutes=1e-4, population=2, seconds=0.5, searched=(0,), found=found
+  )
+  with concurrent.futures.ThreadPoolExecutor(1) as pool:
+    walker = long_walks.search(settings, pool)
+  brisk = TEACHERS["brisk"]()
+  assert read_json(found, WalkerSettings) == walker
+  assert walker.steering == brisk.steering and walker.gait != brisk.gait
