@@ -128,7 +128,8 @@ def library(plant: JointPlant) -> list[Term]:
   ]
   weaker = {"motor_gain", "supply_sag", "thermal_derating"}
   terms = [v for t in terms for v in (_weakenings(plant, t) if t.kind in weaker else [t])]
-  terms = [measured_supply.bounded(plant, t) if t.kind == "supply_sag" else t for t in terms]
+  told = measured_supply.told(plant, [t for t in terms if t.kind == "supply_sag"])
+  terms = [t for t in terms if t.kind != "supply_sag"] + told
   if plant.holds:
     terms.append(_one("measurement_delay", joint, "delay", 0.0, 0.15, 0.01, _DELAYS[:-1]))
     terms.append(_play(plant, encoder_on_motor=True))
@@ -181,8 +182,12 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
   damped = plant.declared[INDEX["damping"]] > 0
   if damped and (term.kind == "thermal_derating" or (limited and term.kind == "supply_sag")):
     # What heats a motor and what its bridge draws is current, of which back-EMF takes.
+    draws = ((), (("pulsed", 1.0),)) if term.kind == "supply_sag" else ((),)
     of_current = [
-      _of_current(plant, form) for form in forms if dict(form.fixed)["scales_limit"] == limited
+      _of_current(plant, dataclasses.replace(form, fixed=(*form.fixed, *draw)))
+      for form in forms
+      if dict(form.fixed)["scales_limit"] == limited
+      for draw in draws
     ]
     forms = [dataclasses.replace(f, fixed=(*f.fixed, ("back_emf", 0.0))) for f in forms]
     forms += of_current
@@ -197,7 +202,9 @@ def _weakenings(plant: JointPlant, term: Term) -> list[Term]:
 def _of_current(plant: JointPlant, term: Term) -> Term:
   """Returns a form of heat or supply by current that begins where as much is lost as by torque."""
   torque, current = plant.declared_torque(), plant.declared_torque(of_current=True)
-  if term.kind == "supply_sag":  # duty times current, as torque
+  if dict(term.fixed).get("pulsed"):
+    more = torque.mean() / max(np.mean(current), 1e-12)
+  elif term.kind == "supply_sag":  # duty times current, as torque
     more = plant.declared[INDEX["highest"]] * torque.mean() / max(np.mean(torque * current), 1e-12)
   else:
     more = np.mean(torque**2) / max(np.mean(current**2), 1e-12)

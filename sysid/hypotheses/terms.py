@@ -213,15 +213,15 @@ def _gain(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
     p[I["damping"]] *= v["gain"]
 
 
-def _weakening(name: str, slots: tuple[str, ...]):
+def _weakening(name: str, slots: tuple[str, ...], choices: tuple[str, ...]):
   """Returns what sets an actuator's weakening, with its choices between models."""
 
   def apply(plant: JointPlant, p: Array, v: dict[str, float]) -> None:
     for slot in slots:
       p[I[slot]] = v[slot]
-    p[I[f"{name}_scales_limit"]] = v.get("scales_limit", 0.0)
     p[I[f"{name}_tells"]] = v.get("effort_tells", 1.0)
-    p[I[f"{name}_back_emf"]] = v.get("back_emf", 0.0)
+    for choice in ("scales_limit", *choices):
+      p[I[f"{name}_{choice}"]] = v.get(choice, 0.0)
 
   return apply
 
@@ -285,8 +285,8 @@ _APPLY = {
   "encoder_offset": _adder(("offset", "encoder_offset")),
   "motor_gain": _gain,
   "torque_limit": _limit,
-  "supply_sag": _weakening("sag", ("droop", "fade")),
-  "thermal_derating": _weakening("heat", ("heating", "time_constant", "derating")),
+  "supply_sag": _weakening("sag", ("droop", "fade"), ("back_emf", "pulsed")),
+  "thermal_derating": _weakening("heat", ("heating", "time_constant", "derating"), ("back_emf",)),
   "spring": _spring,
   "cogging": _setter(("amplitude", "amplitude"), ("periods", "periods"), ("phase", "phase")),
 }

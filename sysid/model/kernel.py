@@ -53,8 +53,8 @@ NAMES = (
   *("tooth_stiffness", "tooth_damping", "friction_on_link"),
   # how far the state follows the readings: share of a difference, and speed per difference
   *("follow", "follow_speed"),
-  # the same of the supply as of heat, whose load is then duty times current
-  *("sag_scales_limit", "sag_tells", "sag_back_emf"),
+  # the same of the supply as of heat, whose load is then duty times current, or the current
+  *("sag_scales_limit", "sag_tells", "sag_back_emf", "sag_pulsed"),
   # torque at a duty over the declared: nothing here needs it, what is told of the duty does
   "strength",
   # s by which the other joints' readings, which prescribe the surroundings, are late
@@ -203,7 +203,7 @@ def simulate(
   tooth_stiffness, tooth_damping = p.tooth_stiffness, p.tooth_damping
   friction_on_link = p.friction_on_link
   follow, follow_speed = p.follow, p.follow_speed
-  sag_by_current = p.sag_back_emf > 0.5 and highest < math.inf
+  sag_by_current, sag_pulsed = p.sag_back_emf > 0.5 and highest < math.inf, p.sag_pulsed > 0.5
   sag_limits, sag_tells = p.sag_scales_limit > 0.5, p.sag_tells > 0.5
   learned = weights.size > 0
   samples = sample_time.size
@@ -281,7 +281,7 @@ def simulate(
       if droop > 0.0 or fade != 0.0:
         if sag_by_current:
           full = before / supply
-          duty = full / highest
+          duty = np.sign(full) if sag_pulsed else full / highest
           weaker = laws.strength_of_source(
             duty * full, duty * damping * v, load[i], time, droop, fade
           )

@@ -166,7 +166,8 @@ class SupplySag(Operator):
 
   Strength is 1 - droop * load - fade * time, at least 0.1; the load is the sum of |torque| of the
   last step. With `back_emf` an actuator with a limit, its torque at full duty, adds what its bridge
-  draws in its place, duty times current, negative where it gives back.
+  draws in its place, negative where it gives back: duty times current in the mean, or, `pulsed`,
+  the current itself, which flows while the bridge is on and lowers what the motor has of it then.
   """
 
   def bind(self, binding: Binding) -> None:
@@ -181,7 +182,7 @@ class SupplySag(Operator):
       self.value(self.effects[0], "back_emf") > 0
     )
     self._per_limit = np.where(bridges, 1.0 / np.maximum(limit, 1e-9), 0.0)
-    self._others = ~bridges
+    self._others, self._pulsed = ~bridges, self.value(self.effects[0], "pulsed") > 0
     self.reset()
 
   def reset(self) -> None:
@@ -194,7 +195,7 @@ class SupplySag(Operator):
       strength = laws.strength_of_supply(load, time, self._droop, self._fade)
     else:
       full = torque / self._strength
-      duty = full * self._per_limit
+      duty = np.sign(full) * ~self._others if self._pulsed else full * self._per_limit
       drawn, spared = float(duty @ full), float(duty @ self._torque.of_back_emf(binding))
       strength = laws.strength_of_source(drawn, spared, load, time, self._droop, self._fade)
     self._strength = strength
@@ -213,6 +214,10 @@ def _choice(name: str, doc: str) -> Parameter:
 _SCALES_LIMIT = _choice("scales_limit", "1 if the actuator's limits weaken with it, 0 if they stay")
 _BACK_EMF = _choice(
   "back_emf", "1 if the joint's damping is a motor's back-EMF, which takes from the current, else 0"
+)
+
+_PULSED = _choice(
+  "pulsed", "1 if no capacitor averages what a bridge draws, the motor's current while on, else 0"
 )
 
 
@@ -283,6 +288,7 @@ KINDS = (
       Parameter("fade", "1/s", 0.0, 0.0, 0.03, "loss per second", minimum=0.0),
       _SCALES_LIMIT,
       _BACK_EMF,
+      _PULSED,
     ),
     SupplySag,
   ),

@@ -116,7 +116,8 @@ def strength_of_source(
 ) -> float:
   """Returns the voltage of a source with a resistance, over that without load.
 
-  Bridges draw duty times current, and the current is the voltage's less what back-EMF takes:
+  Bridges draw duty times current in the mean, or the current while they are on (then the duty is 1
+  or -1 here), and the current is the voltage's less what back-EMF takes:
   s = 1 - droop (s drawn - spared) - droop load - fade time, solved for s.
 
   Args:

@@ -203,6 +203,16 @@ def test_supply_sag_settles_where_load_and_strength_agree():
   assert data.actuator_force[0] == pytest.approx(2 * (1 - 0.5 * 0.2), rel=1e-6)
 
 
+@pytest.mark.parametrize(("pulsed", "strength"), [(0.0, 1 / 1.08), (1.0, 1 / 1.2)])
+def test_a_source_with_a_resistance_feeds_a_bridge(pulsed, strength):
+  # Stalled at a duty of 2/5: in the mean 0.4 * 2 s are drawn, 2 s while the bridge is on.
+  model = _hinge(joint='frictionloss="9"')
+  model.actuator_forcelimited[:], model.actuator_forcerange[:] = 1, (-5, 5)
+  values = {"droop": 0.1, "back_emf": 1.0, "pulsed": pulsed}
+  _, _, _, data = _run(model, [Effect("supply_sag", None, values)], np.full(200, 2.0))
+  assert data.actuator_force[0] == pytest.approx(2 * strength, rel=1e-3)
+
+
 def test_spring_beside_a_spring():
   model = _hinge(joint='damping="0.2" stiffness="1" springref="28.64788975654116"')  # 0.5 rad
   effect = Effect("spring", "hinge", {"stiffness": 3.0, "reference": -0.1})

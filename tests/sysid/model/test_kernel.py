@@ -54,6 +54,11 @@ CASES = [
     3e-4,
   ),
   ("supply_sag", {"droop": 0.4, "fade": 0.01, "scales_limit": 1, "back_emf": 1}, 3e-4),
+  (
+    "supply_sag",
+    {"droop": 0.1, "fade": 0.01, "scales_limit": 1, "back_emf": 1, "pulsed": 1},
+    3e-4,
+  ),
   ("torque_limit", {"limit": 1.2}, 1e-6),
   ("supply_sag", {"droop": 0.05, "fade": 0.01}, 3e-4),
   ("thermal_derating", {"heating": 2.0, "time_constant": 20.0, "derating": 0.004}, 3e-4),
