@@ -130,21 +130,30 @@ def main(settings: Settings) -> None:
 
 
 def _pool(settings: Settings) -> None:
-  """Prints and keeps the table of several runs together."""
-  rows: list[dict[str, Any]] = []
+  """Prints and keeps the table of several runs together, and the figures of each generator's."""
+  parts: dict[str, list[dict[str, Any]]] = {}
   for page in settings.pool:
     path = RESULTS / f"{page}.json"
     if not path.is_file():
       raise ValueError(f"Found no {path}, expected pages such as fourth/7501 after --pool.")
-    rows += json.loads(path.read_text())["scores"]
-  rows = [row | {"score": scoring.Score(**row["score"])} for row in rows]
+    scores = json.loads(path.read_text())["scores"]
+    part = parts.setdefault(page.split("/")[0], [])
+    part += [row | {"score": scoring.Score(**row["score"])} for row in scores]
+  rows = [row for part in parts.values() for row in part]
   text = render(rows, {row["set"]: {} for row in rows})
   print(text)
   folder = settings.results or RESULTS
   (folder / f"{settings.name.removeprefix('identify_')}.md").write_text(text)
-  seeds = ", ".join(page.split("/")[-1] for page in settings.pool)
   options = harness.Options(write=settings.write)
-  harness.finish(settings.name, figures_of(rows), options, seed=seeds, within="analyser")
+  for name, part in {"": rows, **parts}.items():
+    pages = [page for page in settings.pool if page.startswith(name)]
+    harness.finish(
+      f"{settings.name}_{name}".rstrip("_"),
+      figures_of(part),
+      options,
+      seed=", ".join(page.split("/")[-1] for page in pages),
+      within="analyser",
+    )
 
 
 def folder_of(answers: dict[str, Any], generator: str) -> str:
