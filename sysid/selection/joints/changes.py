@@ -37,12 +37,11 @@ _AHEAD = 3  # rivals of an effect whose further effects are tried beside it, cho
 def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   """Explains what is new at a joint, beyond the effects of wider scope that it has.
 
-  One with play, or with stops that hang on small differences of friction as play's courses do, is
-  explained by a simulation that follows the readings.
+  One with play is explained by a simulation that follows the readings.
 
-  Such a course does not repeat, so that no model of it is near a whole log; what it predicts from
-  each reading on is judged where play is in the best hypothesis of whole logs, or in the likeliest,
-  which is seldom clear of the others there.
+  A course through play does not repeat, so that no model of it is near a whole log; what it
+  predicts from each reading on is judged where play is in the best hypothesis of whole logs, or in
+  the likeliest, which is seldom clear of the others there.
   """
   whole = _explained(subject, settings)
   done = subject.now.follows or whole.verdict in ("none", "effects")
@@ -50,8 +49,8 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   if done or not (whole.found.best.names | likely.names) & set(UNREPEATED):
     return whole
   near = _explained(following(subject), settings)
-  has_play = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
-  return near if has_play or (near.named and not whole.named) else whole
+  stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
+  return near if stands else whole
 
 
 def _explained(subject: Subject, settings: Settings) -> Changed:
