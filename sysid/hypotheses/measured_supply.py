@@ -19,7 +19,9 @@ _SLACK = 2.0
 """Times the fall that the voltage tells, chosen: a servo may draw half of what the declared one
 does."""
 _LEAST = 1e-3  # of what was plausible
-_UNLIKELIER = 3.84  # twice the nats by which a form is clearly worse, at a level of 5 %
+_WORSE = 2.0
+"""Times the squares that the best form leaves, from where on another is none, chosen. What is left
+is what no form holds more than noise, so that no likelihood tells which of two is nearer."""
 _EXACT = 1e-9  # V^2: less is rounding
 _SHIFTS = np.arange(-0.02, 0.0501, 0.002)
 """s by which a voltage may show the load late, chosen: commands take a while to be torques, and
@@ -32,8 +34,8 @@ def told(plant: JointPlant, terms: Sequence[Term]) -> list[Term]:
   Where a log has no voltage, or other actuators load the supply, too, they are as they were.
   Voltage is regressed on time and on the load of the declared servo at the measured motion, by the
   duty where it is logged, when the voltage was read: single readings scatter, and are fewer than
-  others. A form is left whose load the voltage goes with about as well as with the best one's, by
-  the likelihood's ratio at the level; its values are bounded by a multiple of what is told.
+  others. A form is left whose load the voltage goes with about as well as with the best one's; its
+  values are bounded by a multiple of what is told.
   """
   read = [r.log.battery for r in plant.reductions if r.log.battery is not None]
   if len(read) < len(plant.logs) or plant.model.nu > 1 or not terms:
@@ -43,7 +45,7 @@ def told(plant: JointPlant, terms: Sequence[Term]) -> list[Term]:
   return [
     _bounded(term, fit)
     for term, fit in zip(terms, fits, strict=True)
-    if best.independent * np.log(max(fit.squares, _EXACT) / max(best.squares, _EXACT)) < _UNLIKELIER
+    if fit.squares < _WORSE * max(best.squares, _EXACT)
   ]
 
 
