@@ -58,8 +58,6 @@ class _Regressed(NamedTuple):
   """Standard deviations of that."""
   squares: float
   """Mean square that is left [V^2]."""
-  independent: float
-  """Readings that count as independent."""
 
 
 def _draw(term: Term) -> str:
@@ -91,13 +89,14 @@ def _regressed(plant: JointPlant, read: Sequence[ScalarSeries], draw: str) -> _R
 
 
 def _least_squares(columns: Array, volt: Array) -> _Regressed:
+  """Returns the regression; its deviations count neighbouring readings that go together once."""
   (full, *lost), *_ = np.linalg.lstsq(columns, volt, rcond=None)
   rest = volt - columns @ np.array([full, *lost])
   square = float(np.mean(rest**2))
   alike = float(np.clip(np.mean(rest[1:] * rest[:-1]) / max(square, _EXACT), 0.0, 0.99))
   independent = len(volt) * (1.0 - alike) / (1.0 + alike)
   spread = np.sqrt(square / independent * len(volt) * np.diag(np.linalg.pinv(columns.T @ columns)))
-  return _Regressed(np.array(lost) / full, spread[1:] / full, square, independent)
+  return _Regressed(np.array(lost) / full, spread[1:] / full, square)
 
 
 def _bounded(term: Term, fit: _Regressed) -> Term:
