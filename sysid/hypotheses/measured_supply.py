@@ -40,12 +40,10 @@ def told(plant: JointPlant, terms: Sequence[Term]) -> list[Term]:
   read = [r.log.battery for r in plant.reductions if r.log.battery is not None]
   if len(read) < len(plant.logs) or plant.model.nu > 1 or not terms:
     return list(terms)
-  fits = [_regressed(plant, read, _draw(term)) for term in terms]
-  best = min(fits, key=lambda fit: fit.squares)
+  fits = {draw: _regressed(plant, read, draw) for draw in {_draw(term) for term in terms}}
+  best = max(min(fit.squares for fit in fits.values()), _EXACT)
   return [
-    _bounded(term, fit)
-    for term, fit in zip(terms, fits, strict=True)
-    if fit.squares < _WORSE * max(best.squares, _EXACT)
+    _bounded(term, fits[_draw(term)]) for term in terms if fits[_draw(term)].squares < _WORSE * best
   ]
 
 

@@ -36,8 +36,12 @@ def test_every_page_is_where_its_sets_belong_and_in_the_index():
       assert identify.folder_of(content["answers"], generator) == page.parent.name, page
 
 
-def test_runs_are_put_together(tmp_path):
-  """Cases add up over pages, and every set is in the list."""
+def test_runs_are_put_together(tmp_path, monkeypatch):
+  """Cases add up over pages, every set is listed, each generator has figures of its own."""
+  kept_of = {}
+  monkeypatch.setattr(
+    identify.harness, "finish", lambda name, figures, *_, seed, within: kept_of.update({name: seed})
+  )
   pages = ("second/8315", "third/9115")
   kept = [json.loads((identify.RESULTS / f"{page}.json").read_text()) for page in pages]
   healthy = sum(row["score"]["mix"] == "healthy" for page in kept for row in page["scores"])
@@ -45,5 +49,10 @@ def test_runs_are_put_together(tmp_path):
   text = (tmp_path / "both.md").read_text()
   assert f"| healthy: accused | 0 % (0 to 31 %) | {healthy} |" in text
   assert all(f"| {name} " in text for page in kept for name in page["sets"])
+  assert kept_of == {
+    "identify_both": "8315, 9115",
+    "identify_both_second": "8315",
+    "identify_both_third": "9115",
+  }
   with pytest.raises(ValueError, match=r"Found no .*third/1\.json"):
     identify.main(identify.Settings(pool=("third/1",), results=tmp_path))
