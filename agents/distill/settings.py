@@ -217,8 +217,8 @@ def nerf_nav_faster() -> DistillSettings:
 
   What it sees and where it believes to be are right already; encoder and memory stay as they are.
   Students whose LSTM was fitted anew to the few frames of such a run knew their place less well,
-  above all in its first seconds (benchmarks/results/policies/navigation.md). For pictures of 60x80:
-  `--env "suite:nerf_nav?image_size=60x80"`.
+  above all in its first seconds (benchmarks/results/policies/navigation_faster.md). For pictures of
+  60x80: `--env "suite:nerf_nav?image_size=60x80"`.
   """
   return dataclasses.replace(
     adapt(),

@@ -149,7 +149,7 @@ def _brisk() -> WalkerSettings:
   taken by 60 %, as all of it falls in 4 of 27 walks with strong motors on a slippery floor, and
   this in 3; `swift` in none. With nominal and weak motors neither falls, and this needs a
   twentieth and a tenth less time. Figures, and what its students came to:
-  benchmarks/results/policies/navigation.md.
+  benchmarks/results/policies/navigation_faster.md.
   """
   gait = GaitSettings(
     stop_time=0.3181,
