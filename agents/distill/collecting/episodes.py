@@ -84,6 +84,8 @@ class _Segment:
   """Of a detour [2] [m]."""
   guide: Teacher | None = None
   """Drives the detour."""
+  is_covered: bool = False
+  """Whether the camera is."""
 
 
 class EpisodeRunner:
@@ -172,6 +174,8 @@ class EpisodeRunner:
       for name, row in rows.items():
         row.append(values[name])
       flat = self._layout.flatten(timestep.observation)
+      if segment.is_covered and flat.image is not None:
+        flat = flat._replace(image=np.zeros_like(flat.image))
       since_success += bool(episode_success(self._environment))
     arrays: dict[str, np.ndarray] = {
       name: np.asarray(rows[name], dtype) for name, (_, dtype) in kept.items()
@@ -187,6 +191,12 @@ class EpisodeRunner:
     return arrays, figures
 
   def _draw_segment(self, has_student: bool, mixture: Mixture) -> _Segment:
+    segment = self._draw_driver(has_student, mixture)
+    share = self._settings.covered_share
+    segment.is_covered = share > 0 and self._rng.random() < share  # 0 draws nothing
+    return segment
+
+  def _draw_driver(self, has_student: bool, mixture: Mixture) -> _Segment:
     settings, rng = self._settings, self._rng
     left = int(rng.integers(settings.segment[0], settings.segment[1] + 1))
     if rng.random() < settings.detour_share:

@@ -133,14 +133,14 @@ def world():
   return environment, Layout.of(environment)
 
 
-def _run(world, mixture, *, policy=None, detours=0.0):
+def _run(world, mixture, *, policy=None, detours=0.0, covered=0.0):
   environment, layout = world
   teacher = _Teacher()
   runner = episodes.EpisodeRunner(
     environment,
     layout,
     teacher=teacher,
-    settings=MixtureSettings(detour_share=detours, segment=(5, 9)),
+    settings=MixtureSettings(detour_share=detours, segment=(5, 9), covered_share=covered),
     rng=np.random.default_rng(0),
   )
   arrays, figures = runner.run(policy, mixture)
@@ -182,3 +182,15 @@ def test_without_a_student_the_teacher_drives_and_detours_are_marked(world):
   arrays, figures, _ = _run(world, schedule.Mixture(1.0, 0.0), detours=0.5)
   assert figures["student_share"] == 0
   assert set(arrays["driver"]) == {episodes.TEACHER, episodes.DETOUR}
+
+
+def test_pictures_are_black_in_some_segments_and_the_rest_is_as_it_was(world):
+  student = _Still(world[0]._environment.task.standing_action)
+  arrays, _, _ = _run(world, schedule.Mixture(0.0, 0.0), policy=student, covered=0.5)
+  is_black = ~arrays["image"].any(axis=(1, 2, 3))
+  assert 0 < is_black.mean() < 1
+  changes = np.flatnonzero(np.diff(is_black.astype(int)))
+  assert (np.diff(changes) >= 5).all()  # whole segments
+  assert arrays["state"][is_black].std() > 0 and (arrays["label"] == 0.5).all()
+  arrays, _, _ = _run(world, schedule.Mixture(0.0, 0.0), policy=student)
+  assert arrays["image"].any(axis=(1, 2, 3)).all()
