@@ -198,8 +198,8 @@ def adapt() -> DistillSettings:
 def nerf_nav_on() -> DistillSettings:
   """Navigation: a student that walks already is trained on towards a faster walk, and on views.
 
-  What it begins from is `--init-from`. The shipped policy was made with it from the one of
-  `nerf_nav` that was shipped before, which collided after starts at which its belief was wrong from
+  What it begins from is `--init-from`. The second step of the shipped policy was made with
+  it, from the student of `nerf_nav`, which collided after starts at which its belief was wrong from
   the first picture on: an episode shows one start, views show a place each. It needs a quarter to a
   third less time than that one and fails as often, still after such starts.
   """
