@@ -25,6 +25,7 @@ from nerf2real.scenes.poses.mapping import registered
 
 _LONGEST = 0.034  # s: a frame at 30 Hz; no video reads a frame for longer than it lasts
 _PRECISION = 0.002  # s of the readout: a fifth of a pixel in a fast pan
+_SEARCHED = 300  # keyframes in the search's adjustments at most: more tell the readout no better
 _TRIALS = 9  # adjustments that a search to that precision takes, for its progress
 _ROUNDS = 3  # final adjustments, each with the motion of the poses before
 _FARTHEST_NEIGHBOURS = 2.0  # s between two keyframes that say how the one between them moved
@@ -51,6 +52,16 @@ class Shutter:
     """Returns the same motion in another unit of length."""
     return dataclasses.replace(
       self, translations=scale * self.translations, depths=scale * self.depths
+    )
+
+  def of_every(self, count: int) -> "Shutter":
+    """Returns the motion of every so many of the pictures, beginning with the first."""
+    chosen = slice(None, None, count)
+    return dataclasses.replace(
+      self,
+      rotations=self.rotations[chosen],
+      translations=self.translations[chosen],
+      depths=self.depths[chosen],
     )
 
   def project(
@@ -185,30 +196,46 @@ def correct(
 ) -> tuple[pycolmap.Reconstruction, Shutter]:
   """Estimates the readout time and returns the model without its effect, and the motion.
 
+  Of many keyframes the search adjusts every so many, with the motion between all; the model
+  returned has all of them.
+
   Args:
     model: Adjusted as if all lines were read at once.
     times: When each picture was taken [s].
-    adjust: Adjusts poses, points and lens of a model in place; keeps all observations.
+    adjust: Adjusts poses, points and lens of a model in place; keeps all observations of the
+      pictures that have a pose.
     report: Called with the fraction done and a text.
   """
-  measured, done = _measured(model), 0
+  every = -(-len(registered(model)) // _SEARCHED)
+  few, done = _thinned(model, every), 0
+  seen = _measured(few)
 
-  def adjusted(readout: float, rounds: int = 1) -> pycolmap.Reconstruction:
+  def said(readout: float) -> None:
     nonlocal done
-    result = pycolmap.Reconstruction(model)
-    for _ in range(rounds):
-      _move_observations(result, measured, motion(result, times, readout))
-      adjust(result)
-      done += 1
-      report(min(1.0, done / (_TRIALS + _ROUNDS)), f"rolling shutter of {1e3 * readout:.0f} ms")
-    return result
+    done += 1
+    report(min(1.0, done / (_TRIALS + _ROUNDS)), f"rolling shutter of {1e3 * readout:.0f} ms")
 
-  best = float(
-    optimize.minimize_scalar(
-      lambda readout: _cost(adjusted(readout), measured),
-      bounds=(-_LONGEST, _LONGEST),
-      options={"xatol": _PRECISION},
-    ).x
-  )
-  result = adjusted(best, _ROUNDS)
+  def cost(readout: float) -> float:
+    tried = pycolmap.Reconstruction(few)
+    _move_observations(tried, seen, motion(model, times, readout).of_every(every))
+    adjust(tried)
+    said(readout)
+    return _cost(tried, seen)
+
+  bounds, precision = (-_LONGEST, _LONGEST), {"xatol": _PRECISION}
+  best = float(optimize.minimize_scalar(cost, bounds=bounds, options=precision).x)
+  result, measured = pycolmap.Reconstruction(model), _measured(model)
+  for _ in range(_ROUNDS):
+    _move_observations(result, measured, motion(result, times, best))
+    adjust(result)
+    said(best)
   return result, motion(result, times, best)
+
+
+def _thinned(model: pycolmap.Reconstruction, every: int) -> pycolmap.Reconstruction:
+  """Returns a model with every so many of the pictures."""
+  result = pycolmap.Reconstruction(model)
+  for row, image in enumerate(registered(result)):
+    if row % every:
+      result.deregister_frame(image.frame_id)
+  return result

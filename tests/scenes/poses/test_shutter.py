@@ -70,6 +70,23 @@ def test_the_readout_time_is_found(readout):
   assert corrected.compute_mean_reprojection_error() < 0.45  # of noise 0.3 in two directions
 
 
+def test_the_readout_time_of_many_keyframes_is_looked_for_in_some_of_them(monkeypatch):
+  monkeypatch.setattr(shutter, "_SEARCHED", PICTURES // 2)
+  model, times = filmed(0.02, noise=0.3)
+  ADJUST(model)
+  adjusted = []
+
+  def adjust(part):
+    adjusted.append(len(mapping.registered(part)))
+    ADJUST(part)
+
+  corrected, found = shutter.correct(model, times, adjust)
+  assert found.readout == pytest.approx(0.02, abs=2e-3)
+  assert set(adjusted[:-3]) == {PICTURES // 2}
+  assert adjusted[-3:] == [PICTURES] * 3
+  assert len(mapping.registered(corrected)) == len(mapping.registered(model)) == PICTURES
+
+
 def seen_while_turning():
   """Returns a motion, a picture of it, and where it shows points: at its middle line, as read."""
   model, times = filmed(0.03)
