@@ -167,10 +167,12 @@ def choose_pairs(
     return exhaustive_pairs(number), f"exhaustive ({number} keyframes)"
   chain = sequential_pairs(number, settings.overlap)
   keyframes = sparse_keyframes(number, settings.loop_keyframes)
+  # In sparse keyframes: what the camera saw moments ago always scores best, and closes no loop.
+  apart = settings.overlap * int(keyframes[1] - keyframes[0]) if len(keyframes) > 1 else 0
   loops = loop_pairs(
     keyframes,
     score(keyframes),
-    min_distance=settings.overlap,
+    min_distance=apart,
     per_keyframe=settings.loop_closures,
     min_score=settings.min_score,
   )

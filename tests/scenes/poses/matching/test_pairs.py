@@ -58,6 +58,20 @@ def test_pairs_grow_linearly_and_connect_everything(count):
   assert len(second_round) > 50  # the second round is tied to the first
 
 
+def test_loops_of_a_dense_film_are_closed_with_places_seen_before_not_with_moments_ago():
+  """A camera that goes round twice: what it sees is alike in neighbours, and a round later."""
+  count, lap = 1000, 500
+
+  def score(keyframes):
+    apart = np.abs(keyframes[:, None] - keyframes[None])
+    near = np.minimum(apart, np.abs(apart - lap))
+    return np.where(apart == 0, 0, np.maximum(0, 200 - near - 40 * (apart > lap // 2)))
+
+  pairs, _ = choose_pairs(np.full(count, 4000), PairSettings(), score=score)
+  again = {i for pair in pairs if abs(pair[1] - pair[0] - lap) <= 8 for i in pair}
+  assert len(again) >= count // 4 - 8  # nearly every keyframe that is scored
+
+
 def test_few_keyframes_are_matched_exhaustively():
   def never(_):
     raise AssertionError("no scores are needed")
