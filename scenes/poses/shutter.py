@@ -25,7 +25,7 @@ from nerf2real.scenes.poses.mapping import registered
 
 _LONGEST = 0.034  # s: a frame at 30 Hz; no video reads a frame for longer than it lasts
 _PRECISION = 0.002  # s of the readout: a fifth of a pixel in a fast pan
-_SEARCHED = 300  # keyframes in the search's adjustments at most: more tell the readout no better
+_SEARCHED = 300  # keyframes in the search's adjustments at most, chosen: as many as a film has
 _TRIALS = 9  # adjustments that a search to that precision takes, for its progress
 _ROUNDS = 3  # final adjustments, each with the motion of the poses before
 _FARTHEST_NEIGHBOURS = 2.0  # s between two keyframes that say how the one between them moved

@@ -167,7 +167,7 @@ def choose_pairs(
     return exhaustive_pairs(number), f"exhaustive ({number} keyframes)"
   chain = sequential_pairs(number, settings.overlap)
   keyframes = sparse_keyframes(number, settings.loop_keyframes)
-  # In sparse keyframes: what the camera saw moments ago always scores best, and closes no loop.
+  # In sparse keyframes: what the camera saw moments ago scores best, and closes no loop.
   apart = settings.overlap * int(keyframes[1] - keyframes[0]) if len(keyframes) > 1 else 0
   loops = loop_pairs(
     keyframes,
