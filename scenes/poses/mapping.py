@@ -22,7 +22,7 @@ _LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]
 _MAX_PRINCIPAL_SHIFT = 0.08  # of the principal point from the middle, times the picture's size
 _MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative
 _MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels
-_NOTHING = (ValueError, RuntimeError)  # what pycolmap raises
+NOTHING = (ValueError, RuntimeError)  # what pycolmap raises
 
 
 def map_globally(
@@ -46,7 +46,7 @@ def map_globally(
     try:
       with quiet():
         found = pycolmap.global_mapping(str(copy), str(images_folder), str(models), options=options)
-    except _NOTHING:  # no connected pictures: the other mapper is tried, then the count is reported
+    except NOTHING:  # no connected pictures: the other mapper is tried, then the count is reported
       found = {}
   return _largest_first(found)
 
@@ -54,7 +54,28 @@ def map_globally(
 def map_incrementally(
   database: Path, images_folder: Path, *, seed: int, report: Progress = no_progress
 ) -> list[pycolmap.Reconstruction]:
-  """Adds picture after picture; the largest model first.
+  """Adds picture after picture; the largest model first."""
+  options = incremental_options(seed)
+  total, seen = len(image_ids(database)), 0
+
+  def next_image() -> None:
+    nonlocal seen
+    seen += 1
+    report(min(1.0, seen / total), f"placed {min(seen, total)} of {total} pictures")
+
+  with tempfile.TemporaryDirectory(dir=database.parent) as folder:
+    try:
+      with quiet():
+        found = pycolmap.incremental_mapping(
+          str(database), str(images_folder), folder, options=options, next_image_callback=next_image
+        )
+    except NOTHING:
+      found = {}
+  return _largest_first(found)
+
+
+def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+  """Returns how pictures are added one after the other.
 
   Thresholds are softer than COLMAP's: a blurred keyframe between two halves of a room has few
   matches, and refusing it splits the model (living room: 82 + 69 keyframes, with these 151).
@@ -69,22 +90,7 @@ def map_incrementally(
   options.ba_global_max_refinements = 2
   options.ba_global_max_num_iterations = 30
   options.ba_local_max_num_iterations = 15
-  total, seen = len(image_ids(database)), 0
-
-  def next_image() -> None:
-    nonlocal seen
-    seen += 1
-    report(min(1.0, seen / total), f"placed {min(seen, total)} of {total} pictures")
-
-  with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-    try:
-      with quiet():
-        found = pycolmap.incremental_mapping(
-          str(database), str(images_folder), folder, options=options, next_image_callback=next_image
-        )
-    except _NOTHING:
-      found = {}
-  return _largest_first(found)
+  return options
 
 
 def _largest_first(models: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:

@@ -17,7 +17,7 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, refinement, shutter
+from nerf2real.scenes.poses import agreement, mapping, refinement, shutter
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -172,7 +172,7 @@ def _map(
     check_registered(model, names, settings, share, film=film)
   if not lens.principal:
     warnings.append(f"Lens: estimated {lens.words}.")
-  return Mapped(model, f"{words}, {mapper} mapper; lens: {lens.words}", tuple(warnings), lens)
+  return Mapped(model, f"{words}, {mapper}; lens: {lens.words}", tuple(warnings), lens)
 
 
 def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -> Mapped:
@@ -199,7 +199,11 @@ def _picture_width(database: Path) -> int:
 def _best_model(
   database: Path, images_folder: Path, count: int, settings: LocaliseSettings, steps: Steps
 ) -> tuple[pycolmap.Reconstruction | None, str]:
-  """Runs the mapper of the settings, and the other one if that leaves too many keyframes out."""
+  """Runs the mapper of the settings, and the other one if that leaves too many keyframes out.
+
+  Returns:
+    The model, and how it came about.
+  """
   mappers = {"global": mapping.map_globally, "incremental": mapping.map_incrementally}
   if settings.mapper == "auto":
     order = ["incremental", "global"]
@@ -209,7 +213,7 @@ def _best_model(
     order = [settings.mapper]
   else:
     raise ValueError(f"mapper is {settings.mapper!r}, expected 'auto', 'global' or 'incremental'.")
-  best, chosen = None, order[0]
+  best, chosen = None, f"{order[0]} mapper"
   for name in order:
     models = mappers[name](database, images_folder, seed=settings.seed, report=steps.report)
     if models:
@@ -218,8 +222,12 @@ def _best_model(
           mapping.MAX_ERROR, mapping.MIN_ANGLE
         )
       mapping.drop_weak_images(models[0])
-      if best is None or models[0].num_reg_images() > best.num_reg_images():
-        best, chosen = models[0], name
+      model, moved = agreement.place_again(
+        models[0], database, images_folder, seed=settings.seed, report=steps.report
+      )
+      if best is None or model.num_reg_images() > best.num_reg_images():
+        best, chosen = model, f"{name} mapper"
+        chosen += f", {moved} pictures placed by what the others see" if moved else ""
     if best is not None and best.num_reg_images() >= settings.repair_below * count:
       break
   return best, chosen
