@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from nerf2real.core.rotations import camera_axes
 
-_RATE = 120.0  # samples of the path a second
+RATE = 120.0  # samples of a path a second
 _SMOOTHING = 0.5  # standard deviation of the filter that rounds off the rounds' joints [s]
 _CENTRE = np.array([0.32, -0.17])  # of the open floor [m]
 
@@ -104,10 +104,10 @@ def _round_samples(part: Round, count: int) -> np.ndarray:
 
 
 def _path_samples(seconds: float) -> np.ndarray:
-  """The rounds, joined by straight walks across the room, [T, 5] at _RATE."""
-  rounds = [_round_samples(r, max(int(r.share * seconds * _RATE), 2)) for r in ROUNDS]
+  """The rounds, joined by straight walks across the room, [T, 5] at RATE."""
+  rounds = [_round_samples(r, max(int(r.share * seconds * RATE), 2)) for r in ROUNDS]
   crossing = (1 - sum(r.share for r in ROUNDS)) / (len(ROUNDS) - 1)
-  s = np.linspace(0, 1, max(int(crossing * seconds * _RATE), 2))[1:-1, None]
+  s = np.linspace(0, 1, max(int(crossing * seconds * RATE), 2))[1:-1, None]
   parts = [rounds[0]]
   for part in rounds[1:]:
     last, first = parts[-1][-1], part[0]
@@ -126,21 +126,28 @@ def _shake(rng: np.random.Generator, times: np.ndarray, low: float, high: float)
   return (amplitude * np.sin(2 * np.pi * frequencies * times[:, None] + phase)).sum(-1)
 
 
-class Walk:
+class HandHeld:
   """A smooth path: `pose(times)` gives the camera at any time."""
 
-  def __init__(self, seed: int, *, seconds: float, shake_position=0.006, shake_angle=0.007):
+  def __init__(
+    self,
+    samples: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    seconds: float,
+    shake_position=0.006,
+    shake_angle=0.007,
+  ):
     """Lays out the path.
 
     Args:
-      seed: Seed of the shake.
+      samples: Position (3) [m], heading and pitch [rad], RATE a second [T, 5].
+      rng: Of the shake.
       seconds: Length of the film [s].
       shake_position: Standard deviation of the hand's shake along each axis [m].
       shake_angle: Standard deviation of the hand's shake about each axis [rad].
     """
-    rng = np.random.default_rng([seed, 4])
-    samples = _path_samples(seconds)
-    sigma = min(_SMOOTHING, 0.05 * seconds) * _RATE
+    sigma = min(_SMOOTHING, 0.05 * seconds) * RATE
     samples = gaussian_filter1d(samples, sigma, axis=0, mode="nearest")
     position, (heading, pitch) = samples[:, :3], samples[:, 3:].T
     times = np.linspace(0, seconds, len(samples))
@@ -169,3 +176,17 @@ class Walk:
     pose[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
     pose[:, :3, 3] = self._position(times)
     return pose
+
+
+class Walk(HandHeld):
+  """The path through the built-in room."""
+
+  def __init__(self, seed: int, *, seconds: float, shake_position=0.006, shake_angle=0.007):
+    """Lays out the path; the seed is the shake's, the rest as in `HandHeld`."""
+    super().__init__(
+      _path_samples(seconds),
+      np.random.default_rng([seed, 4]),
+      seconds=seconds,
+      shake_position=shake_position,
+      shake_angle=shake_angle,
+    )

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from nerf2real.core.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.serialization import from_plain, to_plain, write_json
 from nerf2real.scenes.builtin import camera_path, furniture, room
+from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
 TRUTH_VERSION = 1
@@ -86,20 +87,55 @@ def shoot(seed: int, settings: FilmSettings) -> Iterator[tuple[np.ndarray, np.nd
     shake_angle=settings.shake_angle,
   )
   rng = np.random.default_rng([seed, 5])
-  offsets = ((np.arange(settings.subframes) + 0.5) / settings.subframes - 0.5) * settings.exposure
   with room.room_eye(seed) as eye:
     for index in range(settings.frames):
       middle = min((index + 0.5) / settings.frame_rate, settings.seconds)
-      picture: Any = np.zeros((settings.camera.height, settings.camera.width, 3), np.float32)
-      for pose in path.pose(middle + offsets):
-        picture += eye.render(settings.camera, pose, supersample=settings.supersample)[0]
-      picture /= settings.subframes
-      if settings.lens_blur:
-        picture = cv2.GaussianBlur(picture, (0, 0), settings.lens_blur)
-      deviation = np.sqrt(settings.read_noise**2 + settings.shot_noise * picture)
-      noisy = picture + deviation * rng.standard_normal(picture.shape, np.float32)
-      noisy = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-      yield noisy, picture, path.pose(np.array([middle]))[0]
+      picture = exposed(eye, path, middle, settings)
+      yield with_noise(picture, settings, rng), picture, path.pose(np.array([middle]))[0]
+
+
+def exposed(
+  eye: Eye, path: camera_path.HandHeld, middle: float, settings: FilmSettings
+) -> np.ndarray:
+  """Returns what falls on the sensor while the shutter is open, float32 [H, W, 3].
+
+  Args:
+    eye: Of the room.
+    path: Of the camera.
+    middle: Of the exposure [s].
+    settings: Of the film.
+  """
+  offsets = ((np.arange(settings.subframes) + 0.5) / settings.subframes - 0.5) * settings.exposure
+  picture: Any = np.zeros((settings.camera.height, settings.camera.width, 3), np.float32)
+  for pose in path.pose(middle + offsets):
+    picture += eye.render(settings.camera, pose, supersample=settings.supersample)[0]
+  picture /= settings.subframes
+  return cv2.GaussianBlur(picture, (0, 0), settings.lens_blur) if settings.lens_blur else picture
+
+
+def with_noise(picture: np.ndarray, settings: FilmSettings, rng: np.random.Generator) -> np.ndarray:
+  """Returns what the sensor reads of a picture, uint8 [H, W, 3]."""
+  deviation = np.sqrt(settings.read_noise**2 + settings.shot_noise * picture)
+  noisy = picture + deviation * rng.standard_normal(picture.shape, np.float32)
+  return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def encode(path: Path, pictures: Iterable[np.ndarray], settings: FilmSettings) -> None:
+  """Writes pictures uint8 [H, W, 3] to an .mp4 file (H.264)."""
+  with av.open(str(path), "w") as container:
+    stream = container.add_stream("libx264", rate=round(settings.frame_rate))
+    stream.width, stream.height = settings.camera.width, settings.camera.height
+    stream.pix_fmt = "yuv420p"
+    stream.options = {
+      "crf": str(settings.quality),
+      "preset": settings.speed,
+      "g": "150",
+      "tune": "psnr",
+      "x264-params": f"chroma-qp-offset={_CHROMA_OFFSET}",
+    }
+    for picture in pictures:
+      container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+    container.mux(stream.encode())
 
 
 def film(
@@ -125,26 +161,16 @@ def film(
   out_video.parent.mkdir(parents=True, exist_ok=True)
   truth_path.parent.mkdir(parents=True, exist_ok=True)
   poses = []
+
+  def pictures() -> Iterator[np.ndarray]:
+    for index, (noisy, _, pose) in enumerate(shoot(seed, settings)):
+      yield noisy
+      poses.append(pose)
+      done = index + 1
+      progress(done / settings.frames, f"picture {done} of {settings.frames}")
+
   with files.atomic_path(out_video) as partial, files.atomic_path(truth_path) as partial_truth:
-    with av.open(str(partial), "w") as container:
-      rate = round(settings.frame_rate)
-      stream = container.add_stream("libx264", rate=rate)
-      stream.width, stream.height = settings.camera.width, settings.camera.height
-      stream.pix_fmt = "yuv420p"
-      stream.options = {
-        "crf": str(settings.quality),
-        "preset": settings.speed,
-        "g": "150",
-        "tune": "psnr",
-        "x264-params": f"chroma-qp-offset={_CHROMA_OFFSET}",
-      }
-      for index, (noisy, _, pose) in enumerate(shoot(seed, settings)):
-        frame = av.VideoFrame.from_ndarray(noisy, format="rgb24")
-        container.mux(stream.encode(frame))
-        poses.append(pose)
-        done = index + 1
-        progress(done / settings.frames, f"picture {done} of {settings.frames}")
-      container.mux(stream.encode())
+    encode(partial, pictures(), settings)
     write_json(partial_truth, truth(seed, settings, np.array(poses)), indent=None)
 
 

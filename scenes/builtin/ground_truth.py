@@ -1,11 +1,11 @@
-"""Measures a reconstruction of the built-in room against its truth.
+"""Measures a reconstruction of a known room, the built-in one by default, against its truth.
 
 The truth's frame and the reconstruction's world differ by a turn about the vertical and a shift,
 which nothing but a marker's place fixes; they are taken from the camera positions, and told. Scale
 is not: its error counts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from nerf2real.core.serialization import to_plain
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.builtin import filming, furniture, room
+from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.geometry import convex
 from nerf2real.scenes.quality import collision_error, image_quality, sight_lines
 from nerf2real.scenes.quality import held_out as evaluate
@@ -34,20 +35,33 @@ _ROBOT_VIEWS = 24
 _CLEARANCE = 0.35  # of a robot view from everything [m]
 _SURFACE_POINTS = 60_000
 
+Pictures = Mapping[str, np.ndarray]
+"""Poses of a robot's camera `world_from_camera` [N, 4, 4], and for every size what it truly sees,
+`images_HxW` uint8 [N, H, W, 3]."""
+
 
 def robot_camera(height: int, width: int) -> Camera:
   """The OP3's camera at a picture size."""
   return Camera.from_vertical_fov(_VERTICAL_FOV, width, height)
 
 
-def robot_poses(count: int = _ROBOT_VIEWS, *, seed: int = 0) -> np.ndarray:
-  """Poses [N, 4, 4] of the robot's camera, uniform over the open floor, looking ahead and down."""
+def robot_poses(
+  count: int = _ROBOT_VIEWS, *, seed: int = 0, true_room: room.TrueRoom | None = None
+) -> np.ndarray:
+  """Poses [N, 4, 4] of the robot's camera, uniform over the open floor, looking ahead and down.
+
+  Args:
+    count: Number of poses N.
+    seed: Of the poses, and of the built-in room.
+    true_room: Which room; the built-in one for None.
+  """
   rng = np.random.default_rng([seed, 7])
-  half = np.array(furniture.ROOM_SIZE[:2]) / 2
+  true_room = true_room or room.builtin(seed)
+  half = np.array(true_room.size[:2]) / 2
   poses: list[np.ndarray] = []
   while len(poses) < count:
     position = np.array([*rng.uniform(-half, half), _EYE_HEIGHT])
-    if room.collision_truth(position[None], seed=seed)[0] < _CLEARANCE:
+    if true_room.distance(position[None])[0] < _CLEARANCE:
       continue
     yaw, tilt = (
       rng.uniform(-np.pi, np.pi),
@@ -61,15 +75,21 @@ def robot_poses(count: int = _ROBOT_VIEWS, *, seed: int = 0) -> np.ndarray:
   return np.stack(poses)
 
 
-def write_robot_views(path: Path, *, seed: int = 0) -> None:
-  """Films what the robot's camera truly sees at the policies' picture sizes (needs EGL)."""
-  poses = robot_poses(seed=seed)
+def robot_views(poses: np.ndarray, eye: Eye) -> dict[str, np.ndarray]:
+  """Returns what the robot's camera truly sees from poses [N, 4, 4], at the policies' sizes."""
   arrays: dict[str, np.ndarray] = {"world_from_camera": poses}
+  for height, width in evaluate.ROBOT_SIZES:
+    camera = robot_camera(height, width)
+    pictures = [room.true_view(camera, pose, eye=eye)[0] for pose in poses]
+    arrays[f"images_{height}x{width}"] = np.stack(pictures)
+  return arrays
+
+
+def write_robot_views(path: Path, *, seed: int = 0) -> None:
+  """Films what the robot's camera truly sees of the built-in room (needs EGL)."""
+  poses = robot_poses(seed=seed)
   with room.room_eye(seed) as eye:
-    for height, width in evaluate.ROBOT_SIZES:
-      camera = robot_camera(height, width)
-      pictures = [room.true_view(camera, pose, seed=seed, eye=eye)[0] for pose in poses]
-      arrays[f"images_{height}x{width}"] = np.stack(pictures)
+    arrays = robot_views(poses, eye)
   with files.atomic_path(path) as partial:
     np.savez_compressed(partial, **arrays)  # type: ignore[arg-type]
 
@@ -82,13 +102,23 @@ def measure(result: Reconstruction) -> TruthFigures:
   return compare(result, true_poses)
 
 
-def compare(result: Reconstruction, true_poses: np.ndarray) -> TruthFigures:
+def compare(
+  result: Reconstruction,
+  true_poses: np.ndarray,
+  *,
+  true_room: room.TrueRoom | None = None,
+  pictures: Pictures | None = None,
+) -> TruthFigures:
   """Measures poses, scale, floor, robot views and contact geometry against the truth.
 
   Args:
-    result: A reconstruction of the built-in room.
+    result: A reconstruction of a room.
     true_poses: Where its localised keyframes were taken [N, 4, 4], the room's frame.
+    true_room: Which room; the built-in one for None.
+    pictures: What the robot's camera truly sees of it; the shipped ones for None.
   """
+  true_room = true_room or room.builtin()
+  pictures = np.load(ROBOT_VIEWS) if pictures is None else pictures
   world = result.alignment.world_from_unit.apply_pose(result.localisation.world_from_camera)
   found, true = world[:, :3, 3], true_poses[:, :3, 3]
   free = Similarity.fit(found, true)  # poses may differ by any similarity
@@ -109,19 +139,19 @@ def compare(result: Reconstruction, true_poses: np.ndarray) -> TruthFigures:
   views: list[evaluate.ViewScore] = []
   to_unit = result.alignment.world_from_unit.inverse() @ rigid.inverse()
   for height, width in evaluate.ROBOT_SIZES:
-    scores = _robot_scores(result, to_unit, height, width)
+    scores = _robot_scores(result, to_unit, pictures, height, width)
     size = "" if (height, width) == evaluate.ROBOT_SIZES[0] else f"_{height}x{width}"
     figures[f"robot_psnr{size}_db"] = float(np.mean([score.psnr_db for score in scores]))
     views = views or scores
-  figures |= _contact_figures(result, rigid) | _judge_figures(result, rigid)
+  figures |= _contact_figures(result, rigid, true_room)
+  figures |= _judge_figures(result, rigid, true_room)
   # Where the truth's frame lies: benchmarks compare other pictures of the bundle with the truth.
   return TruthFigures({**figures, "room_from_world": to_plain(rigid)}, views)
 
 
 def _robot_scores(
-  result: Reconstruction, to_unit: Similarity, height: int, width: int
+  result: Reconstruction, to_unit: Similarity, arrays: Pictures, height: int, width: int
 ) -> list[evaluate.ViewScore]:
-  arrays = np.load(ROBOT_VIEWS)
   camera = robot_camera(height, width)
   scores = []
   for number, (pose, true) in enumerate(
@@ -153,15 +183,17 @@ def moved(parts: Sequence[convex.Part], transform: Similarity) -> list[convex.Pa
   return found
 
 
-def _box(result: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
+def _box(result: Reconstruction, true_room: room.TrueRoom) -> tuple[np.ndarray, np.ndarray]:
   """Lower and upper corner [3] of where contact geometry is judged, in the truth's frame."""
-  half = np.array(furniture.ROOM_SIZE[:2]) / 2 + 0.1
+  half = np.array(true_room.size[:2]) / 2 + 0.1
   return np.array([*-half, 0.0]), np.array([*half, result.collision_top])
 
 
-def _judge_figures(result: Reconstruction, rigid: Similarity) -> dict[str, float]:
+def _judge_figures(
+  result: Reconstruction, rigid: Similarity, true_room: room.TrueRoom
+) -> dict[str, float]:
   """Faults that the judge by sight lines finds in the true surfaces: all of them are its own."""
-  lower, upper = _box(result)
+  lower, upper = _box(result, true_room)
   lines = sight_lines.sight_lines(
     result.localisation,
     result.held_out,
@@ -171,7 +203,7 @@ def _judge_figures(result: Reconstruction, rigid: Similarity) -> dict[str, float
   )
   if not len(lines.eyes):
     return {}
-  judged = sight_lines.judge_truth(lines, lambda points: np.abs(room.collision_truth(points)))
+  judged = sight_lines.judge_truth(lines, lambda points: np.abs(true_room.distance(points)))
   return {
     "sight_lines_blocked_by_truth": judged.blocked,
     "sight_lines_blocked_by_truth_p95_m": judged.blocked_p95,
@@ -179,17 +211,19 @@ def _judge_figures(result: Reconstruction, rigid: Similarity) -> dict[str, float
   }
 
 
-def _contact_figures(result: Reconstruction, rigid: Similarity) -> dict[str, float]:
+def _contact_figures(
+  result: Reconstruction, rigid: Similarity, true_room: room.TrueRoom
+) -> dict[str, float]:
   """Distances between the convex parts and the true surfaces, in the truth's frame."""
-  lower, upper = _box(result)
+  lower, upper = _box(result, true_room)
   error = collision_error.collision_error(
     moved(result.parts, rigid),
-    room.sample_surface(_SURFACE_POINTS)[0],
+    true_room.surface(_SURFACE_POINTS, np.random.default_rng([0, 2]))[0],
     eyes=rigid.apply(result.depth.positions),
     lower=lower,
     upper=upper,
     floor_threshold=result.alignment.floor_threshold,
-    distance_to_surface=lambda points: np.abs(room.collision_truth(points)),
+    distance_to_surface=lambda points: np.abs(true_room.distance(points)),
   )
   return {
     "collision_true_p95_m": error.parts_to_surface_p95,

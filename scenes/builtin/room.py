@@ -4,7 +4,9 @@
 in it depends on the camera: the lights are fixed, the materials have no gloss.
 """
 
+import dataclasses
 import functools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -17,7 +19,7 @@ from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 
 _TRUE_VIEW_ROWS = 960  # a true view is sampled with about this many rows
-_LIGHTS = (  # direction of travel, strength: a window in the west, bounce from everywhere else
+LIGHTS = (  # direction of travel, strength: a window in the west, bounce from everywhere else
   ((0.80, -0.15, -0.55), (0.40, 0.40, 0.38)),
   ((-0.20, 0.10, -1.00), (0.22, 0.215, 0.20)),
   ((-0.85, 0.35, -0.25), (0.14, 0.135, 0.125)),
@@ -25,61 +27,84 @@ _LIGHTS = (  # direction of travel, strength: a window in the west, bounce from 
   ((0.10, 0.95, -0.15), (0.15, 0.148, 0.14)),
   ((0.00, 0.05, 1.00), (0.18, 0.17, 0.155)),
 )
-_AMBIENT = 0.50
+AMBIENT = 0.50
 _GLOW = {"window": 0.35}  # emission by texture
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class TrueRoom:
+  """A room whose surfaces are known: z up, floor z = 0, the origin in the middle of the floor."""
+
+  solids: tuple[solids.Solid, ...]
+  """All of it, walls and floor included."""
+  size: tuple[float, float, float]
+  """Along x, y and z [m]; all free space is within."""
+
+  def distance(self, points: np.ndarray, *, limit: float = np.inf) -> np.ndarray:
+    """Returns the signed distance from points [P, 3] to the room's surfaces [P] [m].
+
+    Positive in free space, where it is exact; negative inside walls and furniture.
+    """
+    return solids.distance(self.solids, points, limit=limit)
+
+  def surface(
+    self, count: int, rng: np.random.Generator, *, margin: float = 0.02
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points on the surfaces that border free space, uniform by area.
+
+    Args:
+      count: Number of points N.
+      rng: Of the choice of points.
+      margin: Free space that must lie in front of a point along its normal [m].
+
+    Returns:
+      Points [N, 3] and outward normals [N, 3].
+    """
+    meshes = [(solids.tessellate(solid), solid) for solid in self.solids]
+    triangles = np.concatenate(
+      [m.vertices[m.faces] @ solid.rotation.T + solid.position for m, solid in meshes]
+    )
+    normals = np.concatenate([m.normals[m.faces].mean(1) @ s.rotation.T for m, s in meshes])
+    area = np.linalg.norm(
+      np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1
+    )
+    kept_points, kept_normals, found = [], [], 0
+    half = np.array(self.size) / 2
+    centre = np.array([0, 0, half[2]])
+    while found < count:
+      pick = rng.choice(len(triangles), 2 * count, p=area / area.sum())
+      a, b = np.sqrt(rng.random((2 * count, 1))), rng.random((2 * count, 1))
+      t = triangles[pick]
+      points = (1 - a) * t[:, 0] + a * (1 - b) * t[:, 1] + a * b * t[:, 2]
+      outward = normals[pick] / np.linalg.norm(normals[pick], axis=-1, keepdims=True)
+      probe = points + margin * outward
+      keep = (np.abs(probe - centre) < half).all(-1)
+      keep[keep] = self.distance(probe[keep], limit=margin) > 0.8 * margin
+      kept_points.append(points[keep])
+      kept_normals.append(outward[keep])
+      found += int(keep.sum())
+    return np.concatenate(kept_points)[:count], np.concatenate(kept_normals)[:count]
+
+
 @functools.lru_cache(maxsize=4)
+def builtin(seed: int = 0) -> TrueRoom:
+  """Returns the built-in room; the same seed gives the same room."""
+  return TrueRoom(tuple(furniture.furnish(np.random.default_rng([seed, 1]))), ROOM_SIZE)
+
+
 def room_solids(seed: int = 0) -> tuple[solids.Solid, ...]:
   """Returns every solid of the room; the same seed gives the same room."""
-  return tuple(furniture.furnish(np.random.default_rng([seed, 1])))
+  return builtin(seed).solids
 
 
 def collision_truth(points: np.ndarray, *, seed: int = 0) -> np.ndarray:
-  """Returns the signed distance from points [P, 3] to the room's surfaces [P] [m].
-
-  Positive in free space, where it is exact; negative inside walls and furniture.
-  """
-  return solids.distance(room_solids(seed), points)
+  """Returns the signed distance from points [P, 3] to the room's surfaces [P] [m]."""
+  return builtin(seed).distance(points)
 
 
 def sample_surface(count: int, *, seed: int = 0, margin: float = 0.02):
-  """Returns points on the surfaces that border free space, uniform by area.
-
-  Args:
-    count: Number of points N.
-    seed: Seed of the room and of the choice of points.
-    margin: Free space that must lie in front of a point along its normal [m].
-
-  Returns:
-    Points [N, 3] and outward normals [N, 3].
-  """
-  rng = np.random.default_rng([seed, 2])
-  things = room_solids(seed)
-  meshes = [(solids.tessellate(solid), solid) for solid in things]
-  triangles = np.concatenate(
-    [m.vertices[m.faces] @ solid.rotation.T + solid.position for m, solid in meshes]
-  )
-  normals = np.concatenate([m.normals[m.faces].mean(1) @ s.rotation.T for m, s in meshes])
-  area = np.linalg.norm(
-    np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1
-  )
-  kept_points, kept_normals, found = [], [], 0
-  half = np.array(ROOM_SIZE) / 2
-  centre = np.array([0, 0, half[2]])
-  while found < count:
-    pick = rng.choice(len(triangles), 2 * count, p=area / area.sum())
-    a, b = np.sqrt(rng.random((2 * count, 1))), rng.random((2 * count, 1))
-    t = triangles[pick]
-    points = (1 - a) * t[:, 0] + a * (1 - b) * t[:, 1] + a * b * t[:, 2]
-    outward = normals[pick] / np.linalg.norm(normals[pick], axis=-1, keepdims=True)
-    probe = points + margin * outward
-    keep = (np.abs(probe - centre) < half).all(-1)
-    keep[keep] = solids.distance(things, probe[keep], limit=margin) > 0.8 * margin
-    kept_points.append(points[keep])
-    kept_normals.append(outward[keep])
-    found += int(keep.sum())
-  return np.concatenate(kept_points)[:count], np.concatenate(kept_normals)[:count]
+  """Returns points [N, 3] on the room's surfaces and their normals; see `TrueRoom.surface`."""
+  return builtin(seed).surface(count, np.random.default_rng([seed, 2]), margin=margin)
 
 
 @functools.lru_cache(maxsize=2)
@@ -97,6 +122,24 @@ def build_room(seed: int = 0, *, looks: bool = True) -> mujoco.MjSpec:
     seed: The same seed gives the same room.
     looks: Whether it can be seen; painting takes 10 s, which a robot without a camera saves.
   """
+  return assemble(room_solids(seed), _textures(seed) if looks else None)
+
+
+def assemble(
+  things: Sequence[solids.Solid],
+  textures: Mapping[str, np.ndarray] | None,
+  *,
+  lights: Sequence[tuple[tuple[float, ...], tuple[float, ...]]] = LIGHTS,
+  ambient: float = AMBIENT,
+) -> mujoco.MjSpec:
+  """Returns solids as a MuJoCo specification; see `build_room`.
+
+  Args:
+    things: All of a room.
+    textures: Their materials by name, uint8 [H, W, 3]; None: they cannot be seen.
+    lights: Direction of travel and colour of each.
+    ambient: Light from everywhere.
+  """
   spec = mujoco.MjSpec()
   spec.modelname = "room"
   spec.visual.quality.shadowsize = 0
@@ -105,15 +148,14 @@ def build_room(seed: int = 0, *, looks: bool = True) -> mujoco.MjSpec:
   spec.visual.map.znear, spec.visual.map.zfar = 0.01, 12.0
   spec.stat.extent, spec.stat.center = 1.0, [0, 0, 1]
   spec.visual.headlight.active = 0
-  things = room_solids(seed)
-  for name, picture in _textures(seed).items() if looks else ():
+  for name, picture in (textures or {}).items():
     texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
     texture.height, texture.width = picture.shape[:2]
     texture.data = picture.tobytes()
     glow = _GLOW.get(name, 0.0)
     material = spec.add_material(name=name, specular=0.0, shininess=0.0, emission=glow)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-  for k, (direction, strength) in enumerate(_LIGHTS):
+  for k, (direction, strength) in enumerate(lights):
     spec.worldbody.add_light(
       name=f"light_{k}",
       type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -122,10 +164,10 @@ def build_room(seed: int = 0, *, looks: bool = True) -> mujoco.MjSpec:
       dir=list(direction),
       diffuse=list(strength),
       specular=[0, 0, 0],
-      ambient=[_AMBIENT / len(_LIGHTS)] * 3,
+      ambient=[ambient / len(lights)] * 3,
     )
   for solid in things:
-    _add_solid(spec, solid, looks=looks)
+    _add_solid(spec, solid, looks=textures is not None)
   return spec
 
 

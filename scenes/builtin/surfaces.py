@@ -25,7 +25,7 @@ _POSTERS = (  # heights and widths [pixel]
 )
 
 
-def _occlusion(
+def occlusion(
   solid: solids.Solid, things: list[solids.Solid], shape: tuple[int, int]
 ) -> np.ndarray:
   """Brightness [H, W] of the +z face of a panel: dark in corners and beside furniture."""
@@ -107,5 +107,5 @@ def paint(things: Sequence[solids.Solid], rng: np.random.Generator) -> dict[str,
   for solid in thick:
     if solid.name.startswith("shell") and solid.tiles is None:
       picture = named[solid.material]
-      named[solid.material] = picture * _occlusion(solid, thick, picture.shape[:2])[..., None]
+      named[solid.material] = picture * occlusion(solid, thick, picture.shape[:2])[..., None]
   return {name: textures.to_uint8(picture) for name, picture in named.items()}

@@ -35,8 +35,8 @@ def test_the_judge_finds_hardly_a_fault_in_the_true_surface():
     alignment=SimpleNamespace(world_from_unit=Similarity()),
     collision_top=1.0,
   )
-  figures = ground_truth._judge_figures(result, Similarity())
+  figures = ground_truth._judge_figures(result, Similarity(), room.builtin())
   assert figures["points_missed_by_truth"] == 0  # they lie on it
   assert 0 < figures["sight_lines_blocked_by_truth"] < 1  # some lie behind furniture
   result.held_out[:] = False
-  assert ground_truth._judge_figures(result, Similarity()) == {}
+  assert ground_truth._judge_figures(result, Similarity(), room.builtin()) == {}
