@@ -49,13 +49,13 @@ class Truth:
   """The room's true surface, as visible from a camera."""
 
   def __init__(self, lower: np.ndarray, upper: np.ndarray, floor_threshold: float):
-    points, normals = room.sample_surface(_POINTS)
+    points, normals = room.builtin().surface(_POINTS)
     inside = ((points > lower) & (points < upper)).all(-1) & (points[:, 2] > floor_threshold)
     _, first = np.unique(
       np.floor(points[inside] / _CELL).astype(np.int64), axis=0, return_index=True
     )
     self.points, self.normals = points[inside][first], normals[inside][first]
-    things = room.room_solids()
+    things = room.builtin().solids
     nearest = np.argmin([np.abs(thing.signed_distance(self.points)) for thing in things], axis=0)
     self.owners = np.array([things[k].name.split("_")[0] for k in nearest])
     self._model = room.build_room(looks=False).compile()

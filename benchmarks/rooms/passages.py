@@ -83,7 +83,7 @@ def _ahead(places: np.ndarray, room_from_world: Similarity) -> np.ndarray:
   ).all(-1)
   things = [
     solid
-    for solid in room.room_solids()
+    for solid in room.builtin().solids
     if (solids.tessellate(solid).vertices @ solid.rotation.T + solid.position)[:, 2].max()
     > settings.low
   ]

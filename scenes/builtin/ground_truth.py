@@ -218,7 +218,7 @@ def _contact_figures(
   lower, upper = _box(result, true_room)
   error = collision_error.collision_error(
     moved(result.parts, rigid),
-    true_room.surface(_SURFACE_POINTS, np.random.default_rng([0, 2]))[0],
+    true_room.surface(_SURFACE_POINTS)[0],
     eyes=rigid.apply(result.depth.positions),
     lower=lower,
     upper=upper,

@@ -48,18 +48,19 @@ class TrueRoom:
     return solids.distance(self.solids, points, limit=limit)
 
   def surface(
-    self, count: int, rng: np.random.Generator, *, margin: float = 0.02
+    self, count: int, *, seed: int = 0, margin: float = 0.02
   ) -> tuple[np.ndarray, np.ndarray]:
     """Returns points on the surfaces that border free space, uniform by area.
 
     Args:
       count: Number of points N.
-      rng: Of the choice of points.
+      seed: Of the choice of points.
       margin: Free space that must lie in front of a point along its normal [m].
 
     Returns:
       Points [N, 3] and outward normals [N, 3].
     """
+    rng = np.random.default_rng([seed, 2])
     meshes = [(solids.tessellate(solid), solid) for solid in self.solids]
     triangles = np.concatenate(
       [m.vertices[m.faces] @ solid.rotation.T + solid.position for m, solid in meshes]
@@ -92,24 +93,9 @@ def builtin(seed: int = 0) -> TrueRoom:
   return TrueRoom(tuple(furniture.furnish(np.random.default_rng([seed, 1]))), ROOM_SIZE)
 
 
-def room_solids(seed: int = 0) -> tuple[solids.Solid, ...]:
-  """Returns every solid of the room; the same seed gives the same room."""
-  return builtin(seed).solids
-
-
-def collision_truth(points: np.ndarray, *, seed: int = 0) -> np.ndarray:
-  """Returns the signed distance from points [P, 3] to the room's surfaces [P] [m]."""
-  return builtin(seed).distance(points)
-
-
-def sample_surface(count: int, *, seed: int = 0, margin: float = 0.02):
-  """Returns points [N, 3] on the room's surfaces and their normals; see `TrueRoom.surface`."""
-  return builtin(seed).surface(count, np.random.default_rng([seed, 2]), margin=margin)
-
-
 @functools.lru_cache(maxsize=2)
 def _textures(seed: int) -> dict[str, np.ndarray]:
-  return surfaces.paint(room_solids(seed), np.random.default_rng([seed, 3]))
+  return surfaces.paint(builtin(seed).solids, np.random.default_rng([seed, 3]))
 
 
 def build_room(seed: int = 0, *, looks: bool = True) -> mujoco.MjSpec:
@@ -122,7 +108,7 @@ def build_room(seed: int = 0, *, looks: bool = True) -> mujoco.MjSpec:
     seed: The same seed gives the same room.
     looks: Whether it can be seen; painting takes 10 s, which a robot without a camera saves.
   """
-  return assemble(room_solids(seed), _textures(seed) if looks else None)
+  return assemble(builtin(seed).solids, _textures(seed) if looks else None)
 
 
 def assemble(

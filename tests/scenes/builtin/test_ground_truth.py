@@ -11,7 +11,7 @@ from nerf2real.scenes.poses.tracks import Tracks
 
 
 def test_the_judge_finds_hardly_a_fault_in_the_true_surface():
-  points = room.sample_surface(400)[0]
+  points = room.builtin().surface(400)[0]
   points = points[points[:, 2] < 0.8]
   poses = ground_truth.robot_poses(6)
   seen = [(v, p) for v in range(len(poses)) for p in range(len(points))]

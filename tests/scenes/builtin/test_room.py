@@ -75,7 +75,7 @@ def test_depth_ends_on_the_true_surfaces(renderer):
   pose = _looking((-0.8, -1.0, 0.45), (1.0, 1.2, 0.3))
   _, depth = room.true_view(camera, pose, eye=renderer)
   points = (camera.rays() * depth[..., None]).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-  error = np.abs(room.collision_truth(points))
+  error = np.abs(room.builtin().distance(points))
   assert np.percentile(error, 95) < 0.005
   assert np.median(error) < 0.002
 
@@ -104,7 +104,7 @@ def test_open_floor_is_free(model):
   x, y, z = np.meshgrid(
     np.linspace(x0, x1, 40), np.linspace(y0, y1, 40), [0.03, 0.2, 0.4, 0.5], indexing="ij"
   )
-  distance = room.collision_truth(np.stack([x, y, z], -1).reshape(-1, 3))
+  distance = room.builtin().distance(np.stack([x, y, z], -1).reshape(-1, 3))
   assert distance.min() >= 0.0
 
 
@@ -113,7 +113,7 @@ def test_path_keeps_clear_of_everything():
   np.testing.assert_allclose(
     path[:, :3, :3] @ path[:, :3, :3].transpose(0, 2, 1), [np.eye(3)] * 300, atol=1e-9
   )
-  assert room.collision_truth(path[:, :3, 3]).min() > 0.1
+  assert room.builtin().distance(path[:, :3, 3]).min() > 0.1
   assert path[:, 2, 3].min() < 0.5 and path[:, 2, 3].max() > 1.45
 
 
@@ -179,11 +179,11 @@ def test_meshes_lie_on_the_zero_of_the_distance(kind, size, rounding):
 
 
 def test_surface_samples_border_free_space():
-  points, normals = room.sample_surface(400)
+  points, normals = room.builtin().surface(400)
   assert points.shape == normals.shape == (400, 3)
-  distance = room.collision_truth(points)
+  distance = room.builtin().distance(points)
   assert np.abs(distance).max() < 0.01  # chords of the curved meshes
-  assert room.collision_truth(points + 0.02 * normals).min() > 0.01
+  assert room.builtin().distance(points + 0.02 * normals).min() > 0.01
   floor = np.abs(points[:, 2]) < 1e-3
   assert 0.1 < floor.mean() < 0.5
 

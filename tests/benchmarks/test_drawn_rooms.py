@@ -1,0 +1,64 @@
+"""Tests of the rooms that are drawn: whole, walkable, and the same for the same seed."""
+
+import numpy as np
+import pytest
+
+from benchmarks import other_rooms
+from benchmarks.drawn_rooms import filming, layout, looks
+from nerf2real.scenes.builtin import camera_path, room, solids
+from nerf2real.scenes.builtin.placing import Group
+
+
+def drawn(seed):
+  return layout.draw(np.random.default_rng([seed, 1]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hand_walks_clear_of_things(seed):
+  true_room = drawn(seed).room
+  random = np.random.default_rng([seed, 4])
+  path = camera_path.HandHeld(filming.walk(true_room, random), random, seconds=60.0)
+  places = path.pose(np.linspace(0, 60, 400))[:, :3, 3]
+  assert true_room.distance(places).min() > 0.05
+  assert (np.abs(places[:, :2]) < np.array(true_room.size[:2]) / 2).all()
+  # It sees the room from both heights.
+  assert places[:, 2].min() < 0.7
+  assert places[:, 2].max() > 1.3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_things_are_whole_and_in_the_room(seed):
+  found = drawn(seed)
+  names = [s.name for s in found.room.solids]
+  assert len(set(names)) == len(names)
+  half = np.array(found.room.size) / 2
+  for solid in found.room.solids:
+    if solid.name.startswith("shell"):
+      continue
+    mesh = solids.tessellate(solid)
+    corners = mesh.vertices @ solid.rotation.T + solid.position - [0, 0, half[2]]
+    assert (np.abs(corners) < half + 0.02).all(), solid.name
+  x, y, _ = found.marker
+  assert found.room.distance(np.array([[x, y, 0.2]]))[0] > 0.15  # nothing stands on it
+
+
+def test_the_same_seed_draws_the_same_room():
+  one, again, other = drawn(5), drawn(5), drawn(6)
+  assert one.room.size == again.room.size != other.room.size
+  assert [s.name for s in one.room.solids] == [s.name for s in again.room.solids]
+
+
+def test_every_material_is_painted():
+  things = drawn(3).room.solids
+  painted = looks.paint(things, np.random.default_rng([3, 2]))
+  assert {s.material for s in things} <= set(painted)
+  assert all(p.dtype == np.uint8 and p.ndim == 3 for p in painted.values())
+
+
+def test_the_true_free_floor_of_a_room_with_a_wall_across():
+  group = Group("wall")
+  group.add("box", (0.05, 2.0, 1.0), (1.0, 0.0, 1.0), "white")
+  one, apart = other_rooms.true_free_area(room.TrueRoom(tuple(group.solids), (4.0, 4.0, 2.5)))
+  # A robot of 0.18 m keeps its middle off the room's ends and the wall.
+  assert one == pytest.approx((2.95 - 0.36) * 3.64, rel=0.03)
+  assert apart == pytest.approx((0.95 - 0.36) * 3.64, rel=0.06)
