@@ -8,6 +8,7 @@ see, one after the other, as an incremental mapper does.
 """
 
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,29 @@ from nerf2real.scenes.poses.matching.features import image_ids, quiet
 
 MAJORITY = 0.5  # share of the matches that must agree with a place
 _ROUNDS = 3  # at most: pictures that were placed well are new witnesses
+
+
+def matched_points(
+  model: pycolmap.Reconstruction, database: Path
+) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
+  """Yields what verified matches between pictures with places lead to.
+
+  Yields:
+    The ids of two pictures, the features of their matches [M, 2], and the points that these see
+    [M, 2], 0 for none.
+  """
+  points = {
+    image.image_id: np.array([p.point3D_id if p.has_point3D() else 0 for p in image.points2D])
+    for image in mapping.registered(model)
+  }
+  with pycolmap.Database.open(str(database)) as db:
+    pairs, verified = db.read_two_view_geometries()
+  for pair, geometry in zip(pairs, verified, strict=True):
+    ids = pycolmap.pair_id_to_image_pair(pair)
+    if all(key in points for key in ids):
+      matches = geometry.inlier_matches.reshape(-1, 2)
+      seen = np.stack([points[key][matches[:, k]] for k, key in enumerate(ids)], axis=1)
+      yield ids, matches, seen
 
 
 def shares(model: pycolmap.Reconstruction, database: Path) -> dict[int, float]:
@@ -33,25 +57,15 @@ def shares(model: pycolmap.Reconstruction, database: Path) -> dict[int, float]:
   Returns:
     Shares by the pictures' ids; a picture without such features has none.
   """
-  points = {
-    image.image_id: np.array([p.point3D_id if p.has_point3D() else 0 for p in image.points2D])
-    for image in mapping.registered(model)
-  }
-  asked = {key: np.zeros(len(seen), bool) for key, seen in points.items()}
-  agreed = {key: np.zeros(len(seen), bool) for key, seen in points.items()}
-  with pycolmap.Database.open(str(database)) as db:
-    pairs, verified = db.read_two_view_geometries()
-  for pair, geometry in zip(pairs, verified, strict=True):
-    ids = pycolmap.pair_id_to_image_pair(pair)
-    if not all(key in points for key in ids):
-      continue
-    matches = geometry.inlier_matches.reshape(-1, 2)
+  sees = {image.image_id: len(image.points2D) for image in mapping.registered(model)}
+  asked = {key: np.zeros(count, bool) for key, count in sees.items()}
+  agreed = {key: np.zeros(count, bool) for key, count in sees.items()}
+  for ids, matches, points in matched_points(model, database):
     for own, other in ((0, 1), (1, 0)):
-      theirs = points[ids[other]][matches[:, other]]
-      ours = points[ids[own]][matches[:, own]]
-      asked[ids[own]][matches[theirs != 0, own]] = True
-      agreed[ids[own]][matches[(theirs != 0) & (ours == theirs), own]] = True
-  return {key: agreed[key].sum() / asked[key].sum() for key in points if asked[key].any()}
+      theirs = points[:, other] != 0
+      asked[ids[own]][matches[theirs, own]] = True
+      agreed[ids[own]][matches[theirs & (points[:, own] == points[:, other]), own]] = True
+  return {key: agreed[key].sum() / asked[key].sum() for key in sees if asked[key].any()}
 
 
 def place_again(

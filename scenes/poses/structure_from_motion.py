@@ -17,7 +17,7 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import agreement, mapping, refinement, shutter
+from nerf2real.scenes.poses import agreement, continuity, mapping, refinement, shutter
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -143,7 +143,7 @@ def _map(
   if known is not None:
     fixed = mapping.triangulate(database, images_folder, known, names)
     return Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
-  model, mapper = _best_model(database, images_folder, len(names), settings, steps)
+  model, mapper = _best_model(database, images_folder, len(names), settings, steps, film=film)
   if model is None or model.num_reg_images() < settings.repair_below * len(names):
     placed = {i.name for i in mapping.registered(model)} if model else set()
     missing = [row for row, name in enumerate(names) if name not in placed]
@@ -160,7 +160,9 @@ def _map(
     )
     if added:
       steps.begin("mapping")
-      again, mapper_again = _best_model(database, images_folder, len(names), settings, steps)
+      again, mapper_again = _best_model(
+        database, images_folder, len(names), settings, steps, film=film
+      )
       if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
         model, mapper = again, mapper_again
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
@@ -197,7 +199,13 @@ def _picture_width(database: Path) -> int:
 
 
 def _best_model(
-  database: Path, images_folder: Path, count: int, settings: LocaliseSettings, steps: Steps
+  database: Path,
+  images_folder: Path,
+  count: int,
+  settings: LocaliseSettings,
+  steps: Steps,
+  *,
+  film: bool,
 ) -> tuple[pycolmap.Reconstruction | None, str]:
   """Runs the mapper of the settings, and the other one if that leaves too many keyframes out.
 
@@ -207,7 +215,7 @@ def _best_model(
   mappers = {"global": mapping.map_globally, "incremental": mapping.map_incrementally}
   if settings.mapper == "auto":
     order = ["incremental", "global"]
-    if count > settings.few_keyframes:
+    if count > settings.most_incremental:
       order.reverse()
   elif settings.mapper in mappers:
     order = [settings.mapper]
@@ -222,15 +230,38 @@ def _best_model(
           mapping.MAX_ERROR, mapping.MIN_ANGLE
         )
       mapping.drop_weak_images(models[0])
-      model, moved = agreement.place_again(
-        models[0], database, images_folder, seed=settings.seed, report=steps.report
-      )
+      model, what = _checked(models[0], database, images_folder, settings, steps, film=film)
       if best is None or model.num_reg_images() > best.num_reg_images():
-        best, chosen = model, f"{name} mapper"
-        chosen += f", {moved} pictures placed by what the others see" if moved else ""
+        best, chosen = model, f"{name} mapper{what}"
     if best is not None and best.num_reg_images() >= settings.repair_below * count:
       break
   return best, chosen
+
+
+def _checked(
+  model: pycolmap.Reconstruction,
+  database: Path,
+  images_folder: Path,
+  settings: LocaliseSettings,
+  steps: Steps,
+  *,
+  film: bool,
+) -> tuple[pycolmap.Reconstruction, str]:
+  """Returns a model without the wrong places that its matches show, and what was done, in words.
+
+  What is out of a film's line is placed once more, by what all others see.
+  """
+  placed, dropped = 0, 0
+  for _ in range(2):
+    model, moved = agreement.place_again(
+      model, database, images_folder, seed=settings.seed, report=steps.report
+    )
+    dropped = continuity.drop_out_of_line(model, database) if film else 0
+    placed += moved
+    if not dropped:
+      break
+  words = f", {placed} pictures placed by what the others see" if placed else ""
+  return model, words + (f", {dropped} left out of the film's line" if dropped else "")
 
 
 def _describe(

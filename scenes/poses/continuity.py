@@ -1,0 +1,95 @@
+"""Finds pictures of a film whose places contradict what was filmed moments before and after.
+
+Things that look alike (two beds, rows of chairs) hold matches that agree with a place at the wrong
+one of them: nothing in a single picture tells. What follows each other in a film sees the same
+things, and where neighbours are both placed rightly their matches lead to the same points. N
+pictures in the film's order.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses import agreement
+from nerf2real.scenes.poses.mapping import registered
+
+_NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen
+_ASKED = 15  # matches that a verdict needs, as many as a place does
+
+Votes = Mapping[tuple[int, int], tuple[int, int]]
+"""Of pairs of pictures, the earlier first: matches that agree on a point, and that see one."""
+
+
+def out_of_line(count: int, votes: Votes) -> np.ndarray:
+  """Tells which pictures contradict those before and after them, bool [N].
+
+  Of all parts of the film, half of it at most, the one goes first of whose matches with its
+  neighbours most disagree, the shortest of several; what it stood between are neighbours then.
+
+  Args:
+    count: Pictures N.
+    votes: Of pairs of them.
+  """
+  left = list(range(count))
+  while True:
+    best, part = 0.5, None
+    for length, agreed, asked in _parts(left, votes):
+      share = np.where(asked >= _ASKED, agreed / np.maximum(asked, 1), 1.0)
+      first = int(np.argmin(share))
+      if share[first] < best:
+        best, part = float(share[first]), (first, length)
+    if part is None:
+      found = np.ones(count, bool)
+      found[left] = False
+      return found
+    del left[part[0] : part[0] + part[1]]
+
+
+def _parts(left: list[int], votes: Votes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+  """Yields the votes between all parts of a length and their neighbours.
+
+  Yields:
+    The length, and for each first picture [K] how many agree and how many are asked.
+  """
+  count = len(left)
+  pair = np.zeros((2, count, _NEIGHBOURS + 1))  # of a picture and the one so many later
+  for k in range(count):
+    for later in range(1, min(_NEIGHBOURS, count - 1 - k) + 1):
+      pair[:, k, later] = votes.get((left[k], left[k + later]), (0, 0))
+  border = np.zeros((2, count + 1))  # of pairs that a place lies between
+  for k in range(count):
+    for later in range(1, _NEIGHBOURS + 1):
+      border[:, k + 1 : k + later + 1] += pair[:, k, later, None]
+  for length in range(1, count // 2 + 1):
+    both = border[:, : count - length + 1] + border[:, length:]
+    for later in range(length + 1, _NEIGHBOURS + 1):  # pairs with the part between them
+      for before in range(1, later - length + 1):
+        over = np.zeros_like(both)
+        over[:, before:] = pair[:, : both.shape[1] - before, later]
+        both = both - 2 * over
+    yield length, both[0], both[1]
+
+
+def drop_out_of_line(model: pycolmap.Reconstruction, database: Path) -> int:
+  """Takes the pose from pictures of a film that are out of its line; returns their number.
+
+  Args:
+    model: Poses and points; its pictures' names are in the film's order.
+    database: Their features and verified matches.
+  """
+  images = registered(model)
+  row = {image.image_id: k for k, image in enumerate(images)}
+  votes: dict[tuple[int, int], tuple[int, int]] = {}
+  for ids, _, points in agreement.matched_points(model, database):
+    first, second = row[ids[0]], row[ids[1]]
+    sees = (points != 0).any(axis=1)
+    agreed = sees & (points[:, 0] == points[:, 1])
+    pair = (min(first, second), max(first, second))
+    votes[pair] = int(agreed.sum()), int(sees.sum())
+  wrong = out_of_line(len(images), votes)
+  for image, leaps in zip(images, wrong, strict=True):
+    if leaps:
+      model.deregister_frame(image.frame_id)
+  return int(wrong.sum())
