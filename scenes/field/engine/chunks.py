@@ -48,7 +48,7 @@ def build(f: Functions) -> Chunks:
   parameters = f.shape.parameters
   at_place, at_out = stride * rows.PLACE_U, stride * rows.OUT
   at_extent = stride * (rows.INPUT + 2 * f.shape.levels)
-  ray_losses, draw_empty, empty_loss, clear = f.losses
+  look, ray_losses, draw_empty, empty_loss, clear = f.losses
 
   @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
   def train(
@@ -114,6 +114,10 @@ def build(f: Functions) -> Chunks:
       f.view_forward(w, m, s, 0, count)
       for r in range(rays):
         w.last[r] = w.first[r + 1]
+        look(w, r)
+      for r in range(rays, wp.min(rays + 2, ray_columns)):
+        w.rays[14 * ray_columns + r] = 0.0  # of the chunk before
+      for r in range(rays):
         if w.number[r] < 0 and w.last[r] == w.first[r]:
           waiting += 1
         else:

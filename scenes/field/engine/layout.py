@@ -10,6 +10,7 @@ from nerf2real.scenes.field import encoding
 from nerf2real.scenes.field.field import FieldSettings
 
 CHUNK_RAYS = 128  # of a chunk at most
+RAY_ROWS = 18  # of Worker.rays
 CHUNK_SAMPLES = 768  # chosen: a thread's activations stay in a second-level cache of 1 MB
 Floats = wp.array(dtype=wp.float32)
 Ints = wp.array(dtype=wp.int32)
@@ -156,6 +157,11 @@ class Settings:
   blur_sharp: wp.float32  # fraction of the rays that are not blurred
   blur_power: wp.float32  # blur = blur_max * uniform^power
   random_background: wp.int32
+  planar_fraction: wp.float32  # fraction of the rays that come in threes along a line
+  planar_weight: wp.float32
+  planar_bend: wp.float32  # relative bend from where on it is an edge
+  planar_contrast: wp.float32  # of colour, from where on a picture tells the surface itself
+  planar_reach: wp.int32  # most pixels between two of three
   anchor_fraction: wp.float32  # fraction of the rays that end at a known point
   anchor_weight: wp.float32
   empty_samples: wp.int32  # points a worker in cells known to be empty
@@ -191,7 +197,9 @@ class Worker:
 
   work: Floats  # [rows, samples], see Rows
   rays: Floats
-  """[14, rays]: origin, direction, target, footprint, background, anchor or 0."""
+  """[RAY_ROWS, rays]: origin, direction, target, footprint, background, anchor or 0; of rays in
+  threes: place (1 to 3, 0 for others), number of the three, 1 / z of the direction in the camera's
+  frame, and 1 / z of where the ray ends."""
   ray_of: Ints  # [samples]
   first: Ints  # [rays + 1]: a ray's first sample
   last: Ints  # [rays]: behind a ray's last visible sample

@@ -18,6 +18,7 @@ _EMPTY_SLOPE = 0.1 * math.log2(10.0)  # of a variance input by the deviation's d
 class Losses(NamedTuple):
   """Functions of one shape of field."""
 
+  look: Any
   ray_losses: Any
   draw_empty: Any
   empty_loss: Any
@@ -53,6 +54,46 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
   at_place = stride * rows.PLACE_U
   at_extent = stride * (rows.INPUT + 2 * shape.levels)
   at_specular = at_color + 3 * stride
+
+  @wp.func
+  def look(w: Worker, r: int):
+    """Writes 1 / z of where a ray ends, in the mean over its samples; 0 where it has none."""
+    inverse = wp.float32(0.0)
+    for n in range(w.first[r], w.last[r]):
+      inverse += w.work[at_weight + n] / w.work[at_distance + n]
+    w.rays[17 * ray_columns + r] = inverse * w.rays[16 * ray_columns + r]
+
+  @wp.func
+  def bend_slope(w: Worker, s: Settings, r: int) -> wp.float32:
+    """Returns the derivative of the loss on planes by the 1 / z of a ray of three.
+
+    Along a line of a picture 1 / z of a plane is linear. The loss is that of Geman and McClure of
+    the second difference relative to the middle: an edge counts for little, however sharp it is.
+    The less the more the three colours differ: there the picture itself tells the surface.
+    """
+    slot = wp.int32(w.rays[14 * ray_columns + r])
+    lead = r - slot + 1
+    if slot == 0 or lead < 0 or lead + 2 >= ray_columns:
+      return 0.0
+    whole = wp.bool(True)
+    contrast = wp.float32(0.0)
+    for k in range(3):
+      ray = lead + k
+      whole = whole and wp.int32(w.rays[14 * ray_columns + ray]) == k + 1
+      whole = whole and w.rays[15 * ray_columns + ray] == w.rays[15 * ray_columns + r]
+      whole = whole and w.rays[17 * ray_columns + ray] > 0.0
+      for c in range(3):
+        channel = (6 + c) * ray_columns
+        contrast = wp.max(contrast, wp.abs(w.rays[channel + ray] - w.rays[channel + lead + 1]))
+    if not whole:
+      return 0.0
+    ends = 17 * ray_columns + lead
+    middle = wp.max(w.rays[ends + 1], 1e-3)
+    bend = (w.rays[ends] - 2.0 * w.rays[ends + 1] + w.rays[ends + 2]) / middle
+    scale = s.planar_bend * s.planar_bend
+    weight = s.planar_weight * wp.exp(-contrast / s.planar_contrast)
+    slope = weight * 2.0 * bend * scale / ((bend * bend + scale) * (bend * bend + scale)) / middle
+    return wp.where(slot == 2, -2.0 * slope, slope)
 
   @wp.func
   def ray_losses(w: Worker, s: Settings, r: int) -> wp.vec3:
@@ -93,6 +134,7 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
     anchor = w.rays[13 * ray_columns + r]
     anchored = wp.where(anchor > 0.0, s.anchor_weight, 0.0)
     goal = spacing(anchor)
+    nearer = bend_slope(w, s, r) * w.rays[16 * ray_columns + r]
     below = wp.float32(0.0)
     moment_below = wp.float32(0.0)
     distortion = wp.float32(0.0)
@@ -109,6 +151,7 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
       d_weight = (
         s.distortion * 2.0 * (spread + weight * extent / 3.0)
         + anchored * (wp.abs(m - goal) - (1.0 - goal))
+        + nearer / t
         - behind
       )
       share = wp.min(1.0, t * t * s.near_scale)
@@ -171,4 +214,4 @@ def build(shape: Shape, stride: int, ray_columns: int) -> Losses:
       for i in range(outputs):
         work[at_d_out + i * stride + n] = 0.0
 
-  return Losses(ray_losses, draw_empty, empty_loss, clear)
+  return Losses(look, ray_losses, draw_empty, empty_loss, clear)

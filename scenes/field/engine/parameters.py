@@ -64,7 +64,7 @@ def make_worker(
   work[list(shape.ones)] = 1
   worker: Any = layout.Worker()
   worker.work = device.put(work.ravel())
-  worker.rays = device.zeros(14 * columns)
+  worker.rays = device.zeros(layout.RAY_ROWS * columns)
   worker.ray_of = device.zeros(stride, np.int32)
   worker.first = device.zeros(columns + 1, np.int32)
   worker.last = device.zeros(columns, np.int32)

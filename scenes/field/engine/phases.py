@@ -47,7 +47,7 @@ def build(f: Functions) -> Phases:
   at_alpha, at_weight, at_through = (
     stride * row for row in (rows.ALPHA, rows.WEIGHT, rows.THROUGH)
   )
-  ray_losses, draw_empty, empty_loss, clear = f.losses
+  look, ray_losses, draw_empty, empty_loss, clear = f.losses
 
   @wp.func
   def is_visible(w: Worker, n: int, total: int) -> wp.bool:
@@ -122,6 +122,7 @@ def build(f: Functions) -> Phases:
       w.work[at_through + n] = through
       n += 1
     w.last[r] = n
+    look(w, r)
     wp.atomic_add(w.figures, 1, wp.float64(n - w.first[r]))
 
   @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)

@@ -46,10 +46,20 @@ def look_up(p: Pictures, level: int, image: int, px: int, py: int) -> wp.vec3:
 
 
 @wp.func
+def middle_of_three(chance: float, size: int, apart: int) -> int:
+  """Returns a pixel in [apart, size - apart), so that both others lie in the picture."""
+  room = size - 2 * apart
+  return apart + wp.min(wp.int32(chance * wp.float32(room)), room - 1)
+
+
+@wp.func
 def draw_ray(
   p: Pictures, s: Settings, seed: wp.uint64, index: wp.int64, rays: Floats, size: int, r: int
 ):
-  """Draws a pixel and a blur, or an anchor; writes column r of Worker.rays."""
+  """Draws a pixel and a blur, or an anchor; writes column r of Worker.rays.
+
+  Of some threes of successive numbers the pixels lie in a row or a column, equally far apart.
+  """
   images = p.origins.shape[0]
   height, width = p.heights[0], p.widths[0]
   image = wp.min(wp.int32(uniform(seed, index, 0) * wp.float32(images)), images - 1)
@@ -57,8 +67,20 @@ def draw_ray(
   py = wp.min(wp.int32(uniform(seed, index, 2) * wp.float32(height)), height - 1)
   goal = wp.float32(0.0)
   blur = wp.float32(0.0)
+  slot = wp.float32(0.0)
+  place = wp.int32(index % wp.int64(3))
+  leader = index - wp.int64(place)
   count = p.anchors.shape[0]
-  if count > 0 and uniform(seed, index, 9) < s.anchor_fraction:
+  if s.planar_fraction > 0.0 and uniform(seed, leader, 21) < s.planar_fraction:
+    slot = wp.float32(place + 1)
+    apart = 2 + wp.int32(uniform(seed, leader, 22) * wp.float32(s.planar_reach - 2))
+    image = wp.min(wp.int32(uniform(seed, leader, 0) * wp.float32(images)), images - 1)
+    is_row = uniform(seed, leader, 23) < 0.5
+    dx = wp.where(is_row, wp.min(apart, (width - 1) // 2), 0)
+    dy = wp.where(is_row, 0, wp.min(apart, (height - 1) // 2))
+    px = middle_of_three(uniform(seed, leader, 1), width, dx) + (place - 1) * dx
+    py = middle_of_three(uniform(seed, leader, 2), height, dy) + (place - 1) * dy
+  elif count > 0 and uniform(seed, index, 9) < s.anchor_fraction:
     anchor = p.anchors[wp.min(wp.int32(uniform(seed, index, 10) * wp.float32(count)), count - 1)]
     image = wp.int32(anchor[0])
     px = wp.int32(anchor[1])
@@ -88,6 +110,9 @@ def draw_ray(
     rays[(10 + c) * size + r] = background
   rays[9 * size + r] = 1.0 + 12.0 * blur * blur
   rays[13 * size + r] = goal
+  rays[14 * size + r] = slot
+  rays[15 * size + r] = wp.float32((leader / wp.int64(3)) % wp.int64(1 << 22))
+  rays[16 * size + r] = wp.length(p.directions[py * width + px])
 
 
 @wp.func

@@ -112,6 +112,10 @@ class FusedTrainer:
     numbers.blur_sharp = train.blur_sharp_fraction
     numbers.blur_power = train.blur_power
     numbers.random_background = int(train.random_background)
+    numbers.planar_weight = train.planar_weight
+    numbers.planar_bend = train.planar_bend
+    numbers.planar_contrast = train.planar_contrast
+    numbers.planar_reach = train.planar_reach
     numbers.anchor_fraction = train.anchor_fraction
     numbers.anchor_weight = train.anchor_weight
     numbers.empty_samples = train.empty_samples // self.device.threads
@@ -134,11 +138,13 @@ class FusedTrainer:
     known = step < self._last_known_step
     numbers.anchor_fraction = settings.anchor_fraction if known else 0.0
     numbers.empty_samples = settings.empty_samples // self.device.threads if known else 0
+    numbers.planar_fraction = settings.planar_fraction if step >= settings.planar_start else 0.0
     numbers.distortion = settings.distortion_weight * settings.distortion_ramp(step)
     seed = (self.seed * 1_000_003 + step) & (2**63 - 1)
     threshold = settings.transmittance_threshold
     if self._phased:
-      self.add_gradient(seed, rays=self._rays, threshold=threshold)
+      whole = max(self._rays - self._rays % 3, 1)  # threes; what is behind is of the step before
+      self.add_gradient(seed, rays=whole, threshold=threshold)
       self._adam(self.table, 0, self.table.values.size, learning_rate)
     else:
       self.device.run(

@@ -46,6 +46,10 @@ SETTINGS = TrainSettings(
   blur_max=2.0,
   inner_cells=16,
   outer_cells=16,
+  planar_weight=0.5,
+  planar_bend=0.4,
+  planar_contrast=0.8,
+  planar_reach=8,
 )
 FAST = TrainSettings(
   field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
@@ -79,7 +83,7 @@ def _rough_field(pixel_angle=0.05):
   return Field(SETTINGS.field, params, pixel_angle)
 
 
-def _backward(*, phased=False, with_empty=False, rays=0, depth_limit=1e9):
+def _backward(*, phased=False, with_empty=False, rays=0, depth_limit=1e9, planar=0.0):
   """A trainer after one gradient, its worker's figures and the gradient by name."""
   settings = dataclasses.replace(SETTINGS, depth_limit=depth_limit, batch_samples=1 << 13)
   views = box_views.make_views(3, width=16, height=16, anchors=40)
@@ -88,6 +92,7 @@ def _backward(*, phased=False, with_empty=False, rays=0, depth_limit=1e9):
   assert trainer.pictures.empty.size > 100
   if not with_empty:
     trainer.pictures.empty = wp.zeros(0, dtype=wp.int32, device="cpu")
+  trainer.engine.numbers.planar_fraction = planar
   if phased:
     trainer.add_gradient(SEED, rays=rays, threshold=0.0)
   else:
@@ -112,7 +117,7 @@ def _with_gradient(values, share):
 def _reference_losses(params, trainer, count):
   """The same rays and samples in JAX: sums of the Charbonnier and the distortion loss."""
   worker = trainer.engine.workers[0]
-  rays = worker.rays.numpy().reshape(14, -1).T[:count]
+  rays = worker.rays.numpy().reshape(layout.RAY_ROWS, -1).T[:count]
   first = worker.first.numpy()[: count + 1]
   work = worker.work.numpy().reshape(-1, layout.STRIDE)
   most = np.diff(first).max()
@@ -155,11 +160,34 @@ def _reference_losses(params, trainer, count):
   off = (weights * jnp.abs(sampling.spacing(distance) - goals[:, None])).sum(1) + rest * (1 - goals)
   anchored = SETTINGS.anchor_weight * jnp.where(rays[:, 13] > 0, off, 0).sum()
   loss = photometric + SETTINGS.distortion_weight * distortion + anchored
+  loss += _bends(rays, (weights / distance).sum(1) * rays[:, 16])
   return loss, (photometric, distortion)
 
 
-def test_gradients_agree_with_autodiff(backward):
-  trainer, figures, gradient = backward
+def _bends(rays, inverse):
+  """Loss of the rays in threes: Geman and McClure's, of the bend of 1 / z along a line."""
+  slot, number = rays[:, 14], rays[:, 15]
+  total = 0.0
+  for lead in range(len(rays) - 2):
+    three = slice(lead, lead + 3)
+    if list(slot[three]) != [1, 2, 3] or len(set(number[three])) > 1:
+      continue
+    near, middle, far = inverse[three]
+    bend = (near - 2 * middle + far) / jax.lax.stop_gradient(middle)
+    contrast = np.abs(rays[three, 6:9] - rays[lead + 1, 6:9]).max()
+    weight = SETTINGS.planar_weight * np.exp(-contrast / SETTINGS.planar_contrast)
+    total += weight * bend**2 / (bend**2 + SETTINGS.planar_bend**2)
+  return total
+
+
+@pytest.fixture(scope="module")
+def planar():
+  return _backward(planar=0.6)
+
+
+@pytest.mark.parametrize("fixture", ["backward", "planar"])
+def test_gradients_agree_with_autodiff(fixture, request):
+  trainer, figures, gradient = request.getfixturevalue(fixture)
   params = _rough_field().params
   reference = jax.jit(
     jax.value_and_grad(
@@ -187,12 +215,32 @@ def test_a_grid_that_is_too_dense_ends_no_ray(depth_limit):
     assert error < 1e-5, (name, error)
 
 
+def test_some_rays_come_in_threes_along_a_line(planar, backward):
+  trainer, figures, gradient = planar
+  rays = trainer.engine.workers[0].rays.numpy().reshape(layout.RAY_ROWS, -1).T[: int(figures[0])]
+  leads = [k for k in range(len(rays) - 2) if list(rays[k : k + 3, 14]) == [1, 2, 3]]
+  assert 2 < len(leads) < len(rays) / 3
+  for lead in leads:
+    one, middle, other = rays[lead : lead + 3]
+    np.testing.assert_allclose(one[:3], other[:3])  # one picture
+    ends = one[3:6] * one[16] + other[3:6] * other[16]
+    np.testing.assert_allclose(
+      2 * middle[3:6] * middle[16], ends, atol=5e-3
+    )  # a lens bends lines a little
+    assert (np.abs(one[3:6] - middle[3:6]) > 1e-3).any()
+  change = np.linalg.norm(gradient["table"] - backward[2]["table"])
+  assert change > 0.01 * np.linalg.norm(gradient["table"])
+
+
+@pytest.mark.parametrize("planar", [0.0, 0.6])
 @pytest.mark.parametrize("with_empty", [False, True])
-def test_phases_have_the_gradient_of_chunks(monkeypatch, with_empty):
+def test_phases_have_the_gradient_of_chunks(monkeypatch, with_empty, planar):
   """On one core, where a thread has more points known to be empty than a chunk holds."""
   monkeypatch.setattr(device, "num_threads", lambda: 1)
-  _, figures, gradient = _backward(with_empty=with_empty)
-  trainer, *_ = phases = _backward(phased=True, with_empty=with_empty, rays=int(figures[0]))
+  _, figures, gradient = _backward(with_empty=with_empty, planar=planar)
+  trainer, *_ = phases = _backward(
+    phased=True, with_empty=with_empty, rays=int(figures[0]), planar=planar
+  )
   assert trainer.engine.numbers.empty_samples > layout.CHUNK_SAMPLES
   np.testing.assert_allclose(phases[1][[0, 2, 3, 4, 5]], figures[[0, 2, 3, 4, 5]], rtol=1e-6)
   for name, value in gradient.items():
@@ -238,7 +286,7 @@ def test_empty_space_has_the_gradient_of_its_density(monkeypatch, backward, phas
 
 def test_rays_are_pixels_of_the_pictures(backward):
   trainer, figures, _ = backward
-  rays = trainer.engine.workers[0].rays.numpy().reshape(14, -1).T[: int(figures[0])]
+  rays = trainer.engine.workers[0].rays.numpy().reshape(layout.RAY_ROWS, -1).T[: int(figures[0])]
   sharp = rays[rays[:, 9] == 1.0]
   assert 3 < len(sharp) < len(rays)
   distance = box_views.wall_distance(sharp[:, :3], sharp[:, 3:6])
