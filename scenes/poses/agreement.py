@@ -27,6 +27,10 @@ def matched_points(
 ) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
   """Yields what verified matches between pictures with places lead to.
 
+  Args:
+    model: Poses and points.
+    database: Its features and verified matches.
+
   Yields:
     The ids of two pictures, the features of their matches [M, 2], and the points that these see
     [M, 2], 0 for none.
