@@ -13,10 +13,8 @@ class LocaliseSettings:
   features: FeatureSettings = dataclasses.field(default_factory=FeatureSettings)
   pairs: PairSettings = dataclasses.field(default_factory=PairSettings)
   mapper: str = "auto"
-  """"global", "incremental", or "auto": incremental for up to `most_incremental` keyframes, else
-  global; the other one where the first leaves too many keyframes out."""
-  most_incremental: int = 300
-  """One after the other takes as long up to here, and fewer go to the wrong one of things alike."""
+  """"global", "incremental", or "auto": incremental, and global where that leaves too many
+  keyframes out."""
   repair_below: float = 0.95
   """Fraction of registered keyframes under which more pairs are matched."""
   min_fraction: float = 0.5

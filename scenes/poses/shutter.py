@@ -54,14 +54,13 @@ class Shutter:
       self, translations=scale * self.translations, depths=scale * self.depths
     )
 
-  def of_every(self, count: int) -> "Shutter":
-    """Returns the motion of every so many of the pictures, beginning with the first."""
-    chosen = slice(None, None, count)
+  def of(self, pictures: slice | np.ndarray) -> "Shutter":
+    """Returns the motion of some of the pictures, by a slice or by bool [N]."""
     return dataclasses.replace(
       self,
-      rotations=self.rotations[chosen],
-      translations=self.translations[chosen],
-      depths=self.depths[chosen],
+      rotations=self.rotations[pictures],
+      translations=self.translations[pictures],
+      depths=self.depths[pictures],
     )
 
   def project(
@@ -217,7 +216,7 @@ def correct(
 
   def cost(readout: float) -> float:
     tried = pycolmap.Reconstruction(few)
-    _move_observations(tried, seen, motion(model, times, readout).of_every(every))
+    _move_observations(tried, seen, motion(model, times, readout).of(slice(None, None, every)))
     adjust(tried)
     said(readout)
     return _cost(tried, seen)

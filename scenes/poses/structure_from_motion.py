@@ -189,6 +189,10 @@ def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -
   if fault is not None:
     words = f"{mapped.strategy}; rolling shutter not taken out, because {fault}"
     return dataclasses.replace(mapped, strategy=words)
+  placed = [image.name for image in mapping.registered(model)]
+  if mapping.drop_weak_images(model):
+    kept = {image.name for image in mapping.registered(model)}
+    found = found.of(np.array([name in kept for name in placed]))
   words = f"{mapped.strategy}; rolling shutter of {1e3 * found.readout:.1f} ms taken out"
   return dataclasses.replace(mapped, model=model, strategy=words, shutter=found)
 
@@ -212,15 +216,10 @@ def _best_model(
   Returns:
     The model, and how it came about.
   """
-  mappers = {"global": mapping.map_globally, "incremental": mapping.map_incrementally}
-  if settings.mapper == "auto":
-    order = ["incremental", "global"]
-    if count > settings.most_incremental:
-      order.reverse()
-  elif settings.mapper in mappers:
-    order = [settings.mapper]
-  else:
+  mappers = {"incremental": mapping.map_incrementally, "global": mapping.map_globally}
+  if settings.mapper not in ("auto", *mappers):
     raise ValueError(f"mapper is {settings.mapper!r}, expected 'auto', 'global' or 'incremental'.")
+  order = list(mappers) if settings.mapper == "auto" else [settings.mapper]
   best, chosen = None, f"{order[0]} mapper"
   for name in order:
     models = mappers[name](database, images_folder, seed=settings.seed, report=steps.report)

@@ -9,14 +9,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from benchmarks.rooms import fountain
 from nerf2real.core.cameras import Camera
+from nerf2real.core.progress import no_progress
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses import mapping, shutter, structure_from_motion
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
 from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.poses.matching.features import FeatureSettings
@@ -24,7 +26,7 @@ from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.poses.unit_frame import mean_up
-from nerf2real.scenes.poses.work import prepare_work
+from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
 from tests.scenes import synthetic_capture as synthetic
 from tests.scenes.capture.test_capture import write_transforms
 
@@ -260,6 +262,26 @@ def test_refinement_falls_back_when_distortion_folds(corner, monkeypatch):
   refined, lens = mapping.refine(model)
   assert lens.words == "focal lengths only, no distortion, because the test says so"
   np.testing.assert_array_equal(refined.cameras[1].params[4:], 0)
+
+
+def test_a_picture_that_is_weak_without_the_shutter_has_no_place(corner, monkeypatch):
+  model = pycolmap.Reconstruction(str(corner[0] / "out" / "sfm"))
+  images = mapping.registered(model)
+  for k, point in enumerate(images[3].points2D):
+    if point.has_point3D():
+      model.delete_observation(images[3].image_id, k)
+  count = len(images)
+  motion = shutter.Shutter(
+    readout=0.01,
+    rotations=np.arange(count)[:, None] * np.ones(3),
+    translations=np.zeros((count, 3)),
+    depths=np.ones(count),
+  )
+  monkeypatch.setattr(shutter, "correct", lambda *args, **options: (model, motion))
+  mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
+  found = structure_from_motion._without_shutter(mapped, {}, Steps(no_progress))
+  assert found.model.num_reg_images() == count - 1
+  assert found.shutter.rotations[:, 0].tolist() == [k for k in range(count) if k != 3]
 
 
 def test_figures_are_plain_json(corner):
