@@ -17,6 +17,7 @@ from nerf2real.scenes.poses.mapping import registered
 
 _NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen
 _ASKED = 15  # matches that a verdict needs, as many as a place does
+_AGREED = 0.25  # share of them below which a place is wrong: of wrong ones a tenth at most, chosen
 
 Votes = Mapping[tuple[int, int], tuple[int, int]]
 """Of pairs of pictures, the earlier first: matches that agree on a point, and that see one."""
@@ -26,7 +27,7 @@ def out_of_line(count: int, votes: Votes) -> np.ndarray:
   """Tells which pictures contradict those before and after them, bool [N].
 
   Of all parts of the film, half of it at most, the one goes first of whose matches with its
-  neighbours most disagree, the shortest of several; what it stood between are neighbours then.
+  neighbours fewest agree, the shortest of several; what it stood between are neighbours then.
 
   Args:
     count: Pictures N.
@@ -34,7 +35,7 @@ def out_of_line(count: int, votes: Votes) -> np.ndarray:
   """
   left = list(range(count))
   while True:
-    best, part = 0.5, None
+    best, part = _AGREED, None
     for length, agreed, asked in _parts(left, votes):
       share = np.where(asked >= _ASKED, agreed / np.maximum(asked, 1), 1.0)
       first = int(np.argmin(share))
