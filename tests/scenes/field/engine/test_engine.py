@@ -220,14 +220,16 @@ def test_some_rays_come_in_threes_along_a_line(planar, backward):
   rays = trainer.engine.workers[0].rays.numpy().reshape(layout.RAY_ROWS, -1).T[: int(figures[0])]
   leads = [k for k in range(len(rays) - 2) if list(rays[k : k + 3, 14]) == [1, 2, 3]]
   assert 2 < len(leads) < len(rays) / 3
+  camera = box_views.make_views(3, width=16, height=16).camera
+  origins, rotations = (getattr(trainer.pictures, n).numpy() for n in ("origins", "rotations"))
   for lead in leads:
-    one, middle, other = rays[lead : lead + 3]
-    np.testing.assert_allclose(one[:3], other[:3])  # one picture
-    ends = one[3:6] * one[16] + other[3:6] * other[16]
-    np.testing.assert_allclose(
-      2 * middle[3:6] * middle[16], ends, atol=5e-3
-    )  # a lens bends lines a little
-    assert (np.abs(one[3:6] - middle[3:6]) > 1e-3).any()
+    three = rays[lead : lead + 3]
+    picture = int(np.argmin(np.linalg.norm(origins - three[1, :3], axis=1)))
+    np.testing.assert_allclose(three[:, :3], origins[[picture] * 3], atol=1e-6)
+    pixels = camera.project(three[:, 3:6] @ rotations[picture])
+    np.testing.assert_allclose(pixels[0] + pixels[2], 2 * pixels[1], atol=2e-3)
+    assert np.sort(np.abs(pixels[2] - pixels[0])).round(2).tolist()[0] == 0  # a row or a column
+    assert np.abs(pixels[2] - pixels[0]).max() > 3.9
   change = np.linalg.norm(gradient["table"] - backward[2]["table"])
   assert change > 0.01 * np.linalg.norm(gradient["table"])
 
