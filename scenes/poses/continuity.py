@@ -2,8 +2,9 @@
 
 Things that look alike (two beds, rows of chairs) hold matches that agree with a place at the wrong
 one of them: nothing in a single picture tells. What follows each other in a film sees the same
-things, and where neighbours are both placed rightly their matches lead to the same points. N
-pictures in the film's order.
+things, and where neighbours are both placed rightly their matches lead to the same points. Nor does
+a hand leap: a picture of a plain wall may agree with its neighbours and yet stand anywhere along
+its way. N pictures in the film's order.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,6 +19,9 @@ from nerf2real.scenes.poses.mapping import registered
 _NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen
 _ASKED = 15  # matches that a verdict needs, as many as a place does
 _AGREED = 0.25  # share of them below which a place is wrong: of wrong ones a tenth at most, chosen
+
+_USUAL = 0.8  # share of the steps from picture to picture that are the film's usual speed, chosen
+_LEAP = 3.0  # times that speed, chosen; held by hand, the fastest step has 1.2 to 2.1 times
 
 Votes = Mapping[tuple[int, int], tuple[int, int]]
 """Of pairs of pictures, the earlier first: matches that agree on a point, and that see one."""
@@ -73,12 +77,32 @@ def _parts(left: list[int], votes: Votes) -> Iterator[tuple[int, np.ndarray, np.
     yield length, both[0], both[1]
 
 
-def drop_out_of_line(model: pycolmap.Reconstruction, database: Path) -> int:
+def leaps(centers: np.ndarray, times: np.ndarray) -> list[tuple[int, int]]:
+  """Returns the pairs of pictures between which a hand would have had to leap.
+
+  Args:
+    centers: Positions [N, 3].
+    times: When [s] [N]; where they do not grow, nothing is said.
+  """
+  passed = np.diff(times)
+  if len(times) < 2 or passed.min() <= 0:
+    return []
+  steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) / passed
+  usual = np.quantile(steps, _USUAL)
+  way = np.linalg.norm(centers[:, None] - centers, axis=2)
+  first, second = np.nonzero(way > _LEAP * usual * (times - times[:, None]))
+  return [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
+
+
+def drop_out_of_line(
+  model: pycolmap.Reconstruction, database: Path, times: Mapping[str, float]
+) -> int:
   """Takes the pose from pictures of a film that are out of its line; returns their number.
 
   Args:
     model: Poses and points; its pictures' names are in the film's order.
     database: Their features and verified matches.
+    times: When each picture was taken [s].
   """
   images = registered(model)
   row = {image.image_id: k for k, image in enumerate(images)}
@@ -89,8 +113,11 @@ def drop_out_of_line(model: pycolmap.Reconstruction, database: Path) -> int:
     agreed = sees & (points[:, 0] == points[:, 1])
     pair = (min(first, second), max(first, second))
     votes[pair] = int(agreed.sum()), int(sees.sum())
+  centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
+  for pair in leaps(centers, np.array([times[image.name] for image in images])):
+    votes[pair] = 0, max(votes.get(pair, (0, 0))[1], _ASKED)
   wrong = out_of_line(len(images), votes)
-  for image, leaps in zip(images, wrong, strict=True):
-    if leaps:
+  for image, is_wrong in zip(images, wrong, strict=True):
+    if is_wrong:
       model.deregister_frame(image.frame_id)
   return int(wrong.sum())

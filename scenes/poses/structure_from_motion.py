@@ -87,7 +87,7 @@ def localise(
     result = Mapped(model, f"poses and points of the {known.kind} source", ())
   else:
     database = prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
-    result = _map(database, images_folder, names, settings, known, steps, film=times is not None)
+    result = _map(database, images_folder, names, settings, known, steps, times)
     if times is not None and known is None:
       result = _without_shutter(result, times, steps)
   localisation = _describe(result, len(names), known, images_folder, turned, steps)
@@ -102,10 +102,10 @@ def _map(
   settings: LocaliseSettings,
   known: KnownPoses | None,
   steps: Steps,
-  *,
-  film: bool,
+  times: Mapping[str, float] | None,
 ) -> Mapped:
   """Features, pairs, matches, a model, repairs, refinement."""
+  film = times is not None
   steps.begin("features")
   photographs = not film and known is None
   features.extract_features(
@@ -143,7 +143,7 @@ def _map(
   if known is not None:
     fixed = mapping.triangulate(database, images_folder, known, names)
     return Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
-  model, mapper = _best_model(database, images_folder, len(names), settings, steps, film=film)
+  model, mapper = _best_model(database, images_folder, len(names), settings, steps, times)
   if model is None or model.num_reg_images() < settings.repair_below * len(names):
     placed = {i.name for i in mapping.registered(model)} if model else set()
     missing = [row for row, name in enumerate(names) if name not in placed]
@@ -161,7 +161,7 @@ def _map(
     if added:
       steps.begin("mapping")
       again, mapper_again = _best_model(
-        database, images_folder, len(names), settings, steps, film=film
+        database, images_folder, len(names), settings, steps, times
       )
       if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
         model, mapper = again, mapper_again
@@ -208,8 +208,7 @@ def _best_model(
   count: int,
   settings: LocaliseSettings,
   steps: Steps,
-  *,
-  film: bool,
+  times: Mapping[str, float] | None,
 ) -> tuple[pycolmap.Reconstruction | None, str]:
   """Runs the mapper of the settings, and the other one if that leaves too many keyframes out.
 
@@ -229,7 +228,7 @@ def _best_model(
           mapping.MAX_ERROR, mapping.MIN_ANGLE
         )
       mapping.drop_weak_images(models[0])
-      model, what = _checked(models[0], database, images_folder, settings, steps, film=film)
+      model, what = _checked(models[0], database, images_folder, settings, steps, times)
       if best is None or model.num_reg_images() > best.num_reg_images():
         best, chosen = model, f"{name} mapper{what}"
     if best is not None and best.num_reg_images() >= settings.repair_below * count:
@@ -243,8 +242,7 @@ def _checked(
   images_folder: Path,
   settings: LocaliseSettings,
   steps: Steps,
-  *,
-  film: bool,
+  times: Mapping[str, float] | None,
 ) -> tuple[pycolmap.Reconstruction, str]:
   """Returns a model without the wrong places that its matches show, and what was done, in words.
 
@@ -255,7 +253,7 @@ def _checked(
     model, moved = agreement.place_again(
       model, database, images_folder, seed=settings.seed, report=steps.report
     )
-    dropped = continuity.drop_out_of_line(model, database) if film else 0
+    dropped = 0 if times is None else continuity.drop_out_of_line(model, database, times)
     placed += moved
     if not dropped:
       break

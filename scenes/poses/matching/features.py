@@ -4,6 +4,7 @@ Every call does only what the database does not hold yet.
 """
 
 import contextlib
+import copy
 import dataclasses
 import os
 import sqlite3
@@ -32,6 +33,10 @@ class FeatureSettings:
   """Of each of few pictures; between, as many as the cost of all their pairs allows."""
   max_image_size: int = 1600
   """Long side at which features are sought [pixel]."""
+  faint_below: int = 512
+  """A picture with fewer features is searched again for fainter ones, up to so many: plain walls."""
+  faint_peak: float = 0.002
+  """How much fainter a spot may be there than its surroundings, of white; COLMAP asks for 0.0067."""
   affine_shape: bool = True
   """Paper, appendix A."""
   guided_matching: bool = True
@@ -114,9 +119,11 @@ def extract_features(
   options.num_threads = os.cpu_count() or 1
   options.sift.estimate_affine_shape = settings.affine_shape
   options.sift.max_num_features = settings.of_each(len(names), guided=guided)
-  done = _with_features(database)
-  missing = [name for name in names if name not in done]
-  for first in range(0, len(missing), _EXTRACTION_CHUNK):
+  faint = copy.deepcopy(options)
+  faint.sift.max_num_features = min(settings.faint_below, options.sift.max_num_features)
+  faint.sift.peak_threshold = settings.faint_peak
+
+  def extract(chosen: list[str], how: pycolmap.FeatureExtractionOptions) -> None:
     if database.is_file():
       with pycolmap.Database.open(str(database)) as db:
         cameras = db.read_all_cameras()
@@ -126,14 +133,36 @@ def extract_features(
       pycolmap.extract_features(
         str(database),
         str(images_folder),
-        missing[first : first + _EXTRACTION_CHUNK],
+        chosen,
         camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=reader,
-        extraction_options=options,
+        extraction_options=how,
         device=pycolmap.Device.cpu,
       )
+
+  done = _with_features(database)
+  missing = [name for name in names if name not in done]
+  for first in range(0, len(missing), _EXTRACTION_CHUNK):
+    chunk = missing[first : first + _EXTRACTION_CHUNK]
+    extract(chunk, options)
+    count = dict(zip(sorted(image_ids(database)), feature_counts(database), strict=True))
+    few = [name for name in chunk if count[name] < faint.sift.max_num_features]
+    if few:
+      _forget_features(database, few)
+      extract(few, faint)
     found = min(first + _EXTRACTION_CHUNK, len(missing))
     report(found / len(missing), f"features of {found + len(done)} of {len(names)} pictures")
+
+
+def _forget_features(database: Path, names: list[str]) -> None:
+  """Deletes the features of pictures, which stay."""
+  marks = ",".join("?" * len(names))
+  with contextlib.closing(sqlite3.connect(database)) as db, db:
+    for table in ("keypoints", "descriptors"):
+      db.execute(
+        f"DELETE FROM {table} WHERE image_id IN (SELECT image_id FROM images WHERE name IN ({marks}))",
+        names,
+      )
 
 
 def feature_counts(database: Path) -> np.ndarray:

@@ -138,6 +138,29 @@ def test_pairs_are_matched_again_with_guidance_where_asked(corner, tmp_path):
   assert inliers()[0] == before[0] and inliers()[1] > 0.99 * before[1]
 
 
+def test_pictures_that_show_little_are_searched_for_fainter_things(tmp_path):
+  random = np.random.default_rng(0)
+  spots = cv2.GaussianBlur(random.normal(0, 1, (240, 320)), (0, 0), 3)
+  spots /= np.abs(spots).max()
+  (tmp_path / "images").mkdir()
+  for name, contrast in (("plain.png", 10.0), ("rich.png", 90.0)):
+    cv2.imwrite(str(tmp_path / "images" / name), np.uint8(np.round(128 + contrast * spots)))
+
+  def counts(**settings):
+    database = tmp_path / f"{len(list(tmp_path.iterdir()))}.db"
+    how = FeatureSettings(**settings)
+    names = ["plain.png", "rich.png"]
+    features.extract_features(database, tmp_path / "images", names, settings=how)
+    assert list(features.image_ids(database)) == names
+    with features.pycolmap.Database.open(str(database)) as db:
+      assert len(db.read_all_cameras()) == 1
+    return features.feature_counts(database)
+
+  before, after = counts(faint_below=0), counts(faint_below=200)
+  assert before[0] < 50 < 200 <= after[0] < 400
+  assert before[1] == after[1] > 200
+
+
 def test_an_interrupted_run_continues_with_one_camera(corner, tmp_path):
   folder, _, _, _ = corner
   names = [f"view_{row:03d}.png" for row in range(10)]
