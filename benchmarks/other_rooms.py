@@ -2,26 +2,33 @@
 
   python benchmarks/other_rooms.py --work out/rooms --seeds 1 2 3
   python benchmarks/other_rooms.py --work out/rooms --seeds 1 --no-scene    # the film alone
+  python benchmarks/other_rooms.py --work out/rooms --seeds 1 --capture photographs
 
 Each seed draws a room (`drawn_rooms/`), films it for a minute by hand with a lens of its own and
-automatic exposure, and makes a scene of the film by a preset. A film that is there is kept, and so
-is what a run before has made of it.
+automatic exposure, and makes a scene of the film by a preset; or of 35 photographs; or of the
+film's pictures with a depth sensor's measurements and a tracker's poses. A film that is there is
+kept, and so is what a run before has made of it.
 """
 
 import dataclasses
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
+import av
 import cv2
 import numpy as np
 
 from benchmarks import harness
-from benchmarks.drawn_rooms import filming, layout
+from benchmarks.drawn_rooms import filming, layout, photographs
+from benchmarks.rooms import rgbd
 from nerf2real.core.files import atomic_path
 from nerf2real.core.serialization import write_json
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.builtin import furniture, ground_truth
+from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.room import TrueRoom
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.poses.localisation import LocalisationError
@@ -29,6 +36,8 @@ from nerf2real.scenes.settings import preset, with_marker
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
 _CELL = 0.02  # m of the true map
+_FILM = "film.mp4"
+_QUICK = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _FIGURES = (
   *("registered_fraction", "camera_rmse_m", "scale_error", "floor_tilt_deg"),
   *("held_out_psnr_db", "robot_psnr_db", "robot_psnr_60x80_db"),
@@ -45,6 +54,8 @@ class Settings(harness.Options):
   """Folder of films and bundles."""
   seeds: tuple[int, ...] = (1, 2, 3)
   """Of the rooms."""
+  capture: Literal["film", "photographs", "depth"] = "film"
+  """What the scenes are made of."""
   preset: str = "fast"
   """Preset of the scenes."""
   train_steps: int | None = None
@@ -72,26 +83,30 @@ def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value
   """Draws, films and reconstructs one room; returns its figures."""
   folder.mkdir(parents=True, exist_ok=True)
   drawn = layout.draw(np.random.default_rng([seed, 1]))
-  video, truth = folder / "film.mp4", folder / "truth.npz"
-  if not (video.exists() and truth.exists()):
-    _film(video, truth, drawn.room, seed)
+  truth = folder / "truth.npz"
+  if not ((folder / _FILM).exists() and truth.exists()):
+    _film(folder / _FILM, truth, drawn.room, seed)
   if not settings.scene:
     return {"solids": len(drawn.room.solids)}
   known = np.load(truth)
+  source, poses = _captured(folder, known, drawn.room, seed, settings.capture)
 
   def measure(result: Reconstruction) -> TruthFigures:
-    frames = np.round(np.asarray(result.frame_times) * float(known["rate"])).astype(int)
-    return ground_truth.compare(result, known["film"][frames], true_room=drawn.room, pictures=known)
+    rows = [int(Path(name).stem.split("_")[-1]) for name in result.localisation.names]
+    return ground_truth.compare(result, poses[rows], true_room=drawn.room, pictures=known)
 
-  used = dataclasses.replace(preset(settings.preset), marker_side=furniture.MARKER_SIZE)
+  used = preset(settings.preset)
+  if settings.capture != "depth":
+    x, y, turn = drawn.marker
+    used = dataclasses.replace(used, marker_side=furniture.MARKER_SIZE)
+    used = with_marker(used, MarkerPlace(x, y, float(np.degrees(turn))))
   if settings.train_steps is not None:
     field = dataclasses.replace(used.train, max_steps=settings.train_steps, max_seconds=None)
     used = dataclasses.replace(used, train=field)
-  x, y, turn = drawn.marker
-  used = with_marker(used, MarkerPlace(x, y, float(np.degrees(turn))))
+  scene = "scene" if settings.capture == "film" else f"scene_{settings.capture}"
   began = time.process_time()
   try:
-    made = pipeline.make_scene(video, folder / "scene", settings=used, measure=measure)
+    made = pipeline.make_scene(source, folder / scene, settings=used, measure=measure)
   except (LocalisationError, ValueError) as error:
     return {"refused": str(error)}
   for warning in made.scene["warnings"]:
@@ -99,7 +114,7 @@ def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value
   one, apart = true_free_area(drawn.room)
   figures: dict[str, harness.Value] = {"true_free_area_m2": one, "true_free_area_apart_m2": apart}
   figures |= {name: float(made.figures[name]) for name in _FIGURES if name in made.figures}
-  write_json(folder / "figures.json", figures)
+  write_json(folder / scene / "figures.json", figures)
   return figures | {"processor_s": time.process_time() - began}
 
 
@@ -113,12 +128,49 @@ def _film(video: Path, truth: Path, true_room: TrueRoom, seed: int) -> None:
     np.savez_compressed(partial, film=taken, rate=rate, **arrays)  # type: ignore[arg-type]
 
 
+def _captured(
+  folder: Path, known: Mapping[str, np.ndarray], true_room: TrueRoom, seed: int, capture: str
+) -> tuple[Path, np.ndarray]:
+  """Returns a capture, and the true poses [N, 4, 4] of all its pictures by their number."""
+  if capture == "film":
+    return folder / _FILM, known["film"]
+  poses_file = folder / f"{capture}.npy"
+  if not poses_file.exists():
+    with filming.seen(true_room, seed) as eye:
+      if capture == "photographs":
+        poses = photographs.photograph(folder / capture, true_room, eye, seed)
+      else:
+        poses = known["film"]
+        _sense(folder / capture, folder / _FILM, poses, float(known["rate"]), eye, seed)
+    with atomic_path(poses_file) as partial:
+      np.save(partial, poses)
+  return folder / capture, np.load(poses_file)
+
+
+def _sense(folder: Path, video: Path, poses: np.ndarray, rate: float, eye: Eye, seed: int) -> None:
+  """Writes a film as a hand-held depth camera records it, in TUM's layout."""
+  lens = filming.lens(np.random.default_rng([seed, 4]))
+  random = np.random.default_rng([seed, 6])
+  for name in ("rgb", "depth"):
+    (folder / name).mkdir(parents=True, exist_ok=True)
+  with av.open(str(video)) as container:
+    for k, (pose, frame) in enumerate(zip(poses, container.decode(video=0), strict=True)):
+      depth = rgbd.sensed(eye.render(lens, pose, supersample=1)[1], random)
+      for name, content in (
+        ("rgb", frame.to_ndarray(format="bgr24")),
+        ("depth", np.rint(depth / rgbd.TUM_UNIT).astype(np.uint16)),
+      ):
+        cv2.imwrite(str(folder / name / f"{k:06d}.png"), content, _QUICK)
+  rgbd.write_lists(folder, rgbd.tracked(poses, random, rate=rate), lens, rate=rate)
+
+
 def main(settings: Settings) -> None:
   """Makes all rooms, one after the other, and prints."""
   figures = {}
   for seed in settings.seeds:
-    figures[f"room_{seed}"] = make(settings.work / str(seed), seed, settings)
-    print(f"room_{seed}: {figures[f'room_{seed}']}", flush=True)
+    name = f"room_{seed}" + ("" if settings.capture == "film" else f"_{settings.capture}")
+    figures[name] = make(settings.work / str(seed), seed, settings)
+    print(f"{name}: {figures[name]}", flush=True)
   harness.finish("other_rooms", figures, settings)
 
 

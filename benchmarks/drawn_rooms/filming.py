@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ _SECONDS, _RATE = 60.0, 12.0
 _GREY = 118.0  # level that automatic exposure holds the mean at
 _FOLLOWS = 0.06  # share by which it follows a picture
 _GAINS = (0.6, 1.7)  # that it may take
-_CORNERS = (0.6, 0.95)  # share of the light that a lens leaves in a picture's corners
+CORNERS = (0.6, 0.95)  # share of the light that a lens leaves in a picture's corners
 _CELL = 0.05  # m of the grid in which the walk keeps clear of things
 _CLEAR = 0.35  # m
 _AVOIDS = 60.0  # times the way that a place costs which is not clear
@@ -28,7 +28,7 @@ _STOPS = 24  # of a round
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Round:
+class Round:
   """One closed round through the room."""
 
   height: float
@@ -43,7 +43,7 @@ class _Round:
   sway: float
 
 
-def _rounds(random: Random) -> list[_Round]:
+def rounds(random: Random) -> list[Round]:
   """Returns rounds at a person's eyes and at a robot's, looking across the room and outwards."""
   found = []
   for height, reach, outwards, pitch in (
@@ -53,7 +53,7 @@ def _rounds(random: Random) -> list[_Round]:
     (random.uniform(0.4, 0.6), 0.4, True, 0.2),
   ):
     found.append(
-      _Round(
+      Round(
         height=height,
         reach=reach + random.uniform(-0.08, 0.08),
         outwards=outwards,
@@ -92,17 +92,16 @@ class _Clear:
     return np.stack([np.interp(even, along, line[:, k]) for k in range(2)], -1)
 
 
-def walk(true_room: TrueRoom, random: Random, *, seconds: float = _SECONDS) -> np.ndarray:
+def walk(true_room: TrueRoom, walked: Sequence[Round], *, seconds: float = _SECONDS) -> np.ndarray:
   """Returns a path's position (3) [m], heading and pitch [rad], `camera_path.RATE` a second [T, 5].
 
-  Four rounds with ways between; where a round would lead through things it goes along them.
+  Rounds with ways between; where one would lead through things it goes along them.
   """
-  rounds = _rounds(random)
   crossing = 0.05
-  count = int((1 - crossing * (len(rounds) - 1)) / len(rounds) * seconds * camera_path.RATE)
+  count = int((1 - crossing * (len(walked) - 1)) / len(walked) * seconds * camera_path.RATE)
   parts: list[np.ndarray] = []
   s = np.linspace(0, 1, count)
-  for part in rounds:
+  for part in walked:
     angle = part.start + 2 * np.pi * part.turns * s
     stops = angle[:: count // _STOPS]
     ring = np.stack([np.cos(stops), np.sin(stops)], -1) * part.reach * 0.5
@@ -168,10 +167,22 @@ def film(path: Path, true_room: TrueRoom, eye: Eye, seed: int) -> tuple[np.ndarr
   settings = filming.FilmSettings(
     camera=lens(random), seconds=_SECONDS, frame_rate=_RATE, subframes=2, speed="veryfast"
   )
-  taken = camera_path.HandHeld(walk(true_room, random), random, seconds=_SECONDS)
+  taken = camera_path.HandHeld(walk(true_room, rounds(random)), random, seconds=_SECONDS)
   times = (np.arange(settings.frames) + 0.5) / _RATE
   filming.encode(path, _exposed(eye, taken, times, settings, random), settings)
   return taken.pose(times), _RATE
+
+
+def light(camera: Camera, corners: float) -> np.ndarray:
+  """Returns what a lens leaves of the light [H, W, 1], so much in the corners."""
+  v, u = np.mgrid[: camera.height, : camera.width]
+  radius = np.hypot(u - camera.cx, v - camera.cy) / np.hypot(camera.width, camera.height) * 2
+  return 1 - (1 - corners) * radius[..., None] ** 2
+
+
+def metered(picture: np.ndarray) -> float:
+  """Returns the gain that automatic exposure wants for a picture [H, W, 3]."""
+  return float(np.clip(_GREY / picture.mean(), *_GAINS))
 
 
 def _exposed(
@@ -183,12 +194,10 @@ def _exposed(
 ) -> Iterator[np.ndarray]:
   """Yields pictures whose gain follows their mean, darker towards the corners."""
   camera = settings.camera
-  v, u = np.mgrid[: camera.height, : camera.width]
-  radius = np.hypot(u - camera.cx, v - camera.cy) / np.hypot(camera.width, camera.height) * 2
-  falloff = 1 - (1 - random.uniform(*_CORNERS)) * radius[..., None] ** 2
+  falloff = light(camera, random.uniform(*CORNERS))
   gain = 0.0
   for when in times:
     picture = filming.exposed(eye, taken, when, settings) * falloff
-    wanted = np.clip(_GREY / picture.mean(), *_GAINS)
-    gain = gain + _FOLLOWS * (wanted - gain) if gain else float(wanted)
+    wanted = metered(picture)
+    gain = gain + _FOLLOWS * (wanted - gain) if gain else wanted
     yield filming.with_noise(gain * picture, settings, random)

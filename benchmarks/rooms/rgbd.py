@@ -36,6 +36,7 @@ _POSITION_ERROR = 0.01  # of a tracker, root mean square [m]
 _ROTATION_ERROR = np.radians(0.5)  # of a tracker, root mean square [rad]
 _DRIFT = 2 / 3  # s over which a tracker's errors change
 _RATE = 30.0  # frames a second of the stamps
+TUM_UNIT = 1 / 5000  # m that one count of its depth is
 # Kinect: 7-Scenes' nominal depth camera, 25 mm beside a colour camera of shorter focal length
 _SENSOR = Camera(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0)
 _BESIDE = 0.025  # m along the colour camera's x axis
@@ -98,7 +99,7 @@ def record(folder: Path, settings: Settings) -> np.ndarray:
   apart = settings.layout == "7scenes"
   sensor, sensor_poses = (_SENSOR, poses @ beside) if apart else (truth["camera"], poses)
   given = tracked(sensor_poses, rng)
-  unit = 1e-3 if apart else 1 / 5000
+  unit = 1e-3 if apart else TUM_UNIT
   for name in () if apart else ("rgb", "depth"):
     (folder / name).mkdir(parents=True, exist_ok=True)
   folder.mkdir(parents=True, exist_ok=True)
@@ -121,13 +122,13 @@ def record(folder: Path, settings: Settings) -> np.ndarray:
       for name, content in zip(names, (picture, raw), strict=True):
         cv2.imwrite(str(folder / name), content, [cv2.IMWRITE_PNG_COMPRESSION, 1])
   if not apart:
-    _write_lists(folder, given, truth["camera"])
+    write_lists(folder, given, truth["camera"])
   return poses
 
 
-def _write_lists(folder: Path, poses: np.ndarray, camera: Camera) -> None:
-  """Writes TUM's lists and trajectory, and the camera."""
-  times = 1000 + np.arange(len(poses)) / _RATE
+def write_lists(folder: Path, poses: np.ndarray, camera: Camera, *, rate: float = _RATE) -> None:
+  """Writes TUM's lists and trajectory, and the camera; `rate` poses [N, 4, 4] a second."""
+  times = 1000 + np.arange(len(poses)) / rate
   for kind in ("rgb", "depth"):
     rows = [f"{t:.4f} {kind}/{k:06d}.png\n" for k, t in enumerate(times)]
     (folder / f"{kind}.txt").write_text("".join(rows))

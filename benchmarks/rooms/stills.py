@@ -54,7 +54,7 @@ _SWAY, _TURN = 0.3, 0.03  # rad: looking left and right in turn; how crookedly a
 _STEP_ASIDE = 0.05  # standard deviation of a place [m]
 _EXPOSURE = 0.1, 0.3  # standard deviation of the logarithm of the exposure; in a mixed folder
 # of a phone held upright: the sensor's x is down, its y is left
-_UPRIGHT_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+UPRIGHT_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _QUALITY = 92  # of the JPEG files
 _ASPECT = 4 / 3
 _READ = 8  # files that are read for a time
@@ -123,6 +123,22 @@ def places(count: int, subject: str, rng: np.random.Generator) -> np.ndarray:
   return poses
 
 
+def save(path: Path, picture: np.ndarray, *, upright: bool, millimetres: int) -> None:
+  """Writes a picture [H, W, 3] as a phone does: as its sensor has it, with what EXIF says of it.
+
+  Args:
+    path: Where.
+    picture: Its content.
+    upright: Whether the phone was held so.
+    millimetres: Focal length for film of 36 mm width.
+  """
+  exif = PIL.Image.Exif()
+  exif[PIL.ExifTags.Base.Orientation] = 6 if upright else 1
+  detail = exif.get_ifd(PIL.ExifTags.IFD.Exif)
+  detail[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = millimetres
+  PIL.Image.fromarray(picture).save(path, quality=_QUALITY, exif=exif)
+
+
 def photograph(
   folder: Path, megapixels: float, *, count: int, subject: str, seed: int, mixed: bool = False
 ) -> np.ndarray:
@@ -136,7 +152,7 @@ def photograph(
     for k, pose in enumerate(poses):
       upright, fate = k % 3 == 2, _FATES.get(k % 10, "") if mixed else ""
       if upright:
-        pose[:3, :3] = pose[:3, :3] @ _UPRIGHT_FROM_SENSOR
+        pose[:3, :3] = pose[:3, :3] @ UPRIGHT_FROM_SENSOR
       longer = _SECOND_LENS if fate == "second lens" else 1.0
       lens = dataclasses.replace(_LENS, fx=longer * _LENS.fx, fy=longer * _LENS.fy)
       if mixed and k == _STRANGER:
@@ -157,11 +173,7 @@ def photograph(
           image.thumbnail((_REDUCED, _REDUCED))
         image.save(path.with_suffix(".png" if fate == "png" else ".jpg"), quality=_QUALITY)
         continue
-      exif = PIL.Image.Exif()
-      exif[PIL.ExifTags.Base.Orientation] = 6 if upright else 1
-      detail = exif.get_ifd(PIL.ExifTags.IFD.Exif)
-      detail[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = round(longer * _MILLIMETRES)
-      image.save(path, quality=_QUALITY, exif=exif)
+      save(path, np.asarray(image), upright=upright, millimetres=round(longer * _MILLIMETRES))
   if mixed:
     shutil.copy(folder / "IMG_0000.jpg", folder / "IMG_0000 (1).jpg")
   return poses

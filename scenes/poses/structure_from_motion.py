@@ -160,9 +160,7 @@ def _map(
     )
     if added:
       steps.begin("mapping")
-      again, mapper_again = _best_model(
-        database, images_folder, len(names), settings, steps, times
-      )
+      again, mapper_again = _best_model(database, images_folder, len(names), settings, steps, times)
       if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
         model, mapper = again, mapper_again
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks import other_rooms
-from benchmarks.drawn_rooms import filming, layout, looks
+from benchmarks.drawn_rooms import filming, layout, looks, photographs
 from nerf2real.scenes.builtin import camera_path, room, solids
 from nerf2real.scenes.builtin.placing import Group
+from nerf2real.scenes.capture.media import stills
 
 
 def drawn(seed):
@@ -17,7 +18,7 @@ def drawn(seed):
 def test_a_hand_walks_clear_of_things(seed):
   true_room = drawn(seed).room
   random = np.random.default_rng([seed, 4])
-  path = camera_path.HandHeld(filming.walk(true_room, random), random, seconds=60.0)
+  path = camera_path.HandHeld(filming.walk(true_room, filming.rounds(random)), random, seconds=60.0)
   places = path.pose(np.linspace(0, 60, 400))[:, :3, 3]
   assert true_room.distance(places).min() > 0.05
   assert (np.abs(places[:, :2]) < np.array(true_room.size[:2]) / 2).all()
@@ -53,6 +54,19 @@ def test_every_material_is_painted():
   painted = looks.paint(things, np.random.default_rng([3, 2]))
   assert {s.material for s in things} <= set(painted)
   assert all(p.dtype == np.uint8 and p.ndim == 3 for p in painted.values())
+
+
+def test_photographs_are_a_phones_of_one_lens(tmp_path):
+  true_room = drawn(1).room
+  with filming.seen(true_room, 1) as eye:
+    poses = photographs.photograph(tmp_path, true_room, eye, 1, count=3)
+  assert true_room.distance(poses[:, :3, 3]).min() > 0.05
+  # The third is upright: its sensor's x axis points down.
+  assert np.abs(poses[:2, 2, 0]).max() < 0.2 < 0.8 < -poses[2, 2, 0]
+  files = stills.list_images(tmp_path)
+  assert stills.of_one_camera(files).files == files
+  assert stills.read_still(files[0]).shape == (1440, 1920, 3)
+  assert stills.read_still(files[2]).shape == (1920, 1440, 3)
 
 
 def test_the_true_free_floor_of_a_room_with_a_wall_across():

@@ -34,9 +34,9 @@ class FeatureSettings:
   max_image_size: int = 1600
   """Long side at which features are sought [pixel]."""
   faint_below: int = 512
-  """A picture with fewer features is searched again for fainter ones, up to so many: plain walls."""
+  """A picture with fewer features is searched again for fainter ones: plain walls."""
   faint_peak: float = 0.002
-  """How much fainter a spot may be there than its surroundings, of white; COLMAP asks for 0.0067."""
+  """What a spot then must differ by from its surroundings, of white; COLMAP asks for 0.0067."""
   affine_shape: bool = True
   """Paper, appendix A."""
   guided_matching: bool = True
@@ -156,13 +156,11 @@ def extract_features(
 
 def _forget_features(database: Path, names: list[str]) -> None:
   """Deletes the features of pictures, which stay."""
-  marks = ",".join("?" * len(names))
+  ids = image_ids(database)
+  rows = [(ids[name],) for name in names]
   with contextlib.closing(sqlite3.connect(database)) as db, db:
     for table in ("keypoints", "descriptors"):
-      db.execute(
-        f"DELETE FROM {table} WHERE image_id IN (SELECT image_id FROM images WHERE name IN ({marks}))",
-        names,
-      )
+      db.executemany(f"DELETE FROM {table} WHERE image_id = ?", rows)
 
 
 def feature_counts(database: Path) -> np.ndarray:
