@@ -12,7 +12,7 @@ kept, and so is what a run before has made of it.
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +32,8 @@ from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.room import TrueRoom
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.poses.localisation import LocalisationError
+from nerf2real.scenes.quality import image_quality
+from nerf2real.scenes.quality.held_out import ViewScore
 from nerf2real.scenes.settings import preset, with_marker
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
@@ -40,7 +42,7 @@ _FILM = "film.mp4"
 _QUICK = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _FIGURES = (
   *("registered_fraction", "camera_rmse_m", "scale_error", "floor_tilt_deg"),
-  *("held_out_psnr_db", "robot_psnr_db", "robot_psnr_60x80_db"),
+  *("held_out_psnr_db", "robot_psnr_db", "robot_psnr_own_gain_db", "robot_psnr_60x80_db"),
   *("collision_true_within_5cm", "surface_true_within_5cm", "collision_true_p95_m"),
   *("sight_lines_blocked", "free_area_m2", "free_area_apart_m2"),
 )
@@ -79,6 +81,18 @@ def true_free_area(true_room: TrueRoom) -> tuple[float, float]:
   return (float(areas[0]), float(areas[1:].sum())) if len(areas) else (0.0, 0.0)
 
 
+def psnr_with_gain(views: Sequence[ViewScore]) -> float:
+  """Returns the pictures' mean PSNR with one gain a channel for all [dB].
+
+  How bright the robot's own camera is, no picture of a phone with automatic exposure tells.
+  """
+  true, seen = (np.stack([getattr(view, k) for view in views]) for k in ("truth", "image"))
+  seen = seen.astype(np.float64)
+  gain = (seen * true).sum((0, 1, 2)) / (seen**2).sum((0, 1, 2))
+  fitted = np.rint(np.clip(gain * seen, 0, 255)).astype(np.uint8)
+  return float(np.mean([image_quality.psnr(a, b) for a, b in zip(fitted, true, strict=True)]))
+
+
 def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value]:
   """Draws, films and reconstructs one room; returns its figures."""
   folder.mkdir(parents=True, exist_ok=True)
@@ -93,7 +107,9 @@ def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value
 
   def measure(result: Reconstruction) -> TruthFigures:
     rows = [int(Path(name).stem.split("_")[-1]) for name in result.localisation.names]
-    return ground_truth.compare(result, poses[rows], true_room=drawn.room, pictures=known)
+    found = ground_truth.compare(result, poses[rows], true_room=drawn.room, pictures=known)
+    gained = {"robot_psnr_own_gain_db": psnr_with_gain(found.robot_views)}
+    return found._replace(figures={**found.figures, **gained})
 
   used = preset(settings.preset)
   if settings.capture != "depth":

@@ -8,6 +8,7 @@ from benchmarks.drawn_rooms import filming, layout, looks, photographs
 from nerf2real.scenes.builtin import camera_path, room, solids
 from nerf2real.scenes.builtin.placing import Group
 from nerf2real.scenes.capture.media import stills
+from nerf2real.scenes.quality import held_out, image_quality
 
 
 def drawn(seed):
@@ -67,6 +68,17 @@ def test_photographs_are_a_phones_of_one_lens(tmp_path):
   assert stills.of_one_camera(files).files == files
   assert stills.read_still(files[0]).shape == (1440, 1920, 3)
   assert stills.read_still(files[2]).shape == (1920, 1440, 3)
+
+
+def test_a_gain_of_all_pictures_costs_nothing():
+  truth = np.random.default_rng(0).integers(20, 120, (4, 6, 8, 3), np.uint8)
+  dim = np.rint(truth * np.array([0.5, 0.8, 1.1])).astype(np.uint8)
+  views = [
+    held_out.ViewScore("", true, seen, np.zeros((6, 8)), image_quality.psnr(seen, true), 1.0)
+    for true, seen in zip(truth, dim, strict=True)
+  ]
+  assert np.mean([view.psnr_db for view in views]) < 22
+  assert other_rooms.psnr_with_gain(views) > 45
 
 
 def test_the_true_free_floor_of_a_room_with_a_wall_across():
