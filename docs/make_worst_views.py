@@ -1,6 +1,6 @@
-"""Draws docs/pictures/worst_views.jpg: held-out views as the reports of bundles show them.
+"""Draws a picture of docs/pictures: held-out views as the reports of bundles show them.
 
-python docs/make_worst_views.py "the worst in five minutes=out/fast" "an hour=out/quality:000644"
+python docs/make_worst_views.py worst_views "five minutes=out/fast" "an hour=out/quality:000644"
 """
 
 import base64
@@ -47,11 +47,12 @@ def _row(title: str, shown: list[tuple[np.ndarray, str]]) -> np.ndarray:
 def main() -> None:
   """Writes the picture beside this script."""
   rows = []
-  for argument in sys.argv[1:]:
+  name, *wanted = sys.argv[1:]
+  for argument in wanted:
     title, _, place = argument.partition("=")
     folder, _, frame = place.partition(":")
     rows.append(_row(title, _held_out(Path(folder) / "report.html", frame)))
-  path = Path(__file__).parent / "pictures" / "worst_views.jpg"
+  path = Path(__file__).parent / "pictures" / f"{name}.jpg"
   cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 78])
 
 
