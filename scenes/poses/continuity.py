@@ -20,8 +20,8 @@ _NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen
 _ASKED = 15  # matches that a verdict needs, as many as a place does
 _AGREED = 0.25  # share of them below which a place is wrong: of wrong ones a tenth at most, chosen
 
-_USUAL = 0.8  # share of the steps from picture to picture that are the film's usual speed, chosen
-_LEAP = 3.0  # times that speed, chosen; held by hand, the fastest step has 1.2 to 2.1 times
+_USUAL = 0.9  # share of the steps from picture to picture that are the film's usual speed, chosen
+_LEAP = 3.0  # times that speed, chosen; held by hand, the fastest step has 1.1 to 1.8 times
 
 Votes = Mapping[tuple[int, int], tuple[int, int]]
 """Of pairs of pictures, the earlier first: matches that agree on a point, and that see one."""
@@ -80,6 +80,8 @@ def _parts(left: list[int], votes: Votes) -> Iterator[tuple[int, np.ndarray, np.
 def leaps(centers: np.ndarray, times: np.ndarray) -> list[tuple[int, int]]:
   """Returns the pairs of pictures between which a hand would have had to leap.
 
+  A tenth of the steps at most may be leaps, and nine tenths stand still.
+
   Args:
     centers: Positions [N, 3].
     times: When [s] [N]; where they do not grow, nothing is said.
@@ -87,10 +89,9 @@ def leaps(centers: np.ndarray, times: np.ndarray) -> list[tuple[int, int]]:
   passed = np.diff(times)
   if len(times) < 2 or passed.min() <= 0:
     return []
-  steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) / passed
-  usual = np.quantile(steps, _USUAL)
-  way = np.linalg.norm(centers[:, None] - centers, axis=2)
-  first, second = np.nonzero(way > _LEAP * usual * (times - times[:, None]))
+  usual = np.quantile(np.linalg.norm(np.diff(centers, axis=0), axis=1) / passed, _USUAL)
+  apart = np.linalg.norm(centers[:, None] - centers, axis=2)
+  first, second = np.nonzero(apart > _LEAP * usual * (times - times[:, None]))
   return [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
 
 

@@ -52,14 +52,14 @@ def test_a_few_matches_decide_nothing():
 def test_the_order_is_the_films(monkeypatch):
   taken, other_world = [], [4]
   images = [
-    pycolmap.Image(name=f"frame_{k:06d}.jpg", image_id=20 - k, frame_id=k) for k in range(14)
+    pycolmap.Image(name=f"frame_{k:06d}.jpg", image_id=40 - k, frame_id=k) for k in range(25)
   ]
   monkeypatch.setattr(continuity, "registered", lambda model: images)
   monkeypatch.setattr(pycolmap.Image, "projection_center", lambda image: np.zeros(3))
 
   def pairs(model, database):
-    for i in range(14):
-      for j in range(i + 1, min(14, i + 4)):
+    for i in range(25):
+      for j in range(i + 1, min(25, i + 4)):
         same = (i in other_world) == (j in other_world)
         points = np.ones((30, 2), np.uint64)
         points[:, 1] += 0 if same else 1
@@ -71,12 +71,12 @@ def test_the_order_is_the_films(monkeypatch):
     def deregister_frame(self, key):
       taken.append(key)
 
-  times = {f"frame_{k:06d}.jpg": 0.5 * k for k in range(14)}
+  times = {f"frame_{k:06d}.jpg": 0.5 * k for k in range(25)}
   assert continuity.drop_out_of_line(Model(), None, times) == 1
   assert taken == [4]
   taken.clear()
   other_world.clear()
-  places = np.arange(14.0)
+  places = np.arange(25.0)
   places[6] = 40.0  # all matches agree with it, and no hand gets there and back
   monkeypatch.setattr(pycolmap.Image, "projection_center", lambda i: [places[i.frame_id], 0, 0])
   assert continuity.drop_out_of_line(Model(), None, times) == 1
@@ -84,11 +84,13 @@ def test_the_order_is_the_films(monkeypatch):
 
 
 def test_a_leap_is_a_way_that_the_films_usual_speed_does_not_allow():
-  times = np.arange(20) * 0.5
-  centers = np.zeros((20, 3))
-  centers[:, 0] = np.cumsum(np.random.default_rng(0).uniform(0.0, 0.2, 20))
+  times = np.arange(30) * 0.5
+  centers = np.zeros((30, 3))
+  centers[:, 0] = np.cumsum(np.random.default_rng(0).uniform(0.0, 0.2, 30))
   assert continuity.leaps(centers, times) == []
-  centers[9, 1] = 3.0
+  waits = np.maximum(centers[:, 0] - centers[22, 0], 0.0)  # three quarters of it stand still
+  assert continuity.leaps(np.stack([waits, 0 * waits, 0 * waits], 1), times) == []
+  centers[9, 1] = 0.8
   found = continuity.leaps(centers, times)
   assert {(8, 9), (9, 10)} <= set(found) and all(9 in pair for pair in found)
   assert continuity.leaps(centers, times[::-1]) == []
