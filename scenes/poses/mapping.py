@@ -3,6 +3,7 @@
 import os
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -113,8 +114,30 @@ def drop_weak_images(model: pycolmap.Reconstruction) -> int:
   return len(weak)
 
 
-def adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool) -> None:
-  """Adjusts poses, points, focal lengths and, where chosen, principal point and distortion."""
+class Anchors(NamedTuple):
+  """Where something else than features says that pictures were taken."""
+
+  positions: Mapping[str, np.ndarray]
+  """Of pictures, by their names [3], in the model's unit and near its frame."""
+  deviation: float
+  """Standard deviation of each along an axis."""
+
+
+def adjust(
+  model: pycolmap.Reconstruction,
+  *,
+  principal: bool,
+  distortion: bool,
+  anchors: Anchors | None = None,
+) -> None:
+  """Adjusts poses, points, focal lengths and, where chosen, principal point and distortion.
+
+  Args:
+    model: Changed in place.
+    principal: Whether the principal point is free.
+    distortion: Whether the distortion is.
+    anchors: What holds the positions besides the pictures.
+  """
   options = pycolmap.BundleAdjustmentOptions()
   options.refine_principal_point = principal
   options.refine_extra_params = distortion
@@ -127,9 +150,24 @@ def adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool)
   config = pycolmap.BundleAdjustmentConfig()
   for image in registered(model):
     config.add_image(image.image_id)
-  config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
   with quiet():  # pycolmap.bundle_adjustment writes to the terminal whatever the log level
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    if anchors is None:
+      config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+      pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+      return
+    priors = [
+      pycolmap.PosePrior(
+        corr_data_id=image.data_id,
+        position=anchors.positions[image.name],
+        position_covariance=anchors.deviation**2 * np.eye(3),
+        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+      )
+      for image in registered(model)
+      if image.name in anchors.positions
+    ]
+    how = pycolmap.PosePriorBundleAdjustmentOptions()
+    how.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    pycolmap.create_pose_prior_bundle_adjuster(options, how, config, priors, model).solve()
 
 
 def drop_bad_observations(model: pycolmap.Reconstruction) -> None:
@@ -138,8 +176,10 @@ def drop_bad_observations(model: pycolmap.Reconstruction) -> None:
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
 
 
-def _adjust(model: pycolmap.Reconstruction, *, principal: bool, distortion: bool) -> None:
-  adjust(model, principal=principal, distortion=distortion)
+def _adjust(
+  model: pycolmap.Reconstruction, *, principal: bool, distortion: bool, anchors: Anchors | None
+) -> None:
+  adjust(model, principal=principal, distortion=distortion, anchors=anchors)
   drop_bad_observations(model)
 
 
@@ -173,7 +213,10 @@ class FreeLens(NamedTuple):
 
 
 def refine(
-  model: pycolmap.Reconstruction, *, report: Progress = no_progress
+  model: pycolmap.Reconstruction,
+  *,
+  anchors: Anchors | None = None,
+  report: Progress = no_progress,
 ) -> tuple[pycolmap.Reconstruction, FreeLens]:
   """Adjusts poses, points and all parameters of the lens; frees fewer where the result is absurd.
 
@@ -186,18 +229,18 @@ def refine(
   """
   report(0.0, "adjusting poses and lens")
   base = pycolmap.Reconstruction(model)
-  _adjust(base, principal=False, distortion=True)
+  _adjust(base, principal=False, distortion=True, anchors=anchors)
   fault = camera_fault(_camera(base))
   if fault is not None:
     base = pycolmap.Reconstruction(model)
     for camera in base.cameras.values():
       camera.params = np.concatenate([camera.params[:4], np.zeros(4)])
-    _adjust(base, principal=False, distortion=False)
+    _adjust(base, principal=False, distortion=False, anchors=anchors)
     words = f"focal lengths only, no distortion, because {fault}"
     return base, FreeLens(distortion=False, principal=False, words=words)
   report(0.5, "adjusting poses and lens, principal point free")
   full = pycolmap.Reconstruction(base)
-  _adjust(full, principal=True, distortion=True)
+  _adjust(full, principal=True, distortion=True, anchors=anchors)
   fault = camera_fault(_camera(full))
   change = _camera(full).fx / _camera(base).fx - 1
   if fault is None and abs(change) > _MAX_FOCAL_CHANGE:

@@ -3,13 +3,15 @@
 A tracker's poses are off by a degree and its lens is nominal: more than a field or a surface of
 2 cm bears. Features are matched between pictures that look at the same place, triangulated with the
 poses as they came, and poses, points and lens adjusted together; the result is moved back onto the
-poses that came, which are metric. Shapes: N pictures.
+poses that came, which are metric. These hold, lightly, what sees little: plain walls. Shapes: N
+pictures.
 """
 
 import dataclasses
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.similarity import Similarity
@@ -28,6 +30,11 @@ _PARTNERS = 10  # pictures each is matched with; chosen: as COLMAP's sequence of
 _SAME_VIEW = np.cos(np.radians(60.0))  # of the optical axes of a pair
 _LOOSE = 16.0  # pixels that poses of a degree may be off at first, in a view of a thousand
 _TRIANGULATED = 0.15  # of the progress of both rounds: where one's points are made
+_MEDIAN = 0.6745  # of the size of a normal variable, in standard deviations
+_LIGHTLY = 3.0  # times their deviations; chosen: a tracker errs alike in pictures near each other
+_ASTRAY = 4.0  # times what half of them turn; six deviations of a tracker's errors about three axes
+_LITTLE = 0.5  # of the points that half of them see
+_EXACT = 1e-4  # m that places err by at least
 _FEWEST = 0.5  # of the pictures must see enough points, or the poses stay as they came
 
 
@@ -118,11 +125,12 @@ def refine_known(
 
   Returns:
     The refined poses, and the model with the points that carry them, both in the frame of the
-    poses that came. Pictures that see too few points keep the poses that they came with.
+    poses that came. Pictures that see too few points, and those that turn away from the poses that
+  they came with as no others do, keep those.
   """
   empty = np.zeros((0, 3))
   bare = dataclasses.replace(known, points=empty, point_colors=empty.astype(np.uint8))
-  found = bare
+  found, anchors = bare, None
   for share, error in ((0.0, _LOOSE), (0.5, mapping.MAX_ERROR)):
     report(share, f"points of {len(names)} pictures, matches within {error:g} pixels")
     model = mapping.triangulate(database, images_folder, found, names, max_error=error)
@@ -132,9 +140,43 @@ def refine_known(
     for image in mapping.registered(model):
       if image.name not in strong:
         model.deregister_frame(image.frame_id)
-    model, _ = mapping.refine(model, report=part(report, share + _TRIANGULATED, share + 0.5))
-    found = _moved_back(model, bare, names)
+    model, _ = mapping.refine(
+      model, anchors=anchors, report=part(report, share + _TRIANGULATED, share + 0.5)
+    )
+    found = _let_go(model, bare, _moved_back(model, bare, names), names)
+    anchors = _anchors(bare, found, names)
   return known.with_views(found.camera, found.world_from_camera), model
+
+
+def _anchors(known: KnownPoses, refined: KnownPoses, names: list[str]) -> mapping.Anchors:
+  """The places that came, held lightly: what sees little is held by them, what sees much is not."""
+  places = known.world_from_camera[:, :3, 3]
+  moved = np.abs(refined.world_from_camera[:, :3, 3] - places)
+  moved = moved[moved.any(axis=1)]
+  deviation = float(np.median(moved)) / _MEDIAN if len(moved) else 0.0
+  held = dict(zip(names, places, strict=True))
+  return mapping.Anchors(held, _LIGHTLY * max(deviation, _EXACT))
+
+
+def _let_go(
+  model: pycolmap.Reconstruction, known: KnownPoses, refined: KnownPoses, names: list[str]
+) -> KnownPoses:
+  """Gives pictures that see little and turn far from the poses that came those again.
+
+  The model loses them (in place). One that sees much may turn: then the tracker has slipped.
+  """
+  images = mapping.registered(model)
+  rows = [names.index(image.name) for image in images]
+  poses = np.array(refined.world_from_camera)
+  before = known.world_from_camera[rows, :3, :3]
+  turns = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ poses[rows, :3, :3]).magnitude()
+  points = np.array([image.num_points3D for image in images])
+  astray = (turns > _ASTRAY * np.median(turns)) & (points < _LITTLE * np.median(points))
+  for image, row, leaves in zip(images, rows, astray, strict=True):
+    if leaves:
+      model.deregister_frame(image.frame_id)
+      poses[row] = known.world_from_camera[row]
+  return dataclasses.replace(refined, world_from_camera=poses)
 
 
 def _carries(image: pycolmap.Image) -> bool:

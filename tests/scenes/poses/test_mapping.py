@@ -1,0 +1,54 @@
+"""Tests of adjustments, on made-up places and points."""
+
+import numpy as np
+import pycolmap
+
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.poses import mapping
+
+WEAK = 3  # the picture that sees little
+
+
+def observed():
+  """A model with noise of a pixel, one picture of which sees six points, and its true places."""
+  pycolmap.set_random_seed(0)
+  model = pycolmap.synthesize_dataset(
+    pycolmap.SyntheticDatasetOptions(
+      num_rigs=1,
+      num_cameras_per_rig=1,
+      num_frames_per_rig=8,
+      num_points3D=120,
+      num_points2D_without_point3D=0,
+    )
+  )
+  random = np.random.default_rng(0)
+  for image in model.images.values():
+    for point in image.points2D:
+      point.xy = point.xy + random.normal(0, 1, 2)
+  true = {image.name: image.projection_center() for image in model.images.values()}
+  weak = mapping.registered(model)[WEAK]
+  places = np.array([model.points3D[p.point3D_id].xyz for p in weak.points2D])
+  near = np.argsort(np.linalg.norm(places - places[0], axis=1))[:6]
+  for row in set(range(len(places))) - set(near.tolist()):
+    model.delete_observation(weak.image_id, row)
+  return model, true
+
+
+def errors(model, true):
+  images = mapping.registered(model)
+  found = np.array([image.projection_center() for image in images])
+  wanted = np.array([true[image.name] for image in images])
+  strong = np.arange(len(images)) != WEAK
+  return np.linalg.norm(Similarity.fit(found[strong], wanted[strong]).apply(found) - wanted, axis=1)
+
+
+def test_anchors_hold_what_sees_little_and_little_else():
+  model, true = observed()
+  free, held = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+  mapping.adjust(free, principal=False, distortion=False)
+  shaken = {name: place + 0.01 * np.sin(k) for k, (name, place) in enumerate(true.items())}
+  mapping.adjust(held, principal=False, distortion=False, anchors=mapping.Anchors(shaken, 0.03))
+  before, after = errors(free, true), errors(held, true)
+  assert after[WEAK] < 0.04 < 0.1 < before[WEAK]
+  strong = np.arange(len(before)) != WEAK
+  np.testing.assert_allclose(after[strong], before[strong], atol=2e-3)
