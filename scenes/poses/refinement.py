@@ -125,8 +125,8 @@ def refine_known(
 
   Returns:
     The refined poses, and the model with the points that carry them, both in the frame of the
-    poses that came. Pictures that see too few points, and those that turn away from the poses that
-  they came with as no others do, keep those.
+    poses that came. Pictures that see too few points, and those that see little and turn away from
+    the poses that they came with as no others do, keep those.
   """
   empty = np.zeros((0, 3))
   bare = dataclasses.replace(known, points=empty, point_colors=empty.astype(np.uint8))
