@@ -47,7 +47,7 @@ def _geometry(figures: Mapping[str, Any]) -> Answer:
   blocked, missed = (figures[name] for name in names)
   fit = max(blocked, missed) <= FIT
   words = [
-    f"Of the lines of sight to points of the film 5 % meet matter {100 * blocked:.2g} cm or more"
+    f"Of the lines of sight to localised points 5 % meet matter {100 * blocked:.2g} cm or more"
     f" before their point, of the points 5 % lie {100 * missed:.2g} cm or more from all matter;"
     f" at most {100 * FIT:.0f} cm is asked of both."
   ]
