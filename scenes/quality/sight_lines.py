@@ -68,8 +68,8 @@ class Judgement(NamedTuple):
       return None
     return (
       f"The contact geometry is unfit to train in: {' and '.join(found)}, expected at most "
-      f"{FIT:g} m. Film slower, or photograph from more places, with more light, moving sideways along "
-      "plain walls and black or shiny things, or train longer (--preset quality)."
+      f"{FIT:g} m. Film slower, or photograph from more places, with more light, moving sideways "
+      "along plain walls and black or shiny things, or train longer (--preset quality)."
     )
 
 
