@@ -31,6 +31,8 @@ class Settings(harness.Options):
 
   splats: Path
   """PLY of the built-in room."""
+  scene: Path | None = None
+  """Folder of the bundle that it was made of; the shipped one if not given."""
   samples: int = 1
   """Samples a pixel of the renderer."""
 
@@ -67,7 +69,7 @@ def draw_with_mujoco_warp(splats: Splats, poses: np.ndarray, *, samples: int) ->
 
 def main(settings: Settings) -> None:
   """Draws and prints the table."""
-  bundle = Bundle.load()
+  bundle = Bundle.load() if settings.scene is None else Bundle.load(settings.scene)
   arrays = np.load(ground_truth.ROBOT_VIEWS)
   world_from_room = from_plain(bundle.figures["room_from_world"], Similarity).inverse()
   poses = world_from_room.apply_pose(arrays["world_from_camera"])

@@ -25,9 +25,9 @@ from nerf2real.scenes.field.render.renderer import Renderer
 class FitSettings:
   """Settings of the splats and their fit."""
 
-  max_splats: int = 60_000
+  max_splats: int = 100_000
   """At most so many; at most 200,000 are sensible in a browser."""
-  steps: int = 2000
+  steps: int = 6000
   """Pictures that are fitted to, one a step."""
   uses: int = 3
   """Steps with a picture of the field, on average; to render one takes as long as a step."""
@@ -35,7 +35,7 @@ class FitSettings:
   """The fit ends after this wall time [s] at the latest."""
   seed_views: int = 150
   """Pictures that the splats start from, half from the robot's places, half from the capture's."""
-  finest: float = 0.012
+  finest: float = 0.009
   """Least distance of neighbouring splats at the start [m]."""
   eye_height: float = 0.44
   """Of the robot's camera above the floor [m]: a standing OP3's."""
