@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.geometry import convex, decomposition, fusion
+from nerf2real.scenes.geometry import convex, decomposition, fusion, thin
 from nerf2real.scenes.geometry import mesh as meshes
 
 
@@ -108,9 +108,8 @@ def solid_grid(
     truncation=settings.truncation,
     progress=progress,
   )
-  grid = remove_floor(
-    smooth(grid, deviation=settings.smoothing), threshold=settings.floor_threshold
-  )
+  grid = thin.with_thin_things(smooth(grid, deviation=settings.smoothing), views)
+  grid = remove_floor(grid, threshold=settings.floor_threshold)
   return meshes.drop_floaters(grid, min_component=settings.min_component)
 
 

@@ -17,7 +17,7 @@ from nerf2real.core import cameras, similarity
 from nerf2real.core.progress import Progress, no_progress
 
 _MIN_COSINE = 0.15  # steepest incidence that still counts: at 81 degrees depth is mostly noise
-_EDGE = 0.08  # a pixel whose neighbour is this much deeper (relative) sits on a silhouette
+EDGE = 0.08  # a pixel whose neighbour is this much deeper (relative) sits on a silhouette
 _MAX_VOXELS = 60_000_000  # 0.5 GB of values and weights
 
 
@@ -127,7 +127,7 @@ def pixel_normals(depth: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.n
   near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
   # What a plane seen at this slant would show as relief within 3x3 pixels is no silhouette.
   angle = np.abs(rays[1:-1, 2:, 0] - rays[1:-1, :-2, 0]).mean() / 2
-  relief = _EDGE + 2 * angle * np.sqrt(1 / np.maximum(cosine, _MIN_COSINE) ** 2 - 1)
+  relief = EDGE + 2 * angle * np.sqrt(1 / np.maximum(cosine, _MIN_COSINE) ** 2 - 1)
   bad = (near <= 0) | (far - near > relief * near) | (length < 1e-12)
   bad[[0, -1], :] = bad[:, [0, -1]] = True
   return normal, np.where(bad, 0, cosine)
