@@ -88,9 +88,9 @@ class TrainSettings:
   """Second difference of 1 / z, relative to 1 / z, from where on it is an edge. Chosen."""
   planar_contrast: float = 0.05
   """Difference of colours in [0, 1] by which the weight falls to a third. Chosen."""
-  planar_reach: int = 80
-  """Most pixels between two of three: short threes alone do not see a wide dent. Chosen: with 15
-  pixels and a thirtieth of the weight 59 % are off."""
+  planar_reach: float = 0.16
+  """Widest angle between two of three [rad]: short threes do not see a wide dent. Chosen: with 0.03
+  and a thirtieth of the weight 59 % are off."""
   planar_start: int = 600
   """Step at which they set in: fog has to form surfaces first. Chosen."""
   empty_samples: int = 1024

@@ -115,7 +115,7 @@ class FusedTrainer:
     numbers.planar_weight = train.planar_weight
     numbers.planar_bend = train.planar_bend
     numbers.planar_contrast = train.planar_contrast
-    numbers.planar_reach = train.planar_reach
+    numbers.planar_reach = max(round(train.planar_reach / self._pixel_angle), 3)
     numbers.anchor_fraction = train.anchor_fraction
     numbers.anchor_weight = train.anchor_weight
     numbers.empty_samples = train.empty_samples // self.device.threads

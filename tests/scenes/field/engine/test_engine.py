@@ -49,7 +49,7 @@ SETTINGS = TrainSettings(
   planar_weight=0.5,
   planar_bend=0.4,
   planar_contrast=0.8,
-  planar_reach=8,
+  planar_reach=0.6,
 )
 FAST = TrainSettings(
   field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
