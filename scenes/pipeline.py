@@ -109,7 +109,8 @@ def _run_stages(
   )
   pictures = PosedPictures(capture, poses, settings.train_width, settings.held_out_every)
   show = None if watcher is None else watcher.field
-  field = radiance_field.field(cache, pictures, settings.train, show=show)
+  points = radiance_field.stereo(cache, pictures, settings.stereo)
+  field = radiance_field.field(cache, pictures, points, settings.train, show=show)
   depth = radiance_field.depth(cache, field, capture, poses, width=settings.depth_width)
   figures = judging.figures(cache, field, pictures)
   world = world_frame.world(cache, capture, poses, outlook, depth, settings.align, given)

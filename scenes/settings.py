@@ -11,6 +11,7 @@ from nerf2real.scenes.geometry.collision import CollisionSettings
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.geometry.mesh import MeshSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
+from nerf2real.scenes.stereo.dense import StereoSettings
 
 MARKER_SIDES = (0.01, 2.0)  # m: from a coin's size to a poster's
 CAMERA_HEIGHTS = (0.05, 10.0)  # m: from a crawling robot's to a tripod's on a gallery
@@ -33,6 +34,8 @@ class SceneSettings:
   """Keyframes."""
   localise: LocaliseSettings = LocaliseSettings()
   """Poses."""
+  stereo: StereoSettings = StereoSettings()
+  """Points that stereo finds, for the training."""
   train: TrainSettings = TrainSettings()
   """Radiance field."""
   train_width: int = 1280
@@ -69,6 +72,7 @@ def with_marker(settings: SceneSettings, place: MarkerPlace) -> SceneSettings:
   return dataclasses.replace(settings, align=dataclasses.replace(settings.align, marker_at=place))
 
 
+NO_STEREO = StereoSettings(most_pictures=0)
 PRESETS = ("fast", "quality", "demo", "tiny", "paper")
 
 
@@ -84,17 +88,22 @@ def preset(name: str) -> SceneSettings:
   if name == "demo":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=110),
+      stereo=NO_STEREO,
       train=dataclasses.replace(training.preset("fast"), max_seconds=150.0),
       baseline="colmap",
     )
   if name == "tiny":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=60),
+      stereo=NO_STEREO,
       # a rate for few steps, see benchmarks/results/records/rooms/field_ablation.json
       train=dataclasses.replace(training.preset("fast"), max_seconds=60.0, learning_rate=5e-3),
     )
   if name == "paper":
     return SceneSettings(
-      capture=CaptureSettings(num_keyframes=1000), train=training.preset("paper"), train_width=1920
+      capture=CaptureSettings(num_keyframes=1000),
+      stereo=NO_STEREO,
+      train=training.preset("paper"),
+      train_width=1920,
     )
   raise ValueError(f"Unknown preset {name!r}; expected one of {', '.join(PRESETS)}.")

@@ -24,6 +24,12 @@ class PosedPictures:
   held_out_every: int
   """Every so many are kept from training."""
 
+  @property
+  def measured(self) -> bool:
+    """Whether a sensor measured the keyframes' depth."""
+    known = self.capture.value.known
+    return known is not None and bool(known.depth_files)
+
   def views(self) -> Views:
     """Reads all pictures.
 

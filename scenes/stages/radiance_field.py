@@ -1,8 +1,9 @@
-"""Stages of the radiance field: its training, its depth from the cameras.
+"""Stages of the radiance field: points for it by stereo, its training, its depth from the cameras.
 
 Each runs, or finds done, one stage of the cache: a function of earlier results and settings.
 """
 
+import dataclasses
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -21,22 +22,57 @@ from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.pictures import PosedPictures
 from nerf2real.scenes.stages.results import TrainedField
+from nerf2real.scenes.stereo import dense
 
 _FIELD_VERSION = 2  # 2: the lens's falloff is taken out of the pictures
+
+
+def stereo(
+  cache: Stages, pictures: PosedPictures, settings: dense.StereoSettings
+) -> Made[np.ndarray]:
+  """Finds points by stereo, anchors [A, 4] of the pictures that are not held out.
+
+  None where a sensor measured depth.
+  """
+
+  def write(folder: Path, progress: Progress) -> None:
+    points = np.zeros((0, 4), np.float32)
+    if not pictures.measured:
+      views = pictures.training().evened()
+      points = dense.dense_points(views, settings, progress=progress)
+    np.save(folder / "points.npy", points)
+
+  everything = {
+    "stereo": settings,
+    "held_out_every": pictures.held_out_every,
+    "train_width": pictures.width,
+  }
+  stage = cache.run("stereo", write, settings=everything, inputs={"poses": pictures.poses.stamp})
+  return Made(np.load(stage.folder / "points.npy"), stage)
 
 
 def field(
   cache: Stages,
   pictures: PosedPictures,
+  points: Made[np.ndarray],
   settings: TrainSettings,
   *,
   show: Callable[[training.Snapshot], None] | None = None,
 ) -> Made[TrainedField]:
-  """Trains the radiance field on all pictures that are not held out; `show` sees it grow."""
+  """Trains the radiance field on all pictures that are not held out; `show` sees it grow.
+
+  Args:
+    cache: The stages of the job.
+    pictures: The pictures.
+    points: What stereo found in them, anchors [A, 4].
+    settings: Settings.
+    show: Sees the field grow.
+  """
 
   def write(folder: Path, progress: Progress) -> None:
+    views = pictures.training().evened()
     trained, outcome = training.train(
-      pictures.training().evened(),
+      dataclasses.replace(views, anchors=np.concatenate([views.anchors, points.value])),
       settings,
       progress=progress,
       checkpoint_dir=folder / "checkpoints",
@@ -51,8 +87,8 @@ def field(
     "held_out_every": pictures.held_out_every,
     "train_width": pictures.width,
   }
-  inputs = {"poses": pictures.poses.stamp}
-  if pictures.capture.value.known is not None and pictures.capture.value.known.depth_files:
+  inputs = {"poses": pictures.poses.stamp, "stereo": points.stamp}
+  if pictures.measured:
     inputs["keyframes"] = pictures.capture.stamp
   stage = cache.run("field", write, settings=everything, inputs=inputs, version=_FIELD_VERSION)
   return Made(TrainedField(stage.folder / "field.safetensors"), stage)

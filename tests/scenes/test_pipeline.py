@@ -144,7 +144,7 @@ def test_changed_alignment_keeps_the_field_but_not_the_contact(scene, source, se
   before, after = scene.scene["hashes"], changed.scene["hashes"]
   assert after["field"] == before["field"]
   assert after["world"] != before["world"] and after["contact"] != before["contact"]
-  kept = {"keyframes", "poses", "field", "depth", "figures"}
+  kept = {"keyframes", "poses", "stereo", "field", "depth", "figures"}
   made, made_again = _stamps(scene.folder), _stamps(out)
   assert {name for name in made if made[name] == made_again[name]} == kept
   assert changed.world_from_unit.scale == pytest.approx(2.0)

@@ -1,0 +1,1 @@
+"""Dense stereo between posed pictures: depth wherever they show some texture."""
