@@ -22,7 +22,7 @@ class LocaliseSettings:
   min_registered: int = 10
   """Fewer are an error, unless there are fewer keyframes."""
   min_parallax: float = 0.08
-  """Share of matches off a homography below which a warning is given."""
+  """Share of matches that no turn of the camera explains below which a warning is given."""
   refine_known: bool = True
   """Whether poses that came with measured depth are adjusted to the pictures."""
   seed: int = 0

@@ -132,8 +132,7 @@ def _map(
 
   match(pairs, dataclasses.replace(guided, guided_matching=False) if plain else guided)
   warnings = []
-  width = _picture_width(database)
-  share = parallax_share(database, width=width, seed=settings.seed)
+  share = parallax_share(database, seed=settings.seed)
   if share is not None and share < settings.min_parallax:
     warnings.append(
       f"Hardly any parallax: {1 - share:.0%} of the matches fit a camera that only turns; walk "
@@ -193,11 +192,6 @@ def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -
     found = found.of(np.array([name in kept for name in placed]))
   words = f"{mapped.strategy}; rolling shutter of {1e3 * found.readout:.1f} ms taken out"
   return dataclasses.replace(mapped, model=model, strategy=words, shutter=found)
-
-
-def _picture_width(database: Path) -> int:
-  with pycolmap.Database.open(str(database)) as db:
-    return db.read_all_cameras()[0].width
 
 
 def _best_model(
