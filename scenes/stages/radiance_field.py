@@ -24,7 +24,8 @@ from nerf2real.scenes.stages.pictures import PosedPictures
 from nerf2real.scenes.stages.results import TrainedField
 from nerf2real.scenes.stereo import dense
 
-_FIELD_VERSION = 2  # 2: the lens's falloff is taken out of the pictures
+# 2: the lens's falloff is taken out of the pictures; 3: what is near a camera may be there
+_FIELD_VERSION = 3
 
 
 def stereo(

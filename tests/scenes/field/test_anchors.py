@@ -1,8 +1,11 @@
 """Localised points: distances along pixels' rays, and the space that they show to be empty."""
 
+import dataclasses
+
 import numpy as np
 import pycolmap
 
+from nerf2real.core.rotations import camera_axes
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.field import anchors
 from nerf2real.scenes.poses import localisation
@@ -89,6 +92,24 @@ def test_empty_cells_lie_inside_the_walls():
   assert np.abs(centres).max() < box_views.HALF_SIZE
   for eye in views.world_from_camera[:, :3, 3]:  # every camera stands in empty space
     assert np.linalg.norm(centres - eye, axis=-1).min() < 2 / size
+
+
+def test_what_stands_near_one_camera_is_not_empty():
+  """Three points beside a camera, which another one sees: of all points they are few."""
+  views = box_views.make_views(8, width=64, height=48, anchors=300)
+  poses = views.world_from_camera.copy()
+  eye, other = poses[0, :3, 3], poses[1, :3, 3]
+  place = eye + np.array([0.0, 0.0, 0.12])
+  distance = np.linalg.norm(place - other)
+  poses[1, :3, :3] = camera_axes((place - other) / distance)
+  seen = np.tile(np.float32([1, 32, 24, distance]), (3, 1))
+  known = np.concatenate([views.anchors[views.anchors[:, 0] != 1], seen])
+  changed = dataclasses.replace(views, world_from_camera=poses, anchors=known)
+  size = anchors.EMPTY_CELLS
+  cells = anchors.empty_cells(changed)
+  centres = (np.stack(np.unravel_index(cells, (size,) * 3), -1) + 0.5) * 2 / size - 1
+  assert np.linalg.norm(centres - place, axis=-1).min() > 0.05
+  assert np.linalg.norm(centres - eye, axis=-1).min() < 2 / size
 
 
 def test_without_points_nothing_is_known():
