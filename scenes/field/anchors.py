@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage, spatial
+from scipy import ndimage
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.poses.localisation import Localisation
@@ -22,7 +22,7 @@ _MOST_ERROR = 2.0  # points with a larger reprojection error are left out [pixel
 _FEWEST_VIEWS = 3  # so are points in fewer pictures: the third one checks the first two
 EMPTY_CELLS = 80  # cells along the unit cube: 6 cm in a room of 5 m, finer than furniture
 _CROSSINGS = 4  # sight lines that cross an empty cell; fewer may all end at wrong points
-_CLEARANCE = 0.4  # no matter this near a camera, as a share of the nearest point's distance
+_CLEARANCE = 0.4  # no matter this near a camera, as a share of the nearest points' distance
 _MARGIN = 0.04  # a sight line ends this far before its point [unit]: 10 cm in a room of 5 m
 
 
@@ -77,12 +77,14 @@ def empty_cells(views: Views) -> np.ndarray:
   ends = ends[((ends >= 0) & (ends < EMPTY_CELLS)).all(-1)]
   crossed[tuple(ends.T)] = False
   empty = ndimage.binary_erosion(crossed, np.ones((3, 3, 3)))
-  eyes = views.world_from_camera[:, :3, 3]
-  nearest = spatial.cKDTree(origins + anchors[:, 3:] * directions).query(eyes)[0]
+  seen = np.ones_like(crossed)
+  seen[tuple(ends.T)] = False
+  from_points = step * ndimage.distance_transform_edt(seen)
+  radius = _CLEARANCE * float(np.percentile(anchors[:, 3], 1))
   axis = (np.arange(EMPTY_CELLS) + 0.5) * step - 1
-  for eye, radius in zip(eyes, _CLEARANCE * nearest, strict=True):
-    window = [np.flatnonzero(np.abs(axis - center) < radius) for center in eye]
-    squares = [np.square(axis[line] - center) for line, center in zip(window, eye, strict=True)]
-    near = squares[0][:, None, None] + squares[1][:, None] + squares[2] < radius**2
-    empty[np.ix_(*window)] |= near
+  for eye in views.world_from_camera[:, :3, 3]:
+    window = np.ix_(*[np.flatnonzero(np.abs(axis - center) < radius) for center in eye])
+    offset = [axis[line.ravel()] - center for line, center in zip(window, eye, strict=True)]
+    from_eye = np.sqrt(sum(np.square(part) for part in np.ix_(*offset)))
+    empty[window] |= from_eye < np.minimum(radius, from_points[window])
   return np.flatnonzero(empty)
