@@ -17,6 +17,7 @@ from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.field import training
 from nerf2real.scenes.field.settings import TrainSettings
+from nerf2real.scenes.field.views import held_out_rows
 from nerf2real.scenes.geometry import fusion
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.stages.cache import Made, Stages
@@ -33,12 +34,14 @@ def stereo(
 ) -> Made[np.ndarray]:
   """Finds points by stereo, anchors [A, 4] of the pictures that are not held out.
 
-  None where a sensor measured depth.
+  None of more pictures than the settings allow, and none where a sensor measured depth.
   """
+  count = len(pictures.poses.value.names)
+  trained = int((~held_out_rows(count, pictures.held_out_every)).sum())
 
   def write(folder: Path, progress: Progress) -> None:
     points = np.zeros((0, 4), np.float32)
-    if not pictures.measured:
+    if trained <= settings.most_pictures and not pictures.measured:
       views = pictures.training().evened()
       points = dense.dense_points(views, settings, progress=progress)
     np.save(folder / "points.npy", points)

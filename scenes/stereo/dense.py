@@ -54,7 +54,9 @@ def _pinhole(views: Views, width: int) -> tuple[Camera, np.ndarray]:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     grey = small.astype(np.float32) / 255
-    pictures.append(cv2.remap(grey, at[..., 0], at[..., 1], cv2.INTER_LINEAR))
+    # Beyond the picture its border goes on: a black margin would have an edge that moves with it.
+    x, y = at[..., 0], at[..., 1]
+    pictures.append(cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
   return plain, np.stack(pictures)
 
 
@@ -147,13 +149,9 @@ def dense_points(
     progress: Called with the fraction done and a text.
 
   Returns:
-    float32 [A, 4] as `Views.anchors`: picture, pixel x and y, distance along the ray [unit]; none
-    of more pictures than `most_pictures`.
+    float32 [A, 4] as `Views.anchors`: picture, pixel x and y, distance along the ray [unit].
   """
-  settings = settings or StereoSettings()
-  if len(views) > settings.most_pictures:
-    return np.zeros((0, 4), np.float32)
-  search = _Search(views, settings)
+  search = _Search(views, settings or StereoSettings())
   for n in range(len(views)):
     search.find(n)
     progress((n + 1) / len(views), f"stereo, picture {n + 1} of {len(views)}")

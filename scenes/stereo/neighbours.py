@@ -28,7 +28,9 @@ def neighbours(views: Views, settings: NeighbourSettings) -> list[np.ndarray]:
   size = np.array([camera.width, camera.height])
   owner = views.anchors[:, 0].astype(int)
   x, y = views.anchors[:, 1:3].astype(int).T
-  rays = camera.rays()[y, x]
+  every = camera.rays()
+  widest = np.square(every[..., :2]).sum(-1).max()  # farther out a lens may fold back
+  rays = every[y, x]
   ways = np.einsum("aij,aj->ai", views.world_from_camera[owner, :3, :3], rays)
   ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
   points = eyes[owner] + views.anchors[:, 3:] * ways
@@ -41,7 +43,7 @@ def neighbours(views: Views, settings: NeighbourSettings) -> list[np.ndarray]:
         continue
       offset = mine - eyes[k]
       local = offset @ pose[:3, :3]
-      ahead = local[:, 2] > 0
+      ahead = np.square(local[:, :2]).sum(-1) < widest * np.square(np.maximum(local[:, 2], 0))
       pixel = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
       cosine = (offset * way).sum(-1) / np.maximum(np.linalg.norm(offset, axis=-1), 1e-12)
       angle = np.arccos(np.clip(cosine, -1, 1))

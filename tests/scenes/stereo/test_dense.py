@@ -84,10 +84,6 @@ def test_of_a_picture_some_points_are_taken(views):
   assert np.bincount(few[:, 0].astype(int)).tolist() == 7 * [50]
 
 
-def test_of_many_pictures_there_is_none(views):
-  assert not len(dense_points(views, dataclasses.replace(SETTINGS, most_pictures=6)))
-
-
 def test_neighbours_see_the_same_from_beside(views):
   settings = NeighbourSettings(most=3, least_angle=0.15)
   found = neighbours(views, settings)
