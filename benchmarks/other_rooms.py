@@ -12,23 +12,18 @@ kept, and so is what a run before has made of it.
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
-import av
 import cv2
 import numpy as np
 
 from benchmarks import harness
-from benchmarks.drawn_rooms import filming, layout, photographs
-from benchmarks.rooms import rgbd
-from nerf2real.core.files import atomic_path
+from benchmarks.drawn_rooms import captures
 from nerf2real.core.serialization import write_json
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.builtin import furniture, ground_truth
-from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.room import TrueRoom
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.poses.localisation import LocalisationError
@@ -38,8 +33,6 @@ from nerf2real.scenes.settings import preset, with_marker
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
 _CELL = 0.02  # m of the true map
-_FILM = "film.mp4"
-_QUICK = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _FIGURES = (
   *("registered_fraction", "camera_rmse_m", "scale_error", "floor_tilt_deg"),
   *("held_out_psnr_db", "robot_psnr_db", "robot_psnr_own_gain_db", "robot_psnr_60x80_db"),
@@ -56,7 +49,7 @@ class Settings(harness.Options):
   """Folder of films and bundles."""
   seeds: tuple[int, ...] = (1, 2, 3)
   """Of the rooms."""
-  capture: Literal["film", "photographs", "depth"] = "film"
+  capture: captures.Kind = "film"
   """What the scenes are made of."""
   preset: str = "fast"
   """Preset of the scenes."""
@@ -95,15 +88,11 @@ def psnr_with_gain(views: Sequence[ViewScore]) -> float:
 
 def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value]:
   """Draws, films and reconstructs one room; returns its figures."""
-  folder.mkdir(parents=True, exist_ok=True)
-  drawn = layout.draw(np.random.default_rng([seed, 1]))
-  truth = folder / "truth.npz"
-  if not ((folder / _FILM).exists() and truth.exists()):
-    _film(folder / _FILM, truth, drawn.room, seed)
+  drawn = captures.draw(seed)
+  known = captures.film(folder, drawn.room, seed)
   if not settings.scene:
     return {"solids": len(drawn.room.solids)}
-  known = np.load(truth)
-  source, poses = _captured(folder, known, drawn.room, seed, settings.capture)
+  source, poses = captures.captured(folder, drawn.room, seed, settings.capture)
 
   def measure(result: Reconstruction) -> TruthFigures:
     rows = [int(Path(name).stem.split("_")[-1]) for name in result.localisation.names]
@@ -132,52 +121,6 @@ def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value
   figures |= {name: float(made.figures[name]) for name in _FIGURES if name in made.figures}
   write_json(folder / scene / "figures.json", figures)
   return figures | {"processor_s": time.process_time() - began}
-
-
-def _film(video: Path, truth: Path, true_room: TrueRoom, seed: int) -> None:
-  poses = ground_truth.robot_poses(seed=seed, true_room=true_room)
-  with filming.seen(true_room, seed) as eye:
-    arrays = ground_truth.robot_views(poses, eye)
-    with atomic_path(video) as partial:
-      taken, rate = filming.film(partial, true_room, eye, seed)
-  with atomic_path(truth) as partial:
-    np.savez_compressed(partial, film=taken, rate=rate, **arrays)  # type: ignore[arg-type]
-
-
-def _captured(
-  folder: Path, known: Mapping[str, np.ndarray], true_room: TrueRoom, seed: int, capture: str
-) -> tuple[Path, np.ndarray]:
-  """Returns a capture, and the true poses [N, 4, 4] of all its pictures by their number."""
-  if capture == "film":
-    return folder / _FILM, known["film"]
-  poses_file = folder / f"{capture}.npy"
-  if not poses_file.exists():
-    with filming.seen(true_room, seed) as eye:
-      if capture == "photographs":
-        poses = photographs.photograph(folder / capture, true_room, eye, seed)
-      else:
-        poses = known["film"]
-        _sense(folder / capture, folder / _FILM, poses, float(known["rate"]), eye, seed)
-    with atomic_path(poses_file) as partial:
-      np.save(partial, poses)
-  return folder / capture, np.load(poses_file)
-
-
-def _sense(folder: Path, video: Path, poses: np.ndarray, rate: float, eye: Eye, seed: int) -> None:
-  """Writes a film as a hand-held depth camera records it, in TUM's layout."""
-  lens = filming.lens(np.random.default_rng([seed, 4]))
-  random = np.random.default_rng([seed, 6])
-  for name in ("rgb", "depth"):
-    (folder / name).mkdir(parents=True, exist_ok=True)
-  with av.open(str(video)) as container:
-    for k, (pose, frame) in enumerate(zip(poses, container.decode(video=0), strict=True)):
-      depth = rgbd.sensed(eye.render(lens, pose, supersample=1)[1], random)
-      for name, content in (
-        ("rgb", frame.to_ndarray(format="bgr24")),
-        ("depth", np.rint(depth / rgbd.TUM_UNIT).astype(np.uint16)),
-      ):
-        cv2.imwrite(str(folder / name / f"{k:06d}.png"), content, _QUICK)
-  rgbd.write_lists(folder, rgbd.tracked(poses, random, rate=rate), lens, rate=rate)
 
 
 def main(settings: Settings) -> None:

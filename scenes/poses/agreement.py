@@ -1,15 +1,19 @@
 """Places pictures anew whose matches disagree with where a mapper put them.
 
-A picture's verified matches lead to points that other pictures see. A wrong place shows there: most
-of these points are not where the picture has the match, so that it keeps few of them. A global
-mapper, which solves for all positions at once, may leave a few pictures so at a film's ends, all
-seeing points of their own. Such pictures, and those without a place, are placed by what the others
-see, one after the other, as an incremental mapper does.
+A picture's verified matches lead to points that other pictures see. A wrong place shows there: over
+most of the picture these points are not where it has the match. Areas are compared, not counts: one
+of two paintings that are alike may hold more features than all that is around it, and explains
+nothing but itself. A global mapper, which solves for all positions at once, may leave a few
+pictures so at a film's ends, all seeing points of their own. Such pictures, and those without a
+place, are placed by what the others see, one after the other, as an incremental mapper does; pairs
+of pictures that agreed with a wrong place have no say in it.
 """
 
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +22,9 @@ from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.matching.features import image_ids, quiet
 
-MAJORITY = 0.5  # share of the matches that must agree with a place
+MAJORITY = 0.5  # share of a picture's matched area, or of a pair's matches, that must agree
+_TOLERANCE = 12.0  # pixels between a match and the point it leads to; COLMAP's for a new place
+_CELLS = 12  # into so many parts the longer side of a picture is divided, chosen
 _ROUNDS = 3  # at most: pictures that were placed well are new witnesses
 
 
@@ -49,27 +55,65 @@ def matched_points(
       yield ids, matches, seen
 
 
-def shares(model: pycolmap.Reconstruction, database: Path) -> dict[int, float]:
-  """Returns, for each picture with a place, the share of its matches that agree with it.
+class Evidence(NamedTuple):
+  """What a picture's matches say of its place; M matches to features that see a point."""
 
-  Of its features that are matched to one which sees a point: those that see that point, too.
+  cells: np.ndarray
+  """Cell of a grid in which each of the picture's features lies [F]."""
+  features: np.ndarray
+  """Of the matches [M]."""
+  others: np.ndarray
+  """Ids of the pictures that they are matched to [M]."""
+  agrees: np.ndarray
+  """Whether the point lies where the picture has the feature, bool [M]."""
+
+  @property
+  def share(self) -> float:
+    """Over what share of the matched area the matches agree: the mean over cells that hold any."""
+    asked, agreed = (np.zeros(len(self.cells), bool) for _ in range(2))
+    asked[self.features] = True
+    agreed[self.features[self.agrees]] = True
+    counts = np.bincount(self.cells[asked])
+    agreeing = np.bincount(self.cells[agreed], minlength=len(counts))
+    return float((agreeing[counts > 0] / counts[counts > 0]).mean())
+
+  def agreeing(self) -> Iterator[int]:
+    """Yields the pictures most of whose matches agree."""
+    for other in np.unique(self.others):
+      if self.agrees[self.others == other].mean() >= MAJORITY:
+        yield int(other)
+
+
+def evidence(model: pycolmap.Reconstruction, database: Path) -> dict[int, Evidence]:
+  """Returns what matches say of the places of all pictures that have one, by their ids.
 
   Args:
     model: Poses and points.
     database: Its features and verified matches.
-
-  Returns:
-    Shares by the pictures' ids; a picture without such features has none.
   """
-  sees = {image.image_id: len(image.points2D) for image in mapping.registered(model)}
-  asked = {key: np.zeros(count, bool) for key, count in sees.items()}
-  agreed = {key: np.zeros(count, bool) for key, count in sees.items()}
+  images = {image.image_id: image for image in mapping.registered(model)}
+  said: dict[int, list[np.ndarray]] = {key: [] for key in images}
   for ids, matches, points in matched_points(model, database):
     for own, other in ((0, 1), (1, 0)):
-      theirs = points[:, other] != 0
-      asked[ids[own]][matches[theirs, own]] = True
-      agreed[ids[own]][matches[theirs & (points[:, own] == points[:, other]), own]] = True
-  return {key: agreed[key].sum() / asked[key].sum() for key in sees if asked[key].any()}
+      seen = points[:, other] != 0
+      rows = [matches[seen, own], points[seen, other], np.full(seen.sum(), ids[other])]
+      said[ids[own]].append(np.stack(rows).astype(np.int64))
+  found = {}
+  for key, parts in said.items():
+    features, points, others = np.concatenate([np.zeros((3, 0), np.int64), *parts], axis=1)
+    if len(features):
+      image = images[key]
+      camera = model.cameras[image.camera_id]
+      pixels = np.array([point.xy for point in image.points2D])
+      column, row = (pixels * _CELLS / max(camera.width, camera.height)).astype(np.int64).T
+      positions = np.array([model.points3D[point].xyz for point in points])
+      local = image.cam_from_world() * positions
+      ahead = local[:, 2] > 0
+      local[~ahead] = 0, 0, 1
+      off = np.linalg.norm(camera.img_from_cam(local) - pixels[features], axis=1)
+      cells = row * (_CELLS + 1) + column
+      found[key] = Evidence(cells, features, others, ahead & (off < _TOLERANCE))
+  return found
 
 
 def place_again(
@@ -79,10 +123,10 @@ def place_again(
   *,
   seed: int,
   report: Progress = no_progress,
-) -> tuple[pycolmap.Reconstruction, int]:
+) -> tuple[pycolmap.Reconstruction, int, int]:
   """Places pictures without a place, and those whose matches disagree with theirs.
 
-  All others and the lens stay as they are.
+  All others and the lens stay as they are. A picture with which no place agrees better has none.
 
   Args:
     model: Poses and points.
@@ -92,55 +136,72 @@ def place_again(
     report: Called with the fraction done and a text.
 
   Returns:
-    A model of at least as many pictures (the same object where none found a better place), and how
-    many of them have a new place.
+    The model (the same object where nothing changed), how many pictures have a new place, and how
+    many lost theirs.
   """
-  placed, total = 0, len(image_ids(database))
+  total, given = len(image_ids(database)), _placed(model)
+  moved: set[int] = set()
+  misled: set[tuple[int, int]] = set()
   for _ in range(_ROUNDS):
-    weak = [key for key, share in shares(model, database).items() if share < MAJORITY]
+    judged = evidence(model, database)
+    weak = {key for key, said in judged.items() if said.share < MAJORITY}
     missing = total - model.num_reg_images()
     if not weak and not missing:
       break
     report(0.0, f"placing {len(weak) + missing} pictures by what the others see")
-    found = _continued(model, weak, database, images_folder, seed=seed)
-    if found is None or found.num_reg_images() < model.num_reg_images():
+    misled |= {(key, one) for key in weak for one in judged[key].agreeing() if one not in weak}
+    kept = pycolmap.Reconstruction(model)
+    for key in weak:
+      kept.deregister_frame(kept.images[key].frame_id)
+    found = _continued(kept, misled, database, images_folder, seed=seed)
+    again = evidence(found, database)
+    new = _placed(found) - _placed(kept)
+    for key in new & again.keys():
+      if again[key].share < (judged[key].share if key in weak else MAJORITY):
+        found.deregister_frame(found.images[key].frame_id)
+    if not weak and found.num_reg_images() == model.num_reg_images():
       break
-    after = shares(found, database)
-    better = sum(after.get(key, 0.0) >= MAJORITY for key in weak)
-    better += max(0, found.num_reg_images() - model.num_reg_images())
-    if not better:
-      break
-    model, placed = found, placed + better
-  return model, placed
+    model = found
+    moved |= new
+  after = _placed(model)
+  return model, len(moved & after), len(given - after)
+
+
+def _placed(model: pycolmap.Reconstruction) -> set[int]:
+  return {image.image_id for image in mapping.registered(model)}
 
 
 def _continued(
-  model: pycolmap.Reconstruction,
-  weak: list[int],
+  kept: pycolmap.Reconstruction,
+  without: Collection[tuple[int, int]],
   database: Path,
   images_folder: Path,
   *,
   seed: int,
-) -> pycolmap.Reconstruction | None:
-  """Returns a model with all places but those of weak pictures kept, and theirs found anew."""
-  kept = pycolmap.Reconstruction(model)
-  for key in weak:
-    kept.deregister_frame(kept.images[key].frame_id)
+) -> pycolmap.Reconstruction:
+  """Returns a model with all that can be placed without some pairs' matches, and what it has."""
   options = mapping.incremental_options(seed)
   options.multiple_models = False
   options.structure_less_registration_fallback = False
   options.fix_existing_frames = True
   options.ba_refine_focal_length = False
   options.ba_refine_extra_params = False
+  placed = _placed(kept)
+  pairs = [pair for pair in without if pair[0] not in placed]
   with tempfile.TemporaryDirectory(dir=database.parent) as folder, quiet():
     begun, ended = Path(folder) / "kept", Path(folder) / "found"
     begun.mkdir()
     ended.mkdir()
     kept.write(str(begun))
+    if pairs:
+      database = Path(shutil.copyfile(database, Path(folder) / "database.db"))
+      with pycolmap.Database.open(str(database)) as db:
+        for pair in pairs:
+          db.delete_two_view_geometry(*pair)
     try:
       found = pycolmap.incremental_mapping(
         str(database), str(images_folder), str(ended), options=options, input_path=str(begun)
       )
     except mapping.NOTHING:
-      return None
-  return max(found.values(), key=lambda m: m.num_reg_images(), default=None)
+      return kept
+  return max([kept, *found.values()], key=lambda m: m.num_reg_images())

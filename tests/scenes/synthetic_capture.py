@@ -32,6 +32,19 @@ PLANES = (
 )
 
 
+CORNER = tuple((texture(seed), *plane) for seed, plane in enumerate(PLANES))
+
+# The corner, less rich in features, with one picture on both of its walls.
+TWO_ALIKE = (
+  *((texture(seed, 40), *plane) for seed, plane in enumerate(PLANES)),
+  (texture(3), np.array([0.8, 2.99, 0.7]), np.array([0.9, 0, 0]), np.array([0, 0, 0.9])),
+  (texture(3), np.array([2.99, 2.2, 0.7]), np.array([0, -0.9, 0]), np.array([0, 0, 0.9])),
+)
+FIRST_FROM_SECOND = np.array(  # moves the second of the two to where the first is
+  [[0.0, -1, 0, 3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+)
+
+
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
   """World-from-camera pose [4, 4] of an upright camera, OpenCV axes."""
   forward = (target - position) / np.linalg.norm(target - position)
@@ -43,26 +56,27 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
   return pose
 
 
-def render(world_from_camera: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
+def render(world_from_camera: np.ndarray, camera: Camera = CAMERA, surfaces=CORNER) -> np.ndarray:
   """Renders the planes by one homography each, the nearest in front: BGR uint8 [H, W, 3]."""
-  return cast(world_from_camera, camera)[0]
+  return cast(world_from_camera, camera, surfaces)[0]
 
 
-def cast(world_from_camera: np.ndarray, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
+def cast(
+  world_from_camera: np.ndarray, camera: Camera = CAMERA, surfaces=CORNER
+) -> tuple[np.ndarray, np.ndarray]:
   """Renders the planes: BGR uint8 [H, W, 3] and z-depth [H, W] [m], inf where there is nothing."""
   image = np.zeros((camera.height, camera.width, 3), np.uint8)
   depth = np.full((camera.height, camera.width), np.inf)
   rays = camera.rays()
   origin, rotation = world_from_camera[:3, 3], world_from_camera[:3, :3]
   directions = rays @ rotation.T
-  for seed, (corner, first, second) in enumerate(PLANES):
+  for picture, corner, first, second in surfaces:
     normal = np.cross(first, second)
     along = directions @ normal
     distance = ((corner - origin) @ normal) / np.where(np.abs(along) < 1e-9, 1e-9, along)
     hit = origin + distance[..., None] * directions - corner
     u, v = hit @ first / (first @ first), hit @ second / (second @ second)
     inside = (distance > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (distance < depth)
-    picture = texture(seed)
     scale = len(picture) - 1
     colors = cv2.remap(
       picture, (u * scale).astype(np.float32), (v * scale).astype(np.float32), cv2.INTER_LINEAR
@@ -81,12 +95,12 @@ def walk(count: int) -> np.ndarray:
   return np.stack(poses)
 
 
-def write_images(folder: Path, poses: np.ndarray) -> list[str]:
+def write_images(folder: Path, poses: np.ndarray, surfaces=CORNER) -> list[str]:
   """Renders poses [N, 4, 4] into a folder; returns the names."""
   folder.mkdir(parents=True, exist_ok=True)
   names = [f"view_{row:03d}.png" for row in range(len(poses))]
   for name, pose in zip(names, poses, strict=True):
-    cv2.imwrite(str(folder / name), render(pose))
+    cv2.imwrite(str(folder / name), render(pose, surfaces=surfaces))
   return names
 
 
