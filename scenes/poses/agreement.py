@@ -98,6 +98,9 @@ def evidence(model: pycolmap.Reconstruction, database: Path) -> dict[int, Eviden
       seen = points[:, other] != 0
       rows = [matches[seen, own], points[seen, other], np.full(seen.sum(), ids[other])]
       said[ids[own]].append(np.stack(rows).astype(np.int64))
+  positions = np.full((max(model.points3D, default=0) + 1, 3), np.nan)
+  for number, point in model.points3D.items():
+    positions[number] = point.xyz
   found = {}
   for key, parts in said.items():
     features, points, others = np.concatenate([np.zeros((3, 0), np.int64), *parts], axis=1)
@@ -106,8 +109,7 @@ def evidence(model: pycolmap.Reconstruction, database: Path) -> dict[int, Eviden
       camera = model.cameras[image.camera_id]
       pixels = np.array([point.xy for point in image.points2D])
       column, row = (pixels * _CELLS / max(camera.width, camera.height)).astype(np.int64).T
-      positions = np.array([model.points3D[point].xyz for point in points])
-      local = image.cam_from_world() * positions
+      local = image.cam_from_world() * positions[points]
       ahead = local[:, 2] > 0
       local[~ahead] = 0, 0, 1
       off = np.linalg.norm(camera.img_from_cam(local) - pixels[features], axis=1)

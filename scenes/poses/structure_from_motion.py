@@ -27,7 +27,7 @@ from nerf2real.scenes.poses.localisation import (
   save,
 )
 from nerf2real.scenes.poses.matching import features
-from nerf2real.scenes.poses.matching.features import FeatureSettings, quiet
+from nerf2real.scenes.poses.matching.features import quiet
 from nerf2real.scenes.poses.matching.pairs import repair_pairs
 from nerf2real.scenes.poses.matching.parallax import parallax_share
 from nerf2real.scenes.poses.registered import check_registered
@@ -107,30 +107,24 @@ def _map(
   """Features, pairs, matches, a model, repairs, refinement."""
   film = times is not None
   steps.begin("features")
-  photographs = not film and known is None
   features.extract_features(
     database,
     images_folder,
     names,
     settings=settings.features,
-    guided=not photographs,
+    film=film or known is not None,
     report=steps.report,
     camera=None if known is None else to_colmap(known.camera),
   )
   steps.begin("matching")
   pairs, words = features.find_pairs(database, settings.pairs, report=steps.report)
 
-  guided = settings.features
-  counts = features.feature_counts(database).astype(np.float64)
-  cost = sum(counts[i] * counts[j] for i, j in pairs)
-  plain = guided.guided_matching and photographs and cost > guided.guided_cost
-
-  def match(chosen: list[tuple[int, int]], how: FeatureSettings, *, again: bool = False) -> int:
+  def match(chosen: list[tuple[int, int]]) -> int:
     return features.match_pairs(
-      database, chosen, settings=how, seed=settings.seed, again=again, report=steps.report
+      database, chosen, settings=settings.features, seed=settings.seed, report=steps.report
     )
 
-  match(pairs, dataclasses.replace(guided, guided_matching=False) if plain else guided)
+  match(pairs)
   warnings = []
   share = parallax_share(database, seed=settings.seed)
   if share is not None and share < settings.min_parallax:
@@ -153,9 +147,7 @@ def _map(
         len(names),
         overlap=settings.pairs.overlap,
         loop_keyframes=settings.pairs.loop_keyframes,
-      ),
-      guided,
-      again=plain,
+      )
     )
     if added:
       steps.begin("mapping")

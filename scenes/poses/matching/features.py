@@ -41,19 +41,18 @@ class FeatureSettings:
   """Paper, appendix A."""
   guided_matching: bool = True
   """Paper, appendix A."""
-  guided_cost: float = 2e9
-  """Products of feature counts up to which all pairs may be matched so: of photographs with more
-  only those that found no place without are. Measured: 3e-8 s of processor time each, plainly
-  0.35e-8; poses of 35 photographs were as exact without, those of fountain-P11, which stays below,
-  3.1 for 2.9 mm."""
-  plain_cost: float = 1e10
-  """The same without guidance: 35 s. Strong features have two orientations, and count twice."""
+  film_cost: float = 2e9
+  """Products of feature counts that all pairs of a film's pictures may have before each is given
+  fewer features. Measured: 3e-8 s of processor time each with guidance, 0.35e-8 without."""
+  photographs_cost: float = 1e10
+  """The same of photographs, which show less of the same: of two rooms' 35, guidance took 17 and
+  77 mm to 6 and 13 mm."""
   focal_factor: float = 1.2
   """First guess of the focal length, times the long side; COLMAP."""
 
-  def of_each(self, pictures: int, *, guided: bool) -> int:
+  def of_each(self, pictures: int, *, film: bool) -> int:
     """Features of each picture, so that matching all pairs costs no more than it may."""
-    cost = self.guided_cost if guided else self.plain_cost
+    cost = self.film_cost if film else self.photographs_cost
     allowed = np.sqrt(cost / max(pictures * (pictures - 1) / 2, 1))
     return int(np.clip(allowed, self.max_num_features, self.few_num_features))
 
@@ -95,7 +94,7 @@ def extract_features(
   *,
   settings: FeatureSettings,
   camera: pycolmap.Camera | None = None,
-  guided: bool = True,
+  film: bool = True,
   report: Progress = no_progress,
 ) -> None:
   """Finds affine-shape SIFT features of pictures that share one OPENCV camera.
@@ -106,7 +105,7 @@ def extract_features(
     names: The pictures.
     settings: Of the features.
     camera: Known intrinsics; a first guess from the picture size if None.
-    guided: Whether all pairs may come to be matched with guidance, which allows fewer features.
+    film: Whether they are a film's, or otherwise near each other, which need fewer features.
     report: Called with the fraction done and a text.
   """
   reader = pycolmap.ImageReaderOptions()
@@ -118,7 +117,7 @@ def extract_features(
   options.max_image_size = settings.max_image_size
   options.num_threads = os.cpu_count() or 1
   options.sift.estimate_affine_shape = settings.affine_shape
-  options.sift.max_num_features = settings.of_each(len(names), guided=guided)
+  options.sift.max_num_features = settings.of_each(len(names), film=film)
   faint = copy.deepcopy(options)
   faint.sift.max_num_features = min(settings.faint_below, options.sift.max_num_features)
   faint.sift.peak_threshold = settings.faint_peak
@@ -215,21 +214,12 @@ def matched_pairs(database: Path) -> set[Pair]:
   return {(min(a, b), max(a, b)) for a, b in pairs}
 
 
-def _forget_matches(database: Path, pairs: list[Pair]) -> None:
-  """Deletes the matches of pairs of picture ids."""
-  with pycolmap.Database.open(str(database)) as db:
-    for first, second in pairs:
-      db.delete_matches(first, second)
-      db.delete_two_view_geometry(first, second)
-
-
 def match_pairs(
   database: Path,
   pairs: list[Pair],
   *,
   settings: FeatureSettings,
   seed: int,
-  again: bool = False,
   report: Progress = no_progress,
 ) -> int:
   """Matches and verifies pairs, given as indices into the sorted names.
@@ -239,7 +229,6 @@ def match_pairs(
     pairs: Which pictures.
     settings: How features are matched.
     seed: Of RANSAC.
-    again: Whether pairs that the database has are matched anew.
     report: Called with the fraction done and a text.
 
   Returns:
@@ -248,8 +237,6 @@ def match_pairs(
   ids = image_ids(database)
   names = list(ids)
   numbers = list(ids.values())
-  if again:
-    _forget_matches(database, [(numbers[i], numbers[j]) for i, j in pairs])
   done = matched_pairs(database)
   missing = [
     (i, j)

@@ -90,14 +90,14 @@ def test_the_bound_is_the_cost_not_the_number():
   assert many[1].startswith("sequential")
 
 
-@pytest.mark.parametrize("guided", [False, True])
-def test_features_shrink_smoothly_with_the_number_of_pictures(guided):
+@pytest.mark.parametrize("film", [False, True])
+def test_features_shrink_smoothly_with_the_number_of_pictures(film):
   settings = FeatureSettings()
-  counts = np.array([settings.of_each(number, guided=guided) for number in range(1, 400)])
+  counts = np.array([settings.of_each(number, film=film) for number in range(1, 400)])
   assert counts[0] == settings.few_num_features and counts[-1] == settings.max_num_features
   change = counts[1:] / counts[:-1]
   assert change.max() <= 1 and change.min() > 0.9  # no number from which much is lost
-  limit = settings.guided_cost if guided else settings.plain_cost
+  limit = settings.film_cost if film else settings.photographs_cost
   number = np.arange(1, 400)
   cost = number * (number - 1) / 2 * counts.astype(float) ** 2
   assert cost[counts > settings.max_num_features].max() <= limit
