@@ -23,6 +23,8 @@ class LocaliseSettings:
   """Fewer are an error, unless there are fewer keyframes."""
   min_parallax: float = 0.08
   """Share of matches that no turn of the camera explains below which a warning is given."""
+  max_contradicting: float = 0.05
+  """Share of matching pairs that contradict their places above which a warning is given."""
   refine_known: bool = True
   """Whether poses that came with measured depth are adjusted to the pictures."""
   seed: int = 0

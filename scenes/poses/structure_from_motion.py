@@ -157,6 +157,13 @@ def _map(
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
   check_registered(model, names, settings, share, film=film)
   assert model is not None  # for the type checker: check_registered has raised
+  against = agreement.contradicting(model, database)
+  if against > settings.max_contradicting:
+    warnings.append(
+      f"Things that look alike: {against:.0%} of the matching pairs of pictures contradict where "
+      "these were placed. What was taken before one of them may stand before the other: look at "
+      "the worst held-out views, and cover or move one of the two if they show the wrong one."
+    )
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
   if mapping.drop_weak_images(model):
