@@ -17,7 +17,7 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import agreement, continuity, mapping, refinement, shutter
+from nerf2real.scenes.poses import agreement, certainty, continuity, mapping, refinement, shutter
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -166,7 +166,10 @@ def _map(
     )
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
-  if mapping.drop_weak_images(model):
+  dropped = mapping.drop_weak_images(model)
+  if not film:
+    dropped += certainty.drop_uncertain(model)
+  if dropped:
     check_registered(model, names, settings, share, film=film)
   if not lens.principal:
     warnings.append(f"Lens: estimated {lens.words}.")
