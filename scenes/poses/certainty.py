@@ -17,11 +17,13 @@ _TIMES = 5.0  # the median deviation, beyond which a place is not used, chosen o
 def turns(model: pycolmap.Reconstruction) -> dict[int, float]:
   """Standard deviations of the pictures' rotations [rad] by their ids, for 1 pixel of noise.
 
-  Two pictures, which hold the frame, have none; empty where the adjustment is singular.
+  A picture that holds the frame may have none; empty where the adjustment is singular.
 
   Args:
     model: Adjusted poses and points.
   """
+  model = pycolmap.Reconstruction(model)
+  model.tear_down()  # pictures without a pose, which the covariance cannot have
   options = pycolmap.BundleAdjustmentOptions()
   options.print_summary = False
   config = pycolmap.BundleAdjustmentConfig()

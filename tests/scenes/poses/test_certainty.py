@@ -49,6 +49,7 @@ def test_a_place_that_hangs_on_a_spot_is_not_used(model):
   assert certainty.turns(model)[image.image_id] > 5 * before
   assert certainty.drop_uncertain(model) == 1
   assert not image.has_pose and model.num_reg_images() == 7
+  assert certainty.drop_uncertain(model) == 0  # of those that are left
 
 
 def test_fewer_points_are_less_certain(model):
