@@ -161,8 +161,8 @@ def _map(
   if against > settings.max_contradicting:
     warnings.append(
       f"Things that look alike: {against:.0%} of the matching pairs of pictures contradict where "
-      "these were placed. What was taken before one of them may stand before the other: look at "
-      "the worst held-out views, and cover or move one of the two if they show the wrong one."
+      "these were placed. Where the report's worst view shows another thing than the picture, "
+      "cover one of the two and take the pictures anew."
     )
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
