@@ -147,10 +147,11 @@ def place_again(
   *,
   seed: int,
   report: Progress = no_progress,
-) -> tuple[pycolmap.Reconstruction, int, int]:
+) -> tuple[pycolmap.Reconstruction, int]:
   """Places pictures without a place, and those whose matches disagree with theirs.
 
-  All others and the lens stay as they are. A picture with which no place agrees better has none.
+  All others and the lens stay as they are. A picture with which no place agrees better keeps its
+  own.
 
   Args:
     model: Poses and points.
@@ -160,35 +161,41 @@ def place_again(
     report: Called with the fraction done and a text.
 
   Returns:
-    The model (the same object where nothing changed), how many pictures have a new place, and how
-    many lost theirs.
+    A model of at least as many pictures (the same object where none found a better place), and how
+    many of them have a new place.
   """
-  total, given = len(image_ids(database)), _placed(model)
+  total = len(image_ids(database))
   moved: set[int] = set()
+  staying: set[int] = set()
   misled: set[tuple[int, int]] = set()
   for _ in range(_ROUNDS):
     judged = evidence(model, database)
-    weak = {key for key, said in judged.items() if said.share < MAJORITY}
+    weak = {key for key, said in judged.items() if said.share < MAJORITY} - staying
     missing = total - model.num_reg_images()
-    if not weak and not missing:
+    while weak or missing:
+      report(0.0, f"placing {len(weak) + missing} pictures by what the others see")
+      refuted = {(key, one) for key in weak for one in judged[key].agreeing() if one not in weak}
+      kept = pycolmap.Reconstruction(model)
+      for key in weak:
+        kept.deregister_frame(kept.images[key].frame_id)
+      found = _continued(kept, misled | refuted, database, images_folder, seed=seed)
+      again = evidence(found, database)
+      new = _placed(found) - _placed(kept)
+      least = {key: judged[key].share if key in weak else MAJORITY for key in new}
+      better = {key for key in new if key not in again or again[key].share >= least[key]}
+      if weak <= better:
+        break
+      staying |= weak - better  # the others are placed once more, beside what these see
+      weak &= better
+    else:
       break
-    report(0.0, f"placing {len(weak) + missing} pictures by what the others see")
-    misled |= {(key, one) for key in weak for one in judged[key].agreeing() if one not in weak}
-    kept = pycolmap.Reconstruction(model)
-    for key in weak:
-      kept.deregister_frame(kept.images[key].frame_id)
-    found = _continued(kept, misled, database, images_folder, seed=seed)
-    again = evidence(found, database)
-    new = _placed(found) - _placed(kept)
-    for key in new & again.keys():
-      if again[key].share < (judged[key].share if key in weak else MAJORITY):
-        found.deregister_frame(found.images[key].frame_id)
-    if not weak and found.num_reg_images() == model.num_reg_images():
+    for key in new - better:
+      found.deregister_frame(found.images[key].frame_id)
+    if not better:
       break
-    model = found
-    moved |= new
-  after = _placed(model)
-  return model, len(moved & after), len(given - after)
+    model, misled = found, misled | refuted
+    moved |= better
+  return model, len(moved)
 
 
 def _placed(model: pycolmap.Reconstruction) -> set[int]:

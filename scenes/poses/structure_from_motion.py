@@ -242,17 +242,16 @@ def _checked(
 
   What is out of a film's line is placed once more, by what all others see.
   """
-  placed, lost, dropped = 0, 0, 0
+  placed, dropped = 0, 0
   for _ in range(2):
-    model, moved, gone = agreement.place_again(
+    model, moved = agreement.place_again(
       model, database, images_folder, seed=settings.seed, report=steps.report
     )
     dropped = 0 if times is None else continuity.drop_out_of_line(model, database, times)
-    placed, lost = placed + moved, lost + gone
+    placed += moved
     if not dropped:
       break
   words = f", {placed} pictures placed by what the others see" if placed else ""
-  words += f", {lost} left out that contradict the others" if lost else ""
   return model, words + (f", {dropped} left out of the film's line" if dropped else "")
 
 
