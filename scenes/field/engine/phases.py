@@ -31,7 +31,8 @@ class Phases(NamedTuple):
   """Kernels of one shape of field, in their order."""
 
   draw: Any
-  forward: Any
+  forward: Any  # twice: of all rays' samples, and of those that were marched again
+  march_again: Any
   see: Any
   color: Any
   compare: Any
@@ -56,26 +57,34 @@ def build(f: Functions) -> Phases:
       return False
     return n >= w.first[w.ray_of[n]] and n < w.last[w.ray_of[n]]
 
-  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
-  def draw(
-    p: Pictures, s: Settings, grids: Occupancy, workers: Workers, seed: wp.uint64, used: Ints
-  ):
-    """Draws a ray and finds room for its samples; a ray without room gets none."""
-    r = wp.tid()
-    w = workers[0]
-    draw_ray(p, s, seed, wp.int64(r), w.rays, ray_columns, r)
-    found, _cut = f.march_ray(grids, s, w, seed, wp.int64(r), r, NO_LIMIT, -1)
+  @wp.func
+  def place_ray(
+    grids: Occupancy, s: Settings, w: Worker, seed: wp.uint64, r: int, limit: float, used: Ints
+  ) -> wp.bool:
+    """Finds room for a ray's samples, none where there is too little; whether the limit cut it."""
+    found, cut = f.march_ray(grids, s, w, seed, wp.int64(r), r, limit, -1)
     at = wp.atomic_add(used, 0, found)
     if at + found > stride - PADDING:
       found = 0
     else:
-      f.march_ray(grids, s, w, seed, wp.int64(r), r, NO_LIMIT, at)
+      f.march_ray(grids, s, w, seed, wp.int64(r), r, limit, at)
     w.first[r] = at
     w.last[r] = at + found
     for n in range(at, at + found):
       w.ray_of[n] = r
-    wp.atomic_add(w.figures, 0, wp.float64(1.0))
     wp.atomic_add(w.figures, 2, wp.float64(found))
+    return cut
+
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def draw(
+    p: Pictures, s: Settings, grids: Occupancy, workers: Workers, seed: wp.uint64, used: Ints
+  ):
+    """Draws a ray and marches it up to the depth limit."""
+    r = wp.tid()
+    w = workers[0]
+    draw_ray(p, s, seed, wp.int64(r), w.rays, ray_columns, r)
+    w.number[r] = wp.where(place_ray(grids, s, w, seed, r, s.depth_limit, used), -1, 0)
+    wp.atomic_add(w.figures, 0, wp.float64(1.0))
 
   @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
   def forward(
@@ -85,13 +94,13 @@ def build(f: Functions) -> Phases:
     workers: Workers,
     seed: wp.uint64,
     used: Ints,
-    first: int,
+    first: Ints,
     spare: int,
     size: int,
     weight: float,
   ):
     """Base network at samples from `first` on, and the gradient at points known to be empty."""
-    begin = first + wp.tid() * size
+    begin = first[0] // size * size + wp.tid() * size
     end = begin + size
     w = workers[0]
     if begin < wp.min(used[0], stride - PADDING):
@@ -107,6 +116,20 @@ def build(f: Functions) -> Phases:
           empty_loss(s, w.work, wp.where(n < s.empty_samples, weight, 0.0), n)
       else:
         f.opacity(w, s, begin, end)
+
+  @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
+  def march_again(
+    s: Settings, grids: Occupancy, workers: Workers, seed: wp.uint64, threshold: float, used: Ints
+  ):
+    """Marches a ray to its end that the depth limit cut before opaque matter."""
+    r = wp.tid()
+    w = workers[0]
+    if w.number[r] < 0:
+      through = wp.float32(1.0)
+      for n in range(w.first[r], w.last[r]):
+        through *= 1.0 - w.work[at_alpha + n]
+      if through >= threshold:
+        place_ray(grids, s, w, seed, r, NO_LIMIT, used)
 
   @wp.kernel(module="unique", enable_backward=False, module_options=WIDE_OPTIONS)
   def see(workers: Workers, threshold: float):
@@ -177,4 +200,4 @@ def build(f: Functions) -> Phases:
     if begin < total:
       f.scatter_points(gradient, w, m, begin, wp.min(begin + size, total), level)
 
-  return Phases(draw, forward, see, color, compare, backward, sum_products, scatter)
+  return Phases(draw, forward, march_again, see, color, compare, backward, sum_products, scatter)

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import warp as wp
 
 from nerf2real.scenes.field.anchors import EMPTY_CELLS
 from nerf2real.scenes.field.engine import layout, parameters, pictures
@@ -11,6 +12,7 @@ from nerf2real.scenes.field.engine.device import Device
 from nerf2real.scenes.field.engine.engine import Engine
 from nerf2real.scenes.field.engine.native.vectors import PADDING
 from nerf2real.scenes.field.engine.occupancy import OccupancyGrids, distance_along
+from nerf2real.scenes.field.engine.rays import NO_LIMIT
 from nerf2real.scenes.field.field import Field, init_params
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.field.views import Views
@@ -78,7 +80,8 @@ class FusedTrainer:
     model, zeros = self.engine.model, self.device.zeros
     self.table = self._optimised(model.table, zeros(model.table.size))
     self.network = self._optimised(model.weights, self.engine.workers[0].gradient)
-    self._used = zeros(1, np.int32)
+    # What a step's samples are counted in, and where those begin that the base network has next.
+    self._used, self._since = zeros(1, np.int32), zeros(1, np.int32)
     # Dense levels leave the end of their part of the table unused.
     vertices = [min((cells + 1) ** 3, model.entries) for cells in field.resolutions]
     line = parameters.LINE
@@ -134,7 +137,7 @@ class FusedTrainer:
     settings, numbers, shape = self.settings, self.engine.numbers, self.engine.shape
     step = self.steps_done
     numbers.step = settings.field.march_step * self._coarseness
-    numbers.depth_limit = settings.depth_limit if step >= settings.occupancy_start else 1e9
+    numbers.depth_limit = settings.depth_limit if step >= settings.occupancy_start else NO_LIMIT
     known = step < self._last_known_step
     numbers.anchor_fraction = settings.anchor_fraction if known else 0.0
     numbers.empty_samples = settings.empty_samples // self.device.threads if known else 0
@@ -200,7 +203,7 @@ class FusedTrainer:
     workers = engine.worker_array
     # A thread does a vector of samples on a CPU, one elsewhere.
     block = PADDING if device.is_cpu else 1
-    used, spare = self._used, self._spare
+    used, since, spare = self._used, self._since, self._spare
     known = numbers.empty_samples > 0 and self.pictures.empty.size > 0
     first = 0 if known else spare
     room = engine.stride - PADDING
@@ -211,10 +214,16 @@ class FusedTrainer:
     engine.workers[0].gradient.zero_()
     engine.workers[0].figures.zero_()
     used.fill_(spare)
-    begin = [self.pictures, numbers]
-    device.launch(phases.draw, [*begin, self.grids.data, workers, seed, used], dim=rays)
-    inputs = [*begin, model, workers, seed, used, first, spare, block, weight]
-    device.launch(phases.forward, inputs, dim=blocks)
+    since.fill_(first)
+    begin, grids = [self.pictures, numbers], self.grids.data
+    forward = [*begin, model, workers, seed, used, since, spare, block, weight]
+    device.launch(phases.draw, [*begin, grids, workers, seed, used], dim=rays)
+    device.launch(phases.forward, forward, dim=blocks)
+    if numbers.depth_limit < NO_LIMIT:
+      wp.copy(since, used)
+      inputs = [numbers, grids, workers, seed, threshold, used]
+      device.launch(phases.march_again, inputs, dim=rays)
+      device.launch(phases.forward, forward, dim=blocks)
     device.launch(phases.see, [workers, threshold], dim=rays)
     inputs = [numbers, model, workers, used, spare, block]
     device.launch(phases.color, inputs, dim=(room - spare) // block)
