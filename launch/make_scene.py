@@ -45,6 +45,8 @@ class Arguments:
   """Seconds of training; the preset's if not given."""
   train_steps: int | None = None
   """Steps of training in place of seconds: a busy machine takes longer for the same field."""
+  device: Literal["cpu", "cuda"] = "cpu"
+  """Where the field is trained; preset "paper" trains where JAX does."""
   marker_side: float | None = None
   """Side of the black square of an ArUco or AprilTag marker in the room [m]: gives the scale."""
   marker_at: tuple[float, float, float] | None = None
@@ -82,14 +84,14 @@ def settings_of(arguments: Arguments) -> "SceneSettings":
       settings.capture, num_keyframes=arguments.keyframes, most_keyframes=None
     )
     settings = dataclasses.replace(settings, capture=taken)
+  training = dataclasses.replace(settings.train, device=arguments.device)
   if arguments.train_seconds is not None:
-    training = dataclasses.replace(settings.train, max_seconds=arguments.train_seconds)
-    settings = dataclasses.replace(settings, train=training)
+    training = dataclasses.replace(training, max_seconds=arguments.train_seconds)
   if arguments.train_steps is not None:
     training = dataclasses.replace(
-      settings.train, max_steps=arguments.train_steps, max_seconds=arguments.train_seconds
+      training, max_steps=arguments.train_steps, max_seconds=arguments.train_seconds
     )
-    settings = dataclasses.replace(settings, train=training)
+  settings = dataclasses.replace(settings, train=training)
   if arguments.camera_height is not None:
     placing = dataclasses.replace(settings.align, camera_height=arguments.camera_height)
     settings = dataclasses.replace(settings, align=placing)
@@ -156,8 +158,10 @@ def run(arguments: Arguments) -> int:
   from nerf2real.scenes import pipeline
   from nerf2real.scenes.alignment import overrides
   from nerf2real.scenes.builtin import ground_truth
+  from nerf2real.scenes.field.engine.device import Device
 
   settings = settings_of(arguments)
+  Device(arguments.device)  # a machine without it says so before the hour, not after
   source, measure = Path(arguments.capture), None
   if arguments.capture == BUILT_IN:
     source, measure = ground_truth.VIDEO, ground_truth.measure

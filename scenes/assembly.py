@@ -165,7 +165,7 @@ def _figures(results: SceneResults) -> dict[str, Any]:
 
 def _sight_line_figures(found: sight_lines.Judgement) -> dict[str, float]:
   return {
-    "sight_lines": float(found.lines),
+    "sight_lines": found.lines,
     "sight_lines_blocked": found.blocked,
     "sight_lines_blocked_p95_m": found.blocked_p95,
     "points_missed": found.missed,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.launch.make_scene import Arguments, settings_of
+from nerf2real.launch.make_scene import Arguments, main, settings_of
 
 _ROOT = Path(__file__).parents[2]
 
@@ -69,6 +69,17 @@ def test_bad_captures_are_one_clear_line(three_pictures, tmp_path):
     assert "Traceback" not in said
     assert not (out / "scene.json").exists()
     assert not (out / "field.safetensors").exists()
+
+
+def test_a_gpu_that_is_not_there_is_missed_before_anything_is_made(tmp_path, monkeypatch, capsys):
+  monkeypatch.setattr("warp.is_cuda_available", lambda: False)
+  words = ["--capture", "builtin", "--out", str(tmp_path / "out"), "--device", "cuda"]
+  monkeypatch.setattr("sys.argv", ["make_scene.py", *words])
+  assert main() == 1
+  assert "No CUDA device was found" in capsys.readouterr().err
+  assert not (tmp_path / "out").exists()
+  arguments = Arguments(capture="builtin", out=tmp_path, device="cuda")
+  assert settings_of(arguments).train.device == "cuda"
 
 
 @pytest.mark.parametrize(("seconds", "expected"), [(None, None), (60.0, 60.0)])

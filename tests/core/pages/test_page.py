@@ -70,8 +70,15 @@ def test_page_needs_no_other_file_and_holds_plotly_once_where_a_chart_is(tmp_pat
 def test_figures_have_a_column_for_what_is_good_only_where_it_is_known(tmp_path):
   known = written(tmp_path, Figures([Figure("error", 0.123456, "m", "of all", "lower")]))
   assert "<th>good is</th>" in known and '<td class="good">lower</td>' in known
-  assert '<td class="value">0.1235</td><td class="unit">m</td>' in known
+  assert '<td class="value number">0.1235</td><td class="unit">m</td>' in known
   assert "<th>good is" not in written(tmp_path, Figures([Figure("parts", 3)]))
+
+
+def test_a_sentence_among_figures_may_wrap_and_a_number_may_not(tmp_path):
+  text = written(tmp_path, Figures([Figure("place", "it lies there"), Figure("parts", 3)]))
+  assert '<td class="value">it lies there</td>' in text
+  assert '<td class="value number">3</td>' in text
+  assert "td.value { white-space: nowrap" not in text and "td.number { white-space: nowrap" in text
 
 
 def test_origin_is_shown_where_it_is_given(tmp_path):
