@@ -1,4 +1,4 @@
-"""The fused Warp kernels against JAX: gradients in chunks and in phases, densities; marching."""
+"""The fused Warp kernels against JAX: gradients in chunks and in phases, rays, densities."""
 
 import dataclasses
 import functools
@@ -8,11 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import warp as wp
-from scipy.ndimage import distance_transform_cdt
 
 from nerf2real.scenes.field import losses as field_losses
 from nerf2real.scenes.field import sampling
-from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.encoding import sample_variance
 from nerf2real.scenes.field.engine import (
   chunks,
@@ -23,15 +21,11 @@ from nerf2real.scenes.field.engine import (
   parameters,
   phases,
 )
-from nerf2real.scenes.field.engine.device import OPTIONS, Device
+from nerf2real.scenes.field.engine.device import Device
 from nerf2real.scenes.field.engine.engine import Engine
-from nerf2real.scenes.field.engine.rays import march
 from nerf2real.scenes.field.engine.trainer import FusedTrainer
 from nerf2real.scenes.field.field import Field, FieldSettings, init_params, query, query_density
-from nerf2real.scenes.field.occupancy import OccupancySettings, build
-from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.field.settings import TrainSettings
-from nerf2real.scenes.quality import image_quality
 from tests.scenes import box_views
 
 SETTINGS = TrainSettings(
@@ -50,20 +44,6 @@ SETTINGS = TrainSettings(
   planar_bend=0.4,
   planar_contrast=0.8,
   planar_reach=0.6,
-)
-FAST = TrainSettings(
-  field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
-  max_steps=300,
-  max_seconds=None,
-  final_learning_rate=3e-4,  # in so few steps a higher one leaves fog, in phases
-  batch_samples=1 << 14,
-  inner_cells=32,
-  outer_cells=16,
-  occupancy_samples=1 << 13,
-  occupancy_start=96,
-  occupancy_sweep_steps=160,
-  blur_max=1.0,
-  warmup_steps=16,
 )
 SEED, BUDGET = 5, 300
 
@@ -311,93 +291,6 @@ def test_densities_agree_with_the_field():
   reference = jax.jit(functools.partial(query_density, field.settings))
   expected = reference(field.params, positions, variances)
   np.testing.assert_allclose(found, expected, rtol=2e-4)
-
-
-def _distances(occupied):
-  device = Device()
-  result = device.zeros(occupied.size, np.uint8)
-  occupancy.distances(device, occupied, result)
-  return result.numpy().reshape(occupied.shape)
-
-
-def test_distances_agree_with_scipy():
-  occupied = np.random.default_rng(0).random((20, 20, 20)) < 0.002
-  expected = np.minimum(distance_transform_cdt(~occupied, metric="chessboard"), 12)
-  np.testing.assert_array_equal(_distances(occupied), expected)
-
-
-@wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-def _march(
-  grids: layout.Occupancy,
-  settings: layout.Settings,
-  origins: wp.array(dtype=wp.vec3),
-  directions: wp.array(dtype=wp.vec3),
-  samples: wp.array(dtype=wp.float32),
-  stride: wp.int32,
-  counts: wp.array(dtype=wp.int32),
-):
-  ray = wp.tid()
-  count, _cut = march(
-    grids, settings, origins[ray], directions[ray], 0.0, 1e9, samples, stride, ray * 512
-  )
-  counts[ray] = count
-
-
-def test_march_visits_every_occupied_cell_on_its_way():
-  rng = np.random.default_rng(1)
-  size, rays, step = 16, 20, 0.01
-  occupied = rng.random((size,) * 3) < 0.05
-  device = Device()
-  grids, settings = layout.Occupancy(), layout.Settings()
-  grids.inner_size, grids.outer_size = size, 4
-  grids.inner_distance = device.put(_distances(occupied).ravel())
-  grids.inner_density = device.zeros(size**3)
-  grids.outer_distance = device.put(np.full(64, 6, np.uint8))
-  grids.outer_density = device.zeros(64)
-  settings.step, settings.ray_samples = step, 512
-  origins = rng.uniform(-0.5, 0.5, (rays, 3)).astype(np.float32)
-  directions = rng.normal(size=(rays, 3))
-  directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
-  samples, counts = device.zeros(2 * rays * 512), device.zeros(rays, np.int32)
-  places = device.put(origins, wp.vec3), device.put(directions, wp.vec3)
-  device.launch(_march, [grids, settings, *places, samples, rays * 512, counts], dim=rays)
-  lengths = samples.numpy().reshape(2, rays, 512)[1]
-  for ray, count in enumerate(counts.numpy()):
-    t = np.arange(step / 2, 3.5, step)
-    points = origins[ray] + t[:, None] * directions[ray]
-    points = points[np.abs(points).max(-1) < 1]
-    cells = ((points + 1) * size / 2).astype(int)
-    expected = np.flatnonzero(occupied[cells[:, 0], cells[:, 1], cells[:, 2]]).size
-    assert abs(count - expected) <= 2  # rounding at the faces of cells
-    np.testing.assert_allclose(lengths[ray, :count], step)
-
-
-@pytest.fixture(scope="module")
-def views():
-  return box_views.make_views(60, width=64, height=48)
-
-
-def _train(views, steps=FAST.max_steps, **options):
-  trainer = FusedTrainer(views, FAST, seed=0, **options)
-  for step in range(steps):
-    trainer.step(train.learning_rate(FAST, step / FAST.max_steps, step))
-  return trainer
-
-
-@pytest.mark.parametrize("phased", [False, True])
-def test_training_reproduces_views_it_has_not_seen(views, phased):
-  held_out = box_views.make_views(3, width=64, height=48, seed=100)
-  field = _train(views, phased=phased).field()
-  renderer = Renderer(field, occupancy=build(field, settings=OccupancySettings(cells=64)))
-  figures = []
-  for index in range(3):
-    picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
-    figures.append(image_quality.psnr(picture, held_out.images[index]))
-    origin, directions = held_out.rays(index)
-    z = held_out.camera.rays()
-    truth = box_views.wall_distance(origin, directions) / np.linalg.norm(z, axis=-1)
-    assert np.median(np.abs(depth - truth)) < 0.1
-  assert np.mean(figures) > 25
 
 
 def test_shapes_that_the_kernels_cannot_run_are_refused():
