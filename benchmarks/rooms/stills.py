@@ -208,7 +208,7 @@ def _features(folder: Path, database: Path) -> tuple[float, float]:
   names = sorted(path.name for path in folder.glob("*.jpg"))[:_READ]
   began = time.process_time()
   settings = features.FeatureSettings()
-  features.extract_features(database, folder, names, settings=settings, film=False)
+  features.extract_features(database, folder, names, settings=settings)
   spent = (time.process_time() - began) / len(names)
   return spent, _peak_memory()
 

@@ -112,7 +112,6 @@ def _map(
     images_folder,
     names,
     settings=settings.features,
-    film=film or known is not None,
     report=steps.report,
     camera=None if known is None else to_colmap(known.camera),
   )

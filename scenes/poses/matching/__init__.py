@@ -1,1 +1,1 @@
-"""Features of keyframes, the pairs to match, their verified matches and parallax."""
+"""Features of keyframes, the pairs to match, their verified and guided matches, and parallax."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses.matching import guided
 from nerf2real.scenes.poses.matching.pairs import Pair, PairSettings, choose_pairs, overlap_scores
 
 _EXTRACTION_CHUNK = 8  # pictures between two progress reports
@@ -41,19 +42,15 @@ class FeatureSettings:
   """Paper, appendix A."""
   guided_matching: bool = True
   """Paper, appendix A."""
-  film_cost: float = 2e9
-  """Products of feature counts that all pairs of a film's pictures may have before each is given
-  fewer features. Measured: 3e-8 s of processor time each with guidance, 0.35e-8 without."""
-  photographs_cost: float = 1e10
-  """The same of photographs, which show less of the same: of two rooms' 35, guidance took 17 and
-  77 mm to 6 and 13 mm."""
+  most_products: float = 1e10
+  """Products of feature counts that all pairs of pictures may have before each is given fewer
+  features. Measured: 0.4e-8 s of processor time each."""
   focal_factor: float = 1.2
   """First guess of the focal length, times the long side; COLMAP."""
 
-  def of_each(self, pictures: int, *, film: bool) -> int:
+  def of_each(self, pictures: int) -> int:
     """Features of each picture, so that matching all pairs costs no more than it may."""
-    cost = self.film_cost if film else self.photographs_cost
-    allowed = np.sqrt(cost / max(pictures * (pictures - 1) / 2, 1))
+    allowed = np.sqrt(self.most_products / max(pictures * (pictures - 1) / 2, 1))
     return int(np.clip(allowed, self.max_num_features, self.few_num_features))
 
 
@@ -94,7 +91,6 @@ def extract_features(
   *,
   settings: FeatureSettings,
   camera: pycolmap.Camera | None = None,
-  film: bool = True,
   report: Progress = no_progress,
 ) -> None:
   """Finds affine-shape SIFT features of pictures that share one OPENCV camera.
@@ -105,7 +101,6 @@ def extract_features(
     names: The pictures.
     settings: Of the features.
     camera: Known intrinsics; a first guess from the picture size if None.
-    film: Whether they are a film's, or otherwise near each other, which need fewer features.
     report: Called with the fraction done and a text.
   """
   reader = pycolmap.ImageReaderOptions()
@@ -117,7 +112,7 @@ def extract_features(
   options.max_image_size = settings.max_image_size
   options.num_threads = os.cpu_count() or 1
   options.sift.estimate_affine_shape = settings.affine_shape
-  options.sift.max_num_features = settings.of_each(len(names), film=film)
+  options.sift.max_num_features = settings.of_each(len(names))
   faint = copy.deepcopy(options)
   faint.sift.max_num_features = min(settings.faint_below, options.sift.max_num_features)
   faint.sift.peak_threshold = settings.faint_peak
@@ -238,13 +233,11 @@ def match_pairs(
   names = list(ids)
   numbers = list(ids.values())
   done = matched_pairs(database)
-  missing = [
-    (i, j)
-    for i, j in sorted(pairs)
-    if (min(numbers[i], numbers[j]), max(numbers[i], numbers[j])) not in done
-  ]
+  wanted = {(i, j): (min(numbers[i], numbers[j]), max(numbers[i], numbers[j])) for i, j in pairs}
+  missing = [pair for pair in sorted(wanted) if wanted[pair] not in done]
+  if settings.guided_matching:  # what a run that was interrupted has left
+    guided.match_pairs(database, sorted(done & set(wanted.values())))
   options = pycolmap.FeatureMatchingOptions()
-  options.guided_matching = settings.guided_matching
   options.num_threads = os.cpu_count() or 1
   verification = pycolmap.TwoViewGeometryOptions()
   verification.ransac.random_seed = seed
@@ -263,6 +256,8 @@ def match_pairs(
           verification_options=verification,
           device=pycolmap.Device.cpu,
         )
+      if settings.guided_matching:
+        guided.match_pairs(database, [wanted[pair] for pair in chunk])
       found = min(first + _MATCHING_CHUNK, len(missing))
       report(found / len(missing), f"matched {found} of {len(missing)} pairs")
   return len(missing)

@@ -1,10 +1,8 @@
 """Tests of localisation: a small reconstruction against the truth."""
 
-import contextlib
 import dataclasses
 import json
 import shutil
-import sqlite3
 from pathlib import Path
 
 import cv2
@@ -118,23 +116,42 @@ def test_second_run_repeats_no_feature_and_no_match(corner, monkeypatch, capfd):
   assert capfd.readouterr() == ("", "")  # nothing of COLMAP's log
 
 
-def test_guidance_finds_more_in_the_same_pairs(corner, tmp_path):
+def test_guidance_finds_what_colmaps_finds_and_an_interruption_loses_none(
+  corner, tmp_path, monkeypatch
+):
   folder, _, _, _ = corner
-  database = tmp_path / "database.db"
-  shutil.copy(folder / "out" / "work" / "database.db", database)
-  pairs = [(0, 1), (0, 5), (3, 7)]
-  inliers = "SELECT COUNT(*), SUM(rows) FROM two_view_geometries"
-  counts = []
-  for guided in (False, True):
-    with contextlib.closing(sqlite3.connect(database)) as db, db:
-      db.execute("DELETE FROM matches")
-      db.execute("DELETE FROM two_view_geometries")
-    how = dataclasses.replace(FEW.features, guided_matching=guided)
-    assert features.match_pairs(database, pairs, settings=how, seed=0) == 3
-    with contextlib.closing(sqlite3.connect(database)) as db:
-      counts.append(db.execute(inliers).fetchone())
-  assert counts[0][0] == counts[1][0] == 3
-  assert counts[0][1] < counts[1][1]
+  pairs, pycolmap = [(0, 1), (0, 5), (3, 7)], features.pycolmap
+  ids = list(features.image_ids(folder / "out" / "work" / "database.db").values())
+
+  def matches(name, *runs):
+    """What the pairs have after runs of `match_pairs`, by the number that each matched."""
+    database = tmp_path / name
+    shutil.copy(folder / "out" / "work" / "database.db", database)
+    with pycolmap.Database.open(str(database)) as db:
+      db.clear_matches()
+      db.clear_two_view_geometries()
+    for guided, number in runs:
+      how = dataclasses.replace(FEW.features, guided_matching=guided)
+      assert features.match_pairs(database, pairs, settings=how, seed=0) == number
+    with pycolmap.Database.open(str(database)) as db:
+      found = [db.read_two_view_geometry(ids[i], ids[j]).inlier_matches for i, j in pairs]
+    return [set(map(tuple, rows.tolist())) for rows in found]
+
+  plain = matches("plain.db", (False, 3))
+  ours = matches("ours.db", (True, 3))
+  assert matches("late.db", (False, 3), (True, 0)) == ours
+  assert matches("twice.db", (True, 3), (True, 0)) == ours
+  real = pycolmap.match_image_pairs
+
+  def guided(*arguments, matching_options, **named):
+    matching_options.guided_matching = True
+    real(*arguments, matching_options=matching_options, **named)
+
+  monkeypatch.setattr(pycolmap, "match_image_pairs", guided)
+  theirs = matches("theirs.db", (False, 3))
+  for few, more, expected in zip(plain, ours, theirs, strict=True):
+    assert len(few) < len(more)
+    assert len(more & expected) > 0.95 * max(len(more), len(expected))
 
 
 def test_pictures_that_show_little_are_searched_for_fainter_things(tmp_path):

@@ -90,17 +90,15 @@ def test_the_bound_is_the_cost_not_the_number():
   assert many[1].startswith("sequential")
 
 
-@pytest.mark.parametrize("film", [False, True])
-def test_features_shrink_smoothly_with_the_number_of_pictures(film):
+def test_features_shrink_smoothly_with_the_number_of_pictures():
   settings = FeatureSettings()
-  counts = np.array([settings.of_each(number, film=film) for number in range(1, 400)])
+  counts = np.array([settings.of_each(number) for number in range(1, 400)])
   assert counts[0] == settings.few_num_features and counts[-1] == settings.max_num_features
   change = counts[1:] / counts[:-1]
   assert change.max() <= 1 and change.min() > 0.9  # no number from which much is lost
-  limit = settings.film_cost if film else settings.photographs_cost
   number = np.arange(1, 400)
   cost = number * (number - 1) / 2 * counts.astype(float) ** 2
-  assert cost[counts > settings.max_num_features].max() <= limit
+  assert cost[counts > settings.max_num_features].max() <= settings.most_products
 
 
 def test_sequential_pairs_by_hand():
