@@ -77,7 +77,7 @@ def assemble(
   if not floor.reachable.any():
     warnings.append(f"{floor.why_full} The scene can be looked at and exported, not trained in.")
   goals = results.contact.value.floor.goals
-  path = alignment.world_from_unit.apply(poses.world_from_camera[:, :3, 3])
+  tracked = capture.known is not None and capture.known.is_metric
   report.write(
     out / "report.html",
     report.ReportData(
@@ -90,7 +90,8 @@ def assemble(
       settings=to_plain(settings),
       keyframes=capture.images,
       strategy=poses.strategy,
-      camera_path=path,
+      cameras=alignment.world_from_unit.apply(poses.world_from_camera[:, :3, 3]),
+      filmed=capture.times is not None or tracked,
       views=held_out.load_scores(results.figures.stage.folder),
       robot_views=robot_views,
       baseline=baseline,

@@ -181,12 +181,12 @@ def mesh_trace(mesh: trimesh.Trimesh, *, color: str | None = None, name: str) ->
   )
 
 
-def path_trace(points: Array) -> go.Scatter3d:
-  """Returns a camera's path through points [N, 3] for a 3D figure."""
+def path_trace(points: Array, *, joined: bool = True) -> go.Scatter3d:
+  """Returns a camera's path through points [N, 3], or the points alone, for a 3D figure."""
   return go.Scatter3d(
     **dict(zip("xyz", _short(points).T, strict=True)),
-    mode="lines+markers",
-    name="camera path",
+    mode="lines+markers" if joined else "markers",
+    name="cameras",
     marker={"size": 2.5, "color": palette.VERMILION},
     line={"width": 3, "color": palette.VERMILION},
   )

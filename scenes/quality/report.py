@@ -32,6 +32,7 @@ _THUMBNAIL_WIDTH = 240
 _SHOWN_VIEWS = 5
 _SHOWN_ROBOT_VIEWS = 8
 _VIEW_WIDTH = 480
+_DOT = 0.04  # m, radius of a camera on the map
 
 
 class Meaning(NamedTuple):
@@ -155,8 +156,10 @@ class ReportData:
   keyframes: Sequence[Path]
   strategy: str
   """How the keyframes were matched."""
-  camera_path: np.ndarray
-  """[N, 3]."""
+  cameras: np.ndarray
+  """Places of the pictures [N, 3]."""
+  filmed: bool
+  """Whether they follow each other on a path."""
   views: Sequence[ViewScore]
   """held-out views at full size."""
   robot_views: Sequence[ViewScore]
@@ -166,7 +169,7 @@ class ReportData:
   visual: trimesh.Trimesh
   collision: Sequence[trimesh.Trimesh]
   floor: FloorMap
-  """Without goals and camera path."""
+  """Without goals and cameras."""
   goals: np.ndarray
   """[G, 2]."""
 
@@ -251,14 +254,15 @@ def _robot_views(views: Sequence[ViewScore]) -> Section:
 
 
 def _geometry(data: ReportData) -> list[Section]:
-  surface = [charts.mesh_trace(data.visual, name="surface"), charts.path_trace(data.camera_path)]
+  cameras = charts.path_trace(data.cameras, joined=data.filmed)
+  surface = [charts.mesh_trace(data.visual, name="surface"), cameras]
   convex = [
     charts.mesh_trace(part, color=palette.cycle(index), name=f"part {index}")
     for index, part in enumerate(data.collision)
   ]
   return [
     Section(
-      "Surface and camera path",
+      "Surface and cameras",
       "Drag to turn, scroll to zoom.",
       [charts.figure_3d(surface)],
     ),
@@ -271,13 +275,18 @@ def _geometry(data: ReportData) -> list[Section]:
 
 
 def _free_space(data: ReportData) -> Section:
-  floor = data.floor.copy().path(data.camera_path, palette.rgb(palette.VERMILION))
+  floor, color = data.floor.copy(), palette.rgb(palette.VERMILION)
+  if data.filmed:
+    floor.path(data.cameras, color)
+  else:
+    for place in data.cameras:
+      floor.disc(place[:2], _DOT, color)
   for goal in data.goals:
     floor.cross(goal, palette.rgb(palette.BLUE))
   return Section(
     "Free space",
     "Seen from above: white is floor that the robot's centre may stand on, light grey is too near "
     "to something or cut off, grey was never seen, dark grey is occupied. Crosses are the goals, "
-    "the line is the camera.",
+    f"the {'line is the camera' if data.filmed else 'dots are the cameras'}.",
     [Grid([Picture(floor.scale_bar().picture)], 2)],
   )
