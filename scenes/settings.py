@@ -73,6 +73,7 @@ def with_marker(settings: SceneSettings, place: MarkerPlace) -> SceneSettings:
 
 
 NO_STEREO = StereoSettings(most_pictures=0)
+ONE_ATTEMPT = LocaliseSettings(attempts=1)
 PRESETS = ("fast", "quality", "demo", "tiny", "paper")
 
 
@@ -88,6 +89,7 @@ def preset(name: str) -> SceneSettings:
   if name == "demo":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=110),
+      localise=ONE_ATTEMPT,
       stereo=NO_STEREO,
       train=dataclasses.replace(training.preset("fast"), max_seconds=150.0),
       baseline="colmap",
@@ -95,6 +97,7 @@ def preset(name: str) -> SceneSettings:
   if name == "tiny":
     return SceneSettings(
       capture=CaptureSettings(num_keyframes=60),
+      localise=ONE_ATTEMPT,
       stereo=NO_STEREO,
       # a rate for few steps, see benchmarks/results/records/rooms/field_ablation.json
       train=dataclasses.replace(training.preset("fast"), max_seconds=60.0, learning_rate=5e-3),

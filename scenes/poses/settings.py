@@ -15,6 +15,10 @@ class LocaliseSettings:
   mapper: str = "auto"
   """"global", "incremental", or "auto": incremental, and global where that leaves too many
   keyframes out."""
+  attempts: int = 3
+  """Of the mapper at most, of which the one that the matches support most is taken."""
+  attempted: int = 300
+  """More keyframes are mapped once: a thousand take half an hour."""
   repair_below: float = 0.95
   """Fraction of registered keyframes under which more pairs are matched."""
   min_fraction: float = 0.5

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
@@ -32,6 +32,7 @@ from nerf2real.scenes.poses.matching.pairs import repair_pairs
 from nerf2real.scenes.poses.matching.parallax import parallax_share
 from nerf2real.scenes.poses.registered import check_registered
 from nerf2real.scenes.poses.settings import LocaliseSettings
+from nerf2real.scenes.poses.support import best_supported
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
 from nerf2real.scenes.poses.work import KNOWN_SHARES, Mapped, Steps, prepare_work
 
@@ -213,15 +214,25 @@ def _best_model(
     raise ValueError(f"mapper is {settings.mapper!r}, expected 'auto', 'global' or 'incremental'.")
   order = list(mappers) if settings.mapper == "auto" else [settings.mapper]
   best, chosen = None, f"{order[0]} mapper"
+  attempts = settings.attempts if count <= settings.attempted else 1
   for name in order:
-    models = mappers[name](database, images_folder, seed=settings.seed, report=steps.report)
-    if models:
+
+    def attempt(number: int, name: str = name) -> pycolmap.Reconstruction | None:
+      seed, ends = settings.seed + number, (number / attempts, (number + 1) / attempts)
+      report = part(steps.report, *ends)
+      models = mappers[name](database, images_folder, seed=seed, report=report)
+      if not models:
+        return None
       with quiet():
         pycolmap.ObservationManager(models[0]).filter_all_points3D(
           mapping.MAX_ERROR, mapping.MIN_ANGLE
         )
       mapping.drop_weak_images(models[0])
-      model, what = _checked(models[0], database, images_folder, settings, steps, times)
+      return models[0]
+
+    found = best_supported(attempt, database, attempts=attempts)
+    if found is not None:
+      model, what = _checked(found, database, images_folder, settings, steps, times)
       if best is None or model.num_reg_images() > best.num_reg_images():
         best, chosen = model, f"{name} mapper{what}"
     if best is not None and best.num_reg_images() >= settings.repair_below * count:

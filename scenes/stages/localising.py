@@ -30,7 +30,7 @@ _PICTURES_VERSION = 2  # of all others
 # 2: the unit frame's yaw; 3: the rolling shutter is taken out; 4: up by level right axes;
 # 5: wrong places found, fainter features; 6: places that came hold what sees little;
 # 7: areas of matches are compared, photographs matched with guidance, uncertain ones left out;
-# 8: guidance of our own
+# 8: guidance of our own, attempts
 _POSES_VERSION = 8
 _SENSOR_VERSION = 2  # 2: depth at the pictures' times
 _SENSOR_RECORD = "sensor.json"  # what was done to the depth

@@ -49,11 +49,9 @@ def match(one: Features, two: Features, geometry: pycolmap.TwoViewGeometry) -> n
   Returns:
     Rows of features that belong together, uint32 [M, 2]; None where the geometry is neither.
   """
-  if geometry.config in _LINES:
-    matrix, is_line = geometry.F, True
-  elif geometry.config in _PLACES:
-    matrix, is_line = geometry.H, False
-  else:
+  is_line = geometry.config in _LINES
+  matrix = geometry.F if is_line else geometry.H if geometry.config in _PLACES else None
+  if matrix is None:
     return None
   best = _best(*one, *two, np.asarray(matrix, np.float32), is_line)
   return best.astype(np.uint32)

@@ -1,0 +1,73 @@
+"""Of several models of the same matches the one that joins most of them is taken."""
+
+import numpy as np
+import pytest
+
+from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses import support
+from nerf2real.scenes.poses.matching.features import FeatureSettings
+from nerf2real.scenes.poses.settings import LocaliseSettings
+from nerf2real.scenes.poses.structure_from_motion import localise
+from tests.scenes import synthetic_capture as synthetic
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+  """Eight pictures of a textured corner, localised."""
+  folder = tmp_path_factory.mktemp("corner")
+  synthetic.write_images(folder / "images", synthetic.walk(8))
+  few = LocaliseSettings(features=FeatureSettings(few_num_features=800))
+  localise(folder / "images", folder / "out", settings=few)
+  return folder
+
+
+def _torn(model):
+  """The model in two halves: what both see is points of each half's own."""
+  torn = pycolmap.Reconstruction(model)
+  half = {image for image in torn.images if image <= len(torn.images) // 2}
+  for number, point in list(torn.points3D.items()):
+    seen = [(e.image_id, e.point2D_idx) for e in point.track.elements if e.image_id in half]
+    if 2 <= len(seen) <= len(point.track.elements) - 2:
+      for image, feature in seen:
+        torn.delete_observation(image, feature)
+      track = pycolmap.Track(elements=[pycolmap.TrackElement(*place) for place in seen])
+      torn.add_point3D(point.xyz, track, point.color)
+      assert number in torn.points3D
+  return torn
+
+
+def test_a_model_in_two_halves_joins_fewer_matches(folder):
+  database = folder / "out" / "work" / "database.db"
+  whole = pycolmap.Reconstruction(str(folder / "out" / "sfm"))
+  torn = _torn(whole)
+  assert torn.num_reg_images() == whole.num_reg_images()
+  assert torn.compute_num_observations() == whole.compute_num_observations()
+  assert support.support(torn, database) < 0.9 * support.support(whole, database)
+  assert 0.5 < support.support(whole, database) <= 1
+
+
+@pytest.mark.parametrize(
+  ("shares", "taken", "asked"),
+  [
+    ((0.83, 0.877, 0.867), 1, 3),  # all differ: the best
+    ((0.877, 0.8768, 0.9), 0, 2),  # two alike: no third
+    ((0.83, 0.877, 0.8768), 1, 3),
+    ((None, 0.5, None), 1, 3),  # an attempt that found nothing
+    ((None, None, None), None, 3),
+  ],
+)
+def test_attempts_end_with_two_that_are_alike(monkeypatch, tmp_path, shares, taken, asked):
+  tried = []
+  monkeypatch.setattr(support, "support", lambda model, database: shares[model])
+
+  def attempt(number):
+    tried.append(number)
+    return None if shares[number] is None else number
+
+  assert support.best_supported(attempt, tmp_path, attempts=3) == taken
+  assert tried == list(np.arange(asked))
+
+
+def test_one_attempt_is_not_judged(monkeypatch, tmp_path):
+  monkeypatch.setattr(support, "support", None)
+  assert support.best_supported(lambda number: "model", tmp_path, attempts=1) == "model"
