@@ -19,6 +19,9 @@ class LocaliseSettings:
   """Of the mapper at most, of which the one that the matches support most is taken."""
   attempted: int = 300
   """More keyframes are mapped once: a thousand take half an hour."""
+  max_apart: float = 0.05
+  """Of the room's width by which a picture's places in the best attempts may differ without a
+  warning."""
   repair_below: float = 0.95
   """Fraction of registered keyframes under which more pairs are matched."""
   min_fraction: float = 0.5

@@ -136,7 +136,7 @@ def _map(
   if known is not None:
     fixed = mapping.triangulate(database, images_folder, known, names)
     return Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
-  model, mapper = _best_model(database, images_folder, len(names), settings, steps, times)
+  model, mapper, apart = _best_model(database, images_folder, len(names), settings, steps, times)
   if model is None or model.num_reg_images() < settings.repair_below * len(names):
     placed = {i.name for i in mapping.registered(model)} if model else set()
     missing = [row for row, name in enumerate(names) if name not in placed]
@@ -151,12 +151,19 @@ def _map(
     )
     if added:
       steps.begin("mapping")
-      again, mapper_again = _best_model(database, images_folder, len(names), settings, steps, times)
+      again, how, unsure = _best_model(database, images_folder, len(names), settings, steps, times)
       if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
-        model, mapper = again, mapper_again
+        model, mapper, apart = again, how, unsure
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
   check_registered(model, names, settings, share, film=film)
   assert model is not None  # for the type checker: check_registered has raised
+  if apart > settings.max_apart:
+    weakest = min(mapping.registered(model), key=lambda image: image.num_points3D)
+    warnings.append(
+      f"Parts of the capture hang together by little: attempts to place the pictures differ by up "
+      f"to {apart:.0%} of the room's width. {weakest.name} sees fewest points "
+      f"({weakest.num_points3D}): take more pictures there, slowly and with more in view."
+    )
   against = agreement.contradicting(model, database)
   if against > settings.max_contradicting:
     warnings.append(
@@ -203,17 +210,17 @@ def _best_model(
   settings: LocaliseSettings,
   steps: Steps,
   times: Mapping[str, float] | None,
-) -> tuple[pycolmap.Reconstruction | None, str]:
+) -> tuple[pycolmap.Reconstruction | None, str, float]:
   """Runs the mapper of the settings, and the other one if that leaves too many keyframes out.
 
   Returns:
-    The model, and how it came about.
+    The model, how it came about, and how far attempts are apart, see `support`.
   """
   mappers = {"incremental": mapping.map_incrementally, "global": mapping.map_globally}
   if settings.mapper not in ("auto", *mappers):
     raise ValueError(f"mapper is {settings.mapper!r}, expected 'auto', 'global' or 'incremental'.")
   order = list(mappers) if settings.mapper == "auto" else [settings.mapper]
-  best, chosen = None, f"{order[0]} mapper"
+  best, chosen, apart = None, f"{order[0]} mapper", 0.0
   attempts = settings.attempts if count <= settings.attempted else 1
   for name in order:
 
@@ -230,14 +237,14 @@ def _best_model(
       mapping.drop_weak_images(models[0])
       return models[0]
 
-    found = best_supported(attempt, database, attempts=attempts)
+    found, unsure = best_supported(attempt, database, attempts=attempts)
     if found is not None:
       model, what = _checked(found, database, images_folder, settings, steps, times)
       if best is None or model.num_reg_images() > best.num_reg_images():
-        best, chosen = model, f"{name} mapper{what}"
+        best, chosen, apart = model, f"{name} mapper{what}", unsure
     if best is not None and best.num_reg_images() >= settings.repair_below * count:
       break
-  return best, chosen
+  return best, chosen, apart
 
 
 def _checked(

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.agreement import matched_points
+from nerf2real.scenes.poses.mapping import registered
 
 _SAME = 0.002
 """Difference of the support of two models that are the same; chosen: of five of the living room two
@@ -33,25 +35,41 @@ def support(model: pycolmap.Reconstruction, database: Path) -> float:
   return joined / max(total, 1)
 
 
+def apart(one: pycolmap.Reconstruction, two: pycolmap.Reconstruction) -> float:
+  """How far a picture's places in two models are from each other at most, of the places' width."""
+  places = [{i.name: i.projection_center() for i in registered(model)} for model in (one, two)]
+  common = sorted(set(places[0]) & set(places[1]))
+  first, second = (np.array([found[name] for name in common]).reshape(-1, 3) for found in places)
+  if len(common) < 3:
+    return 0.0
+  off = np.linalg.norm(Similarity.fit(second, first).apply(second) - first, axis=1)
+  return float(off.max() / np.ptp(first, axis=0).max())
+
+
 def best_supported(
   attempt: Callable[[int], pycolmap.Reconstruction | None], database: Path, *, attempts: int
-) -> pycolmap.Reconstruction | None:
-  """Returns the model that the matches support most, of several attempts.
+) -> tuple[pycolmap.Reconstruction | None, float]:
+  """Returns the model that the matches support most, of several attempts, and how sure it is.
 
   Args:
     attempt: Makes a model from the attempt's number, or None.
     database: Features and verified matches.
     attempts: How many there are at most; none follows on two that are the same.
+
+  Returns:
+    The model, and how far it is `apart` from the other that is nearest; 0 where there is none.
   """
-  best, shares = None, list[float]()
+  found: list[tuple[float, pycolmap.Reconstruction]] = []
   for number in range(attempts):
     model = attempt(number)
     if model is None:
       continue
     share = support(model, database) if attempts > 1 else 0.0
-    if best is None or share > max(shares):
-      best = model
-    if any(abs(share - other) <= _SAME for other in shares):
+    found.append((share, model))
+    if any(abs(share - other) <= _SAME for other, _ in found[:-1]):
       break
-    shares.append(share)
-  return best
+  if not found:
+    return None, 0.0
+  found.sort(key=lambda pair: -pair[0])
+  best, *others = (model for _, model in found)
+  return best, min((apart(best, other) for other in others), default=0.0)

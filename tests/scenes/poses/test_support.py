@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import support
+from nerf2real.scenes.poses import mapping, support
 from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
@@ -59,15 +59,30 @@ def test_a_model_in_two_halves_joins_fewer_matches(folder):
 def test_attempts_end_with_two_that_are_alike(monkeypatch, tmp_path, shares, taken, asked):
   tried = []
   monkeypatch.setattr(support, "support", lambda model, database: shares[model])
+  monkeypatch.setattr(support, "apart", lambda one, two: abs(one - two))
 
   def attempt(number):
     tried.append(number)
     return None if shares[number] is None else number
 
-  assert support.best_supported(attempt, tmp_path, attempts=3) == taken
+  several = sum(share is not None for share in shares) > 1
+  assert support.best_supported(attempt, tmp_path, attempts=3) == (taken, float(several))
   assert tried == list(np.arange(asked))
 
 
 def test_one_attempt_is_not_judged(monkeypatch, tmp_path):
   monkeypatch.setattr(support, "support", None)
-  assert support.best_supported(lambda number: "model", tmp_path, attempts=1) == "model"
+  assert support.best_supported(lambda number: "model", tmp_path, attempts=1) == ("model", 0.0)
+
+
+def test_places_of_two_attempts_are_compared_whatever_their_frames(folder):
+  one = pycolmap.Reconstruction(str(folder / "out" / "sfm"))
+  two = pycolmap.Reconstruction(one)
+  two.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0, 0, 1, 0.0])), np.ones(3)))
+  assert support.apart(one, two) < 1e-6
+  image = mapping.registered(two)[3]
+  width = np.ptp([i.projection_center() for i in mapping.registered(two)], axis=0).max()
+  pose = image.cam_from_world()
+  moved = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0.2 * width, 0, 0]))
+  image.frame.set_cam_from_world(image.camera_id, moved)
+  assert 0.1 < support.apart(one, two) < 0.3
