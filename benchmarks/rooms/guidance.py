@@ -1,6 +1,6 @@
 """Matches the pairs of a localisation anew: by descriptors, with guidance, and with COLMAP's.
 
-  python benchmarks/rooms/guidance.py --database out/rooms/8/scene/.stages/poses/work/database.db
+  python benchmarks/rooms/guidance.py --database out/room/database.db
 
 The database is copied, its features are kept. Guidance is what is added to matches by descriptors
 alone; COLMAP's includes those.

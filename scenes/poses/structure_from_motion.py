@@ -237,7 +237,7 @@ def _best_model(
       mapping.drop_weak_images(models[0])
       return models[0]
 
-    found, unsure = best_supported(attempt, database, attempts=attempts)
+    found, unsure = best_supported(attempt, database, attempts=attempts, same=settings.max_apart)
     if found is not None:
       model, what = _checked(found, database, images_folder, settings, steps, times)
       if best is None or model.num_reg_images() > best.num_reg_images():

@@ -16,10 +16,6 @@ from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.agreement import matched_points
 from nerf2real.scenes.poses.mapping import registered
 
-_SAME = 0.002
-"""Difference of the support of two models that are the same; chosen: of five of the living room two
-were, by 0.0002, and the others at least 0.004 apart."""
-
 
 def support(model: pycolmap.Reconstruction, database: Path) -> float:
   """Share of all verified matches that a model joins: both features see the same point.
@@ -36,18 +32,25 @@ def support(model: pycolmap.Reconstruction, database: Path) -> float:
 
 
 def apart(one: pycolmap.Reconstruction, two: pycolmap.Reconstruction) -> float:
-  """How far a picture's places in two models are from each other at most, of the places' width."""
+  """How far a picture's places in two models are from each other at most, of the places' width.
+
+  Models with fewer than three pictures in common are as far apart as they are wide.
+  """
   places = [{i.name: i.projection_center() for i in registered(model)} for model in (one, two)]
   common = sorted(set(places[0]) & set(places[1]))
   first, second = (np.array([found[name] for name in common]).reshape(-1, 3) for found in places)
   if len(common) < 3:
-    return 0.0
+    return 1.0
   off = np.linalg.norm(Similarity.fit(second, first).apply(second) - first, axis=1)
-  return float(off.max() / np.ptp(first, axis=0).max())
+  return float(off.max() / max(np.ptp(first, axis=0).max(), 1e-12))
 
 
 def best_supported(
-  attempt: Callable[[int], pycolmap.Reconstruction | None], database: Path, *, attempts: int
+  attempt: Callable[[int], pycolmap.Reconstruction | None],
+  database: Path,
+  *,
+  attempts: int,
+  same: float,
 ) -> tuple[pycolmap.Reconstruction | None, float]:
   """Returns the model that the matches support most, of several attempts, and how sure it is.
 
@@ -55,6 +58,7 @@ def best_supported(
     attempt: Makes a model from the attempt's number, or None.
     database: Features and verified matches.
     attempts: How many there are at most; none follows on two that are the same.
+    same: How far such two are `apart` at most.
 
   Returns:
     The model, and how far it is `apart` from the other that is nearest; 0 where there is none.
@@ -64,9 +68,8 @@ def best_supported(
     model = attempt(number)
     if model is None:
       continue
-    share = support(model, database) if attempts > 1 else 0.0
-    found.append((share, model))
-    if any(abs(share - other) <= _SAME for other, _ in found[:-1]):
+    found.append((support(model, database) if attempts > 1 else 0.0, model))
+    if any(apart(model, other) <= same for _, other in found[:-1]):
       break
   if not found:
     return None, 0.0

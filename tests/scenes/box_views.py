@@ -3,9 +3,25 @@
 import numpy as np
 
 from nerf2real.core.cameras import Camera
+from nerf2real.scenes.field.field import FieldSettings
+from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.field.views import Views
 
 HALF_SIZE = 0.8  # the walls are at +-0.8 units
+TRAINING = TrainSettings(
+  field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
+  max_steps=300,
+  max_seconds=None,
+  batch_samples=1 << 14,
+  inner_cells=32,
+  outer_cells=16,
+  occupancy_samples=1 << 13,
+  occupancy_start=96,
+  occupancy_sweep_steps=160,
+  blur_max=1.0,
+  warmup_steps=16,
+)
+"""Seconds of training that show the box."""
 
 
 def wall_distance(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -12,19 +12,7 @@ from nerf2real.scenes.field.render.renderer import Renderer
 from nerf2real.scenes.quality import image_quality
 from tests.scenes import box_views
 
-FAST = train.TrainSettings(
-  field=FieldSettings(log2_table_size=12, growth=1.3, march_step=0.03),
-  max_steps=300,
-  max_seconds=None,
-  batch_samples=1 << 14,
-  inner_cells=32,
-  outer_cells=16,
-  occupancy_samples=1 << 13,
-  occupancy_start=96,
-  occupancy_sweep_steps=160,
-  blur_max=1.0,
-  warmup_steps=16,
-)
+FAST = box_views.TRAINING
 REFERENCE = dataclasses.replace(
   FAST,
   engine="jax",

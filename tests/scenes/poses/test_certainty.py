@@ -6,19 +6,6 @@ import pytest
 
 from nerf2real.scenes.poses import certainty
 from nerf2real.scenes.poses.mapping import registered
-from nerf2real.scenes.poses.matching.features import FeatureSettings
-from nerf2real.scenes.poses.settings import LocaliseSettings
-from nerf2real.scenes.poses.structure_from_motion import localise
-from tests.scenes import synthetic_capture as synthetic
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-  folder = tmp_path_factory.mktemp("corner")
-  synthetic.write_images(folder / "images", synthetic.walk(8))
-  few = LocaliseSettings(features=FeatureSettings(few_num_features=800))
-  localise(folder / "images", folder / "out", settings=few)
-  return folder
 
 
 @pytest.fixture

@@ -5,20 +5,6 @@ import pytest
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, support
-from nerf2real.scenes.poses.matching.features import FeatureSettings
-from nerf2real.scenes.poses.settings import LocaliseSettings
-from nerf2real.scenes.poses.structure_from_motion import localise
-from tests.scenes import synthetic_capture as synthetic
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-  """Eight pictures of a textured corner, localised."""
-  folder = tmp_path_factory.mktemp("corner")
-  synthetic.write_images(folder / "images", synthetic.walk(8))
-  few = LocaliseSettings(features=FeatureSettings(few_num_features=800))
-  localise(folder / "images", folder / "out", settings=few)
-  return folder
 
 
 def _torn(model):
@@ -47,32 +33,38 @@ def test_a_model_in_two_halves_joins_fewer_matches(folder):
 
 
 @pytest.mark.parametrize(
-  ("shares", "taken", "asked"),
+  ("shares", "places", "taken", "unsure"),
   [
-    ((0.83, 0.877, 0.867), 1, 3),  # all differ: the best
-    ((0.877, 0.8768, 0.9), 0, 2),  # two alike: no third
-    ((0.83, 0.877, 0.8768), 1, 3),
-    ((None, 0.5, None), 1, 3),  # an attempt that found nothing
-    ((None, None, None), None, 3),
+    ((0.83, 0.87, 0.86), (0.0, 0.2, 0.5), 1, 0.2),  # all differ: the best
+    ((0.87, 0.86), (0.0, 0.01), 0, 0.01),  # two are the same: no third
+    ((0.83, 0.86, 0.87), (0.2, 0.0, 0.01), 2, 0.01),
+    ((0.87, 0.83, 0.84), (0.0, 0.2, 0.21), 0, 0.2),  # two are, and another is better
+    ((None, 0.5, None), (None, 0.0, None), 1, 0.0),  # an attempt that found nothing
+    ((None, None, None), (None, None, None), None, 0.0),
   ],
 )
-def test_attempts_end_with_two_that_are_alike(monkeypatch, tmp_path, shares, taken, asked):
+def test_attempts_end_with_two_that_are_the_same(
+  monkeypatch, tmp_path, shares, places, taken, unsure
+):
   tried = []
   monkeypatch.setattr(support, "support", lambda model, database: shares[model])
-  monkeypatch.setattr(support, "apart", lambda one, two: abs(one - two))
+  monkeypatch.setattr(support, "apart", lambda one, two: abs(places[one] - places[two]))
 
   def attempt(number):
     tried.append(number)
     return None if shares[number] is None else number
 
-  several = sum(share is not None for share in shares) > 1
-  assert support.best_supported(attempt, tmp_path, attempts=3) == (taken, float(several))
-  assert tried == list(np.arange(asked))
+  best, apart = support.best_supported(attempt, tmp_path, attempts=3, same=0.05)
+  assert best == taken and apart == pytest.approx(unsure)
+  assert tried == list(range(len(shares)))
 
 
 def test_one_attempt_is_not_judged(monkeypatch, tmp_path):
   monkeypatch.setattr(support, "support", None)
-  assert support.best_supported(lambda number: "model", tmp_path, attempts=1) == ("model", 0.0)
+  assert support.best_supported(lambda number: "model", tmp_path, attempts=1, same=0.05) == (
+    "model",
+    0.0,
+  )
 
 
 def test_places_of_two_attempts_are_compared_whatever_their_frames(folder):
@@ -80,6 +72,7 @@ def test_places_of_two_attempts_are_compared_whatever_their_frames(folder):
   two = pycolmap.Reconstruction(one)
   two.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0, 0, 1, 0.0])), np.ones(3)))
   assert support.apart(one, two) < 1e-6
+  assert support.apart(one, pycolmap.Reconstruction()) == 1.0
   image = mapping.registered(two)[3]
   width = np.ptp([i.projection_center() for i in mapping.registered(two)], axis=0).max()
   pose = image.cam_from_world()
