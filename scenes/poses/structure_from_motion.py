@@ -17,7 +17,10 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import agreement, certainty, continuity, mapping, refinement, shutter
+from nerf2real.scenes.poses import mapping, refinement, shutter
+from nerf2real.scenes.poses.checks import agreement, certainty, continuity
+from nerf2real.scenes.poses.checks.registered import check_registered
+from nerf2real.scenes.poses.checks.support import best_supported
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -30,9 +33,7 @@ from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.poses.matching.features import quiet
 from nerf2real.scenes.poses.matching.pairs import repair_pairs
 from nerf2real.scenes.poses.matching.parallax import parallax_share
-from nerf2real.scenes.poses.registered import check_registered
 from nerf2real.scenes.poses.settings import LocaliseSettings
-from nerf2real.scenes.poses.support import best_supported
 from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_frame
 from nerf2real.scenes.poses.work import KNOWN_SHARES, Mapped, Steps, prepare_work
 

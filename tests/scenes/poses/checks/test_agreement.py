@@ -10,7 +10,8 @@ import pytest
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.media.stills import list_images
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
-from nerf2real.scenes.poses import agreement, mapping
+from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.checks import agreement
 from nerf2real.scenes.poses.localisation import poses_of
 from nerf2real.scenes.poses.mapping import registered
 from nerf2real.scenes.poses.matching import features

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import agreement
+from nerf2real.scenes.poses.checks import agreement
 from nerf2real.scenes.poses.mapping import registered
 
 _NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from nerf2real.scenes.poses import agreement, continuity
+from nerf2real.scenes.poses.checks import agreement, continuity
 
 
 def votes_of(place, reach=3, matches=40):

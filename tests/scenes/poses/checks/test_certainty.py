@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from nerf2real.scenes.poses import certainty
+from nerf2real.scenes.poses.checks import certainty
 from nerf2real.scenes.poses.mapping import registered
 
 

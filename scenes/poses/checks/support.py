@@ -13,7 +13,7 @@ import numpy as np
 
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses.agreement import matched_points
+from nerf2real.scenes.poses.checks.agreement import matched_points
 from nerf2real.scenes.poses.mapping import registered
 
 

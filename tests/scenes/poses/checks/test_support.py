@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, support
+from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.checks import support
 
 
 def _torn(model):
