@@ -16,7 +16,8 @@ class CaptureSettings:
   """Settings of the keyframes and of the warnings."""
 
   num_keyframes: int = 150
-  """Parts of the capture; the sharpest frame of each is kept."""
+  """Parts of the capture; the sharpest frame of each is kept. A video's are spread over its time
+  and over what its picture moves, all others' are equal."""
   most_keyframes: int | None = None
   """Parts of a long video, which has two a second up to these; `num_keyframes` if None."""
   max_size: int = 1920

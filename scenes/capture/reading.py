@@ -16,6 +16,7 @@ from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.media import stills
 from nerf2real.scenes.capture.media.blur import blur_width
 from nerf2real.scenes.capture.media.errors import CaptureError
+from nerf2real.scenes.capture.media.spacing import spread
 from nerf2real.scenes.capture.media.stills import list_images, list_images_below
 from nerf2real.scenes.capture.media.video import (
   Frame,
@@ -29,6 +30,7 @@ from nerf2real.scenes.capture.posed.colmap_model import read_colmap
 from nerf2real.scenes.capture.posed.rgbd import read_rgbd
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 
+_CANDIDATES = 3  # of a video, for each keyframe; chosen: what moves five times as fast is as dense
 _KEYFRAME_RATE = 2.0  # of a long video [1/s]; chosen: about that of the shipped film, 150 in 70 s
 
 
@@ -87,15 +89,17 @@ def _read_video(
       f"Too short: the video lasts {info.duration:.1f} s, expected {settings.warn_duration:.0f} s "
       "or more; walk slowly through the whole room."
     )
+  count = keyframe_count(settings, info.duration)
   frames = sharpest_frames(
     source,
-    keyframe_count(settings, info.duration),
+    _CANDIDATES * count,
     max_size=settings.max_size,
     info=info,
     warnings=warnings,
     progress=progress,
   )
-  return _write("video", frames, folder, settings, warnings)
+  written = _spread(_write(frames, folder, settings), count)
+  return _gather("video", written, folder, settings, warnings)
 
 
 def _read_pictures(
@@ -119,7 +123,8 @@ def _read_pictures(
     return limit_size(_read_posed(files[index], camera, settings.max_size), settings.max_size)
 
   frames = _sharpest_pictures(len(files), read, settings, progress)
-  capture = _write(kind, frames, folder, settings, list(known.warnings))
+  written = _write(frames, folder, settings)
+  capture = _gather(kind, written, folder, settings, list(known.warnings))
   known = known.selected(_numbers(capture), _written_camera(camera, capture))
   known, warnings = agreement.settled(known, capture.images)
   capture.warnings.extend(warnings)
@@ -147,7 +152,8 @@ def _read_stills(
     return image if same else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
   frames = _sharpest_pictures(len(found.files), read, settings, progress)
-  capture = _write("images", frames, folder, settings, found.warnings)
+  written = _write(frames, folder, settings)
+  capture = _gather("images", written, folder, settings, found.warnings)
   numbers = _numbers(capture)
   turned = found.turned[numbers]
   return dataclasses.replace(
@@ -210,17 +216,25 @@ def _sharpest_pictures(
       yield best
 
 
-def _write(
-  kind: str, frames: Iterator[Frame], folder: Path, settings: CaptureSettings, warnings: list[str]
-) -> Capture:
-  """Writes keyframes as they come and gathers what the warnings need."""
-  images, values, brightness, times, blur = [], [], [], [], []
+@dataclasses.dataclass(frozen=True)
+class _Written:
+  """What is kept of a frame on disk."""
+
+  path: Path
+  index: int
+  time: float
+  travelled: float
+  sharpness: float
+
+
+def _write(frames: Iterator[Frame], folder: Path, settings: CaptureSettings) -> list[_Written]:
+  """Writes frames as they come."""
+  written: list[_Written] = []
   size: tuple[int, int] | None = None
   for frame in frames:
     height, width = frame.image.shape[:2]
-    if size is None:
-      size = (width, height)
-    elif size != (width, height):
+    size = size or (width, height)
+    if size != (width, height):
       raise CaptureError(
         f"Picture {frame.index} is {width}x{height}, the ones before it {size[0]}x{size[1]}: "
         "expected one camera, one zoom and one orientation for the whole capture."
@@ -228,22 +242,40 @@ def _write(
     path = folder / f"frame_{frame.index:06d}.jpg"
     if not cv2.imwrite(str(path), frame.image, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]):
       raise OSError(f"{path} could not be written: is the disk full?")
-    images.append(path)
-    values.append(frame.sharpness)
-    brightness.append(float(frame.image.mean()))
-    times.append(frame.time)
-    blur.append(blur_width(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)))
-  if size is None:
+    written.append(_Written(path, frame.index, frame.time, frame.travelled, frame.sharpness))
+  if not written:
     raise CaptureError("The capture holds no picture.")
+  return written
+
+
+def _spread(written: list[_Written], count: int) -> list[_Written]:
+  """Keeps `count` of a film's frames, see `spacing.spread`, and removes the others."""
+  index, travelled, sharp = np.array([[w.index, w.travelled, w.sharpness] for w in written]).T
+  kept = spread(index, travelled, sharp, min(count, len(written)))
+  for number in set(range(len(written))) - set(kept.tolist()):
+    written[number].path.unlink()
+  return [written[number] for number in kept]
+
+
+def _gather(
+  kind: str, written: list[_Written], folder: Path, settings: CaptureSettings, warnings: list[str]
+) -> Capture:
+  """Returns what is known of keyframes on disk, with the warnings about them."""
+  brightness, blur = [], []
+  for picture in written:
+    image = stills.read_still(picture.path)
+    brightness.append(float(image.mean()))
+    blur.append(blur_width(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)))
+  height, width = image.shape[:2]
   capture = Capture(
     kind=kind,
     folder=folder,
-    images=images,
-    width=size[0],
-    height=size[1],
-    sharpness=np.array(values),
+    images=[w.path for w in written],
+    width=width,
+    height=height,
+    sharpness=np.array([w.sharpness for w in written]),
     brightness=np.array(brightness),
-    times=np.array(times),
+    times=np.array([w.time for w in written]),
     warnings=warnings,
     blur=np.array(blur),
   )

@@ -24,8 +24,9 @@ from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Source
 
-# 2: stills turned and without copies, depth checked with the pictures; 3: depth has its own poses
-_PICTURES_VERSIONS = {"video": 1, "rgbd": 3}
+# 2: stills turned and without copies, depth checked with the pictures; rgbd 3: depth has its own
+# poses; video 2: keyframes where the picture moves
+_PICTURES_VERSIONS = {"video": 2, "rgbd": 3}
 _PICTURES_VERSION = 2  # of all others
 # 2: the unit frame's yaw; 3: the rolling shutter is taken out; 4: up by level right axes;
 # 5: wrong places found, fainter features; 6: places that came hold what sees little;

@@ -15,6 +15,7 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.media.errors import CaptureError
+from nerf2real.scenes.capture.media.spacing import ImageMotion
 
 STANDARD_SIZE = 480  # short side at which sharpness is measured [pixel]; chosen: less than any
 # phone's video, so that resolutions are comparable; pictures are never enlarged
@@ -33,6 +34,8 @@ class Frame:
   """Variance of the Laplacian at the standard size [grey level^2]."""
   image: np.ndarray
   """Upright BGR picture uint8 [H, W, 3]."""
+  travelled: float = 0.0
+  """How far the video's picture had moved by then, see `spacing.ImageMotion`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,7 +171,8 @@ def sharpest_frames(
   parts = min(num_parts, info.num_frames)
   edges = np.linspace(0, info.num_frames, parts + 1).astype(int)
   counts: collections.Counter = collections.Counter()
-  best: tuple[float, int, av.VideoFrame] | None = None
+  best: tuple[float, int, av.VideoFrame, float] | None = None
+  motion = ImageMotion()
   part, last_time = 0, 0.0
   for index, frame in enumerate(_decode(path, counts)):
     last_time = float(frame.time or 0.0)
@@ -177,9 +181,10 @@ def sharpest_frames(
         yield _chosen(best, max_size)
       best, part = None, part + 1
     # The luma plane is the grey picture: no colour conversion for frames that are not kept.
-    value = sharpness(frame.reformat(format="gray").to_ndarray())
+    grey = at_standard_size(frame.reformat(format="gray").to_ndarray())
+    value, travelled = sharpness(grey), motion.add(grey)
     if best is None or value > best[0]:
-      best = (value, index, frame)
+      best = (value, index, frame, travelled)
     if index % 10 == 0:
       progress(min(1.0, index / info.num_frames), f"frame {index} of {info.num_frames}")
   expected = max(info.num_frames, info.declared_frames)
@@ -196,6 +201,6 @@ def sharpest_frames(
     yield _chosen(best, max_size)
 
 
-def _chosen(best: tuple[float, int, av.VideoFrame], max_size: int) -> Frame:
-  value, index, frame = best
-  return Frame(index, float(frame.time or 0.0), value, _upright(frame, max_size))
+def _chosen(best: tuple[float, int, av.VideoFrame, float], max_size: int) -> Frame:
+  value, index, frame, travelled = best
+  return Frame(index, float(frame.time or 0.0), value, _upright(frame, max_size), travelled)

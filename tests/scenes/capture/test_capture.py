@@ -12,6 +12,7 @@ import pytest
 from nerf2real.scenes.capture import reading
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.media.errors import CaptureError
+from nerf2real.scenes.capture.media.spacing import ImageMotion, spread
 from nerf2real.scenes.capture.media.video import inspect_video, sharpest_frames, sharpness
 from nerf2real.scenes.capture.posed.colmap_model import read_colmap, to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
@@ -44,8 +45,13 @@ def test_keeps_the_sharpest_frame_of_each_part(frames, tmp_path, codec, suffix):
   result = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
   with av.open(str(path)) as container:
     values = [sharpness(f.to_ndarray(format="gray")) for f in container.decode(video=0)]
-  expected = [3 * part + int(np.argmax(values[3 * part : 3 * part + 3])) for part in range(8)]
-  assert [int(p.stem.split("_")[1]) for p in result.images] == expected
+  motion = ImageMotion()
+  with av.open(str(path)) as container:
+    moved = [motion.add(f.to_ndarray(format="gray")) for f in container.decode(video=0)]
+  expected = spread(np.arange(24), np.array(moved), np.array(values), 8)
+  assert [int(p.stem.split("_")[1]) for p in result.images] == expected.tolist()
+  left = sorted(p.name for p in (tmp_path / "keyframes").iterdir())
+  assert left == [p.name for p in result.images]
   np.testing.assert_allclose(result.sharpness, np.array(values)[expected])
   np.testing.assert_allclose(result.times, np.array(expected) / 10, atol=2e-3)
   assert all(path.is_file() for path in result.images)
