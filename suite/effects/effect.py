@@ -40,7 +40,7 @@ class Parameter:
 
   name: str
   unit: str
-  """SI, of a hinge joint where it concerns joints; see SLIDE_UNITS."""
+  """SI, of a hinge joint where it concerns joints (`of_joint`); see SLIDE_UNITS."""
   nominal: float
   """The value at which the kind does nothing (for shape parameters: a usual value)."""
   low: float
@@ -58,10 +58,13 @@ class Parameter:
   """The value is a list of numbers."""
   fitted: bool = True
   """False for a choice between models (0 or 1) or a grid's bounds, which a fit keeps fixed."""
+  of_joint: bool = True
+  """False for what the world or a sensor turns by, whose unit is the same beside a slide."""
 
   def units(self) -> tuple[str, ...]:
-    """Returns the units that a file may state."""
-    return (self.unit, SLIDE_UNITS[self.unit]) if self.unit in SLIDE_UNITS else (self.unit,)
+    """Returns the units that a file may state: of a hinge joint and, if another, of a slide."""
+    slide = SLIDE_UNITS.get(self.unit) if self.of_joint else None
+    return (self.unit,) if slide is None else (self.unit, slide)
 
 
 @dataclasses.dataclass(frozen=True)

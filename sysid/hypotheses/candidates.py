@@ -135,22 +135,19 @@ def library(plant: JointPlant) -> list[Term]:
     terms.append(_play(plant, encoder_on_motor=True))
   if plant.holds or plant.hinge:  # a slide without a servo has no place that its zero could show
     terms.append(_one("encoder_offset", joint, "offset", -0.4, 0.4, 0.03, (0.03, -0.03)))
-  if plant.hinge:
-    terms.append(_payload(plant))
-    terms.append(
-      Term(
-        "gravity_tilt",
-        None,
-        ("x", "y"),
-        (-0.5, -0.5),
-        (0.5, 0.5),
-        (0.03, 0.03),
-        ((0.03, 0.03), (-0.03, -0.03)),
-        (0.3, 0.3),
-      )
+  terms.append(_payload(plant))
+  terms.append(
+    Term(
+      "gravity_tilt",
+      None,
+      ("x", "y"),
+      (-0.5, -0.5),
+      (0.5, 0.5),
+      (0.03, 0.03),
+      ((0.03, 0.03), (-0.03, -0.03)),
+      (0.3, 0.3),
     )
-  else:
-    terms.append(_payload(plant))
+  )
   most = strongest(plant)
   limit = most if not np.isfinite(top) else min(top, most)
   terms.append(

@@ -86,8 +86,8 @@ KINDS = (
     "geom",
     "model",
     (
-      Parameter("x", "rad", 0.0, -0.1, 0.1, "turn about the world's x axis"),
-      Parameter("y", "rad", 0.0, -0.1, 0.1, "turn about the world's y axis"),
+      Parameter("x", "rad", 0.0, -0.1, 0.1, "turn about the world's x axis", of_joint=False),
+      Parameter("y", "rad", 0.0, -0.1, 0.1, "turn about the world's y axis", of_joint=False),
     ),
     FloorSlope,
   ),

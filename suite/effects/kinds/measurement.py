@@ -126,8 +126,9 @@ class ImuLag(Operator):
 
 
 def _axes(channel: str, unit: str, bound: float) -> tuple[Parameter, ...]:
+  doc = "reading minus truth along "
   return tuple(
-    Parameter(f"{channel}_{axis}", unit, 0.0, -bound, bound, f"reading minus truth along {axis}")
+    Parameter(f"{channel}_{axis}", unit, 0.0, -bound, bound, f"{doc}{axis}", of_joint=False)
     for axis in "xyz"
   )
 
@@ -154,7 +155,9 @@ KINDS = (
     "the IMU is mounted turned",
     "none",
     "measurement",
-    tuple(Parameter(a, "rad", 0.0, -0.2, 0.2, f"turn about its {a} axis") for a in "xyz"),
+    tuple(
+      Parameter(a, "rad", 0.0, -0.2, 0.2, f"turn about its {a} axis", of_joint=False) for a in "xyz"
+    ),
     ImuTilt,
   ),
   Kind(

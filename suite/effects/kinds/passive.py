@@ -162,8 +162,8 @@ KINDS = (
     "none",
     "model",
     (
-      Parameter("x", "rad", 0.0, -0.2, 0.2, "turn about the world's x axis"),
-      Parameter("y", "rad", 0.0, -0.2, 0.2, "turn about the world's y axis"),
+      Parameter("x", "rad", 0.0, -0.2, 0.2, "turn about the world's x axis", of_joint=False),
+      Parameter("y", "rad", 0.0, -0.2, 0.2, "turn about the world's y axis", of_joint=False),
     ),
     GravityTilt,
   ),

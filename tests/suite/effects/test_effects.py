@@ -322,6 +322,11 @@ def test_a_slide_joint_may_use_its_own_units(tmp_path):
   assert read_effects(path)[0].parameters == {"coefficient": 0.1}
 
 
+@pytest.mark.parametrize("kind", ["gravity_tilt", "floor_slope", "imu_tilt"])
+def test_what_the_world_turns_by_is_no_slide_joint_s_length(kind):
+  assert kind_of(kind).parameter("x").units() == ("rad",)
+
+
 @pytest.mark.parametrize(
   ("effect", "message"),
   [

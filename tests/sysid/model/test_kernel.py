@@ -154,6 +154,27 @@ def test_every_candidate_is_checked() -> None:
   assert kinds - {case[0] for case in CASES} == {"clock_drift"}  # checked below
 
 
+_CARRIAGE = """
+<mujoco><option timestep="0.001" integrator="implicitfast"/>
+  <worldbody><body name="carriage">
+    <joint name="joint" type="slide" axis="1 0 0" damping="3"/>
+    <inertial pos="0 0 0" mass="2" diaginertia="1e-3 1e-3 1e-3"/>
+  </body></worldbody>
+  <actuator><position name="joint" joint="joint" kp="300" kv="20"/></actuator>
+</mujoco>"""
+
+
+def test_a_slide_leans_as_mujoco_has_it() -> None:
+  model = mujoco.MjModel.from_xml_string(_CARRIAGE)
+  log = log_of(_CARRIAGE, "sweep", rounding=0.0, duration=4.0)
+  plant = JointModel(model, "joint", [log])
+  lean = next(t for t in candidates.library(plant) if t.kind == "gravity_tilt")
+  effect = Effect("gravity_tilt", None, {"x": 0.05, "y": 0.1})
+  want = evaluation.simulate(model, log, [effect])[:, 0]
+  assert np.abs(_position(plant) - want).max() > 5e-3
+  np.testing.assert_allclose(_position(plant, [lean], [0.05, 0.1]), want, atol=1e-6)
+
+
 def test_every_candidate_at_rest_leaves_the_motion_as_it_was() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   plant = JointModel(model, "joint", [log_of(PENDULUM, "steps", duration=2.0)])
