@@ -28,6 +28,7 @@ from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import FREE, Term
 from nerf2real.sysid.selection.wider import zeros
+from nerf2real.sysid.selection.wider.wide import ZERO
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 Array = np.ndarray
@@ -127,8 +128,9 @@ def _refit(
     return None
   if members:
     together = [j for j in stored.joints if j.joint in members]
-    if row["kind"] == zeros.KIND:
-      return _zero_of_tilt(row, stored.model, together, now, settings)
+    if row["kind"] == ZERO:
+      as_tilt = _zero_of_tilt(row, stored.model, together, now, settings)
+      return as_tilt or _shared(row, together, now, settings)
     return _shared(row, together, now, settings)
   mine = next(
     (j for j in stored.joints if row["joint"] in (None, j.joint) and _named(j, row["kind"])), None
@@ -190,7 +192,7 @@ def _shared(
   if term is None:
     return None
   values = np.array([known[name] for name in term.names])
-  where = str(row.get("body") or "all")
+  where = str(row.get("body") or row["joint"] or "all")
   shown = [
     _shows(j, terms[0], term, values) for j, (terms, _) in zip(joints, own_terms, strict=True)
   ]
@@ -211,7 +213,8 @@ def _zero_of_tilt(
   now: Mapping[str, JointLikelihood],
   settings: Settings,
 ) -> _Refit | None:
-  """Returns a joint's zero that a tilt of the machine was told as, fitted anew as that tilt."""
+  """Returns a joint's zero that a tilt of the machine was told as, fitted anew as that tilt; None
+  where it was none."""
   refit = _shared(row | {"kind": zeros.TILT}, members, now, settings)
   if refit is None:
     return None

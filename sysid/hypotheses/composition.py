@@ -32,8 +32,11 @@ def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
   for index in _order(tuple(term.kind for term in terms)):
     term = terms[index]
     part = x[ends[index] - len(term.names) : ends[index]]
-    term.apply(plant, p, part)
     values = dict(zip(term.names, map(float, part), strict=True)) | dict(term.fixed)
+    if term.kind == "encoder_offset" and term.target != plant.joint:
+      loads.append(plant.zero_load(str(term.target), values["offset"]))
+      continue
+    term.apply(plant, p, part)
     if term.kind in KINDS and KINDS[term.kind].law is not None:
       forces.append((term, values))
     elif term.kind == "payload":

@@ -27,6 +27,7 @@ FOLLOWED_S = 0.02
 """s in which a state that follows the readings makes up for a difference."""
 
 
+_ZERO_OF = "zero of "  # begins the key of what another joint's shifted zero adds
 _NEAR = 0.1  # s on either side of a sample over which an error is averaged; chosen
 _KEPT = 2  # sets of loads of a log whose fields are kept: a fit's and that of a difference to it
 
@@ -35,7 +36,7 @@ class Load(NamedTuple):
   """A linear change of what a joint feels: factors of the parts of a basis."""
 
   key: str
-  """"mass", "gravity" or the name of a body that carries more."""
+  """"mass", "gravity", the name of a body that carries more, or `zero_load`'s of another joint."""
   factors: Array
 
 
@@ -78,6 +79,9 @@ class JointModel(JointPlant):
         self._bases[key] = [fields[None] for fields in self._unloaded]
       elif key == "gravity":
         self._bases[key] = self._parts([r.gravity(self.joint) for r in self.reductions])
+      elif key.startswith(_ZERO_OF):
+        other = key.removeprefix(_ZERO_OF)
+        self._bases[key] = self._parts([r.zero(self.joint, other) for r in self.reductions])
       else:
         body = self._body(key)
         self._bases[key] = self._parts([r.moments(self.joint, body) for r in self.reductions])
@@ -115,6 +119,10 @@ class JointModel(JointPlant):
     """Returns what turning gravity by the rotation vector (x, y, 0) adds."""
     before = self.model.opt.gravity
     return Load("gravity", matrix_from_rotvec([x, y, 0.0]) @ before - before)
+
+  def zero_load(self, joint: str, offset: float) -> Load:
+    """Returns what an offset of another joint's readings, rad (or m), adds."""
+    return Load(f"{_ZERO_OF}{joint}", np.array([offset, offset**2]))
 
   def forces(self, loads: Sequence[Load], index: int) -> tuple[Array, ...]:
     """Returns what a log's joint feels as the kernel takes it, each [T]: inertia, gravity's torque

@@ -37,6 +37,7 @@ LONGEST_STEP = 5e-3
 
 _SPACING = 0.03  # s between poses at which a model is evaluated; chosen
 _MISSED = 0.05  # of an acceleration's standard deviation that a line between knots may miss; chosen
+_SHIFT = 0.1  # rad (or m) by which a zero is shifted to see what that changes; chosen: a large one
 _REACH = 0.1  # m of the places at which a mass is put to see its moments
 _UNIT = _REACH * np.eye(3)
 _MONOMIALS_AT = np.array(
@@ -72,6 +73,10 @@ class Surroundings:
       self.bias + factor * other.bias,
     )
 
+  def times(self, factor: float) -> "Surroundings":
+    """Returns factor * self (the position stays)."""
+    return self.plus(self, factor - 1.0)
+
 
 class Reduction:
   """Computes the surroundings of joints of a model along a log."""
@@ -100,6 +105,7 @@ class Reduction:
     self._dofs = model.jnt_dofadr[ids]
     self._poses: point_mass.Poses | None = None
     self._moments: dict[int, dict[str, Array]] = {}
+    self._reread: dict[str, tuple[Reduction, Reduction]] = {}
 
   @functools.cached_property
   def twin(self) -> tuple["Reduction", Array] | None:
@@ -132,6 +138,23 @@ class Reduction:
     none = np.zeros(len(self._knots))
     parts = np.moveaxis(self._weights(joint), -1, 0)
     return [self._on_grid(joint, none, here, across, none) for here, across in parts]
+
+  def zero(self, joint: str, shifted: str) -> list[Surroundings]:
+    """Returns what an offset of another joint's readings, by which the machine is not where they
+    say, adds to a joint's surroundings: per rad (or m), and per square of it."""
+    if shifted not in self._reread:
+      self._reread[shifted] = self._shifted(shifted, _SHIFT), self._shifted(shifted, -_SHIFT)
+    here = self.of_joint(joint)
+    ahead, back = (r.of_joint(joint).plus(here, -1.0) for r in self._reread[shifted])
+    odd, even = ahead.plus(back, -1.0), ahead.plus(back, 1.0)
+    return [odd.times(0.5 / _SHIFT), even.times(0.5 / _SHIFT**2)]
+
+  def _shifted(self, joint: str, offset: float) -> "Reduction":
+    """Returns the same motion where a joint's readings lack an offset."""
+    position = self.detailed.position.copy()
+    position[:, self.log.states.column(joint)] -= offset
+    motion = dataclasses.replace(self.detailed, position=position)
+    return Reduction(self.model, self.log, motion=motion)
 
   @functools.cached_property
   def _evaluated(self) -> tuple[Array, Array, Array]:

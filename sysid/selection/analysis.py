@@ -166,12 +166,17 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
     "held_out_gain_nats": round(shared.nats, 2),
     "joints": [m.joint for m in shared.members],
   }
-  zero = shared.term.kind == zeros.TILT and zeros.of_tilt(result.model, shared.x, bounds)
-  if zero:
+  zero = None
+  if shared.term.kind == zeros.TILT:
+    zero = zeros.of_tilt(result.model, shared.x, bounds)
+  elif shared.term.kind == wide.ZERO:
+    zero = str(shared.term.target), float(shared.x[0]), bounds["offset"]
+  if zero is not None:
     joint, offset, (low, high) = zero
     result.zeros[joint] = Zero(offset, (high - low) / (2 * SETTINGS.sigmas))
     result.effects.append(claims.zero(joint, offset, (low, high), evidence))
-    result.twins.append(claims.alike(shared.term, shared.x))
+    if shared.term.kind == zeros.TILT:
+      result.twins.append(claims.alike(shared.term, shared.x))
     return
   effect, row = claims.shared(shared.term, shared.x, bounds, evidence)
   if shared.term.kind == "payload":

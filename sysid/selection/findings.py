@@ -32,9 +32,11 @@ def effects_of(joint: str, item: Scored, *, offset: float = 0.0) -> tuple[list[E
       effects.append(dataclasses.replace(term.effect(x), target=joint))
     elif term.kind == FREE:
       effects.append(free_force.effect(term, x))
+    elif not term.names:  # of a wider scope
+      continue
     elif term.kind == "encoder_offset":
       offset += values["offset"]
-    elif term.names:
+    else:
       effects.append(beside_machine(term.effect(x), item.terms))
   if offset:
     effects.append(Effect("encoder_offset", joint, {"offset": offset}))

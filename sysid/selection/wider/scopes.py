@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
+from scipy.stats import norm
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
@@ -183,7 +184,9 @@ def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool)
   near = [w for w in others if (top.evidence() - w.possible()).clear < beyond]
   top = wide.adopted(wide.fitted(top), [m for w in near for m in w.members])
   items = sorted([top, *map(wide.fitted, near)], key=lambda w: -w.evidence().total)
-  alike = [w for w in items if wide.same(items[0], w)]
+  first = items[0].evidence()
+  as_likely = float(norm.isf(top.members[0].now.settings.level))
+  alike = [w for w in items if (first - w.evidence()).clear < as_likely and wide.same(items[0], w)]
   best = min(alike, key=lambda w: USUAL.index(w.key[0]) if w.key[0] in USUAL else len(USUAL))
   mine = best.evidence()
   single = [wide.alone(best, at) for at in range(len(best.members))]

@@ -33,6 +33,8 @@ LATE = ("command_delay", "measurement_delay")
 _OF_ALL = {"measurement_delay": (("of_all", 1.0),)}
 """What is fixed of a kind where it is the machine's: the motion that the other joints' readings
 prescribe is late, too."""
+ZERO = "encoder_offset"
+"""Kind of one joint that those before and beyond it feel, which are where it is not read to be."""
 _ENOUGH = 20  # steps of a fit, which ends by itself: a bound on time
 
 
@@ -148,12 +150,28 @@ def hypotheses(
       members = tuple(s for s in subjects if s.joint in way)
       if len(members) > 1:
         result.append((term, members))
+    chain = along(model, subject.joint)
+    for term in (t for t in subject.library if t.kind == ZERO and chain[0] != subject.joint):
+      members = tuple(s for s in subjects if s.joint in chain)
+      if len(members) > 1:
+        result.append((term, members))
   return [*((term, everyone) for term in machine.values()), *result]
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
   """Returns the joints that carry a body, the nearest first."""
   return [model.joint(k).name for k in reversed(carrying(model, body))]
+
+
+def along(model: mujoco.MjModel, joint: str) -> list[str]:
+  """Returns the joints that carry a joint, itself, and those that it carries, from the root on."""
+  index, body = model.joint(joint).id, model.jnt_bodyid
+  near = [
+    k
+    for k in range(model.njnt)
+    if index in carrying(model, body[k]) or k in carrying(model, body[index])
+  ]
+  return [model.joint(k).name for k in near]
 
 
 def _of_machine(term: Term) -> Term:

@@ -18,11 +18,12 @@ from nerf2real.sysid.selection.joints import changes
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.joints.subject import beside
 from nerf2real.sysid.selection.wider.scopes import better
+from nerf2real.sysid.selection.wider.wide import ZERO
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
 
-KIND, TILT = "encoder_offset", "gravity_tilt"
+TILT = "gravity_tilt"
 _FIRST = 0  # the joint that carries all others, if one does: joints come from the root outwards
 _LEVEL = 0.9  # cosine of how far an axis may be from level; about an upright one nothing is tilted
 
@@ -39,10 +40,10 @@ def reread(model: mujoco.MjModel, changed: Sequence[Changed], settings: Settings
     settings: tolerances and effort.
   """
   result, done = {c.joint: c for c in changed}, set[str]()
-  while shifted := [c for c in result.values() if KIND in c.named and c.joint not in done]:
+  while shifted := [c for c in result.values() if ZERO in c.named and c.joint not in done]:
     first = min(shifted, key=lambda c: model.joint(c.joint).id)
     done.add(first.joint)
-    offset = first.found.best.values(KIND)["offset"]
+    offset = first.found.best.values(ZERO)["offset"]
     kept: dict[int, Reduction] = {}  # joints share them
     for other in [c for c in result.values() if c is not first]:
       reductions = []

@@ -1,5 +1,6 @@
 """Shifted zeros as the other joints feel them."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import mujoco
@@ -8,9 +9,11 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.model import simulation
+from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection.joints import changes, subject
-from nerf2real.sysid.selection.wider import zeros
+from nerf2real.sysid.selection.wider import scopes, wide, zeros
+from nerf2real.sysid.selection.wider.wide import ZERO
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.joints.test_changes import few
 from tests.sysid.synthetic import log_of
@@ -51,8 +54,8 @@ def machine():
         model, "shoulder", logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS
       )
     )
-  best = SimpleNamespace(values=lambda kind: {"offset": SHIFT} if kind == zeros.KIND else {})
-  elbow = SimpleNamespace(joint="elbow", named=(zeros.KIND,), found=SimpleNamespace(best=best))
+  best = SimpleNamespace(values=lambda kind: {"offset": SHIFT} if kind == ZERO else {})
+  elbow = SimpleNamespace(joint="elbow", named=(ZERO,), found=SimpleNamespace(best=best))
   return model, logs, shoulder, elbow
 
 
@@ -78,6 +81,47 @@ def test_what_another_zero_does_not_change_stays(machine):
 def test_without_a_named_zero_nothing_is_explained_anew(machine):
   model, _, shoulder, _ = machine
   assert zeros.reread(model, [shoulder], SETTINGS) == [shoulder]
+
+
+def test_what_another_zero_adds_is_what_the_right_readings_show(machine):
+  model, logs, shoulder, elbow = machine
+  position = logs[0].states.position - np.array([0.0, SHIFT])
+  right = dataclasses.replace(logs[0].states, position=position)
+  detailed = Reduction(model, logs[0]).detailed  # the same but for the elbow's place
+  moved = dataclasses.replace(detailed, position=detailed.position - np.array([0.0, SHIFT]))
+  log = dataclasses.replace(logs[0], states=right)
+  plant = JointModel(model, "shoulder", [logs[0]], reductions=[Reduction(model, logs[0])])
+  other = Reduction(model, log, motion=moved)
+  want = JointModel(model, "shoulder", [log], reductions=[other]).forces((), 0)
+  got = plant.forces([plant.zero_load("elbow", SHIFT)], 0)
+  for before, mine, true in zip(plant.forces((), 0), got, want, strict=True):
+    change = np.abs(true - before).max()
+    np.testing.assert_allclose(mine, true, atol=0.01 * change)
+  assert shoulder.joint == "shoulder" and elbow.joint == "elbow"
+
+
+def test_a_zero_is_named_by_what_the_joint_before_it_feels():
+  model = mujoco.MjModel.from_xml_string(CHAIN)
+  far = Effect("encoder_offset", "elbow", {"offset": 0.18})  # less is a payload as well as a zero
+  logs = [log_of(CHAIN, kind, [far], duration=8.0) for kind in ("sweep", "steps", "slow")]
+  reductions = [Reduction(model, log) for log in logs]
+  subjects = [
+    subject.prepare(model, j, logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS)
+    for j in ("shoulder", "elbow")
+  ]
+  (found,) = scopes.shared_effects(model, subjects, SETTINGS)
+  assert (found.term.kind, found.term.target) == (ZERO, "elbow")
+  assert found.x[0] == pytest.approx(0.18, abs=0.003)
+
+
+@pytest.mark.parametrize(
+  ("joint", "chain"),
+  [("shoulder", ["shoulder", "elbow"]), ("elbow", ["shoulder", "elbow"]), ("wheel", ["wheel"])],
+)
+def test_a_chain_is_what_carries_a_joint_and_what_it_carries(joint, chain):
+  beside = '<body><joint name="wheel"/><geom size="0.1"/></body></worldbody>'
+  model = mujoco.MjModel.from_xml_string(CHAIN.replace("</worldbody>", beside))
+  assert wide.along(model, joint) == chain
 
 
 @pytest.mark.parametrize(
