@@ -168,15 +168,18 @@ def test_what_else_predicts_the_same_is_said_of_claimed_names_by_the_fewest_effe
   assert said == [few]
 
 
-def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch):
+@pytest.mark.parametrize(("behind", "said"), [(0.0, "encoder_offset"), (1.7, "payload")])
+def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch, behind, said):
   load, shift, spring = (
     SimpleNamespace(names=frozenset([kind]), neutral=False, beside_force=False)
     for kind in ("payload", "encoder_offset", "spring")
   )
   monkeypatch.setattr(naming, "_same", lambda *_: True)
+  monkeypatch.setattr(naming, "clear", lambda *_: behind)  # of the load, by which others are
+  best = naming._usual(_Joint, load, [load, spring, shift])
+  assert best.names == {said}
   monkeypatch.setattr(naming, "clear", lambda *_: 0.0)
-  assert naming._usual(None, load, [load, spring, shift], 3.0) is shift
-  assert naming._usual(None, spring, [load, spring], 3.0) is load
+  assert naming._usual(_Joint, spring, [load, spring]) is load
 
 
 def test_the_threshold_grows_with_what_was_tried():
