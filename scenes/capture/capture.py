@@ -22,8 +22,6 @@ class CaptureSettings:
   """Parts of a long video, which has two a second up to these; `num_keyframes` if None."""
   max_size: int = 1920
   """Long side of a keyframe; larger pictures are reduced [pixel]."""
-  jpeg_quality: int = 95
-  """Of written keyframes."""
   min_images: int = MIN_IMAGES
   """Fewer pictures are an error."""
   warn_duration: float = 15.0

@@ -16,7 +16,7 @@ from nerf2real.scenes.export import views
 from nerf2real.scenes.poses import localisation
 
 _POINTS = "sparse_points.ply"
-_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)  # as the keyframes'
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
 
 
 def transforms(camera: Camera, world_from_camera: np.ndarray, names: list[str]) -> dict:

@@ -24,10 +24,10 @@ from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Source
 
-# 2: stills turned and without copies, depth checked with the pictures; rgbd 3: depth has its own
-# poses; video 2: keyframes where the picture moves
-_PICTURES_VERSIONS = {"video": 2, "rgbd": 3}
-_PICTURES_VERSION = 2  # of all others
+# 2: stills turned and without copies, depth checked with the pictures, a video's keyframes where
+# the picture moves; rgbd 3: depth has its own poses; the last of each: kept without loss
+_PICTURES_VERSIONS = {"video": 3, "rgbd": 4}
+_PICTURES_VERSION = 3  # of all others
 # 2: the unit frame's yaw; 3: the rolling shutter is taken out; 4: up by level right axes;
 # 5: wrong places found, fainter features; 6: places that came hold what sees little;
 # 7: areas of matches are compared, photographs matched with guidance, uncertain ones left out;
