@@ -31,8 +31,8 @@ from nerf2real.scenes.capture.posed.rgbd import read_rgbd
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 
 # JPEG's rounding shows as faint features where a picture shows little: of a phone's film of a room
-# whose parts hang together by blurred walls 8 of 8 attempts to map such keyframes were right, and
-# 2 of 9 of JPEGs, of quality 95 or 100.
+# whose parts hang together by blurred walls five of five attempts to map such keyframes were right,
+# and none of four of JPEGs of quality 95 or 100.
 _WITHOUT_LOSS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # level 1: fast
 _CANDIDATES = 3  # of a video, for each keyframe; chosen: what moves five times as fast is as dense
 _KEYFRAME_RATE = 2.0  # of a long video [1/s]; chosen: about that of the shipped film, 150 in 70 s
