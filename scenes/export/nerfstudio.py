@@ -16,7 +16,6 @@ from nerf2real.scenes.export import views
 from nerf2real.scenes.poses import localisation
 
 _POINTS = "sparse_points.ply"
-_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
 
 
 def transforms(camera: Camera, world_from_camera: np.ndarray, names: list[str]) -> dict:
@@ -77,11 +76,11 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
       target = partial / "images" / name
       if renderer is not None:
         picture = renderer.render(camera, unit_from_world.apply_pose(pose))[0][..., ::-1]
-        cv2.imwrite(str(target), picture, _JPEG)
+        cv2.imwrite(str(target), picture)
       elif localised.shutter is None:
         target.write_bytes((keyframes / name).read_bytes())
       else:
-        cv2.imwrite(str(target), localised.read_picture(keyframes, index), _JPEG)
+        cv2.imwrite(str(target), localised.read_picture(keyframes, index))
       progress((index + 1) / len(names), f"picture {index + 1} of {len(names)}")
     cloud = trimesh.PointCloud(
       bundle.world_from_unit.apply(localised.points), localised.point_colors

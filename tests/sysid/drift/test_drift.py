@@ -49,7 +49,7 @@ def recorded(name, xml, kind, effects, *, seed, size=1.0):
   return dataclasses.replace(log, states=dataclasses.replace(log.states, position=positions))
 
 
-def store(folder, xml, effects, kind, values, *, shared=False):
+def store(folder, xml, effects, kind, values, *, shared=False, target=None):
   """Writes a result with one named effect, fitted where the truth is; returns its folder.
 
   What `identify` writes is tested with it (`slow`); here only what is read of it is written.
@@ -63,13 +63,14 @@ def store(folder, xml, effects, kind, values, *, shared=False):
     both = [JointLikelihood(JointModel(model, name, some)) for some in (logs, held)]
     own = constants(both[0].plant)
     term = next(t for t in library(both[0].plant) if t.kind == kind)
+    term = dataclasses.replace(term, target=target or term.target)
     x = np.concatenate([own.starts[0], values])
     both[0].rescale(both[0].residuals((own, term), x[None])[0])
     fit = Fitter(both[:1], Layout([(own, term)])).fit(x, iterations=4)
     bounds = intervals.intervals(both[0], fit, term, own_latency=False)
     if shared:
       bounds = {n: (v - WIDE, v + WIDE) for n, v in zip(term.names, values, strict=True)}
-      held_term = dataclasses.replace(term.held_at(np.array(values)), target=None, known=True)
+      held_term = dataclasses.replace(term.held_at(np.array(values)), target=target, known=True)
       kept.append(joint_of(both, (own, held_term), fit.x[: len(own.names)]))
     else:
       kept.append(joint_of(both, (own, term), fit.x))
@@ -82,7 +83,7 @@ def store(folder, xml, effects, kind, values, *, shared=False):
     rows.append(
       {
         "kind": kind,
-        "joint": None if shared else name,
+        "joint": target if shared else name,
         "evidence": evidence,
         "parameters": parameters,
       }
@@ -239,6 +240,18 @@ def test_a_zero_that_a_tilt_was_told_as_is_fitted_anew(later, tmp_path):
   (value,) = sysid.check_drift(folder, [Path("later")]).moved
   assert (value.kind, value.where, value.name) == ("encoder_offset", "shoulder", "offset")
   assert value.later is not None and value.later[0] == pytest.approx(ZERO + 0.1, abs=0.02)
+
+
+def test_a_zero_that_its_chain_feels_is_fitted_anew(later, tmp_path):
+  shifted = [Effect("encoder_offset", "elbow", {"offset": ZERO})]
+  folder = store(tmp_path, ARM, shifted, "encoder_offset", [ZERO], shared=True, target="elbow")
+  effects = [Effect("encoder_offset", "elbow", {"offset": ZERO + 0.1})]
+  later["later"] = recorded("later", ARM, "sweep", effects, seed=9)
+  drift = sysid.check_drift(folder, [Path("later")])
+  (value,) = drift.moved
+  assert (value.kind, value.where, value.name) == ("encoder_offset", "elbow", "offset")
+  assert value.later is not None and value.later[0] == pytest.approx(ZERO + 0.1, abs=0.02)
+  assert not drift.not_judged
 
 
 @pytest.mark.slow
