@@ -84,7 +84,7 @@ def test_without_a_named_zero_nothing_is_explained_anew(machine):
 
 
 def test_what_another_zero_adds_is_what_the_right_readings_show(machine):
-  model, logs, shoulder, elbow = machine
+  model, logs, *_ = machine
   position = logs[0].states.position - np.array([0.0, SHIFT])
   right = dataclasses.replace(logs[0].states, position=position)
   detailed = Reduction(model, logs[0]).detailed  # the same but for the elbow's place
@@ -97,7 +97,6 @@ def test_what_another_zero_adds_is_what_the_right_readings_show(machine):
   for before, mine, true in zip(plant.forces((), 0), got, want, strict=True):
     change = np.abs(true - before).max()
     np.testing.assert_allclose(mine, true, atol=0.01 * change)
-  assert shoulder.joint == "shoulder" and elbow.joint == "elbow"
 
 
 def test_a_zero_is_named_by_what_the_joint_before_it_feels():
