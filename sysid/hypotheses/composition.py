@@ -33,10 +33,10 @@ def compose(plant: JointModel, terms: Sequence[Term], x: Array) -> Composed:
     term = terms[index]
     part = x[ends[index] - len(term.names) : ends[index]]
     values = dict(zip(term.names, map(float, part), strict=True)) | dict(term.fixed)
-    if term.kind == "encoder_offset" and term.target != plant.joint:
+    if term.kind == "encoder_offset" and plant.among_others:
       loads.append(plant.zero_load(str(term.target), values["offset"]))
-      continue
-    term.apply(plant, p, part)
+    if term.kind != "encoder_offset" or term.target == plant.joint:
+      term.apply(plant, p, part)
     if term.kind in KINDS and KINDS[term.kind].law is not None:
       forces.append((term, values))
     elif term.kind == "payload":

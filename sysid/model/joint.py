@@ -120,8 +120,13 @@ class JointModel(JointPlant):
     before = self.model.opt.gravity
     return Load("gravity", matrix_from_rotvec([x, y, 0.0]) @ before - before)
 
+  @property
+  def among_others(self) -> bool:
+    """Whether other joints move beside it."""
+    return len(self.reductions[0].log.joints) > 1
+
   def zero_load(self, joint: str, offset: float) -> Load:
-    """Returns what an offset of another joint's readings, rad (or m), adds."""
+    """Returns what an offset of a joint's readings, rad (or m), adds to what this one feels."""
     return Load(f"{_ZERO_OF}{joint}", np.array([offset, offset**2]))
 
   def forces(self, loads: Sequence[Load], index: int) -> tuple[Array, ...]:

@@ -140,12 +140,18 @@ class Reduction:
     return [self._on_grid(joint, none, here, across, none) for here, across in parts]
 
   def zero(self, joint: str, shifted: str) -> list[Surroundings]:
-    """Returns what an offset of another joint's readings, by which the machine is not where they
-    say, adds to a joint's surroundings: per rad (or m), and per square of it."""
+    """Returns what an offset of a joint's readings adds to a joint's surroundings.
+
+    The machine is not where they say. Per rad (or m), and per square of it; gravity's torque on a
+    joint at its own angle is known of each angle, so that its own offset adds none.
+    """
     if shifted not in self._reread:
       self._reread[shifted] = self._shifted(shifted, _SHIFT), self._shifted(shifted, -_SHIFT)
     here = self.of_joint(joint)
     ahead, back = (r.of_joint(joint).plus(here, -1.0) for r in self._reread[shifted])
+    if joint == shifted:
+      none = np.zeros(len(self.time))
+      ahead, back = (dataclasses.replace(p, here=none, across=none) for p in (ahead, back))
     odd, even = ahead.plus(back, -1.0), ahead.plus(back, 1.0)
     return [odd.times(0.5 / _SHIFT), even.times(0.5 / _SHIFT**2)]
 

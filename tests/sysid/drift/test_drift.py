@@ -245,13 +245,14 @@ def test_a_zero_that_a_tilt_was_told_as_is_fitted_anew(later, tmp_path):
 def test_a_zero_that_its_chain_feels_is_fitted_anew(later, tmp_path):
   shifted = [Effect("encoder_offset", "elbow", {"offset": ZERO})]
   folder = store(tmp_path, ARM, shifted, "encoder_offset", [ZERO], shared=True, target="elbow")
-  effects = [Effect("encoder_offset", "elbow", {"offset": ZERO + 0.1})]
-  later["later"] = recorded("later", ARM, "sweep", effects, seed=9)
-  drift = sysid.check_drift(folder, [Path("later")])
-  (value,) = drift.moved
+  for name, zero in (("same", ZERO), ("later", ZERO + 0.1)):
+    effects = [Effect("encoder_offset", "elbow", {"offset": zero})]
+    later[name] = recorded(name, ARM, "sweep", effects, seed=9)
+  same = sysid.check_drift(folder, [Path("same")])
+  assert same.holds and not same.not_judged
+  (value,) = sysid.check_drift(folder, [Path("later")]).moved
   assert (value.kind, value.where, value.name) == ("encoder_offset", "elbow", "offset")
-  assert value.later is not None and value.later[0] == pytest.approx(ZERO + 0.1, abs=0.02)
-  assert not drift.not_judged
+  assert value.later is not None and value.later[0] == pytest.approx(ZERO + 0.1, abs=0.005)
 
 
 @pytest.mark.slow

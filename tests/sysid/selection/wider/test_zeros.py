@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
@@ -16,7 +18,7 @@ from nerf2real.sysid.selection.wider import scopes, wide, zeros
 from nerf2real.sysid.selection.wider.wide import ZERO
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.joints.test_changes import few
-from tests.sysid.synthetic import log_of
+from tests.sysid.synthetic import ARM, log_of
 
 # Both joints turn about one axis, and the lower link is heavy: where the elbow is misread, the link
 # hangs elsewhere than the shoulder is told.
@@ -97,6 +99,20 @@ def test_what_another_zero_adds_is_what_the_right_readings_show(machine):
   for before, mine, true in zip(plant.forces((), 0), got, want, strict=True):
     change = np.abs(true - before).max()
     np.testing.assert_allclose(mine, true, atol=0.01 * change)
+
+
+@pytest.mark.parametrize("joint", ["shoulder", "elbow"])
+def test_a_zero_at_its_true_size_leaves_nothing_at_a_joint_of_its_chain(joint):
+  effect = Effect("encoder_offset", "elbow", {"offset": 0.15})
+  log = log_of(ARM, "sweep", [effect], duration=4.0, rounding=0.0)
+  plant = JointModel(mujoco.MjModel.from_xml_string(ARM), joint, [log])
+  term = Term("encoder_offset", "elbow", (), (), (), (), ((),), fixed=(("offset", 0.15),))
+  left = []
+  for terms in ((term,), ()):
+    composed = compose(plant, terms, np.zeros(0))
+    course = plant.run(composed.p, composed.loads, 0).position
+    left.append(np.sqrt(np.mean((course - plant.logs[0].position)[100:] ** 2)))
+  assert left[0] < 2e-4 < 2e-3 < left[1]
 
 
 def test_a_zero_is_named_by_what_the_joint_before_it_feels():
