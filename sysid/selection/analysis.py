@@ -164,7 +164,7 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   evidence = {
     "clear_by_standard_errors": round(shared.clear, 2),
     "held_out_gain_nats": round(shared.nats, 2),
-    "joints": [m.joint for m in shared.members],
+    "joints": shared.joints,
   }
   zero = None
   if shared.term.kind == zeros.TILT:

@@ -147,30 +147,19 @@ def prepare(
 
 
 def following(subject: Subject) -> Subject:
-  """Returns a joint judged by a simulation whose state follows the readings."""
+  """Returns a joint judged by a simulation whose state follows the readings, beside the same
+  effects of wider scope; what its reference has is found there anew."""
   now, before = (
     None if j is None else JointLikelihood(j.plant, settings=j.settings, follows=True)
     for j in (subject.now, subject.before)
   )
   assert now is not None
-  return _subject(now, before, subject.library, subject.thresholds, alone=subject.alone)
-
-
-def beside(subject: Subject, reductions: Sequence[Reduction]) -> Subject:
-  """Returns a joint of the same logs beside another motion of the other joints, its constants
-  fitted anew."""
-  now = _likelihood(
-    subject.now.plant.model,
-    subject.joint,
-    [r.log for r in reductions],
-    reductions,
-    subject.now.settings,
-    follows=subject.now.follows,
-  )
-  now.ahead, now.expectation = subject.now.ahead, subject.now.expectation
-  now.effort_unit = subject.now.effort_unit
-  explainer = _explainer(now, subject.before, subject.known, subject.library, subject.freed)
-  return dataclasses.replace(subject, now=now, explainer=explainer)
+  found = _subject(now, before, subject.library, subject.thresholds, alone=subject.alone)
+  for term in (t for t in subject.known if t.wider):
+    found.take(term)
+  if subject.usual is not None and subject.usual.names:
+    explain_reference(found, now.settings)
+  return found
 
 
 def _tells(joint: JointLikelihood) -> bool:
@@ -258,11 +247,9 @@ def _likelihood(
   logs: Sequence[Log],
   reductions: Sequence[Reduction],
   settings: Settings,
-  *,
-  follows: bool = False,
 ) -> JointLikelihood:
   plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)
-  return JointLikelihood(plant, settings=settings, follows=follows)
+  return JointLikelihood(plant, settings=settings)
 
 
 def _explainer(

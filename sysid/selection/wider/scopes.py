@@ -56,6 +56,11 @@ class Shared:
   """Other effects of wider scope that predict the same motion, and their values [n]."""
 
   @property
+  def joints(self) -> list[str]:
+    """Names of the joints that it concerns: how one is judged may have changed since."""
+    return [m.joint for m in self.members]
+
+  @property
   def held(self) -> Term:
     """The effect with its values, of which none is fitted."""
     return dataclasses.replace(self.term.held_at(self.x), known=True)
@@ -271,7 +276,7 @@ def with_twins(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shar
     if shared.term.kind in wide.LATE and not shared.alike:
       term = wide.twin(shared.term)
       other = dataclasses.replace(term.held_at(shared.x), known=True)
-      concerned = [(c.subject, c.found.best) for c in changed if c.subject in shared.members]
+      concerned = [(c.subject, c.found.best) for c in changed if c.joint in shared.joints]
       if all(wide.with_twin(subject, best, shared.held, other) for subject, best in concerned):
         shared = dataclasses.replace(shared, alike=((term, shared.x),))
     result.append(shared)
@@ -292,7 +297,7 @@ def needless(found: Sequence[Shared], changed: Sequence[Changed]) -> list[Shared
   result = []
   for shared in found:
     rows, prior = {}, 0.0
-    for item in (c for c in changed if c.subject in shared.members):
+    for item in (c for c in changed if c.joint in shared.joints):
       best = item.found.best
       without = wide.without(item.subject, best, shared.held)
       if item.more_remains:

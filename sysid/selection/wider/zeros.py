@@ -12,13 +12,11 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints import changes
 from nerf2real.sysid.selection.joints.changes import Changed
-from nerf2real.sysid.selection.joints.subject import beside
 from nerf2real.sysid.selection.wider.scopes import better
-from nerf2real.sysid.selection.wider.wide import ZERO
+from nerf2real.sysid.selection.wider.wide import ZERO, along
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
@@ -43,15 +41,13 @@ def reread(model: mujoco.MjModel, changed: Sequence[Changed], settings: Settings
   while shifted := [c for c in result.values() if ZERO in c.named and c.joint not in done]:
     first = min(shifted, key=lambda c: model.joint(c.joint).id)
     done.add(first.joint)
-    offset = first.found.best.values(ZERO)["offset"]
-    kept: dict[int, Reduction] = {}  # joints share them
-    for other in [c for c in result.values() if c is not first]:
-      reductions = []
-      for old in other.subject.now.plant.reductions:
-        if id(old) not in kept:
-          kept[id(old)] = Reduction(model, _without(old.log, first.joint, offset))
-        reductions.append(kept[id(old)])
-      result[other.joint] = _again(other, reductions, settings)
+    best = first.found.best
+    (term,) = (t for t in best.terms if t.kind == ZERO)
+    held = term.held_at(np.array([best.values(ZERO)[name] for name in term.names]))
+    zero = dataclasses.replace(held, known=True)
+    for joint in along(model, first.joint):
+      if joint != first.joint and joint in result:
+        result[joint] = _again(result[joint], zero, settings)
   return [result[c.joint] for c in changed]
 
 
@@ -109,21 +105,18 @@ def _level_axis(model: mujoco.MjModel) -> Array | None:
   return along if float(along @ along) >= _LEVEL**2 else None
 
 
-def _without(log: Log, joint: str, offset: float) -> Log:
-  """Returns a log whose readings of a joint lack an offset, rad."""
-  assert log.states.position is not None
-  position = log.states.position.copy()
-  position[:, log.states.column(joint)] -= offset
-  return dataclasses.replace(log, states=dataclasses.replace(log.states, position=position))
-
-
-def _again(item: Changed, reductions: Sequence[Reduction], settings: Settings) -> Changed:
-  """Returns a joint's explanation beside another motion of the others, the old one where that
-  changes nothing or is clearly worse."""
-  subject, best = beside(item.subject, reductions), item.found.best
-  apart = subject.now.residuals(best.terms, best.fit.x[None])[0] - best.fit.residuals[0]
-  if item.likelihood.alike(apart):
+def _again(item: Changed, zero: Term, settings: Settings) -> Changed:
+  """Returns a joint's explanation beside another's shifted zero, the old one where that changes
+  nothing or is clearly worse."""
+  subject, best = item.subject, item.found.best
+  beside = subject.now.residuals((*best.terms, zero), best.fit.x[None])[0]
+  if item.likelihood.alike(beside - best.fit.residuals[0]):
     return item
+  before = subject.state
+  subject.take(zero)
   again = changes.explain(subject, settings)
   comparable = again.likelihood.follows == item.likelihood.follows
-  return item if comparable and better([item], [again]) else again
+  if comparable and better([item], [again]):
+    subject.state = before
+    return item
+  return again

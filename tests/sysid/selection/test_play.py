@@ -9,9 +9,12 @@ import pytest
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.composition import compose
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.joints import changes, subject
+from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.joints.test_changes import KINDS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
 
@@ -105,3 +108,22 @@ def test_play_that_is_likeliest_but_not_clear_is_judged_from_each_reading_on(
   monkeypatch.setattr(changes, "following", lambda _: again)
   monkeypatch.setattr(changes, "_explained", lambda of, _: near if of is again else whole)
   assert changes.explain(subject) is (near if stands else whole)
+
+
+def test_a_joint_that_is_followed_has_what_others_share_and_what_its_reference_has(model) -> None:
+  load = {"mass": 0.2, "x": 0.0, "y": 0.0, "z": -0.15}
+  had = [Effect("coulomb_friction", "joint", {"torque": 0.15})]
+  has = [*had, Effect("payload", "arm", load)]
+  logs = [logs_of(PENDULUM, effects, duration=5.0) for effects in (had, has)]
+  before, now = ([Reduction(model, log) for log in part] for part in logs)
+  whole = subject.prepare(
+    model, "joint", logs[1], logs[0], reductions=(now, before), tried=2, settings=SETTINGS
+  )
+  subject.explain_reference(whole, SETTINGS)
+  values = tuple(load.items())
+  shared = Term("payload", "arm", (), (), (), (), ((),), fixed=values, known=True)
+  whole.take(shared)
+  near = subject.following(whole)
+  assert near.now.follows
+  assert shared in near.known
+  assert whole.usual.names == near.usual.names == {"coulomb_friction"}

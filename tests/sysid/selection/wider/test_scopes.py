@@ -204,7 +204,7 @@ def test_a_shared_name_stands_beside_a_free_force_where_more_remains(monkeypatch
   monkeypatch.setattr(wide.Row, "of", lambda one, other: _row(one.nats - other.nats))
   monkeypatch.setattr(wide, "without", lambda *_: without)
   monkeypatch.setattr(rivals, "beside", lambda *_: best)  # the force does as well without the name
-  shared = SimpleNamespace(members=(joint,), held=None, origin=joint)
+  shared = SimpleNamespace(joints=["elbow"], held=None, origin=joint)
   found = SimpleNamespace(best=best)
   item = SimpleNamespace(subject=joint, joint="elbow", found=found, more_remains=more_remains)
   assert scopes.needless([shared], [item]) == ([shared] if more_remains else [])
