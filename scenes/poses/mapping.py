@@ -19,7 +19,7 @@ from nerf2real.scenes.poses.matching.features import image_ids, quiet
 MIN_OBSERVATIONS = 20  # points a picture must see to count as registered
 MAX_ERROR = 4.0  # observations further off are dropped [pixel]; COLMAP
 MIN_ANGLE = 1.5  # points seen under a smaller angle are dropped [degree]; COLMAP
-_LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]
+LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]
 _MAX_PRINCIPAL_SHIFT = 0.08  # of the principal point from the middle, times the picture's size
 _MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative
 _MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels
@@ -143,7 +143,7 @@ def adjust(
   options.refine_extra_params = distortion
   options.print_summary = False
   options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-  options.ceres.loss_function_scale = _LOSS_SCALE
+  options.ceres.loss_function_scale = LOSS_SCALE
   options.ceres.solver_options.num_threads = os.cpu_count() or 1
   options.ceres.solver_options.max_num_iterations = 50
   options.ceres.solver_options.function_tolerance = 1e-6

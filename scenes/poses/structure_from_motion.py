@@ -6,7 +6,6 @@ keyframes, P points.
 """
 
 import dataclasses
-import functools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, refinement, shutter
+from nerf2real.scenes.poses import mapping, readout, refinement
 from nerf2real.scenes.poses.checks import agreement, certainty, continuity
 from nerf2real.scenes.poses.checks.registered import check_registered
 from nerf2real.scenes.poses.checks.support import best_supported
@@ -188,9 +187,14 @@ def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -
   """Takes the rolling shutter out of a model; the model itself where that spoils the lens."""
   lens = mapped.lens
   assert lens is not None  # for the type checker: only known poses have none
-  adjust = functools.partial(mapping.adjust, principal=lens.principal, distortion=lens.distortion)
   steps.begin("shutter")
-  model, found = shutter.correct(mapped.model, times, adjust, report=steps.report)
+  model, found = readout.take_out(
+    mapped.model,
+    times,
+    principal=lens.principal,
+    distortion=lens.distortion,
+    report=steps.report,
+  )
   mapping.drop_bad_observations(model)
   fault = mapping.camera_fault(to_opencv(next(iter(model.cameras.values()))))
   if fault is not None:

@@ -9,14 +9,15 @@ import pytest
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.export import nerfstudio
-from nerf2real.scenes.poses import localisation, shutter
-from tests.scenes.poses.test_shutter import CAMERA, PICTURES, filmed
+from nerf2real.scenes.poses import localisation
+from nerf2real.scenes.poses.readout import motion
+from tests.scenes.poses.test_readout import CAMERA, PICTURES, filmed
 
 
 @pytest.mark.parametrize("readout", [0.03, None])
 def test_exported_pictures_are_those_the_poses_belong_to(readout, tmp_path):
   model, times = filmed(readout or 0.0)
-  moved = None if readout is None else shutter.motion(model, times, readout)
+  moved = None if readout is None else motion(model, times, readout)
   found = localisation.from_model(
     model,
     {

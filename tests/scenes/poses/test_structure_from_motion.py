@@ -16,7 +16,7 @@ from nerf2real.core.progress import no_progress
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.poses import mapping, shutter, structure_from_motion
+from nerf2real.scenes.poses import mapping, readout, shutter, structure_from_motion
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
 from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.poses.matching.features import FeatureSettings
@@ -316,7 +316,7 @@ def test_a_picture_that_is_weak_without_the_shutter_has_no_place(corner, monkeyp
     translations=np.zeros((count, 3)),
     depths=np.ones(count),
   )
-  monkeypatch.setattr(shutter, "correct", lambda *args, **options: (model, motion))
+  monkeypatch.setattr(readout, "take_out", lambda *args, **options: (model, motion))
   mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
   found = structure_from_motion._without_shutter(mapped, {}, Steps(no_progress))
   assert found.model.num_reg_images() == count - 1

@@ -1,0 +1,217 @@
+"""Estimates a rolling shutter's readout time and takes it out of observations.
+
+With the motion between neighbouring keyframes known, an observation moves to where a shutter that
+reads all lines at once, in the middle of the readout, would have seen it; the readout time is the
+one that poses, points and lens fit best together with.
+Source of the model: Hedborg et al. 2012, Rolling shutter bundle adjustment, with the motion of
+neighbouring keyframes in place of a pose a frame. Shapes: N pictures, O observations.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.capture.posed.colmap_model import to_opencv
+from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.mapping import registered
+from nerf2real.scenes.poses.shutter import Shutter, instants
+
+_LONGEST = 0.034  # s: a frame at 30 Hz; no video reads a frame for longer than it lasts
+_PRECISION = 0.0005  # s of the readout, chosen: a twentieth of a pixel in a fast pan
+_ROUNDS = 6  # of the readout and adjustments at most, chosen: three or four suffice
+_SMALL = 0.001  # s: unit of the readout in its derivatives
+_DAMPING = 1e-9  # of the curvature, chosen: holds the place, the turn and the size of all
+_NEAREST = 0.02  # of a picture's median depth, chosen: 6 cm in a room of 3 m
+_FARTHEST_NEIGHBOURS = 2.0  # s between two keyframes that say how the one between them moved
+
+_FOCAL, _PRINCIPAL, _DISTORTION = (6, 7), (8, 9), (10, 11, 12, 13)
+"""Columns of `cv2.projectPoints`'s Jacobian; a turn and a move of all points come before."""
+
+
+class _Sight(NamedTuple):
+  """What a picture saw, as measured."""
+
+  rows: np.ndarray  # indices into its points2D [O]
+  pixels: np.ndarray  # [O, 2]
+
+
+def _measured(model: pycolmap.Reconstruction) -> list[_Sight]:
+  sights = []
+  for image in registered(model):
+    places = image.points2D
+    rows = np.array([k for k, place in enumerate(places) if place.has_point3D()], np.int64)
+    sights.append(_Sight(rows, np.array([places[int(k)].xy for k in rows]).reshape(-1, 2)))
+  return sights
+
+
+def _local_points(
+  model: pycolmap.Reconstruction, image: pycolmap.Image, rows: np.ndarray
+) -> np.ndarray:
+  """Points [O, 3] that a picture's observations show, in its camera's frame."""
+  places, pose = image.points2D, image.cam_from_world()
+  world = np.array([model.points3D[places[int(k)].point3D_id].xyz for k in rows]).reshape(-1, 3)
+  local: np.ndarray = world @ pose.rotation.matrix().T + pose.translation
+  return local
+
+
+def _drop_points_in_cameras(model: pycolmap.Reconstruction) -> None:
+  """Drops points that lie in a camera: it shows them anywhere, and the least motion moves them by
+  more than a picture."""
+  found = set[int]()
+  for image, sight in zip(registered(model), _measured(model), strict=True):
+    depth = _local_points(model, image, sight.rows)[:, 2]
+    near = sight.rows[depth < _NEAREST * np.median(depth)] if len(depth) else sight.rows
+    found |= {image.points2D[int(row)].point3D_id for row in near}
+  for point in found:
+    model.delete_point3D(point)
+
+
+def motion(model: pycolmap.Reconstruction, times: Mapping[str, float], readout: float) -> Shutter:
+  """Derives the motion during the readout from the poses of neighbouring keyframes.
+
+  Args:
+    model: Localised pictures.
+    times: When each was taken [s].
+    readout: From the first line to the last [s].
+  """
+  images = registered(model)
+  when = np.array([times[image.name] for image in images])
+  poses = [image.cam_from_world().inverse() for image in images]
+  rotations = Rotation.from_matrix([pose.rotation.matrix() for pose in poses])
+  centres = np.array([pose.translation for pose in poses])
+  before = np.maximum(np.arange(len(images)) - 1, 0)
+  after = np.minimum(np.arange(len(images)) + 1, len(images) - 1)
+  lasted = when[after] - when[before]
+  share = np.where(lasted < _FARTHEST_NEIGHBOURS, readout / lasted, 0.0)[:, None]
+  depths = [
+    np.median(_local_points(model, image, sight.rows)[:, 2])
+    for image, sight in zip(images, _measured(model), strict=True)
+  ]
+  return Shutter(
+    readout=readout,
+    rotations=share * (rotations[before].inv() * rotations[after]).as_rotvec(),
+    translations=share * rotations.inv().apply(centres[after] - centres[before]),
+    depths=np.array(depths),
+  )
+
+
+def _move_observations(
+  model: pycolmap.Reconstruction, measured: list[_Sight], moved: Shutter
+) -> None:
+  """Moves the observations of a model, in place, to the middle of the readout."""
+  camera = to_opencv(next(iter(model.cameras.values())))
+  for index, (image, sight) in enumerate(zip(registered(model), measured, strict=True)):
+    points = _local_points(model, image, sight.rows)
+    shift = moved.project(points, instants(sight.pixels, camera), index, camera)
+    shift -= camera.project(points)
+    for k, pixel in zip(sight.rows, sight.pixels - shift, strict=True):
+      image.points2D[int(k)].xy = pixel
+
+
+def _change(
+  model: pycolmap.Reconstruction,
+  measured: list[_Sight],
+  times: Mapping[str, float],
+  lens: list[int],
+) -> float:
+  """Returns by how much the readout changes in a Gauss-Newton step of poses, points, lens and it.
+
+  Adjustments end before they have settled, by more than the costs of two readouts differ: what they
+  would do yet is a part of the step. Errors are weighed as in an adjustment.
+
+  Args:
+    model: With its observations as they are at the present readout.
+    measured: Its observations as read.
+    times: When each picture was taken [s].
+    lens: Columns of `cv2.projectPoints`'s Jacobian that are free.
+  """
+  camera, moves = to_opencv(next(iter(model.cameras.values()))), motion(model, times, _SMALL)
+  still, ids = np.zeros(3), []
+  outer, inner, errors = [], [], []  # by poses, lens and readout, by points
+  for index, (image, sight) in enumerate(zip(registered(model), measured, strict=True)):
+    if not len(sight.rows):
+      continue
+    local, pose = _local_points(model, image, sight.rows), image.cam_from_world()
+    ids.append([image.points2D[int(k)].point3D_id for k in sight.rows])
+    _, slope = cv2.projectPoints(local, still, still, camera.opencv_matrix, camera.distortion)
+    slope, found = slope.reshape(len(local), 2, -1), camera.project(local)
+    error = found - np.array([image.points2D[int(k)].xy for k in sight.rows]).reshape(-1, 2)
+    ahead = moves.project(local, instants(sight.pixels, camera), index, camera) - found
+    weight = (1.0 + np.square(error).sum(-1) / mapping.LOSS_SCALE**2) ** -0.25  # soft L1's root
+    weight = weight[:, None, None]
+    own = np.concatenate([slope[..., :6], slope[..., lens], ahead[..., None]], -1)
+    outer.append(weight * own)
+    inner.append(weight * slope[..., 3:6] @ pose.rotation.matrix())
+    errors.append((weight[..., 0] * error).ravel())
+  _, point = np.unique(np.concatenate(ids), return_inverse=True)
+  return _SMALL * _last_unknown(outer, np.concatenate(inner), point, np.concatenate(errors))
+
+
+def _last_unknown(
+  outer: list[np.ndarray], inner: np.ndarray, point: np.ndarray, errors: np.ndarray
+) -> float:
+  """Returns the last unknown of a least-squares step, all points eliminated (Schur's complement).
+
+  Args:
+    outer: Of each picture's observations [O, 2, 6 + S], by its pose and by S unknowns of all.
+    inner: Of all observations by their points [O, 2, 3].
+    point: Of which point each is [O].
+    errors: The residuals [2 O].
+  """
+  shared, count = outer[0].shape[-1] - 6, 1 + int(point.max())
+  poses = sparse.block_diag([part[..., :6].reshape(-1, 6) for part in outer], format="csr")
+  of_all = np.concatenate([part[..., 6:].reshape(-1, shared) for part in outer])
+  by_outer = sparse.hstack([poses, sparse.csr_matrix(of_all)], format="csr")
+  rows = np.arange(len(point) + 1)
+  by_inner = sparse.bsr_matrix((inner, point, rows), shape=(len(errors), 3 * count)).tocsr()
+  blocks = np.zeros((count, 3, 3))
+  np.add.at(blocks, point, np.swapaxes(inner, 1, 2) @ inner)
+  blocks += _DAMPING * np.trace(blocks, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+  inverse = sparse.bsr_matrix(
+    (np.linalg.inv(blocks), np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count)
+  )
+  mixed = by_outer.T @ by_inner
+  eliminated = mixed @ inverse
+  own = (by_outer.T @ by_outer).toarray()
+  curvature = own - (eliminated @ mixed.T).toarray() + _DAMPING * np.diag(own.diagonal())
+  gradient = by_outer.T @ errors - eliminated @ (by_inner.T @ errors)
+  return float(np.linalg.solve(curvature, -gradient)[-1])
+
+
+def take_out(
+  model: pycolmap.Reconstruction,
+  times: Mapping[str, float],
+  *,
+  principal: bool,
+  distortion: bool,
+  report: Progress = no_progress,
+) -> tuple[pycolmap.Reconstruction, Shutter]:
+  """Estimates the readout time and returns the model without its effect, and the motion.
+
+  Args:
+    model: Adjusted as if all lines were read at once.
+    times: When each picture was taken [s].
+    principal: Whether the lens's principal point is free in adjustments.
+    distortion: Whether its distortion is.
+    report: Called with the fraction done and a text.
+  """
+  lens = [*_FOCAL, *(_PRINCIPAL if principal else ()), *(_DISTORTION if distortion else ())]
+  result, readout = pycolmap.Reconstruction(model), 0.0
+  _drop_points_in_cameras(result)
+  measured = _measured(result)
+  for done in range(_ROUNDS):
+    report(done / _ROUNDS, f"rolling shutter of {1e3 * readout:.1f} ms")
+    before = readout
+    readout += _change(result, measured, times, lens)
+    readout = float(np.clip(readout, -_LONGEST, _LONGEST))
+    _move_observations(result, measured, motion(result, times, readout))
+    mapping.adjust(result, principal=principal, distortion=distortion)
+    if abs(readout - before) < _PRECISION:
+      break
+  return result, motion(result, times, readout)
