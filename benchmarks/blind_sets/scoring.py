@@ -72,6 +72,9 @@ class Score:
   """Held-out error after over the floor that the report states."""
   over_healthy: float | None
   """Held-out error after over the declared model's on the same machine without the effect."""
+  right_or_alike: bool | None = None
+  """Singles: the right name is the first, or listed as predicting the same as that; None of scores
+  that were kept before this was asked."""
 
 
 def score(truth: Entry, report: Entry) -> Score:
@@ -84,10 +87,11 @@ def score(truth: Entry, report: Entry) -> Score:
   verdict = report.get("verdict", "failed")
   below = bool(truth.get("below_floor"))
   first = sought[0] if sought else None
-  right_first = right_joint = all_right = unexplained = accused = None
+  right_first = right_joint = all_right = unexplained = accused = alike = None
   none_wrong = all(any(_is(e, effect) for effect in effects) for e in accusations)
   if mix == "single":
     right_first = first is not None and first["kind"] == effects[0]["kind"]
+    alike = right_first or (first is not None and _alike(effects[0], first, report))
   if mix == "pair":
     all_right = kinds <= {e["kind"] for e in named}
   if mix in ("single", "pair", "outside"):
@@ -114,6 +118,7 @@ def score(truth: Entry, report: Entry) -> Score:
     gain=gain,
     over_floor=over_floor,
     over_healthy=over_healthy,
+    right_or_alike=alike,
   )
 
 
@@ -136,6 +141,15 @@ def _is(said: Entry, effect: Entry) -> bool:
   """Returns whether an entry of a report is of an effect's kind, and not at another place."""
   places, found = _places(effect), _places(said)
   return said["kind"] == effect["kind"] and not (places and found and not places & found)
+
+
+def _alike(effect: Entry, first: Entry, report: Entry) -> bool:
+  """Returns whether an effect alone is listed as predicting the same as the first name."""
+  return any(
+    other.get("confounded") and other["kinds"] == [effect["kind"]]
+    for other in report.get("alternatives", ())
+    if other.get("joint") == first.get("joint")
+  )
 
 
 def _right_joint(truth: list[Entry], first: Entry | None, report: Entry) -> bool | None:
@@ -212,6 +226,7 @@ def table(scores: list[Score]) -> list[Row]:
   seen = [s for s in scores if not s.below_floor]
   rows = [
     _share("single: right name first", [s.right_first for s in seen], 0.95),
+    _share("single: right, or predicts the same", [s.right_or_alike for s in seen], 0.95),
     _share("single: none wrong", [s.none_wrong for s in seen if s.mix == "single"], 0.95),
     _share("right joint", [s.right_joint for s in seen], 0.98),
     _share("healthy: accused", [s.accused for s in seen], 1 / 60, most=True),

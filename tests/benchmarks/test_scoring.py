@@ -47,6 +47,23 @@ def test_a_right_name():
 
 
 @pytest.mark.parametrize(
+  ("kinds", "confounded", "joint", "alike"),
+  [
+    (["command_delay"], True, "elbow", True),
+    (["command_delay"], False, "elbow", False),
+    (["command_delay", "backlash"], True, "elbow", False),
+    (["command_delay"], True, "wrist", False),
+  ],
+)
+def test_a_name_that_is_listed_as_predicting_the_same(kinds, confounded, joint, alike):
+  other = {"kinds": kinds, "confounded": confounded, "joint": joint}
+  report = _report(_effect("measurement_delay", delay=0.03), alternatives=[other])
+  score = scoring.score(_truth("single", DELAY), report)
+  assert (score.right_first, score.right_or_alike) == (False, alike)
+  assert scoring.score(_truth("single", DELAY), _report(_effect("command_delay"))).right_or_alike
+
+
+@pytest.mark.parametrize(
   ("report", "first", "joint", "clean"),
   [
     (_report(_effect("measurement_delay")), False, True, False),
