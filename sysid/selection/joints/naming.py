@@ -29,6 +29,9 @@ USUAL = (
 command is more usual than a late reading, a shifted zero than a machine that has been tilted, and
 that a load, with its place, looks like a shifted zero would be a coincidence."""
 
+SPECIAL = {"asymmetric_friction": "coulomb_friction"}
+"""Kinds that have another as their special case: they are named where they are clear of it."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Name:
@@ -102,7 +105,7 @@ def conclude(
       if all(clear(top, s) > beyond[size - 1] for s in (best, *idle)):
         best = top
   last = beyond[max(len(best.names), 1) - 1]
-  best = _usual(joint, best, ranked)
+  best = _usual(joint, best, ranked, last)
   names = [_name(joint, best, kind, ranked, last) for kind in sorted(best.names)]
   clearest = sorted(names, key=lambda n: -n.clear)
   certain = {n.kind for n, z in zip(clearest, beyond, strict=False) if n.certain and n.clear >= z}
@@ -112,13 +115,17 @@ def conclude(
   return Explanation(best, tuple(names), left, *share)
 
 
-def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored]) -> Scored:
-  """Returns the most usual of the hypotheses that predict what the best one does and are as likely;
-  of two there is one comparison, at the level itself."""
+def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
+  """Returns the most usual of the hypotheses that predict what the best one does and are as likely
+  (of two there is one comparison, at the level itself), or are its special case and not clearly
+  worse."""
   order = {kind: index for index, kind in enumerate(USUAL)}
-  behind = float(norm.isf(joint.settings.level))
+  as_likely = float(norm.isf(joint.settings.level))
+  special = {SPECIAL.get(kind, kind) for kind in best.names}
   alike = [
-    s for s in of_size(ranked, len(best.names)) if clear(best, s) < behind and _same(joint, best, s)
+    s
+    for s in of_size(ranked, len(best.names))
+    if clear(best, s) < (beyond if s.names == special else as_likely) and _same(joint, best, s)
   ]
   return min([best, *alike], key=lambda s: sorted(order.get(k, len(order)) for k in s.names))
 

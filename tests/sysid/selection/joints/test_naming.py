@@ -168,6 +168,22 @@ def test_what_else_predicts_the_same_is_said_of_claimed_names_by_the_fewest_effe
   assert said == [few]
 
 
+@pytest.mark.parametrize(
+  ("behind", "said"), [(2.0, "coulomb_friction"), (3.5, "asymmetric_friction")]
+)
+def test_a_special_case_is_said_where_the_general_kind_is_not_clear_of_it(
+  monkeypatch, behind, said
+):
+  general, case, other = (
+    SimpleNamespace(names=frozenset([kind]), neutral=False, beside_force=False)
+    for kind in ("asymmetric_friction", "coulomb_friction", "viscous_friction")
+  )
+  monkeypatch.setattr(naming, "_same", lambda *_: True)
+  monkeypatch.setattr(naming, "clear", lambda *_: behind)
+  best = naming._usual(_Joint, general, [general, other, case], 3.0)
+  assert best.names == {said}
+
+
 @pytest.mark.parametrize(("behind", "said"), [(0.0, "encoder_offset"), (1.7, "payload")])
 def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch, behind, said):
   load, shift, spring = (
@@ -176,10 +192,10 @@ def test_of_hypotheses_that_predict_the_same_the_most_usual_is_said(monkeypatch,
   )
   monkeypatch.setattr(naming, "_same", lambda *_: True)
   monkeypatch.setattr(naming, "clear", lambda *_: behind)  # of the load, by which others are
-  best = naming._usual(_Joint, load, [load, spring, shift])
+  best = naming._usual(_Joint, load, [load, spring, shift], 3.0)
   assert best.names == {said}
   monkeypatch.setattr(naming, "clear", lambda *_: 0.0)
-  assert naming._usual(_Joint, spring, [load, spring]) is load
+  assert naming._usual(_Joint, spring, [load, spring], 3.0) is load
 
 
 def test_the_threshold_grows_with_what_was_tried():
