@@ -19,6 +19,7 @@ from nerf2real.scenes.poses.matching.features import image_ids, quiet
 MIN_OBSERVATIONS = 20  # points a picture must see to count as registered
 MAX_ERROR = 4.0  # observations further off are dropped [pixel]; COLMAP
 MIN_ANGLE = 1.5  # points seen under a smaller angle are dropped [degree]; COLMAP
+_NEAREST = 0.02  # of a picture's median depth, chosen: nearer points lie in it, 6 cm in a room
 LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]
 _MAX_PRINCIPAL_SHIFT = 0.08  # of the principal point from the middle, times the picture's size
 _MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative
@@ -171,9 +172,25 @@ def adjust(
 
 
 def drop_bad_observations(model: pycolmap.Reconstruction) -> None:
-  """Drops observations far from their point, and points seen under a small angle only."""
+  """Drops observations far from their point, and points seen under a small angle only or that lie
+  in a camera."""
   with quiet():
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+  drop_points_in_cameras(model)
+
+
+def drop_points_in_cameras(model: pycolmap.Reconstruction) -> None:
+  """Drops points that lie in a camera that sees them: it shows them anywhere, the least motion
+  moves them by more than a picture, and an adjustment ends before it has settled."""
+  found = set[int]()
+  for image in registered(model):
+    ids = [place.point3D_id for place in image.points2D if place.has_point3D()]
+    if ids:
+      pose = image.cam_from_world().matrix()
+      depth = np.array([model.points3D[k].xyz for k in ids]) @ pose[2, :3] + pose[2, 3]
+      found.update(np.array(ids)[depth < _NEAREST * np.median(depth)].tolist())
+  for point in found:
+    model.delete_point3D(point)
 
 
 def _adjust(
@@ -228,6 +245,8 @@ def refine(
     The refined model and the free parameters of the lens.
   """
   report(0.0, "adjusting poses and lens")
+  model = pycolmap.Reconstruction(model)
+  drop_points_in_cameras(model)
   base = pycolmap.Reconstruction(model)
   _adjust(base, principal=False, distortion=True, anchors=anchors)
   fault = camera_fault(_camera(base))

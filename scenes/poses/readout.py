@@ -27,7 +27,6 @@ _PRECISION = 0.0005  # s of the readout, chosen: a twentieth of a pixel in a fas
 _ROUNDS = 6  # of the readout and adjustments at most, chosen: three or four suffice
 _SMALL = 0.001  # s: unit of the readout in its derivatives
 _DAMPING = 1e-9  # of the curvature, chosen: holds the place, the turn and the size of all
-_NEAREST = 0.02  # of a picture's median depth, chosen: 6 cm in a room of 3 m
 _FARTHEST_NEIGHBOURS = 2.0  # s between two keyframes that say how the one between them moved
 
 _FOCAL, _PRINCIPAL, _DISTORTION = (6, 7), (8, 9), (10, 11, 12, 13)
@@ -58,18 +57,6 @@ def _local_points(
   world = np.array([model.points3D[places[int(k)].point3D_id].xyz for k in rows]).reshape(-1, 3)
   local: np.ndarray = world @ pose.rotation.matrix().T + pose.translation
   return local
-
-
-def _drop_points_in_cameras(model: pycolmap.Reconstruction) -> None:
-  """Drops points that lie in a camera: it shows them anywhere, and the least motion moves them by
-  more than a picture."""
-  found = set[int]()
-  for image, sight in zip(registered(model), _measured(model), strict=True):
-    depth = _local_points(model, image, sight.rows)[:, 2]
-    near = sight.rows[depth < _NEAREST * np.median(depth)] if len(depth) else sight.rows
-    found |= {image.points2D[int(row)].point3D_id for row in near}
-  for point in found:
-    model.delete_point3D(point)
 
 
 def motion(model: pycolmap.Reconstruction, times: Mapping[str, float], readout: float) -> Shutter:
@@ -203,7 +190,7 @@ def take_out(
   """
   lens = [*_FOCAL, *(_PRINCIPAL if principal else ()), *(_DISTORTION if distortion else ())]
   result, readout = pycolmap.Reconstruction(model), 0.0
-  _drop_points_in_cameras(result)
+  mapping.drop_points_in_cameras(result)
   measured = _measured(result)
   for done in range(_ROUNDS):
     report(done / _ROUNDS, f"rolling shutter of {1e3 * readout:.1f} ms")

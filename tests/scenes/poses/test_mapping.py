@@ -52,3 +52,16 @@ def test_anchors_hold_what_sees_little_and_little_else():
   assert after[WEAK] < 0.04 < 0.1 < before[WEAK]
   strong = np.arange(len(before)) != WEAK
   np.testing.assert_allclose(after[strong], before[strong], atol=2e-3)
+
+
+def test_points_in_a_camera_are_dropped_and_no_others():
+  model, _ = observed()
+  image = mapping.registered(model)[0]
+  first, second, *_ = {place.point3D_id for place in image.points2D if place.has_point3D()}
+  pose = image.cam_from_world().inverse()
+  ahead = pose.rotation.matrix()[:, 2]
+  model.points3D[first].xyz = pose.translation + 1e-7 * ahead
+  model.points3D[second].xyz = pose.translation - 0.5 * ahead
+  before = set(model.points3D)
+  mapping.drop_points_in_cameras(model)
+  assert before - set(model.points3D) == {first, second}
