@@ -42,8 +42,8 @@ def reread(model: mujoco.MjModel, changed: Sequence[Changed], settings: Settings
     first = min(shifted, key=lambda c: model.joint(c.joint).id)
     done.add(first.joint)
     best = first.found.best
-    (term,) = (t for t in best.terms if t.kind == ZERO)
-    held = term.held_at(np.array([best.values(ZERO)[name] for name in term.names]))
+    own = next(t for t in best.terms if t.kind == ZERO and not t.wider)  # others' are held there
+    held = own.held_at(np.array([best.fit.values(own)[name] for name in own.names]))
     zero = dataclasses.replace(held, known=True)
     for joint in along(model, first.joint):
       if joint != first.joint and joint in result:

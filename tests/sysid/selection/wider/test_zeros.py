@@ -60,9 +60,11 @@ def machine():
 
 
 def misread(offset: float) -> SimpleNamespace:
-  """An elbow of which a shifted zero is named."""
+  """An elbow of which a shifted zero is named, beside another joint's."""
   term = Term(ZERO, "elbow", ("offset",), (-1.0,), (1.0,), (1.0,), ((0.0,),))
-  best = SimpleNamespace(terms=(term,), values=lambda _: {"offset": offset})
+  other = Term(ZERO, "wrist", (), (), (), (), ((),), fixed=(("offset", 0.5),), known=True)
+  fit = SimpleNamespace(values=lambda of: {"offset": {term: offset}[of]})
+  best = SimpleNamespace(terms=(other, term), fit=fit)
   return SimpleNamespace(joint="elbow", named=(ZERO,), found=SimpleNamespace(best=best))
 
 
