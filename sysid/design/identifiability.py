@@ -90,7 +90,12 @@ class Identifiability:
 
 
 def of_machine(
-  model: mujoco.MjModel, logs: Sequence[Log], *, repeated: bool, settings: Settings
+  model: mujoco.MjModel,
+  logs: Sequence[Log],
+  *,
+  repeated: bool,
+  settings: Settings,
+  reductions: Sequence[Reduction] | None = None,
 ) -> list[Identifiability]:
   """Returns what logs can show of every joint that all of them command, before anything is fitted.
 
@@ -99,6 +104,7 @@ def of_machine(
     logs: to identify from.
     repeated: whether reference logs tell the constants, so that they vary by `settings.repeat`.
     settings: tolerances.
+    reductions: of the logs, where they were made before.
   """
   joints = [
     name
@@ -107,7 +113,7 @@ def of_machine(
   ]
   if repeated:
     settings = dataclasses.replace(settings, tolerances=settings.repeat)
-  reductions = [Reduction(model, log) for log in logs]
+  reductions = reductions or [Reduction(model, log) for log in logs]
   result = []
   for joint in joints:
     plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)

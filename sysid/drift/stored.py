@@ -18,6 +18,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks, Member
+from nerf2real.sysid.model.supported import on_a_stand
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.settings import Settings
 
@@ -176,9 +177,10 @@ def read(folder: Path) -> Stored:
       f"Found no joints in {folder / 'details.json'}, expected a result of this version: identify"
       " from the first logs again."
     )
+  model = Path(details["model"])
   return Stored(
     content,
-    load_model(Path(details["model"])),
+    on_a_stand(model, load_model(model)),
     [_member(item) for item in (details, *details.get("near", []))],
     [from_plain(joint, StoredJoint, source=folder / "details.json") for joint in details["joints"]],
   )

@@ -15,12 +15,14 @@ import dataclasses
 import mujoco
 import numpy as np
 from mujoco import rollout
+from scipy.stats import norm
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model.drive import actuator_of, mean_commands
 
 Array = np.ndarray
 
+_START = 0.011  # s within which the first readings tell a velocity: two readings at 100 Hz; chosen
 _SMOOTHING = 0.035  # s, half width of the local polynomial that differentiates positions; chosen
 _LATEST = 0.25  # s that a machine's motion is looked for behind its commands, as late commands are
 _CLEARLY = 0.9  # of what the best lateness explains: the earliest peak is taken that does; chosen
@@ -86,14 +88,21 @@ def start_velocity(log: Log) -> Array:
   """Returns the joints' velocity [J] at a log's first sample: 0 where they start from rest.
 
   A one-sided derivative at the start of a motion is wrong by the acceleration; logs begin at rest
-  unless the first readings say otherwise.
+  unless the first readings say otherwise, by more than three times what their noise does.
   """
-  position = log.states.position
+  position, stamp = log.states.position, log.states.stamp
   assert position is not None
-  first = position[:4]
-  slope = (first[1] - first[0]) / max(float(log.states.stamp[1] - log.states.stamp[0]), 1e-9)
+  count = max(2, int(np.searchsorted(stamp, stamp[0] + _START, side="right")))
+  apart = stamp[:count] - stamp[:count].mean()
+  reach = float(apart @ apart)
+  if reach == 0.0:
+    return np.zeros(position.shape[1])
+  slope = apart @ position[:count] / reach
   spread = np.ptp(position, axis=0) / max(log.duration, 1e-9)
-  moving = np.abs(slope) > 2.0 * spread
+  # third differences of noise have 20 times its square
+  third = np.abs(np.diff(position, n=3, axis=0))
+  noise = np.median(third, axis=0) / norm.ppf(0.75) / np.sqrt(20.0) if len(third) else 0.0
+  moving = np.abs(slope) > np.maximum(2.0 * spread, 3.0 * noise / np.sqrt(reach))
   return np.where(moving, slope, 0.0)
 
 

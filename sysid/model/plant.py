@@ -67,6 +67,10 @@ def declared_parameters(model: mujoco.MjModel, joint: str) -> Array:
     if model.actuator_forcelimited[u]:
       low, high = sorted(gear * model.actuator_forcerange[u])
       values["lowest"], values["highest"] = float(low), float(high)
+    if model.jnt_actfrclimited[index]:
+      low, high = model.jnt_actfrcrange[index]
+      values["lowest"] = max(values["lowest"], float(low))
+      values["highest"] = min(values["highest"], float(high))
   return np.array([values[name] for name in kernel.NAMES])
 
 

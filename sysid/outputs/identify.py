@@ -25,6 +25,8 @@ from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
 from nerf2real.sysid.model import extended_model
+from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.supported import check_supported, on_a_stand
 from nerf2real.sysid.outputs.details import claimed_effects, details_of
 from nerf2real.sysid.outputs.errors import errors, floor
 from nerf2real.sysid.outputs.notes import another_session, of_one, spread, supply
@@ -75,13 +77,14 @@ def identify(
     FolderInUseError: another process identifies into the folder.
     OSError: the folder cannot be written.
     LogError: a log cannot be used, or the held or reference logs lack a joint of the others.
-    ValueError: the model cannot be read, or there is no log.
+    ValueError: the model cannot be read, or has what is not simulated, or there is no log.
   """
   if not train:
     raise ValueError("Found no log to identify from, expected at least one --logs file.")
   compiled = load_model(Path(model))
   logs, others = read_logs(train, compiled), read_logs(held, compiled)
   healthy = read_logs(reference, compiled)
+  check_supported(compiled, logs[0].commands.joints)
   check_motion(logs)
   _check_joints(logs, [*others, *healthy])
   with lock_folder(out):
@@ -111,9 +114,13 @@ def _identify(
   """Analyses logs that were read, and writes; see `identify`."""
   began = time.perf_counter()
   progress(0.0, "what the logs can show")
-  shown = identifiability.of_machine(compiled, logs, repeated=bool(reference), settings=settings)
+  stand = on_a_stand(model, compiled)
+  reductions = [Reduction(stand, log) for log in logs]
+  shown = identifiability.of_machine(
+    stand, logs, repeated=bool(reference), settings=settings, reductions=reductions
+  )
   progress(_SHOWN, "comparing with the reference" if reference else "explaining every joint")
-  found = analyse(compiled, logs, reference, settings=settings)
+  found = analyse(stand, logs, reference, reductions=reductions, settings=settings)
   by_duty, before = servo.rows(found)
   found.in_reference += before
   _add(found, by_duty)

@@ -36,9 +36,17 @@ def analyse(
   logs: Sequence[Log],
   reference: Sequence[Log] = (),
   *,
+  reductions: Sequence[Reduction] | None = None,
   settings: Settings = SETTINGS,
 ) -> Identified:
   """Returns what a machine has that its model, or reference logs, have not.
+
+  Args:
+    model: the declared one.
+    logs: to identify from.
+    reference: logs of the same machine without what is looked for.
+    reductions: of the logs, where they were made before.
+    settings: tolerances and effort.
 
   Raises:
     ValueError: no joint has an actuator and commands in all logs.
@@ -53,11 +61,10 @@ def analyse(
     raise ValueError(
       "Found no joint with an actuator that all logs command, expected at least one."
     )
-  reductions = [Reduction(model, log) for log in logs], [Reduction(model, log) for log in reference]
+  made = reductions or [Reduction(model, log) for log in logs]
+  both = list(made), [Reduction(model, log) for log in reference]
   subjects = [
-    prepare(
-      model, joint, logs, reference, reductions=reductions, tried=len(joints), settings=settings
-    )
+    prepare(model, joint, logs, reference, reductions=both, tried=len(joints), settings=settings)
     for joint in joints
   ]
   shared, changed = _explained(model, subjects, settings)

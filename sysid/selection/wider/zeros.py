@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.point_mass import carrying
 from nerf2real.sysid.selection.joints import changes
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.wider.scopes import better
@@ -96,8 +97,9 @@ def _level_axis(model: mujoco.MjModel) -> Array | None:
   """Returns the axis [2] in the plane of the joint that carries all others; None without one."""
   if model.njnt == 0 or model.jnt_type[_FIRST] != mujoco.mjtJoint.mjJNT_HINGE:
     return None
-  carriers = model.body_rootid[model.jnt_bodyid]
-  if np.any(carriers != carriers[_FIRST]) or model.body_jntnum[model.jnt_bodyid[_FIRST]] != 1:
+  if not all(_FIRST in carrying(model, int(body)) for body in model.jnt_bodyid):
+    return None
+  if model.body_jntnum[model.jnt_bodyid[_FIRST]] != 1:
     return None
   data = mujoco.MjData(model)
   mujoco.mj_kinematics(model, data)

@@ -171,6 +171,12 @@ def test_a_machine_of_several_chains_or_an_upright_axis_is_tilted():
     + "</worldbody></mujoco>"
   )
   assert zeros.of_tilt(two, np.array([0.0, 0.05]), bounds) is None
+  torso = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><body>"
+    + 2 * '<body><joint axis="0 1 0"/><geom size="0.1"/></body>'
+    + "</body></worldbody></mujoco>"
+  )
+  assert zeros.of_tilt(torso, np.array([0.0, 0.05]), bounds) is None
   upright = mujoco.MjModel.from_xml_string(CHAIN.replace('axis="0 1 0"', 'axis="0 0 1"'))
   assert zeros.of_tilt(upright, np.array([0.0, 0.05]), bounds) is None
 

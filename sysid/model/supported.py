@@ -1,0 +1,95 @@
+"""What of a declared model the simulation of one joint holds; anything else is refused.
+
+A feature that is left out silently makes a healthy machine look as if it had an effect.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from nerf2real.sysid.model.drive import actuator_of
+
+_CHAIN = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+
+
+def check_supported(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+  """Raises a ValueError where the model has a feature at joints that identification leaves out.
+
+  Args:
+    model: declared model.
+    joints: hinges and slides that logs command, each with an actuator.
+  """
+  for name in joints:
+    found = _beyond(model, name)
+    if found is not None:
+      raise ValueError(
+        f"The model has {found} at joint {name!r}, which identification leaves out: expected a "
+        "hinge or slide with one motor or servo without a state; give a model without it."
+      )
+
+
+def _beyond(model: mujoco.MjModel, joint: str) -> str | None:
+  """Returns what a joint has that the simulation of it leaves out; None without any."""
+  u, index = actuator_of(model, joint), model.joint(joint).id
+  fixed, affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
+  if int(model.actuator_dyntype[u]) != int(mujoco.mjtDyn.mjDYN_NONE):
+    return "an actuator with a time constant or another state"
+  if int(model.actuator_gaintype[u]) != fixed or int(model.actuator_biastype[u]) > affine:
+    return "an actuator that is neither a motor nor an affine servo"
+  if np.any(model.body_gravcomp[_carried(model, int(model.jnt_bodyid[index]))] != 0.0):
+    return "gravity compensation"
+  wraps = (model.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)) & (model.wrap_objid == index)
+  if np.any(wraps):
+    return "a tendon"
+  if any(_ties(model, int(e), index) for e in np.flatnonzero(model.eq_active0)):
+    return "an equality constraint"
+  return None
+
+
+def _carried(model: mujoco.MjModel, body: int) -> np.ndarray:
+  """Returns a body and all that it carries."""
+  carried = np.zeros(model.nbody, bool)
+  carried[body] = True
+  for k in range(body + 1, model.nbody):
+    carried[k] |= carried[model.body_parentid[k]]
+  return np.flatnonzero(carried)
+
+
+def _ties(model: mujoco.MjModel, equality: int, joint: int) -> bool:
+  """Tells whether an equality constraint is of a joint, or closes a chain that it is in."""
+  kind, ends = int(model.eq_type[equality]), (model.eq_obj1id[equality], model.eq_obj2id[equality])
+  if kind == int(mujoco.mjtEq.mjEQ_JOINT):
+    return joint in ends
+  bodies = int(model.eq_objtype[equality]) == int(mujoco.mjtObj.mjOBJ_BODY)
+  held = ends if bodies else model.site_bodyid[list(ends)]
+  carried = _carried(model, int(model.jnt_bodyid[joint]))
+  return kind in _CHAIN and sum(int(end) in carried for end in held) == 1
+
+
+def on_a_stand(path: Path, model: mujoco.MjModel) -> mujoco.MjModel:
+  """Returns a model whose driven machine cannot fall: a free base is held where it is declared.
+
+  Args:
+    path: of the model.
+    model: the same, compiled; returned itself where no driven machine is free.
+  """
+  driven = {
+    int(model.body_rootid[model.jnt_bodyid[model.actuator_trnid[u, 0]]])
+    for u in range(model.nu)
+    if int(model.actuator_trntype[u]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+  }
+  free = int(mujoco.mjtJoint.mjJNT_FREE)
+  loose = [j for j in np.flatnonzero(model.jnt_type == free) if model.jnt_bodyid[j] in driven]
+  if not loose:
+    return model
+  spec = mujoco.MjSpec.from_file(str(path))
+  spec.compile()  # gives its bodies their numbers
+  bases = {int(model.jnt_bodyid[j]) for j in loose}
+  for joint in list(spec.joints):
+    if joint.type == mujoco.mjtJoint.mjJNT_FREE and joint.parent.id in bases:
+      spec.delete(joint)
+  for key in list(spec.keys):  # their states have the base's, too
+    spec.delete(key)
+  return spec.compile()
