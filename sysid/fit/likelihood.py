@@ -186,6 +186,15 @@ class JointLikelihood:
         row[0] -= np.clip(late - late.mean(), -most, most)[self.log_at] * self.speed
     return result * self.gain
 
+  def courses(self, terms: Sequence[Term], x: Array) -> list[Array]:
+    """Returns measured minus simulated position [N] of every log, rad (m); NaN where a reading
+    repeats an earlier one."""
+    (outputs,) = self.simulate(terms, x[None])
+    return [
+      np.where(log.valid, log.position - o.position, np.nan)
+      for log, (o, _) in zip(self.plant.logs, outputs, strict=True)
+    ]
+
   def _late(self, residual: Array) -> Array:
     """Returns the s by which each log [L] is earlier than simulated, by a residual course [N]."""
     weights = self.gain[0] ** 2 * self.speed
@@ -359,6 +368,11 @@ class JointLikelihood:
     self.independent[:] = 1.0 / np.maximum(times, times[0])
     if self._known is not None:
       self.scale[1], self.independent[1] = self._known[0], 1.0 / self._known[1]
+
+
+def rms_of(courses: Sequence[Array]) -> float:
+  """Returns the RMS of residual courses [N], rad (m), over readings that are not NaN."""
+  return float(np.sqrt(np.nanmean(np.square(np.concatenate(courses)))))
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 
 from nerf2real.sysid.design import excitation
 from nerf2real.sysid.design.identifiability import Identifiability
+from nerf2real.sysid.fit.likelihood import rms_of
 from nerf2real.sysid.report import capability
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.joints.changes import Changed
@@ -24,13 +25,14 @@ def residual_at(found: Identified) -> dict[str, Any]:
     "velocity": np.concatenate([log.velocity for log in logs]),
     "time": np.concatenate([log.time - log.time[0] for log in logs]),
   }
-  squares = np.square(item.extended.fit.residuals[0][0])
-  result: dict[str, Any] = {"joint": item.joint, "rms": float(np.sqrt(np.mean(squares)))}
+  courses = item.likelihood.courses(item.extended.terms, item.extended.fit.x)
+  squares = np.square(np.concatenate(courses))
+  read = np.isfinite(squares)
+  result: dict[str, Any] = {"joint": item.joint, "rms": rms_of(courses)}
   for name, values in joined.items():
-    low, high, share = _concentrated(values, squares)
+    low, high, share = _concentrated(values[read], squares[read])
     result[name] = {"low": low, "high": high, "share_of_square": share}
-  ends = np.cumsum([len(log.time) for log in logs])[:-1]
-  result["log"] = logs[int(np.argmax([np.mean(part) for part in np.split(squares, ends)]))].name
+  result["log"] = logs[int(np.argmax([rms_of([course]) for course in courses]))].name
   return result
 
 

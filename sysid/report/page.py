@@ -13,6 +13,7 @@ from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, kind_of
 from nerf2real.sysid.design.identifiability import Identifiability
 from nerf2real.sysid.fit.layout import CONSTANTS
+from nerf2real.sysid.fit.likelihood import rms_of
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import capability, meanings, residual_plots, summary
 from nerf2real.sysid.report.alike import together
@@ -221,8 +222,8 @@ def _errors(found: Identified, content: dict[str, Any]) -> Section:
 
 def _by_joint(found: Identified) -> Block:
   before, after = (
-    [1e3 * float(np.sqrt(np.mean(h.fit.residuals[0][0] ** 2))) for h in hypotheses]
-    for hypotheses in ([j.declared for j in found.joints], [j.extended for j in found.joints])
+    [1e3 * rms_of(j.likelihood.courses(h.terms, h.fit.x)) for j, h in pairs]
+    for pairs in ([(j, j.declared) for j in found.joints], [(j, j.extended) for j in found.joints])
   )
   series = [Bars("declared", BEFORE, before), Bars("extended", AFTER, after)]
   names = [j.joint for j in found.joints]

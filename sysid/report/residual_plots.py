@@ -31,11 +31,11 @@ def residuals(item: Changed) -> Section:
   joint, unit = item.likelihood, unit_of(item)
   hypotheses = ((item.declared, "declared", BEFORE), (item.extended, "extended", AFTER))
   figures: list[Chart | None] = []
-  simulated = [joint.simulate(h.terms, h.fit.x[None])[0] for h, _, _ in hypotheses]
+  left = [joint.courses(h.terms, h.fit.x) for h, _, _ in hypotheses]
   for index, log in enumerate(joint.plant.logs):
     curves = [
-      Curve(name, color, log.time, 1e3 * (log.position - outputs[index][0].position))
-      for (_, name, color), outputs in zip(hypotheses, simulated, strict=True)
+      Curve(name, color, log.time[log.valid], 1e3 * courses[index][log.valid])
+      for (_, name, color), courses in zip(hypotheses, left, strict=True)
     ]
     title = f"{log.name}: residual against time"
     figures.append(charts.lines(title, "time [s]", f"position residual [{unit}]", curves))

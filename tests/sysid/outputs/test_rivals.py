@@ -2,7 +2,16 @@
 
 from types import SimpleNamespace
 
+import mujoco
+import numpy as np
+import pytest
+
+from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit.likelihood import JointLikelihood, rms_of
+from nerf2real.sysid.model import simulation
+from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.outputs import rivals
+from tests.sysid.synthetic import PENDULUM, log_of
 
 
 def test_alternatives_that_predict_the_same_are_listed_first():
@@ -10,3 +19,13 @@ def test_alternatives_that_predict_the_same_are_listed_first():
   all_of_them = [SimpleNamespace(names=names) for names in kinds]  # the likeliest first
   item = SimpleNamespace(alternatives=all_of_them, confounded=[SimpleNamespace(names=kinds[7])])
   assert [min(other.names) for other in rivals._listed(item)] == list("habcde")
+
+
+def test_what_remains_is_stated_as_it_was_measured():
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  rough = Effect("coulomb_friction", "joint", {"torque": 0.2})
+  logs = [log_of(PENDULUM, kind, [rough], duration=4.0) for kind in ("sweep", "slow")]
+  joint = JointLikelihood(JointModel(model, "joint", logs))
+  joint.mask[:] = joint.gain[0] = 0.1  # what a sample weighs is no size
+  left = joint.courses((), np.zeros(0))
+  assert rms_of(left) == pytest.approx(simulation.error(model, logs), rel=0.02)
