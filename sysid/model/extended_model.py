@@ -7,7 +7,7 @@ later and nothing of this project. What MJCF cannot hold (load friction, heat, s
 forces, sensors' errors) is listed in a comment of the file, and stays in effects.json.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation
 from nerf2real.core.files import write_atomically
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.model import native_effects
+from nerf2real.sysid.model.simulation import Clocks
 
+_PROMPT = 1e-4  # s, of latencies that need no word
 _POINT = 1e-4  # m, radius of a payload: no inertia of its own
 
 EXPRESSED = (
@@ -28,13 +30,20 @@ EXPRESSED = (
 """Kinds that are constants of a model."""
 
 
-def write(source: Path, target: Path, effects: Sequence[Effect]) -> list[Effect]:
+def write(
+  source: Path,
+  target: Path,
+  effects: Sequence[Effect],
+  *,
+  clocks: Mapping[str, Clocks] | None = None,
+) -> list[Effect]:
   """Writes the extended model.
 
   Args:
     source: declared model.
     target: file to write.
     effects: corrections of constants and effects.
+    clocks: latencies by joint, which a comment names.
 
   Returns:
     The effects that MJCF cannot hold.
@@ -55,11 +64,13 @@ def write(source: Path, target: Path, effects: Sequence[Effect]) -> list[Effect]
   spec.compile()
   _absolute(spec, source.resolve().parent)
   head, body = spec.to_xml().split("\n", 1)
-  write_atomically(target, f"{head}\n{_comment(written, left)}{body}")
+  write_atomically(target, f"{head}\n{_comment(written, left, clocks or {})}{body}")
   return left
 
 
-def _comment(written: Sequence[Effect], left: Sequence[Effect]) -> str:
+def _comment(
+  written: Sequence[Effect], left: Sequence[Effect], clocks: Mapping[str, Clocks]
+) -> str:
   """Returns what a reader of the file must know, as an XML comment."""
   lines = [
     f"{len(written)} corrections and effects are in this model; plain MuJoCo simulates them."
@@ -74,6 +85,12 @@ def _comment(written: Sequence[Effect], left: Sequence[Effect]) -> str:
   for effect in left:
     values = ", ".join(f"{name} {value}" for name, value in effect.parameters.items())
     lines.append(f"Not in this model: {effect.kind} on {effect.target or 'all'} ({values}).")
+  for joint, clock in clocks.items():
+    if max(clock.latency, abs(clock.skew)) >= _PROMPT:
+      lines.append(
+        f"Not in this model: a command of {joint} takes {1e3 * clock.latency:.1f} ms, a reading is "
+        f"{1e3 * clock.skew:.1f} ms old; errors are stated with both."
+      )
   # A comment may not hold two hyphens in a row.
   text = "\n".join(f"    {line.replace('--', '- -')}" for line in lines)
   return f"  <!--\n{text}\n  -->\n"

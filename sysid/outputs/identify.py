@@ -184,7 +184,7 @@ def _identify(
   content["alternatives"] += sensed.alternatives
   drawn = samples.with_samples(found, claimed_effects(found), np.random.default_rng(0))
   write_effects(out / "effects.json", servo.apart(drawn, by_duty))
-  extended_model.write(model, out / "model_extended.xml", [*found.calibration, *found.objects])
+  extended_model.write(model, out / "model_extended.xml", whole, clocks=found.clocks)
   details = details_of(found, model, near, sensed)
   details["identifiability"] = [to_plain(item) for item in shown]
   details["joints"] = stored.to_json(stored.remembered(found, held, settings))

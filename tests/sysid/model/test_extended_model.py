@@ -10,6 +10,7 @@ import pytest
 
 from nerf2real.suite.effects import Effect, EffectStack
 from nerf2real.sysid.model import extended_model
+from nerf2real.sysid.model.simulation import Clocks
 from tests.sysid.synthetic import ARM, PENDULUM
 
 STEPS = 4000
@@ -151,6 +152,16 @@ def test_what_mjcf_cannot_hold_is_listed_in_the_file(tmp_path):
   text = path.read_text()
   assert "Not in this model: load_friction on joint (coefficient 0.2)." in text
   assert text.index("<!--") < text.index("-->") < text.index("<worldbody>")
+
+
+def test_latencies_that_are_no_effects_are_named_in_the_file(tmp_path):
+  (tmp_path / "model.xml").write_text(PENDULUM)
+  target = tmp_path / "extended.xml"
+  late = {"joint": Clocks(skew=9e-4, latency=2.8e-3)}
+  extended_model.write(tmp_path / "model.xml", target, [], clocks=late)
+  assert "a command of joint takes 2.8 ms, a reading is 0.9 ms old" in target.read_text()
+  extended_model.write(tmp_path / "model.xml", target, [], clocks={"joint": Clocks()})
+  assert "takes" not in target.read_text()
 
 
 def test_plain_mujoco_opens_the_file_without_this_project(tmp_path):
