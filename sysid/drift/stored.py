@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nerf2real.core.files import hash_path
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.serialization import from_plain, to_plain
 from nerf2real.suite.effects.files import from_list, to_list
@@ -162,7 +163,7 @@ def read(folder: Path) -> Stored:
 
   Raises:
     FileNotFoundError: the folder holds none.
-    ValueError: its files are not of this version.
+    ValueError: its files are not of this version, or the model has changed since.
   """
   folder = Path(folder)
   for name in ("report.json", "details.json"):
@@ -178,9 +179,15 @@ def read(folder: Path) -> Stored:
       " from the first logs again."
     )
   model = Path(details["model"])
+  compiled = load_model(model)
+  if details.get("model_hash", hash_path(model)) != hash_path(model):
+    raise ValueError(
+      f"Found {model} changed since {folder} was written, expected the same model: restore it, or "
+      "identify from the first logs again."
+    )
   return Stored(
     content,
-    on_a_stand(model, load_model(model)),
+    on_a_stand(model, compiled),
     [_member(item) for item in (details, *details.get("near", []))],
     [from_plain(joint, StoredJoint, source=folder / "details.json") for joint in details["joints"]],
   )

@@ -29,8 +29,9 @@ BESIDE_PLAY = 0.025  # the same where a course does not repeat; ours
 PEAK = 0.08
 """Of all dry friction: it is larger at rest, over a way no rigid model has; ours."""
 LATE = 6e-4  # s of a delay; firmware and bus work in cycles of a millisecond; ours
-OWN_LATENCY = 0.004  # s; what a healthy machine may have of a delay: two of latency's tolerances
-RUBS = 0.2  # of the declared dry friction; servos of one batch differ by that much; ours
+_TOLERANCES = dict(SETTINGS.tolerances)
+OWN_LATENCY = 2.0 * _TOLERANCES["latency"]  # s; what a healthy machine may have of a delay
+RUBS = _TOLERANCES["friction"]  # of the declared dry friction, by which servos of a batch differ
 _DRY = ("torque", "positive", "negative")  # dry friction that is added to the declared one
 _PLAY = {"gap": (0.85, 1.35), "stiffness": (0.4, 2.5), "damping": (0.4, 2.5)}
 """Times a value of play, the least of an interval: gears that give way take a part of the gap, and

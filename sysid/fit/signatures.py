@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerf2real.sysid.hypotheses.candidates import SHORTEST
 from nerf2real.sysid.hypotheses.composition import Composed, compose
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX, table_force
 
 Array = np.ndarray
 
-_SHORTEST = 300.0  # 1/rad, of waves of torque over position; as `candidates.cogging` bounds it
 EDGES = 10  # samples at either end whose derivatives are one-sided
 
 
@@ -78,9 +78,9 @@ def waves(plant: JointModel, *, count: int = 3) -> list[tuple[float, float, floa
   base = np.stack([np.ones_like(q), q, np.sign(v), v], axis=1)
   r = r - base @ np.linalg.lstsq(base, r, rcond=None)[0]
   # At least one wave over the range; a fifth of a wave over the range between neighbours.
-  grid = np.arange(2 * np.pi / reach, min(1500 / reach, _SHORTEST), 2 * np.pi / reach / 5)
+  grid = np.arange(2 * np.pi / reach, min(1500 / reach, SHORTEST), 2 * np.pi / reach / 5)
   if not len(grid):  # a joint that hardly moves: the shortest wave that is looked for
-    grid = np.array([_SHORTEST])
+    grid = np.array([SHORTEST])
   power = np.empty(len(grid))
   complex_part = np.empty(len(grid), complex)
   for i, k in enumerate(grid):

@@ -31,6 +31,9 @@ where the first are nearest."""
 _TEETH = 0.5
 """Share that the stiffness of teeth differs from what is usual; a gap and soft teeth are alike."""
 
+SHORTEST = 300.0
+"""1/rad (1/m), of waves of torque over position that are looked for; chosen."""
+
 _BOUNCY = 0.15
 """Damping ratio of teeth that meet; ours: they bounce."""
 
@@ -223,16 +226,16 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
   of the motion differs by one are different effects, of which the spectrum has chosen.
   """
   torque = typical_torque(plant)
-  longest = min(np.pi * _SEEN / _reach(plant), 299.0)
+  longest = min(np.pi * _SEEN / _reach(plant), SHORTEST - 1.0)
   return Term(
     "cogging",
     plant.joint,
     ("amplitude", "periods", "phase"),
     (0.0, longest, -10.0),
-    (0.5 * torque, 300.0, 10.0),
+    (0.5 * torque, SHORTEST, 10.0),
     (0.03 * torque, 0.05, 0.3),
     tuple(waves),
-    choices=max((300.0 - longest) * _reach(plant) / np.pi, 1.0),
+    choices=max((SHORTEST - longest) * _reach(plant) / np.pi, 1.0),
   )
 
 

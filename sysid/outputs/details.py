@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from nerf2real.core.files import hash_path
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.drift import stored
@@ -20,6 +21,7 @@ def details_of(
   first = found.least_explained
   return {
     "model": str(model.resolve()),
+    "model_hash": hash_path(model),
     **stored.member_to_json(near[0]),
     "near": [stored.member_to_json(member) for member in near[1:]],
     "calibration": {

@@ -267,6 +267,9 @@ def test_what_identify_writes_is_judged(later, tmp_path):
   assert sysid.check_drift(tmp_path / "out", [Path("same.mcap")]).holds
   moved = sysid.check_drift(tmp_path / "out", [Path("rubs_more.mcap")]).moved
   assert [value.kind for value in moved] == ["coulomb_friction"]
+  (tmp_path / "model.xml").write_text(PENDULUM.replace('mass="0.5"', 'mass="0.7"'))
+  with pytest.raises(ValueError, match="model.xml changed since"):
+    sysid.check_drift(tmp_path / "out", [Path("same.mcap")])
 
 
 def test_the_sentence_names_what_grew_most():
