@@ -39,9 +39,7 @@ def hull(points: np.ndarray, *, max_vertices: int | None = None) -> Part | None:
     solid = spatial.ConvexHull(points)
     if max_vertices is not None and len(solid.vertices) > max_vertices:
       corners = points[solid.vertices]
-      spread = (corners - corners.mean(0)) / np.maximum(np.ptp(corners, axis=0), 1e-9)
-      picked = np.unique((spread @ _directions(2 * max_vertices).T).argmax(0))
-      solid = spatial.ConvexHull(corners[picked[:max_vertices]])
+      solid = spatial.ConvexHull(corners[_farthest(corners, max_vertices)])
   except spatial.QhullError:
     return None
   corners = solid.points[solid.vertices]
@@ -52,6 +50,16 @@ def hull(points: np.ndarray, *, max_vertices: int | None = None) -> Part | None:
   inward = (np.cross(b - a, c - a) * solid.equations[:, :3]).sum(-1) < 0
   faces[inward] = faces[inward][:, ::-1]
   return Part(corners, faces, solid.equations, float(solid.volume))
+
+
+def _farthest(corners: np.ndarray, count: int) -> np.ndarray:
+  """Indices of at most `count` corners [P, 3] that lie farthest out along spread directions.
+
+  They come from as many directions first, which leave no side out, and then from twice as many.
+  """
+  spread = (corners - corners.mean(0)) / np.maximum(np.ptp(corners, axis=0), 1e-9)
+  first, more = (np.unique((spread @ _directions(n).T).argmax(0)) for n in (count, 2 * count))
+  return np.append(first, np.setdiff1d(more, first)[: count - len(first)])
 
 
 def _directions(count: int) -> np.ndarray:

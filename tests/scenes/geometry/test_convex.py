@@ -68,3 +68,14 @@ def test_a_part_beside_the_grid_takes_nothing():
   part = convex.hull(np.array([5.0, 0, 0]) + SIGNS)
   assert part is not None
   assert convex.intrusion_of(part, space, TOLERANCE).bad == 0
+
+
+@pytest.mark.parametrize("stretched", [(1, 1, 1), (1, 0.4, 0.7)])
+def test_a_round_part_loses_no_side_with_its_vertices(stretched):
+  axis = np.arange(-0.3, 0.301, 0.02)
+  grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+  ball = grid[np.linalg.norm(grid, axis=-1) <= 0.3] * stretched
+  whole, part = convex.hull(ball), convex.hull(ball, max_vertices=48)
+  assert 40 <= len(part.vertices) <= 48
+  assert part.volume > 0.85 * whole.volume
+  assert np.ptp(part.vertices, axis=0) == pytest.approx(np.ptp(ball, axis=0), rel=0.05)
