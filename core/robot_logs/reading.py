@@ -131,9 +131,9 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
   start = min(min(topic.stamp_ns) for topic in topics.values())
   commands = joint_series(path.name, topics[COMMANDS], start)
   states = joint_series(path.name, topics[STATES], start)
-  if commands.position is None and commands.effort is None:
+  if all(field is None for field in (commands.position, commands.velocity, commands.effort)):
     raise LogError(
-      f"{path.name} has no commands: {COMMANDS} holds neither positions nor efforts in its "
+      f"{path.name} has no commands: {COMMANDS} holds no positions, velocities or efforts in its "
       f"{len(commands.stamp)} messages; record what the actuators are told."
     )
   if states.position is None:

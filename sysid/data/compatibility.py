@@ -6,7 +6,9 @@ import numpy as np
 from nerf2real.core.robot_logs.messages import COMMANDS, STATES
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.robot_logs.streaming import LogError
+from nerf2real.sysid.model.drive import actuator_of, command_of, holds_position, takes
 
+_PLURAL = {"position": "positions", "velocity": "velocities", "effort": "efforts"}
 _NEAR = 0.005  # of a joint's range from its end that counts as there; chosen
 _OFTEN = 0.01  # of the readings that may be held there; chosen
 
@@ -40,26 +42,25 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
         f"{log.name} commands {name!r}, but no actuator of the model drives that joint: it drives "
         f"{sorted(driven)}."
       )
-    takes = "position" if model.actuator_biasprm[driven[name], 1] != 0.0 else "effort"
-    if getattr(log.commands, takes) is None:
+    if command_of(log, model, name) is None:
+      wanted = _PLURAL[takes(model, actuator_of(model, name))]
       raise LogError(
-        f"{log.name} has no {takes}s in {COMMANDS}, which the model's actuator on {name!r} takes: "
-        f"record {takes}s, or give a model with the actuator that was driven."
+        f"{log.name} has no {wanted} in {COMMANDS}, which the model's actuator on {name!r} takes: "
+        f"record {wanted}, or give a model with the actuator that was driven."
       )
     _check_range(log, model, name)
 
 
 def _check_range(log: Log, model: mujoco.MjModel, name: str) -> None:
   """Raises a LogError where a joint is commanded past its declared range and stops at the end."""
-  index = model.joint(name).id
-  wanted = log.commands.position
-  if not model.jnt_limited[index] or wanted is None:
+  index, wanted = model.joint(name).id, command_of(log, model, name)
+  holds = holds_position(model, actuator_of(model, name))
+  if not model.jnt_limited[index] or not holds or wanted is None:
     return
   assert log.states.position is not None
   low, high = model.jnt_range[index]
   at, near = log.states.position[:, log.states.column(name)], _NEAR * (high - low)
-  column = wanted[:, log.commands.column(name)]
-  command = np.interp(log.states.stamp, log.commands.stamp, column)
+  command = np.interp(log.states.stamp, log.commands.stamp, wanted)
   pushed = (at > high - near) & (command > high + near)
   pushed |= (at < low + near) & (command < low - near)
   if np.mean(pushed) > _OFTEN:

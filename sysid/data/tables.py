@@ -1,9 +1,9 @@
 """Reads measured logs from CSV files with a header.
 
 One row a reading. Columns are `time` [s] and, with a joint's name after the colon, any of
-`command_position:J`, `command_effort:J`, `position:J`, `velocity:J`, `effort:J`, `duty:J` and
-`temperature:J` (SI, degrees Celsius), and `voltage`. An empty field is a value that was not read at
-that time, so commands and states may have rows of their own.
+`command_position:J`, `command_velocity:J`, `command_effort:J`, `position:J`, `velocity:J`,
+`effort:J`, `duty:J` and `temperature:J` (SI, degrees Celsius), and `voltage`. An empty field is a
+value that was not read at that time, so commands and states may have rows of their own.
 """
 
 import csv
@@ -18,9 +18,10 @@ from nerf2real.core.robot_logs.series import JointSeries, ScalarSeries
 from nerf2real.core.robot_logs.streaming import LogError
 from nerf2real.sysid.data.checks import checked
 
+COMMANDED = ("command_position", "command_velocity", "command_effort")
 OF_JOINTS = (
-  *("command_position", "command_effort", "position", "velocity", "effort", "duty"),
-  "temperature",
+  *COMMANDED,
+  *("position", "velocity", "effort", "duty", "temperature"),
 )
 ALONE = ("time", "voltage")
 
@@ -42,11 +43,11 @@ def read_csv(path: Path) -> Log:
     quantity, _, joint = name.partition(":")
     quantities.setdefault(quantity, {})[joint] = values
   stamps = time - start
-  commands = _series(path, stamps, quantities, ("command_position", None, "command_effort"))
+  commands = _series(path, stamps, quantities, COMMANDED)
   states = _series(path, stamps, quantities, ("position", "velocity", "effort"))
   if commands is None or states is None or states.position is None:
     lacks = (
-      "command_position:JOINT or command_effort:JOINT" if commands is None else "position:JOINT"
+      " or ".join(f"{name}:JOINT" for name in COMMANDED) if commands is None else "position:JOINT"
     )
     raise LogError(f"{path.name} has no column {lacks}, found {sorted(columns)}.")
   voltage = _scalar(stamps, columns.get("voltage"))

@@ -26,6 +26,21 @@ def actuator_of(model: mujoco.MjModel, joint: str) -> int:
   return -1
 
 
+def takes(model: mujoco.MjModel, actuator: int) -> str:
+  """Returns what an actuator is told, as a field of commands: position, velocity or effort."""
+  if holds_position(model, actuator):
+    return "position"
+  speed_gain = -float(model.actuator_biasprm[actuator, 2])
+  is_velocity_servo = speed_gain > 0.0 and speed_gain == float(model.actuator_gainprm[actuator, 0])
+  return "velocity" if is_velocity_servo else "effort"
+
+
+def command_of(log: Log, model: mujoco.MjModel, joint: str) -> Array | None:
+  """Returns a joint's commands [N] in what its actuator takes, None where a log lacks those."""
+  values = getattr(log.commands, takes(model, actuator_of(model, joint)))
+  return None if values is None else values[:, log.commands.column(joint)]
+
+
 def mean_commands(
   model: mujoco.MjModel, log: Log, times: Array, step: float, late_by: Array | None = None
 ) -> Array:
@@ -41,14 +56,12 @@ def mean_commands(
     step: s.
     late_by: of every actuator [U], s; none is if left out.
   """
-  commands = log.commands
-  source = commands.position if commands.position is not None else commands.effort
-  assert source is not None
-  stamp = commands.stamp
+  stamp = log.commands.stamp
   spans = np.diff(stamp, append=stamp[-1])
   result = np.zeros((len(times), model.nu))
-  for column, name in enumerate(commands.joints):
-    u, command = actuator_of(model, name), source[:, column]
+  for name in log.commands.joints:
+    u, command = actuator_of(model, name), command_of(log, model, name)
+    assert command is not None
     total = np.concatenate([[0.0], np.cumsum(command * spans)[:-1]])
     begin = times - (0.0 if late_by is None else late_by[u])
     edges = []

@@ -5,9 +5,11 @@ Shapes: N samples of a log.
 
 import dataclasses
 
+import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.sysid.model.drive import command_of
 from nerf2real.sysid.model.motion import Motion
 
 Array = np.ndarray
@@ -41,16 +43,15 @@ class Measured:
   """[N], -1 to 1."""
 
 
-def measured(log: Log, motion: Motion, joint: str) -> Measured:
-  """Returns one joint's part of a log."""
+def measured(log: Log, motion: Motion, joint: str, model: mujoco.MjModel) -> Measured:
+  """Returns one joint's part of a log; its commands are those that the model's actuator takes."""
   states, commands = log.states, log.commands
   column = states.column(joint)
   assert states.position is not None
   position = states.position[:, column]
   if joint in commands.joints:
-    source = commands.position if commands.position is not None else commands.effort
-    assert source is not None
-    command_time, command = commands.stamp, source[:, commands.column(joint)]
+    command_time, command = commands.stamp, command_of(log, model, joint)
+    assert command is not None
   else:
     command_time, command = np.zeros(1), np.zeros(1)
   series = log.temperatures.get(joint)

@@ -119,7 +119,7 @@ class JointPlant:
     self.inverse_weight = float(model.dof_invweight0[model.jnt_dofadr[index]])
     self.hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
     self.logs = [
-      measured(log, reduction.motion, joint)
+      measured(log, reduction.motion, joint, model)
       for log, reduction in zip(logs, self.reductions, strict=True)
     ]
     self.surroundings = [reduction.of_joint(joint) for reduction in self.reductions]
