@@ -6,7 +6,7 @@ import numpy as np
 from nerf2real.core.robot_logs.messages import COMMANDS, STATES
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.robot_logs.streaming import LogError
-from nerf2real.sysid.model.drive import actuator_of, command_of, holds_position, takes
+from nerf2real.sysid.model.drive import actuator_of, actuators_of, command_of, holds_position, takes
 
 _PLURAL = {"position": "positions", "velocity": "velocities", "effort": "efforts"}
 _NEAR = 0.005  # of a joint's range from its end that counts as there; chosen
@@ -27,20 +27,22 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
     raise LogError(
       f"{log.name} commands {unmeasured} but {STATES} has no such joints: record their positions."
     )
-  joint_transmission = int(mujoco.mjtTrn.mjTRN_JOINT)
-  driven = {
-    names[model.actuator_trnid[index, 0]]: index
-    for index in range(model.nu)
-    if model.actuator_trntype[index] == joint_transmission
-  }
   for name in log.commands.joints:
     kind = int(model.joint(name).type[0])
     if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
       raise LogError(f"{log.name} commands {name!r}, in the model neither a hinge nor a slide.")
-    if name not in driven:
+    actuators = actuators_of(model, name)
+    if not actuators:
+      driven = sorted(joint for joint in filter(None, names) if actuators_of(model, joint))
       raise LogError(
         f"{log.name} commands {name!r}, but no actuator of the model drives that joint: it drives "
-        f"{sorted(driven)}."
+        f"{driven}."
+      )
+    if len(actuators) > 1:
+      several = [model.actuator(u).name or f"number {u}" for u in actuators]
+      raise LogError(
+        f"{log.name} commands {name!r}, which the actuators {several} of the model drive, expected "
+        "one: keep the one that is commanded."
       )
     if command_of(log, model, name) is None:
       wanted = _PLURAL[takes(model, actuator_of(model, name))]

@@ -16,14 +16,16 @@ def holds_position(model: mujoco.MjModel, actuator: int) -> bool:
   return float(model.actuator_biasprm[actuator, 1]) < 0.0
 
 
+def actuators_of(model: mujoco.MjModel, joint: str) -> list[int]:
+  """Returns all actuators on a joint."""
+  on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+  found = np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == model.joint(joint).id))
+  return [int(u) for u in found]
+
+
 def actuator_of(model: mujoco.MjModel, joint: str) -> int:
   """Returns the actuator that drives a joint, -1 if none does."""
-  index = model.joint(joint).id
-  for u in range(model.nu):
-    on_joint = model.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_JOINT)
-    if on_joint and model.actuator_trnid[u, 0] == index:
-      return u
-  return -1
+  return next(iter(actuators_of(model, joint)), -1)
 
 
 def takes(model: mujoco.MjModel, actuator: int) -> str:

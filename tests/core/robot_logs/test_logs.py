@@ -247,6 +247,7 @@ def test_other_files_are_refused(tmp_path):
     ("wrist", "ball", '<position joint="elbow" kp="5"/>', "neither a hinge nor a slide"),
     ("wrist", "hinge", '<position joint="elbow" kp="5"/>', "no actuator"),
     ("wrist", "hinge", '<motor joint="wrist"/><position joint="elbow" kp="5"/>', "no efforts"),
+    ("wrist", "hinge", POSITIONS + '<motor name="m" joint="wrist"/>', "['number 1', 'm']"),
     ("wrist", "hinge", '<velocity joint="wrist"/><position joint="elbow"/>', "record velocities"),
   ],
 )
