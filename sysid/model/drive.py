@@ -48,6 +48,9 @@ def mean_commands(
 ) -> Array:
   """Returns the mean command [T, U] of every step, each held until the next comes, and late.
 
+  A joint that is measured and not commanded is held at its first reading where its actuator holds
+  a position: it was not told to go to 0.
+
   A command that comes within a step acts for the rest of it: used from the next step on it would be
   half a step late in the mean, which a moving joint shows.
 
@@ -61,6 +64,9 @@ def mean_commands(
   stamp = log.commands.stamp
   spans = np.diff(stamp, append=stamp[-1])
   result = np.zeros((len(times), model.nu))
+  for name in set(log.joints) - set(log.commands.joints):
+    for u in actuators_of(model, name):
+      result[:, u] = _holding(model, log, name, u)
   for name in log.commands.joints:
     u, command = actuator_of(model, name), command_of(log, model, name)
     assert command is not None
@@ -72,3 +78,15 @@ def mean_commands(
       edges.append(total[index] + command[index] * (at - stamp[index]))
     result[:, u] = (edges[1] - edges[0]) / step
   return result
+
+
+def _holding(model: mujoco.MjModel, log: Log, joint: str, actuator: int) -> float:
+  """Returns the command at which a position servo's torque is zero at a joint's first reading; 0
+  of an actuator that holds no position."""
+  if not holds_position(model, actuator):
+    return 0.0
+  assert log.states.position is not None
+  first = float(log.states.position[0, log.states.column(joint)])
+  gear, gain = float(model.actuator_gear[actuator, 0]), float(model.actuator_gainprm[actuator, 0])
+  constant, per_position = model.actuator_biasprm[actuator, :2]
+  return -float(constant + per_position * gear * first) / gain

@@ -189,20 +189,20 @@ def error(
   clocks: dict[str, Clocks] | None = None,
   window_s: float = 0.5,
   restart: bool = False,
-  joints: Sequence[str] | None = None,
 ) -> float:
-  """Returns the RMSE of positions over logs and joints, rad (or m); readings that were repeated
-  while the joint moved are left out: they measure nothing. See `simulate` for the others."""
+  """Returns the RMSE of positions over logs and the joints that they command, rad (or m); readings
+  that were repeated while the joint moved are left out: they measure nothing. See `simulate`."""
   courses = [
     simulate(model, log, effects, clocks=clocks, window_s=window_s, restart=restart) for log in logs
   ]
-  return _rmse(logs, courses, joints)
+  return _rmse(logs, courses)
 
 
 def errors(
   model: mujoco.MjModel, logs: Sequence[Log], members: Sequence[Member], *, window_s: float = 0.5
 ) -> dict[str, float]:
-  """Returns the RMSE of the mean of several models' predictions, rad (or m).
+  """Returns the RMSE of the mean of several models' predictions over the joints that the logs
+  command, rad (or m).
 
   Args:
     model: compiled model.
@@ -226,15 +226,13 @@ def errors(
   return result
 
 
-def _rmse(
-  logs: Sequence[Log], courses: Sequence[Array], joints: Sequence[str] | None = None
-) -> float:
-  """Returns the RMSE of simulated courses [N, J] a log over new readings."""
+def _rmse(logs: Sequence[Log], courses: Sequence[Array]) -> float:
+  """Returns the RMSE of simulated courses [N, J] a log over new readings of commanded joints."""
   squares = []
   for log, positions in zip(logs, courses, strict=True):
     assert log.states.position is not None
     measured, speeds = log.states.position, smooth_motion(log).velocity
-    for column in (log.states.column(j) for j in (joints or log.joints)):
+    for column in (log.states.column(j) for j in log.joints if j in log.commands.joints):
       kept = fresh(log.states.stamp, measured[:, column], speeds[:, column])
       squares.append(np.square((measured - positions)[kept, column]))
   return float(np.sqrt(np.mean(np.concatenate(squares))))

@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.drive import mean_commands
 from nerf2real.sysid.model.measured import measured
 from nerf2real.sysid.model.motion import smooth_motion
-from tests.sysid.synthetic import PENDULUM, log_of
+from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 
 @pytest.mark.parametrize(
@@ -26,3 +27,18 @@ def test_commands_are_those_that_the_actuator_takes(actuator, value):
   model = mujoco.MjModel.from_xml_string(xml)
   np.testing.assert_allclose(mean_commands(model, log, np.array([0.5]), 0.001), value)
   assert set(measured(log, smooth_motion(log), "joint", model).command) == {value}
+
+
+def test_a_joint_that_is_not_commanded_is_held_where_it_was_and_not_judged():
+  model, log = mujoco.MjModel.from_xml_string(ARM), log_of(ARM, "sweep", duration=2.0)
+  states, commands = log.states, log.commands
+  still = np.column_stack([states.position[:, 0], np.full(len(states.stamp), 0.5)])
+  log = dataclasses.replace(
+    log,
+    states=dataclasses.replace(states, position=still),
+    commands=dataclasses.replace(commands, joints=("shoulder",), position=commands.position[:, :1]),
+  )
+  positions = simulation.simulate(model, log)
+  assert np.abs(positions[:, 1] - 0.5).max() < 0.1  # gravity and the other joint move it a little
+  own = np.sqrt(np.mean((positions - still)[:, 0] ** 2))
+  assert simulation.error(model, [log]) == pytest.approx(own)
