@@ -167,13 +167,19 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
 
 def check_motion(logs: Sequence[Log]) -> None:
   """Raises a LogError where no joint that is commanded moves in any of the logs."""
-  for log in logs:
-    assert log.states.position is not None
-    columns = [log.states.column(joint) for joint in log.commands.joints]
-    if np.ptp(log.states.position[:, columns], axis=0).max() > MINIMUM_MOTION:
-      return
+  if any(moves([log], joint) for log in logs for joint in log.commands.joints):
+    return
   names = ", ".join(log.name for log in logs)
   raise LogError(
     f"Found no commanded joint that moves in {names}, expected some motion: record a sweep, a slow "
     "motion and steps."
   )
+
+
+def moves(logs: Sequence[Log], joint: str) -> bool:
+  """Tells whether a joint moves in any of some logs that measure it."""
+  for log in logs:
+    assert log.states.position is not None
+    if np.ptp(log.states.position[:, log.states.column(joint)]) > MINIMUM_MOTION:
+      return True
+  return False

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.robot_logs.reading import Log, moves
 from nerf2real.sysid.design import excitation
 from nerf2real.sysid.design.information import Place, beside, information, places
 from nerf2real.sysid.fit.likelihood import JointLikelihood
@@ -97,7 +97,8 @@ def of_machine(
   settings: Settings,
   reductions: Sequence[Reduction] | None = None,
 ) -> list[Identifiability]:
-  """Returns what logs can show of every joint that all of them command, before anything is fitted.
+  """Returns what logs can show of every joint that all of them command and that moves, before
+  anything is fitted.
 
   Args:
     model: the declared one.
@@ -109,7 +110,9 @@ def of_machine(
   joints = [
     name
     for name in logs[0].commands.joints
-    if actuator_of(model, name) >= 0 and all(name in log.commands.joints for log in logs)
+    if actuator_of(model, name) >= 0
+    and all(name in log.commands.joints for log in logs)
+    and moves(logs, name)
   ]
   if repeated:
     settings = dataclasses.replace(settings, tolerances=settings.repeat)

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import t
 
-from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError
+from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, moves
 from nerf2real.sysid.drift.stored import Stored, StoredJoint, squares_by_log
 from nerf2real.sysid.drift.values import Value, compare
 from nerf2real.sysid.fit.likelihood import JointLikelihood
@@ -60,7 +60,7 @@ class Drift:
   errors: tuple[Error, ...]
   values: tuple[Value, ...]
   not_judged: tuple[str, ...]
-  """Effects that were named and are not compared, as sensors'."""
+  """Effects that were named and are not compared, as sensors', and joints that do not move."""
 
   @property
   def grown(self) -> list[Error]:
@@ -86,8 +86,10 @@ def judge(stored: Stored, logs: Sequence[Log], *, settings: Settings = SETTINGS)
     logs: later ones, one or several.
     settings: level of significance, what two recordings of a machine differ by.
 
+  Joints that do not move in the later logs are not judged.
+
   Raises:
-    LogError: a log lacks a joint of the result.
+    LogError: a log lacks a joint of the result, or none of its joints moves.
   """
   for log in logs:
     missing = [j.joint for j in stored.joints if j.joint not in log.commands.joints]
@@ -96,6 +98,13 @@ def judge(stored: Stored, logs: Sequence[Log], *, settings: Settings = SETTINGS)
         f"{log.name} has no commands for {missing}: found {list(log.commands.joints)} in "
         f"{COMMANDS}, expected the joints of the stored result; record the same joints."
       )
+  still = [j.joint for j in stored.joints if not moves(logs, j.joint)]
+  if len(still) == len(stored.joints):
+    raise LogError(
+      f"Found no motion of {still} in {', '.join(log.name for log in logs)}, expected some: record "
+      "the motions of the stored result."
+    )
+  stored = _without(stored, still)
   reductions = [Reduction(stored.model, log) for log in logs]
   now = {
     item.joint: JointLikelihood(
@@ -108,7 +117,19 @@ def judge(stored: Stored, logs: Sequence[Log], *, settings: Settings = SETTINGS)
   level = settings.level / _TESTS
   values, skipped = compare(stored, now, level=level, settings=settings)
   errors = _errors(stored.joints, now, level=level, settings=settings)
+  skipped += tuple(f"{joint}, which does not move in these logs" for joint in still)
   return Drift(tuple(log.name for log in logs), errors, values, skipped)
+
+
+def _without(stored: Stored, still: Sequence[str]) -> Stored:
+  """Returns a stored result without some joints and what was named of them alone."""
+  rows = [
+    row
+    for row in stored.content["effects"]
+    if not set(row.get("evidence", {}).get("joints") or [row["joint"]]) <= set(still)
+  ]
+  joints = [item for item in stored.joints if item.joint not in still]
+  return dataclasses.replace(stored, joints=joints, content=stored.content | {"effects": rows})
 
 
 def _errors(

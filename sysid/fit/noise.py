@@ -30,7 +30,8 @@ def timing(plant: JointPlant) -> tuple[float, float]:
     speed.append(log.velocity[2:-1] ** 2)
   s, v = np.concatenate(scatter), np.concatenate(speed)
   slow, fast = v <= np.quantile(v, 0.3), v >= np.quantile(v, 0.8)
-  steps = min(quantum(log.position) for log in plant.logs) / np.sqrt(12.0)
+  resolutions = [quantum(log.position) for log in plant.logs]  # 0 of a log without motion
+  steps = min((r for r in resolutions if r > 0.0), default=0.0) / np.sqrt(12.0)
   rest = max(float(_trimmed(s[slow])), steps**2, 1e-18)
   error = max(_trimmed(s[fast]) - rest, 0.0) / max(float(v[fast].mean()), 1e-18)
   return float(np.sqrt(rest)), float(np.sqrt(error))

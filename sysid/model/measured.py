@@ -77,9 +77,11 @@ def fresh(time: Array, position: Array, velocity: Array) -> Array:
   """Returns which readings [N] are not repeats of an earlier one while the joint was moving.
 
   A reading is a repeat when it equals the one before although the joint moved by more than
-  three times the sensor's resolution.
+  three times the sensor's resolution. Where all readings are the same none is a repeat.
   """
   resolution = quantum(position)
+  if resolution == 0.0:
+    return np.ones(len(position), bool)
   repeated = np.zeros(len(position), bool)
   moved = np.abs(velocity[1:]) * np.diff(time)
   repeated[1:] = (np.diff(position) == 0) & (moved > 3.0 * resolution)

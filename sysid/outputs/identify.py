@@ -29,7 +29,7 @@ from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.supported import check_supported, on_a_stand
 from nerf2real.sysid.outputs.details import claimed_effects, details_of
 from nerf2real.sysid.outputs.errors import errors, floor
-from nerf2real.sysid.outputs.notes import another_session, of_one, spread, supply
+from nerf2real.sysid.outputs.notes import another_session, of_one, spread, still, supply
 from nerf2real.sysid.outputs.rivals import alternatives, next_motion, residual_at
 from nerf2real.sysid.report import capability, samples, servo
 from nerf2real.sysid.report import page as report
@@ -86,6 +86,8 @@ def identify(
   healthy = read_logs(reference, compiled)
   check_supported(compiled, logs[0].commands.joints)
   check_motion(logs)
+  if healthy:
+    check_motion(healthy)
   _check_joints(logs, [*others, *healthy])
   with lock_folder(out):
     return _identify(
@@ -148,6 +150,7 @@ def _identify(
     "next_excitation": next_motion(found, shown),
     "notes": [
       *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
+      *still(found.still),
       *supply(logs, reference),
       *(note for item in found.found for note in another_session(item)),
       *sensed.notes,

@@ -18,6 +18,16 @@ def of_one(row: dict[str, Any]) -> str:
   )
 
 
+def still(joints: Sequence[str]) -> list[str]:
+  """Returns a sentence on joints that are commanded and do not move; none where there are none."""
+  if not joints:
+    return []
+  return [
+    f"Commanded and not moving in the logs or in the reference, and so not judged: "
+    f"{', '.join(joints)}. Command a motion, or look whether they are stuck or switched off."
+  ]
+
+
 def another_session(item: Changed) -> list[str]:
   """Returns a sentence on what a reference of another session cannot show."""
   if not (item.subject.paired and item.subject.another_session):

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.robot_logs.reading import Log, moves
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
@@ -41,6 +41,8 @@ def analyse(
 ) -> Identified:
   """Returns what a machine has that its model, or reference logs, have not.
 
+  A joint that does not move in the logs, or not in the reference, is not judged: see `still`.
+
   Args:
     model: the declared one.
     logs: to identify from.
@@ -49,17 +51,19 @@ def analyse(
     settings: tolerances and effort.
 
   Raises:
-    ValueError: no joint has an actuator and commands in all logs.
+    ValueError: no joint has an actuator and commands in all logs, and moves.
   """
-  joints = [
+  commanded = [
     name
     for name in logs[0].commands.joints
     if actuator_of(model, name) >= 0
     and all(name in log.commands.joints for log in (*logs, *reference))
   ]
+  recordings = [part for part in (logs, reference) if part]
+  joints = [name for name in commanded if all(moves(part, name) for part in recordings)]
   if not joints:
     raise ValueError(
-      "Found no joint with an actuator that all logs command, expected at least one."
+      "Found no joint with an actuator that all logs command and that moves, expected at least one."
     )
   made = reductions or [Reduction(model, log) for log in logs]
   both = list(made), [Reduction(model, log) for log in reference]
@@ -77,6 +81,7 @@ def analyse(
     )
   )
   result = Identified(model, list(logs), changed, audits=[audit(log) for log in logs])
+  result.still = [name for name in commanded if name not in joints]
   for effect in shared:
     _write_shared(result, effect, own_latency=not reference)
   for item in changed:

@@ -97,6 +97,8 @@ class Identified:
   """Entries of alternatives: an effect of several joints at one of them alone."""
   twins: list[dict[str, Any]] = dataclasses.field(default_factory=list)
   """Entries of alternatives: effects of several joints that predict the same as a claimed one."""
+  still: list[str] = dataclasses.field(default_factory=list)
+  """Joints that are commanded and do not move in the logs, or not in the reference."""
 
   @property
   def near(self) -> list[Member]:

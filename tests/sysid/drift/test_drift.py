@@ -222,6 +222,14 @@ def test_an_effect_of_the_machine_is_fitted_to_all_joints(later, tmp_path):
   (value,) = sysid.check_drift(folder, [Path("later")]).moved
   assert value.later is not None and value.where == "all"
   assert value.later[0] == pytest.approx(LATE + 0.02, abs=0.004)
+  states = later["same"].states
+  frozen = states.position * (1.0, 0.0) + (0.0, 0.3)
+  later["still"] = dataclasses.replace(
+    later["same"], states=dataclasses.replace(states, position=frozen)
+  )
+  found = sysid.check_drift(folder, [Path("still")])
+  assert found.not_judged == ("elbow, which does not move in these logs",)
+  assert [error.joint for error in found.errors] == ["shoulder"]
 
 
 def test_a_zero_that_a_tilt_was_told_as_is_fitted_anew(later, tmp_path):
