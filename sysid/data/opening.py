@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from nerf2real.core.robot_logs import reading
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.core.robot_logs.series import JointSeries
+from nerf2real.core.robot_logs.series import JointSeries, ScalarSeries
 from nerf2real.core.robot_logs.streaming import LogError
 from nerf2real.sysid.data.bam import UNNAMED, read_bam
 from nerf2real.sysid.data.compatibility import check_against_model
@@ -67,11 +68,24 @@ def load_model(path: Path) -> mujoco.MjModel:
     raise ValueError(f"{path} is not a MuJoCo model: {first}") from error
 
 
+def without_fillers(log: Log) -> Log:
+  """Returns a log without what drivers fill in for what they do not measure: efforts that never
+  change, and voltages that are not above 0."""
+  states, battery = log.states, log.battery
+  if states.effort is not None and not np.ptp(states.effort, axis=0).any():
+    states = dataclasses.replace(states, effort=None)
+  if battery is not None and not np.all(battery.value > 0.0):
+    read = battery.value > 0.0
+    columns = (battery.stamp[read], battery.log_time[read], battery.value[read])
+    battery = ScalarSeries(*columns) if read.any() else None
+  return dataclasses.replace(log, states=states, battery=battery)
+
+
 def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:
   """Reads logs and checks them against the model."""
   logs = []
   for path in paths:
-    log = named(read_log(path), model)
+    log = without_fillers(named(read_log(path), model))
     check_against_model(log, model)
     logs.append(log)
   return logs

@@ -32,7 +32,7 @@ class Measured:
   acceleration: Array
   """[N], smoothed from positions."""
   effort: Array | None
-  """[N] N m."""
+  """[N] N m; None where it never changes: drivers fill in what they do not measure."""
   command_time: Array
   command: Array
   valid: Array
@@ -54,6 +54,7 @@ def measured(log: Log, motion: Motion, joint: str, model: mujoco.MjModel) -> Mea
     assert command is not None
   else:
     command_time, command = np.zeros(1), np.zeros(1)
+  effort = None if states.effort is None else states.effort[:, column]
   series = log.temperatures.get(joint)
   duty = None
   if log.pwm is not None and log.pwm.effort is not None and joint in log.pwm.joints:
@@ -64,7 +65,7 @@ def measured(log: Log, motion: Motion, joint: str, model: mujoco.MjModel) -> Mea
     position=position,
     velocity=motion.velocity[:, column],
     acceleration=motion.acceleration[:, column],
-    effort=None if states.effort is None else states.effort[:, column],
+    effort=effort if effort is not None and np.ptp(effort) > 0.0 else None,
     command_time=np.ascontiguousarray(command_time),
     command=np.ascontiguousarray(command),
     valid=fresh(states.stamp, position, motion.velocity[:, column]),

@@ -1,5 +1,6 @@
 """Logs as CSV and as BAM's JSON."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from nerf2real.core.robot_logs.reading import LogError
 from nerf2real.sysid.data.bam import UNNAMED
 from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.opening import named, read_log, read_logs
-from tests.sysid.synthetic import ARM, PENDULUM
+from nerf2real.sysid.model.measured import measured
+from nerf2real.sysid.model.motion import smooth_motion
+from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 MEASURED = Path(__file__).parents[4] / "shared/data/measured"
 TIME = 0.01 * np.arange(200)
@@ -64,6 +67,28 @@ def test_a_csv_log(tmp_path):
   (tmp_path / "m.xml").write_text(PENDULUM)
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   assert read_logs([tmp_path / "log.csv"], model)[0].duration == pytest.approx(log.duration)
+
+
+@pytest.mark.parametrize("effort", [0.0, 0.25])
+def test_what_a_driver_fills_in_is_not_measured(effort, tmp_path):
+  lines = [line.replace(",12.1,", ",0,") for line in rows()]
+  filled = [",".join([*(f := line.split(","))[:3], f"{effort}", *f[4:]]) for line in lines[2::2]]
+  lines[2::2] = filled
+  path, model = csv_of(tmp_path, lines), mujoco.MjModel.from_xml_string(PENDULUM)
+  (log,) = read_logs([path], model)
+  assert log.states.effort is None and log.battery is None
+  lines[2::4] = [line.replace(",0,", ",12.1,") for line in lines[2::4]]
+  (log,) = read_logs([csv_of(tmp_path, lines)], model)
+  assert set(log.battery.value) == {12.1} and len(log.battery.stamp) == 100
+
+
+def test_an_effort_that_never_changes_beside_one_that_does_is_not_measured():
+  log = log_of(ARM, "slow", duration=1.5)
+  efforts = np.column_stack([np.zeros(len(log.states.stamp)), log.states.position[:, 1]])
+  log = dataclasses.replace(log, states=dataclasses.replace(log.states, effort=efforts))
+  model, motion = mujoco.MjModel.from_xml_string(ARM), smooth_motion(log)
+  assert measured(log, motion, "shoulder", model).effort is None
+  assert measured(log, motion, "elbow", model).effort is not None
 
 
 @pytest.mark.parametrize(
