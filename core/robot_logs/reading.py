@@ -77,6 +77,15 @@ class Log:
   """The file, which holds the pictures too; None of a log that was never written."""
   pictures: int = 0
   """How many pictures the file holds."""
+  recorded: JointSeries | None = None
+  """All states, where `states` leave out those before the first command; None where none are."""
+
+  @property
+  def whole(self) -> "Log":
+    """The log with the states before its first command, too."""
+    if self.recorded is None:
+      return self
+    return dataclasses.replace(self, states=self.recorded, recorded=None)
 
   @property
   def joints(self) -> tuple[str, ...]:

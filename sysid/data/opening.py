@@ -81,11 +81,27 @@ def without_fillers(log: Log) -> Log:
   return dataclasses.replace(log, states=states, battery=battery)
 
 
+def from_first_command(log: Log) -> Log:
+  """Returns a log whose states begin with its commands: what came before was told what no log says.
+
+  A single reading before the first command is of the same cycle, and stays.
+  """
+  states = log.states
+  first = int(np.searchsorted(states.stamp, log.commands.stamp[0]))
+  if first < 2:
+    return log
+  arrays = {
+    name: None if (values := getattr(states, name)) is None else values[first:]
+    for name in ("stamp", "log_time", "position", "velocity", "effort")
+  }
+  return dataclasses.replace(log, states=dataclasses.replace(states, **arrays), recorded=states)
+
+
 def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:
-  """Reads logs and checks them against the model."""
+  """Reads logs, whose states begin with their commands, and checks them against the model."""
   logs = []
   for path in paths:
-    log = without_fillers(named(read_log(path), model))
+    log = from_first_command(without_fillers(named(read_log(path), model)))
     check_against_model(log, model)
     logs.append(log)
   return logs

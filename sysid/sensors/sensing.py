@@ -70,10 +70,11 @@ def find(
 
   Args:
     model: the declared one.
-    logs: to identify from.
+    logs: to identify from; what they hold from before their first commands counts, too.
     reference: of the same apparatus at the same place; what sensors show there, too, is no change.
     tilt: turn of gravity about x and y in the logs, as the joints show it [rad].
   """
+  logs, reference = [log.whole for log in logs], [log.whole for log in reference]
   parts: dict[str, Part] = {}
   imu = inertial.find(_leaning(model, tilt) if tilt else model, logs)
   if imu is not None:

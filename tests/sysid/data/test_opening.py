@@ -11,9 +11,11 @@ import pytest
 from nerf2real.core.robot_logs.reading import LogError
 from nerf2real.sysid.data.bam import UNNAMED
 from nerf2real.sysid.data.compatibility import check_against_model
-from nerf2real.sysid.data.opening import named, read_log, read_logs
+from nerf2real.sysid.data.opening import from_first_command, named, read_log, read_logs
+from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.measured import measured
 from nerf2real.sysid.model.motion import smooth_motion
+from nerf2real.sysid.sensors import floor, inertial, optical, sensing
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 MEASURED = Path(__file__).parents[4] / "shared/data/measured"
@@ -80,6 +82,43 @@ def test_what_a_driver_fills_in_is_not_measured(effort, tmp_path):
   lines[2::4] = [line.replace(",0,", ",12.1,") for line in lines[2::4]]
   (log,) = read_logs([csv_of(tmp_path, lines)], model)
   assert set(log.battery.value) == {12.1} and len(log.battery.stamp) == 100
+
+
+@pytest.mark.parametrize("missing", [0, 1, 50])
+def test_states_begin_with_the_commands(missing, tmp_path, monkeypatch):
+  """One reading before the first command is of its cycle."""
+  lines = rows()
+  commands = [line for line in lines[1::2] if line][missing:]
+  table = sorted(commands + lines[2::2], key=lambda line: float(line.split(",")[0]))
+  path, model = csv_of(tmp_path, [lines[0], *table]), mujoco.MjModel.from_xml_string(PENDULUM)
+  (log,) = read_logs([path], model)
+  cut = missing if missing > 1 else 0
+  assert len(log.states.stamp) == len(log.states.position) == len(log.states.effort) == 200 - cut
+  assert (log.states.stamp[0] > log.commands.stamp[0]) == (missing != 1)
+  assert len(log.whole.states.stamp) == 200 and log.whole.recorded is None
+  given = []
+  for sensor in (inertial, optical, floor):
+    monkeypatch.setattr(sensor, "find", lambda _, logs: given.append(len(logs[0].states.stamp)))
+  sensing.find(model, [log])
+  assert given == [200, 200, 200]
+
+
+def test_a_recorder_that_starts_before_a_step_shows_no_delay():
+  """What came before the first command is not simulated under it."""
+  log, model = log_of(PENDULUM, "steps", duration=4.0), mujoco.MjModel.from_xml_string(PENDULUM)
+  position = np.where(log.commands.stamp[:, None] < 2.0, 0.0, 0.9)
+  log = dataclasses.replace(log, commands=dataclasses.replace(log.commands, position=position))
+  states = dataclasses.replace(log.states, position=simulation.simulate(model, log))
+  told = log.commands.stamp >= 2.0
+  commands = dataclasses.replace(
+    log.commands,
+    stamp=log.commands.stamp[told],
+    log_time=log.commands.stamp[told],
+    position=position[told],
+  )
+  log = dataclasses.replace(log, states=states, commands=commands)
+  assert simulation.error(model, [log]) > 0.2
+  assert simulation.error(model, [from_first_command(log)]) < 0.01
 
 
 def test_an_effort_that_never_changes_beside_one_that_does_is_not_measured():
