@@ -1,9 +1,16 @@
-"""What a log of another format must be to be usable; of MCAP see `core.robot_logs.reading`."""
+"""What a log of another format must be to be usable, and one that stands alone; of MCAP see
+`core.robot_logs.reading`."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import MINIMUM_DURATION, MINIMUM_RATE, Log
 from nerf2real.core.robot_logs.streaming import LogError
+from nerf2real.sysid.model.measured import block_starts
+
+_FEWEST_BLOCKS = 3
+"""Blocks of a log from which on parts of it can be left out and predicted by the others."""
 
 
 def checked(log: Log) -> Log:
@@ -36,3 +43,18 @@ def checked(log: Log) -> Log:
       f"{MINIMUM_RATE:g} a second: record faster."
     )
   return log
+
+
+def check_length(logs: Sequence[Log], block_s: float) -> None:
+  """Raises a LogError where a single log is too short to predict a part of it by the others.
+
+  Args:
+    logs: that are fitted together; of several each is predicted by the others.
+    block_s: s of a block of the likelihood.
+  """
+  if len(logs) != 1 or len(block_starts(logs[0].states.stamp, block_s)) >= _FEWEST_BLOCKS:
+    return
+  raise LogError(
+    f"{logs[0].name} alone is too short: found {np.ptp(logs[0].states.stamp):.3g} s of readings, "
+    f"expected at least {_FEWEST_BLOCKS * block_s:g} s: record a longer log, or give several."
+  )

@@ -90,11 +90,12 @@ def from_first_command(log: Log) -> Log:
   first = int(np.searchsorted(states.stamp, log.commands.stamp[0]))
   if first < 2:
     return log
-  arrays = {
-    name: None if (values := getattr(states, name)) is None else values[first:]
-    for name in ("stamp", "log_time", "position", "velocity", "effort")
-  }
-  return dataclasses.replace(log, states=dataclasses.replace(states, **arrays), recorded=states)
+  fields = (states.position, states.velocity, states.effort)
+  begun = JointSeries(
+    *(states.joints, states.stamp[first:], states.log_time[first:]),
+    *(None if values is None else values[first:] for values in fields),
+  )
+  return dataclasses.replace(log, states=begun, recorded=states)
 
 
 def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:

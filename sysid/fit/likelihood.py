@@ -22,7 +22,7 @@ from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.model.measured import Measured
+from nerf2real.sysid.model.measured import Measured, block_starts
 from nerf2real.sysid.model.servo_law import Asked, command_jump, duty_for
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -108,16 +108,13 @@ class JointLikelihood:
     alone = len(self.plant.logs) == 1
     log_of, log_at = [], []
     for index, log in enumerate(self.plant.logs):
-      label = np.floor((log.time - log.time[0]) / self.settings.block_s).astype(int)
-      first = np.unique(label, return_index=True)[1]
-      if len(first) > 1 and len(label) - first[-1] < 0.5 * np.median(np.diff(first)):
-        first = first[:-1]
+      first = block_starts(log.time, self.settings.block_s)
       starts.append(first + offset)
       half = np.arange(len(first)) // 2 % self.settings.folds
       folds.append(half if alone else np.full(len(first), index))
       log_of.append(np.full(len(first), index))
-      log_at.append(np.full(len(label), index))
-      offset += len(label)
+      log_at.append(np.full(len(log.time), index))
+      offset += len(log.time)
     self.starts, self.fold = np.concatenate(starts), np.concatenate(folds)
     self.log_of, self.log_at = np.concatenate(log_of), np.concatenate(log_at)
     self.size = offset

@@ -1,6 +1,6 @@
 """What a log says of one joint: its readings, its commands, and which readings are new.
 
-Shapes: N samples of a log.
+Shapes: N samples of a log, B blocks.
 """
 
 import dataclasses
@@ -87,6 +87,19 @@ def fresh(time: Array, position: Array, velocity: Array) -> Array:
   moved = np.abs(velocity[1:]) * np.diff(time)
   repeated[1:] = (np.diff(position) == 0) & (moved > 3.0 * resolution)
   return ~repeated
+
+
+def block_starts(time: Array, length: float) -> Array:
+  """Returns where blocks of a log begin [B], a last one of less than half a block left out.
+
+  Args:
+    time: stamps [N], s.
+    length: of a block, s.
+  """
+  first = np.unique(np.floor((time - time[0]) / length).astype(int), return_index=True)[1]
+  if len(first) > 1 and len(time) - first[-1] < 0.5 * np.median(np.diff(first)):
+    first = first[:-1]
+  return first
 
 
 def quantum(values: Array) -> float:

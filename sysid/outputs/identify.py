@@ -21,6 +21,7 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import write_effects
+from nerf2real.sysid.data.checks import check_length
 from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
@@ -85,9 +86,9 @@ def identify(
   logs, others = read_logs(train, compiled), read_logs(held, compiled)
   healthy = read_logs(reference, compiled)
   check_supported(compiled, logs[0].commands.joints)
-  check_motion(logs)
-  if healthy:
-    check_motion(healthy)
+  for part in filter(None, (logs, healthy)):
+    check_motion(part)
+    check_length(part, settings.block_s)
   _check_joints(logs, [*others, *healthy])
   with lock_folder(out):
     return _identify(

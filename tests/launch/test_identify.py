@@ -28,7 +28,7 @@ def identify(monkeypatch, capsys):
   return run
 
 
-def _log(path, *, duration=2.0, commands=True, joints=("joint",), spoil=None, cut=None):
+def _log(path, *, duration=3.0, commands=True, joints=("joint",), spoil=None, cut=None):
   """Writes a log of joints that move; `spoil(index, fields)` changes states."""
   with open_log(path) as log:
     for index in range(round(duration * 100)):

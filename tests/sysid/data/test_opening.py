@@ -10,12 +10,16 @@ import pytest
 
 from nerf2real.core.robot_logs.reading import LogError
 from nerf2real.sysid.data.bam import UNNAMED
+from nerf2real.sysid.data.checks import check_length
 from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.opening import from_first_command, named, read_log, read_logs
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.model import simulation
+from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.measured import measured
 from nerf2real.sysid.model.motion import smooth_motion
 from nerf2real.sysid.sensors import floor, inertial, optical, sensing
+from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 MEASURED = Path(__file__).parents[4] / "shared/data/measured"
@@ -209,6 +213,20 @@ def test_a_bam_log(tmp_path):
 def test_a_json_that_is_no_usable_bam_log_is_one_clear_error(content, message, tmp_path):
   with pytest.raises(LogError, match=message) as caught:
     read_log(bam_of(tmp_path, content))
+  assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("seconds", "refused"), [(1.05, True), (2.1, True), (3.0, False)])
+def test_a_single_log_is_long_enough_to_leave_a_part_out(seconds, refused):
+  log = log_of(PENDULUM, "slow", duration=seconds)
+  check_length([log, log], SETTINGS.block_s)
+  model = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", [log])
+  assert (len(np.unique(JointLikelihood(model).fold)) < 2) == refused
+  if not refused:
+    check_length([log], SETTINGS.block_s)
+    return
+  with pytest.raises(LogError, match=r"slow.mcap alone is too short: .* at least 3 s") as caught:
+    check_length([log], SETTINGS.block_s)
   assert "\n" not in str(caught.value)
 
 
