@@ -3,7 +3,8 @@
 One row a reading. Columns are `time` [s] and, with a joint's name after the colon, any of
 `command_position:J`, `command_velocity:J`, `command_effort:J`, `position:J`, `velocity:J`,
 `effort:J`, `duty:J` and `temperature:J` (SI, degrees Celsius), and `voltage`. An empty field is a
-value that was not read at that time, so commands and states may have rows of their own.
+value that was not read at that time, so commands and states may have rows of their own; a column
+without values is as none. `velocity:J` is not looked at: velocities are those of the positions.
 """
 
 import csv
@@ -37,6 +38,7 @@ def read_csv(path: Path) -> Log:
   time = columns.pop("time")
   if np.isnan(time).any():
     raise LogError(f"{path.name} has rows without a time, expected seconds in every row.")
+  columns = {name: values for name, values in columns.items() if not np.isnan(values).all()}
   start = float(time[0])
   quantities: dict[str, dict[str, np.ndarray]] = {}
   for name, values in columns.items():
@@ -44,12 +46,12 @@ def read_csv(path: Path) -> Log:
     quantities.setdefault(quantity, {})[joint] = values
   stamps = time - start
   commands = _series(path, stamps, quantities, COMMANDED)
-  states = _series(path, stamps, quantities, ("position", "velocity", "effort"))
+  states = _series(path, stamps, quantities, ("position", None, "effort"))
   if commands is None or states is None or states.position is None:
     lacks = (
       " or ".join(f"{name}:JOINT" for name in COMMANDED) if commands is None else "position:JOINT"
     )
-    raise LogError(f"{path.name} has no column {lacks}, found {sorted(columns)}.")
+    raise LogError(f"{path.name} has no column {lacks} with values, found {sorted(columns)}.")
   voltage = _scalar(stamps, columns.get("voltage"))
   heat = {j: _scalar(stamps, v) for j, v in quantities.get("temperature", {}).items()}
   return checked(

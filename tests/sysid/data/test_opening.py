@@ -134,6 +134,19 @@ def test_an_effort_that_never_changes_beside_one_that_does_is_not_measured():
   assert measured(log, motion, "elbow", model).effort is not None
 
 
+def test_columns_without_values_and_gaps_in_velocities_are_no_errors(tmp_path):
+  names = "time,command_position:joint,command_effort:joint,position:joint,velocity:joint"
+  lines = [f"{names},effort:joint"]
+  for index, (t, p) in enumerate(zip(TIME, PATH, strict=True)):
+    lines.append(f"{t:.4f},{0.5 * p:.6f},,{p:.6f},{'' if index % 3 else '0.1'},")
+  log = read_log(csv_of(tmp_path, lines))
+  assert len(log.states.stamp) == len(TIME) and log.states.effort is None
+  assert log.commands.effort is None and log.commands.position is not None
+  empty = [lines[0], *(",".join([(f := line.split(","))[0], "", *f[2:]]) for line in lines[1:])]
+  with pytest.raises(LogError, match="no column command_position:JOINT or .* with values, found"):
+    read_log(csv_of(tmp_path, empty))
+
+
 @pytest.mark.parametrize(
   ("change", "message"),
   [
