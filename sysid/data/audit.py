@@ -30,6 +30,7 @@ def audit(log: Log) -> dict[str, Any]:
     float(np.mean(~fresh(states.stamp, states.position[:, j], motion.velocity[:, j])))
     for j in range(len(states.joints))
   ]
+  steps = [quantum(column) for column in states.position.T]
   result: dict[str, Any] = {
     "log": log.name,
     "duration_s": round(log.duration, 3),
@@ -40,7 +41,7 @@ def audit(log: Log) -> dict[str, Any]:
     "command_gaps": _gaps(commands),
     "duplicate_stamps": int(np.sum(np.diff(states.stamp) == 0)),
     "stale_share": round(max(stale), 4),
-    "position_step": float(min(quantum(states.position[:, j]) for j in range(len(states.joints)))),
+    "position_step": min((step for step in steps if step > 0.0), default=0.0),  # still ones: 0
     "state_clock_drift": _drift(states) - _drift(commands),
     "recorder_drift": _drift(commands),
     "saturated_share": _saturated(states),

@@ -186,11 +186,13 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   if zero is not None:
     joint, offset, (low, high) = zero
     result.zeros[joint] = Zero(offset, (high - low) / (2 * SETTINGS.sigmas))
-    result.effects.append(claims.zero(joint, offset, (low, high), evidence))
+    slide = _slide(result.model, [joint])
+    result.effects.append(claims.zero(joint, offset, (low, high), evidence, slide=slide))
     if shared.term.kind == zeros.TILT:
       result.twins.append(claims.alike(shared.term, shared.x))
     return
-  effect, row = claims.shared(shared.term, shared.x, bounds, evidence)
+  slide = _slide(result.model, shared.joints)
+  effect, row = claims.shared(shared.term, shared.x, bounds, evidence, slide=slide)
   if shared.term.kind == "payload":
     body = result.model.body(str(shared.term.target)).id
     row |= {"joint": wide.ancestors(result.model, body)[0], "body": shared.term.target}
@@ -199,6 +201,11 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   if shared.or_alone is not None:
     result.scopes.append(claims.alone(shared.term, shared.origin.joint, *shared.or_alone))
   result.twins += [claims.alike(term, x) for term, x in shared.alike]
+
+
+def _slide(model: mujoco.MjModel, joints: Sequence[str]) -> bool:
+  """Tells whether all of some joints are slides."""
+  return all(model.joint(joint).type[0] == int(mujoco.mjtJoint.mjJNT_SLIDE) for joint in joints)
 
 
 def machine_verdict(verdicts: Sequence[str], *, claimed: bool) -> str:

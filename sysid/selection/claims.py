@@ -52,7 +52,12 @@ def free(item: Changed, term: Term) -> Claim:
 
 
 def shared(
-  term: Term, x: Array, bounds: dict[str, tuple[float, float]], evidence: dict[str, Any]
+  term: Term,
+  x: Array,
+  bounds: dict[str, tuple[float, float]],
+  evidence: dict[str, Any],
+  *,
+  slide: bool,
 ) -> Claim:
   """Returns an effect of several joints.
 
@@ -61,9 +66,10 @@ def shared(
     x: its values [n].
     bounds: their intervals.
     evidence: for the report.
+    slide: whether all of the joints are slides.
   """
   found = term.effect(x, bounds)
-  parameters = _parameters(found, bounds, term, slide=False)
+  parameters = _parameters(found, bounds, term, slide=slide)
   return found, {
     "kind": found.kind,
     "joint": None,
@@ -73,18 +79,25 @@ def shared(
 
 
 def zero(
-  joint: str, offset: float, interval: tuple[float, float], evidence: dict[str, Any]
+  joint: str,
+  offset: float,
+  interval: tuple[float, float],
+  evidence: dict[str, Any],
+  *,
+  slide: bool,
 ) -> dict[str, Any]:
   """Returns the entry of a joint's shifted zero that the others' motion shows, too.
 
   Args:
     joint: which joint.
-    offset: of its readings, rad.
+    offset: of its readings, rad or m.
     interval: of that.
     evidence: for the report.
+    slide: whether the joint is a slide.
   """
   low, high = interval
-  parameters = {"offset": {"value": offset, "low": low, "high": high, "unit": "rad"}}
+  unit = "m" if slide else "rad"
+  parameters = {"offset": {"value": offset, "low": low, "high": high, "unit": unit}}
   return {
     "kind": "encoder_offset",
     "joint": joint,

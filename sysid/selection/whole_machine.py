@@ -59,8 +59,8 @@ def _parts(found: Identified) -> list[list[Effect]]:
   followed = [j.joint for j in found.followed]
   parts: dict[object, list[Effect]] = {}
   for effect in (*found.calibration, *found.objects):
-    claimed = bool(_rows(found, effect))
-    if not (claimed and effect.target in followed):
+    claimed = bool(rows := _rows(found, effect))
+    if not any(row["joint"] in followed for row in rows):
       parts.setdefault(id(effect) if claimed else effect.target, []).append(effect)
   return list(parts.values())
 
@@ -85,8 +85,9 @@ def _take_out(found: Identified, effect: Effect) -> None:
   found.objects[:] = [e for e in found.objects if e is not effect]
   found.effects[:] = [row for row in found.effects if not any(row is other for other in lost)]
   found.nearest += lost
+  claimed = [row["joint"] for row in lost]  # of a payload: its target is a body
   for item in found.joints:
-    if effect.target in (item.joint, None):
+    if effect.target in (item.joint, None) or item.joint in claimed:
       item.elaborated = []
-    if lost and effect.target == item.joint and item.verdict in ("effects", "partly"):
+    if item.joint in claimed and item.verdict in ("effects", "partly"):
       item.verdict = "unexplained"

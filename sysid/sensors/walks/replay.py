@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, EffectStack
 from nerf2real.suite.effects.drawing import as_gravity
+from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.sensors import standing
 
 Array = np.ndarray
@@ -79,7 +80,7 @@ class Replay:
     stack = EffectStack(self._effects).bind(model, joints=log.joints)
     try:
       places = self._stand(data, walk)
-      actuators = [model.actuator(name).id for name in commands.joints]
+      actuators = [actuator_of(model, name) for name in commands.joints]
       control = np.zeros(model.nu)
       steps = round((_SETTLE + walk.seconds) / _STEP)
       time = _STEP * np.arange(1, steps + 1) - _SETTLE

@@ -226,6 +226,13 @@ def test_audit_reports_gaps_and_rates() -> None:
   assert audit(log)["state_gaps"] == 1
 
 
+def test_a_still_joint_does_not_hide_the_readings_steps() -> None:
+  log = log_of(ARM, "slow", duration=3.0)
+  step = audit(log)["position_step"]
+  log.states.position[:, 1] = 0.3
+  assert audit(log)["position_step"] == pytest.approx(step, rel=1e-6) and step > 0.0
+
+
 def test_bad_input_is_one_clear_error(tmp_path: Path) -> None:
   with pytest.raises(FileNotFoundError, match=r"no file .*model\.xml"):
     sysid.identify(tmp_path / "model.xml", [tmp_path / "a.mcap"], out=tmp_path / "out")

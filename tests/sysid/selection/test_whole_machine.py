@@ -49,6 +49,19 @@ def test_an_effect_that_makes_the_whole_machine_worse_is_taken_out() -> None:
   ]
 
 
+def test_the_joint_that_a_refuted_payload_was_claimed_of_is_unexplained() -> None:
+  found = _found()
+  payload = Effect("payload", "lower", {"mass": 0.5, "x": 0.0, "y": 0.0, "z": -0.2})
+  found.objects[:] = [_TRUE, payload]
+  found.effects[1:] = [_row(payload, 9.0) | {"joint": "elbow", "body": "lower"}]
+  discard_refuted(found, SETTINGS)
+  assert found.objects == [_TRUE]
+  assert [(j.verdict, j.elaborated) for j in found.joints] == [
+    ("effects", ["a fit"]),
+    ("unexplained", []),
+  ]
+
+
 def test_what_is_not_claimed_of_a_joint_is_taken_out_together() -> None:
   found = _found()
   other = Effect("encoder_offset", "elbow", {"offset": 0.0})

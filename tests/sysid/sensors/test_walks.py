@@ -133,6 +133,19 @@ def test_a_walk_is_simulated_again(before):
   }
 
 
+def test_actuators_need_not_be_called_like_their_joints():
+  walk, figures = _walk([], 0), []
+  spec = mujoco.MjSpec.from_string(OP3().mjcf_model.to_xml_string())
+  spec.body(constants.TORSO_LINK).add_freejoint()
+  spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
+  for ending in ("", "_servo"):
+    for actuator in spec.actuators:
+      actuator.name += ending
+    model = spec.compile()
+    figures.append(Replay(model, [], model.body(constants.TORSO_LINK).id).figures(walk))
+  np.testing.assert_allclose(*figures)
+
+
 @pytest.mark.parametrize(
   ("effect", "parameter", "reach"), [(KNEE, "coefficient", 0.08), (SLIPPERY, "scale", 0.06)]
 )

@@ -140,7 +140,7 @@ def test_explanations_beside_a_further_effect_must_be_better(square, stands):
   assert scopes.better([explained(square)], [explained(1.0)]) == stands
 
 
-def test_what_predicts_the_same_as_a_shared_effect_is_said_beside_it():
+def test_what_predicts_the_same_as_a_shared_effect_is_said_beside_it(model):
   term = Term("command_delay", None, ("delay",), (0.0,), (0.1,), (0.01,), ((0.0,),))
   twin = dataclasses.replace(term, kind="measurement_delay")
   joints = tuple(SimpleNamespace(joint=name) for name in ("shoulder", "elbow"))
@@ -149,13 +149,29 @@ def test_what_predicts_the_same_as_a_shared_effect_is_said_beside_it():
     *(term, np.array([0.0153]), (near, near), joints[1], joints, 4.2, 150.0),
     alike=((twin, np.array([0.0154])),),
   )
-  found = SimpleNamespace(objects=[], effects=[], scopes=[], twins=[])
+  found = SimpleNamespace(model=model, objects=[], effects=[], scopes=[], twins=[])
   analysis._write_shared(found, shared, own_latency=False)
   assert [(e["kind"], e["joint"]) for e in found.effects] == [("command_delay", None)]
   (other,) = found.twins
   assert (other["kind"], other["joint"], other["confounded"]) == ("measurement_delay", None, True)
   assert other["parameters"] == {"measurement_delay": {"delay": 0.0154}}
   assert found.scopes == []
+
+
+@pytest.mark.parametrize(("joint", "unit"), [("rail", "m"), ("arm", "rad")])
+def test_the_zero_of_a_slide_is_told_in_metres(joint, unit):
+  model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><body><joint name='rail' type='slide'/><geom size='.1'/>"
+    "<body><joint name='arm' axis='0 1 0'/><geom size='.1'/></body></body></worldbody></mujoco>"
+  )
+  term = Term(wide.ZERO, joint, ("offset",), (-0.1,), (0.1,), (0.01,), ((0.0,),))
+  members = tuple(SimpleNamespace(joint=name) for name in ("rail", "arm"))
+  near = np.array([0.001])
+  shared = scopes.Shared(term, np.array([0.02]), (near, near), members[0], members, 4.2, 150.0)
+  found = SimpleNamespace(model=model, effects=[], zeros={})
+  analysis._write_shared(found, shared, own_latency=False)
+  (row,) = found.effects
+  assert row["joint"] == joint and row["parameters"]["offset"]["unit"] == unit
 
 
 def test_two_healthy_joints_have_nothing(model):
