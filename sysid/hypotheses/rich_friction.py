@@ -9,9 +9,7 @@ simulation of servo actuators", whose models of load, square and Stribeck this j
 Four values imitate much, so that it makes predictions better and is no ground for a name.
 """
 
-import numpy as np
-
-from nerf2real.sysid.hypotheses.candidates import typical_torque
+from nerf2real.sysid.hypotheses.candidates import typical_speed, typical_torque
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.plant import JointPlant
 
@@ -34,9 +32,7 @@ def rich_friction(plant: JointPlant, carried: int) -> Term:
     plant: the joint.
     carried: which torque loads the gear.
   """
-  speed = np.abs(np.concatenate([log.velocity for log in plant.logs]))
-  fast = max(float(np.quantile(speed, 0.98)), 1e-6)
-  large = typical_torque(plant)
+  fast, large = typical_speed(plant), typical_torque(plant)
   names = ("coefficient", "quadratic", "rest", "velocity")
   return Term(
     "load_friction",

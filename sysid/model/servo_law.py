@@ -17,6 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from nerf2real.core import least_squares
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model.kernel import INDEX, NAMES
 from nerf2real.sysid.model.measured import Measured, quantum
@@ -251,9 +252,6 @@ def _integral(x: Array, time: Array) -> Array:
 
 def _regressed(columns: Array, values: Array, block: Array) -> tuple[Array, Array]:
   """Returns coefficients [K] of least squares and their deviations [K] by the blocks' scatter."""
-  inverse = np.linalg.pinv(columns.T @ columns)
-  beta = inverse @ (columns.T @ values)
-  scores = columns * (values - columns @ beta)[:, None]
-  _, label = np.unique(block, return_inverse=True)
-  summed = np.array([np.bincount(label, column) for column in scores.T])
-  return beta, np.sqrt(np.maximum(np.diag(inverse @ (summed @ summed.T) @ inverse), 0.0))
+  beta = np.linalg.pinv(columns.T @ columns) @ (columns.T @ values)
+  spread = least_squares.block_covariance(columns.T, values - columns @ beta, block)
+  return beta, least_squares.standard_deviations(spread)

@@ -159,11 +159,6 @@ def _identify(
   }
   # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
   content["alternatives"] = [*_effects_first(found.nearest), *content["alternatives"]]
-  if found.verdict == "unexplained":
-    # What IMU, camera and floor show is explained all the same.
-    claimed = [row for row in found.effects if row not in sensed.rows]
-    content["alternatives"] = [*claimed, *content["alternatives"]]
-    content["effects"] = list(sensed.rows)
   if found.followed:
     joints = ", ".join(item.joint for item in found.followed)
     content["notes"] = [

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.sensors import optical, pictures, sensed
+from nerf2real.sysid.sensors import optical, pictures, sensed, viewpoint
 from nerf2real.sysid.sensors.sensed import Part, row
 from nerf2real.sysid.sensors.viewpoint import View
 from nerf2real.sysid.settings import SETTINGS
@@ -52,16 +52,13 @@ class _Small:
   lens: Camera
 
 
-def find(
-  model: mujoco.MjModel, seen: optical.Seen, reference: Sequence[Log], camera: str = "camera"
-) -> Part:
+def find(model: mujoco.MjModel, seen: optical.Seen, reference: Sequence[Log]) -> Part:
   """Returns the camera's gain.
 
   Args:
     model: the declared one.
     seen: pictures and poses of the logs, by `optical.find`.
     reference: logs of the same apparatus at the same place.
-    camera: name for the report.
   """
   filmed = optical.with_pictures(reference)
   if not filmed or not seen.sources:
@@ -83,7 +80,9 @@ def find(
       "The reference logs' pictures do not show what the logs' show: the camera's gain is unknown."
     )
     return Part(notes=[note])
-  return _judge(np.array(levels), np.unique(blocks, return_inverse=True)[1], camera)
+  camera = viewpoint.choose(model, seen.sources[0].frame)
+  name = model.camera(camera).name
+  return _judge(np.array(levels), np.unique(blocks, return_inverse=True)[1], name)
 
 
 def _judge(levels: Array, block: Array, camera: str) -> Part:

@@ -22,7 +22,6 @@ import numpy as np
 from nerf2real.core import least_squares
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
-from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model.motion import smooth_motion
 from nerf2real.sysid.sensors import sensed
 from nerf2real.sysid.sensors.sensed import Estimate, Estimates, Part
@@ -88,7 +87,7 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Part | None:
     values, sure = _claimed(name, names, fitted, bounds)
     gain = without[name] - full
     if sure and gain > sensed.GAIN:
-      row = _row(name, values, bounds[name], where, gain, bare - full)
+      row = sensed.row(_kind(name), where, values, gain, bare - full)
       known = rows.setdefault(row["kind"], row)
       known["parameters"] |= row["parameters"]
   alternatives = []
@@ -98,9 +97,9 @@ def find(model: mujoco.MjModel, logs: Sequence[Log]) -> Part | None:
       own = _intervals(parts, noise, (name,), x)
       values, sure = _claimed(name, (name,), x, own)
       if sure:
-        row = _row(name, values, own[name], where, bare - alone, bare - full)
+        row = sensed.row(_kind(name), where, values, bare - alone, bare - full)
         alternatives.append(row)
-  kept = tuple(n for n in names if n.split("/")[0] in rows)
+  kept = tuple(n for n in names if _kind(n) in rows)
   after = _score(parts, noise, kept)[0]
   return Part(
     list(rows.values()),
@@ -116,37 +115,15 @@ def _estimates(
 ) -> Estimates:
   """Returns all values of a fit with their intervals."""
   return {
-    (part.split("/")[0], name): Estimate(float(value), *bounds[part][name], _USUAL[part])
+    (_kind(part), name): Estimate(float(value), *bounds[part][name], _USUAL[part])
     for part, values in _unpack(names, x).items()
     for name, value in zip(_LAYOUT[part], values, strict=True)
   }
 
 
-def _row(
-  part: str,
-  values: dict[str, float],
-  bounds: dict[str, tuple[float, float]],
-  sensor: str,
-  gain: float,
-  most: float,
-) -> dict[str, Any]:
-  """Returns a part's entry in the report."""
-  kind = part.split("/")[0]
-  return {
-    "kind": kind,
-    "joint": None,
-    "sensor": sensor,
-    "parameters": {
-      name: {
-        "value": value,
-        "low": bounds[name][0],
-        "high": bounds[name][1],
-        "unit": kind_of(kind).parameter(name).unit,
-      }
-      for name, value in values.items()
-    },
-    "evidence": {"gain_nats": round(gain, 4), "gain_of_all_nats": round(most, 4)},
-  }
+def _kind(part: str) -> str:
+  """Returns the kind of effect that a part of `_LAYOUT` is of."""
+  return part.split("/")[0]
 
 
 def _sensors(model: mujoco.MjModel) -> tuple[int, int] | None:
@@ -303,12 +280,13 @@ def _intervals(
 
 def _claimed(
   kind: str, kinds: Sequence[str], x: Array, bounds: dict[str, dict[str, tuple[float, float]]]
-) -> tuple[dict[str, float], bool]:
-  """Returns a kind's values, and whether one of them is surely larger than usual."""
-  values = dict(zip(_LAYOUT[kind], map(float, _unpack(kinds, x)[kind]), strict=True))
+) -> tuple[dict[str, tuple[float, float, float]], bool]:
+  """Returns a kind's values with their bounds, and whether one is surely larger than usual."""
+  fitted = zip(_LAYOUT[kind], map(float, _unpack(kinds, x)[kind]), strict=True)
+  values = {name: (value, *bounds[kind][name]) for name, value in fitted}
   nominal = float(_nominal((kind,))[0])
-  sure = False
-  for name in values:
-    low, high = bounds[kind][name]
-    sure |= low > nominal + _USUAL[kind] or high < nominal - _USUAL[kind]
-  return values, sure and values.get("delay", 0.0) >= 0.0
+  sure = any(
+    low > nominal + _USUAL[kind] or high < nominal - _USUAL[kind]
+    for _, low, high in values.values()
+  )
+  return values, sure and values.get("delay", (0.0,))[0] >= 0.0

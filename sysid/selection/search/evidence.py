@@ -150,10 +150,9 @@ def by_pattern(rows: Sequence[Array], prior: float, expected: Sequence[Array]) -
   return float(np.sign(over_error) * norm.isf(rare))
 
 
-def standardised(differences: Array, total: float | None = None, least: float = 1e-300) -> float:
-  """Returns a sum of blocks' differences over its standard error."""
-  total = float(differences.sum()) if total is None else total
-  return total / max(np.sqrt(variance(differences)), least)
+def standardised(differences: Array, least: float = 1e-300) -> float:
+  """Returns a sum of blocks' differences over its standard error, which is at least so large."""
+  return float(differences.sum()) / max(np.sqrt(variance(differences)), least)
 
 
 def variance(differences: Array) -> float:

@@ -182,7 +182,8 @@ def test_tracks_follow_a_picture_that_shifts(tmp_path):
 
 
 @pytest.mark.parametrize(("gain", "late"), [(1.4, 0.0), (0.5, 0.04), (1.0, 0.0)])
-def test_gain_is_found_beside_reference_logs(model, gain, late, reference, tmp_path):
+def test_gain_is_found_beside_reference_logs(gain, late, reference, tmp_path):
+  model = mujoco.MjModel.from_xml_string(film.MODEL.replace('name="camera"', 'name="eye"'))
   log = film.record(tmp_path / "a.mcap", Film(gain=gain, late=late, duration=SHORT), seed=1)
   seen = optical.Seen(optical.Part(), *optical.look(model, [log]), late)
   part = brightness.find(model, seen, [reference])
@@ -190,6 +191,7 @@ def test_gain_is_found_beside_reference_logs(model, gain, late, reference, tmp_p
     assert part.rows == []
   else:
     assert _named(part)["camera_gain"]["value"] == pytest.approx(gain, rel=0.03)
+    assert [row["sensor"] for row in part.rows] == ["eye"]
     assert _named(part)["camera_gain"]["low"] < gain < _named(part)["camera_gain"]["high"]
 
 
