@@ -31,8 +31,8 @@ class Arguments:
   held: tuple[Path, ...] = ()
   """Logs on which only errors are reported."""
   reference: tuple[Path, ...] = ()
-  """Logs of the same apparatus without the effect, best of the same motions: what differs is looked
-  for (one joint), or they calibrate the declared constants (several); they are how bright it is."""
+  """Logs of the same apparatus without the effect, best of the same motions: they tell each joint's
+  constants and what differs from them is looked for; they are how bright it is."""
   out: Path | None = None
   """Folder to write; with --evaluate the evaluated one if left out."""
   evaluate: Path | None = None

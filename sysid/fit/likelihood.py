@@ -388,12 +388,12 @@ def _same_commands(one: Measured, other: Measured) -> bool:
 
 
 def _correlation_time(row: Array, starts: Array) -> float:
-  """Returns the integrated autocorrelation time in samples, up to the first negative value."""
+  """Returns the integrated autocorrelation time in samples, up to where it falls below 0.05."""
   length = max(8, int(np.median(np.diff(starts)))) if len(starts) > 1 else len(row)
   centred = row - row.mean()
   power = np.abs(np.fft.rfft(centred, 2 * len(row))) ** 2
   correlation = np.fft.irfft(power)[: 2 * length]
   correlation = correlation / max(correlation[0], 1e-30)
-  negative = np.flatnonzero(correlation < 0.05)
-  end = negative[0] if len(negative) else len(correlation)
+  small = np.flatnonzero(correlation < 0.05)
+  end = small[0] if len(small) else len(correlation)
   return float(max(1.0, 1.0 + 2.0 * correlation[1:end].sum()))

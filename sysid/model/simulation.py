@@ -32,7 +32,7 @@ def is_worse(error: Mapping[str, float]) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Clocks:
-  """Latencies of one joint that are no effects: see `candidates.calibration`."""
+  """Latencies of one joint that are no effects: see `constants.constants`."""
 
   skew: float = 0.0
   """s that a position is older than its stamp."""
