@@ -41,7 +41,8 @@ def analyse(
 ) -> Identified:
   """Returns what a machine has that its model, or reference logs, have not.
 
-  A joint that does not move in the logs, or not in the reference, is not judged: see `still`.
+  A joint that does not move in the logs, or not in the reference, is not judged
+  (`Identified.still`).
 
   Args:
     model: the declared one.
