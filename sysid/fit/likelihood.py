@@ -231,7 +231,8 @@ class JointLikelihood:
       if like is None:
         return False
       other, keep = reference.plant.logs[like], reference.mask[starts[like] : ends[like]] > 0
-      likes.append((other.time[keep], residuals[:, starts[like] : ends[like]][:, keep]))
+      stamps = other.time[keep] + log.command_time[0] - other.command_time[0]
+      likes.append((stamps, residuals[:, starts[like] : ends[like]][:, keep]))
     baseline = compose(reference.plant, terms, x)[0]
     late, apart = reference._late(residuals[0]), 0.0
     if len(late) > 1 and not self.follows:
@@ -373,16 +374,16 @@ def rms_of(courses: Sequence[Array]) -> float:
 
 
 def _same_commands(one: Measured, other: Measured) -> bool:
-  """Tells whether two logs hold the same commands at the same times."""
-  end = min(one.command_time[-1], other.command_time[-1])
-  period = float(np.median(np.diff(one.command_time))) if len(one.command_time) > 1 else 1.0
-  grid = np.arange(0.0, end, period) + 0.5 * period
+  """Tells whether two logs hold the same commands, each at the same time since its first."""
+  times = [log.command_time - log.command_time[0] for log in (one, other)]
+  lengths = [float(time[-1]) for time in times]
+  period = float(np.median(np.diff(times[0]))) if len(times[0]) > 1 else 1.0
+  grid = np.arange(0.0, min(lengths), period) + 0.5 * period
   values = [
-    log.command[np.clip(np.searchsorted(log.command_time, grid) - 1, 0, None)]
-    for log in (one, other)
+    log.command[np.clip(np.searchsorted(time, grid) - 1, 0, None)]
+    for log, time in zip((one, other), times, strict=True)
   ]
   apart = np.abs(values[0] - values[1])
-  lengths = one.command_time[-1], other.command_time[-1]
   alike = abs(lengths[0] - lengths[1]) < 0.05 * max(lengths)
   return bool(alike and np.mean(apart > 1e-3 * max(np.ptp(values[0]), 1e-12)) < 0.05)
 

@@ -38,9 +38,14 @@ def takes(model: mujoco.MjModel, actuator: int) -> str:
 
 
 def command_of(log: Log, model: mujoco.MjModel, joint: str) -> Array | None:
-  """Returns a joint's commands [N] in what its actuator takes, None where a log lacks those."""
-  values = getattr(log.commands, takes(model, actuator_of(model, joint)))
-  return None if values is None else values[:, log.commands.column(joint)]
+  """Returns a joint's commands [N] in what its actuator takes, within what it takes of that; None
+  where a log lacks those."""
+  u = actuator_of(model, joint)
+  values = getattr(log.commands, takes(model, u))
+  if values is None:
+    return None
+  column: Array = values[:, log.commands.column(joint)]
+  return np.clip(column, *model.actuator_ctrlrange[u]) if model.actuator_ctrllimited[u] else column
 
 
 def mean_commands(

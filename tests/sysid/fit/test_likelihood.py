@@ -129,6 +129,24 @@ def test_only_the_very_same_commands_are_the_same(viscous):
   assert not _same_commands(sweep, slow)
 
 
+def test_a_recorder_that_starts_earlier_has_the_same_commands():
+  log, model = log_of(PENDULUM, "sweep", duration=5.0), mujoco.MjModel.from_xml_string(PENDULUM)
+  later = {
+    name: dataclasses.replace(series, stamp=series.stamp + 0.37)
+    for name, series in (("commands", log.commands), ("states", log.states))
+  }
+  before, now = (
+    JointLikelihood(JointModel(model, "joint", [one]))
+    for one in (dataclasses.replace(log, **later), log)
+  )
+  assert _same_commands(now.plant.logs[0], before.plant.logs[0])
+  wave = np.sin(3.0 * (before.plant.logs[0].time - 0.37))
+  assert now.expect(before, (wave * before.gain[0])[None])
+  expected = now.expectation.under(now.plant.declared)[0]
+  inner = slice(20, -20)
+  assert expected[inner] == pytest.approx(np.sin(3.0 * now.plant.logs[0].time)[inner], abs=1e-3)
+
+
 def test_what_a_reference_leaves_cancels_beside_the_same_commands():
   effect = [Effect("cogging", "joint", {"amplitude": 0.1, "periods": 9.0, "phase": 0.3})]
   _, before = joint_of(effects=effect)

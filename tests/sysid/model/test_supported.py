@@ -35,8 +35,15 @@ def test_what_the_simulation_of_a_joint_leaves_out_is_refused(old, new, found):
     check_supported(mujoco.MjModel.from_xml_string(changed), ["joint"])
 
 
-def test_a_joints_limit_on_its_actuator_is_the_actuators_limit():
-  limited = PENDULUM.replace('<joint name="joint"', '<joint name="joint" actuatorfrcrange="-2 1"')
+@pytest.mark.parametrize(
+  ("old", "new"),
+  [
+    ('<joint name="joint"', '<joint name="joint" actuatorfrcrange="-2 1"'),
+    (SERVO, f'{SERVO} ctrlrange="-0.3 0.5"'),
+  ],
+)
+def test_ranges_of_force_and_command_hold_at_one_joint_as_in_mujoco(old, new):
+  limited = PENDULUM.replace(old, new)
   model = mujoco.MjModel.from_xml_string(limited)
   log = log_of(limited, "steps", duration=4.0, rounding=0.0)
   plant = JointModel(model, "joint", [log])
