@@ -26,7 +26,7 @@ class Arguments:
   """"splat": 3D Gaussians (.ply); "mjcf": a folder for MuJoCo; "usd" and "glb": one file;
   "nerfstudio": pictures and transforms.json; "heightfield": PNG and MJCF hfield."""
   out: Path = tyro.MISSING
-  """File or folder to write; an older one is replaced."""
+  """File or folder to write; an earlier export of the kind is replaced."""
   robot: Literal["op3"] | None = None
   """Robot that stands in an MJCF scene."""
   splat_seconds: float | None = None

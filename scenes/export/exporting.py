@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, get_args
 
 from nerf2real.core import files
 from nerf2real.core.progress import Progress, no_progress, part
-from nerf2real.scenes.bundle import Bundle
+from nerf2real.scenes.bundle import STAGES, Bundle
 from nerf2real.scenes.export import gltf, heightfield, mjcf, nerfstudio, texture, usd, views
 from nerf2real.scenes.geometry import collision
 from nerf2real.scenes.geometry import mesh as meshes
@@ -101,6 +101,36 @@ _EXPORTERS: dict[str, Callable[[Order], str]] = {
   "heightfield": _heightfield,
 }
 _SUFFIXES = {"splat": (".ply",), "glb": (".glb",), "usd": usd.SUFFIXES}  # others are folders
+_MARKS = {  # a file that a folder of the kind has, and other programs' folders do not
+  "mjcf": "assets/visual.obj",
+  "nerfstudio": nerfstudio.POINTS,
+  "heightfield": heightfield.PICTURE,
+}
+
+
+def _check_replaced(kind: Kind, order: Order) -> None:
+  """Raises ValueError where --out has something else than an earlier export of the kind."""
+  out, bundle, mark = order.out.resolve(), order.bundle.folder.resolve(), _MARKS.get(kind)
+  if out == bundle or out in bundle.parents:
+    raise ValueError(
+      f"--out {order.out} is or holds the scene bundle {order.bundle.folder}, which the export "
+      "would replace: name a folder or file of its own."
+    )
+  if STAGES in out.parts or out == order.bundle.visual_path.resolve():
+    raise ValueError(
+      f"--out {order.out} is a part of a scene bundle, which the export would replace: name "
+      "another one."
+    )
+  if mark is None:
+    if out.is_dir():
+      raise ValueError(f"--out {order.out} is a folder, expected a file for {kind}: name another.")
+  elif out.exists() and not out.is_dir():
+    raise ValueError(f"--out {order.out} is a file, expected a folder for {kind}: name another.")
+  elif out.is_dir() and not (out / mark).is_file() and any(out.iterdir()):
+    raise ValueError(
+      f"--out {order.out} holds files and no {mark}: expected a new or empty folder, or an earlier "
+      f"{kind} export, which is replaced; name another one."
+    )
 
 
 def export(kind: Kind, order: Order) -> str:
@@ -111,7 +141,8 @@ def export(kind: Kind, order: Order) -> str:
 
   Raises:
     OSError: The file or folder cannot be written.
-    ValueError: The name does not fit the kind, or the bundle lacks what the kind needs.
+    ValueError: The name does not fit the kind, what is there under it is no earlier export of the
+      kind, or the bundle lacks what the kind needs.
   """
   suffixes = _SUFFIXES.get(kind, ("",))
   if order.out.suffix not in suffixes:
@@ -121,4 +152,5 @@ def export(kind: Kind, order: Order) -> str:
     raise ValueError(f"A robot can be added to mjcf only, found {kind}: leave --robot out.")
   order.out.parent.mkdir(parents=True, exist_ok=True)
   files.check_writable(order.out)
+  _check_replaced(kind, order)
   return _EXPORTERS[kind](order)

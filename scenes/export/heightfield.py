@@ -14,6 +14,7 @@ import numpy as np
 from nerf2real.core import files
 from nerf2real.scenes.geometry import collision, convex
 
+PICTURE = "heightfield.png"
 _BASE = 0.1  # thickness of the field below its lowest point [m]
 
 
@@ -72,14 +73,14 @@ def write(
   spec = mujoco.MjSpec()
   spec.modelname = name
   spec.stat.center, spec.stat.extent = [*center, 0.5], float(half.max())
-  spec.add_hfield(name="scene", file="heightfield.png", size=[*half, highest, _BASE])
+  spec.add_hfield(name="scene", file=PICTURE, size=[*half, highest, _BASE])
   spec.worldbody.add_light(pos=[*center, 3.0], dir=[0, 0, -1])
   spec.worldbody.add_geom(
     name="scene", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="scene", pos=[*center, 0]
   )
   with files.atomic_folder(folder) as partial:
     grey = np.round(255 * height[::-1] / highest).astype(np.uint8)
-    cv2.imwrite(str(partial / "heightfield.png"), grey)
+    cv2.imwrite(str(partial / PICTURE), grey)
     spec.modelfiledir = str(partial)
     spec.compile()
     (partial / "scene.xml").write_text(spec.to_xml(), encoding="utf-8")

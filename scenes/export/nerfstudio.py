@@ -15,7 +15,7 @@ from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views
 from nerf2real.scenes.poses import localisation
 
-_POINTS = "sparse_points.ply"
+POINTS = "sparse_points.ply"  # the localised points
 
 
 def transforms(camera: Camera, world_from_camera: np.ndarray, names: list[str]) -> dict:
@@ -42,7 +42,7 @@ def transforms(camera: Camera, world_from_camera: np.ndarray, names: list[str]) 
     "k2": camera.k2,
     "p1": camera.p1,
     "p2": camera.p2,
-    "ply_file_path": _POINTS,
+    "ply_file_path": POINTS,
     "frames": [
       {"file_path": name, "transform_matrix": pose.tolist()}
       for name, pose in zip(names, poses, strict=True)
@@ -85,7 +85,7 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
     cloud = trimesh.PointCloud(
       bundle.world_from_unit.apply(localised.points), localised.point_colors
     )
-    cloud.export(str(partial / _POINTS))
+    cloud.export(str(partial / POINTS))
     content = transforms(camera, poses, [f"images/{name}" for name in names])
     (partial / "transforms.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
   return "keyframes" if found else "rendered from the field"

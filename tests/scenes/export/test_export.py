@@ -10,9 +10,10 @@ import trimesh
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.export import exporting, gltf, heightfield, mjcf, nerfstudio, texture, usd
-from nerf2real.scenes.geometry import convex
+from nerf2real.scenes.geometry import collision, convex
 from nerf2real.scenes.geometry.mesh import Mesh
 from tests.scenes import furnished_room
 
@@ -200,3 +201,43 @@ def test_where_nothing_can_be_written_is_refused_before_the_work(tmp_path):
   order = exporting.Order(None, tmp_path / f"{'x' * 300}.glb")
   with pytest.raises(OSError, match="too long"):
     exporting.export("glb", order)
+
+
+@pytest.mark.parametrize("kind", ["mjcf", "nerfstudio", "heightfield"])
+def test_a_folder_that_is_no_earlier_export_stays(kind, tmp_path):
+  room = tmp_path / "out" / "room"
+  (room / "collision").mkdir(parents=True)
+  (room / "scene.json").write_text("{}")
+  (tmp_path / "begun" / ".stages").mkdir(parents=True)
+  (tmp_path / "model").mkdir()
+  (tmp_path / "model" / "scene.xml").write_text("<mujoco/>")
+  (tmp_path / "plain").write_text("")
+  bundle = Bundle(room, {})
+  for taken in (room, room.parent, room / "collision", tmp_path / "model", tmp_path / "begun"):
+    (taken / "mine").write_text("")
+    with pytest.raises(ValueError, match="^--out .*name .*\\.$"):
+      exporting.export(kind, exporting.Order(bundle, taken))
+    assert (taken / "mine").is_file()
+  with pytest.raises(ValueError, match="is a file"):
+    exporting.export(kind, exporting.Order(bundle, tmp_path / "plain"))
+
+
+def test_an_earlier_export_is_replaced(parts, tmp_path):
+  out = tmp_path / "heights"
+  room = tmp_path / "room"
+  collision.write_parts(parts, room / "collision")
+  extent = {name: corner.tolist() for name, corner in zip(("lower", "upper"), EXTENT, strict=True)}
+  bundle = Bundle(room, {"extent": extent})
+  for _ in range(2):
+    exporting.export("heightfield", exporting.Order(bundle, out))
+    assert (out / "scene.xml").is_file()
+
+
+def test_a_file_of_the_bundle_or_a_folder_is_not_replaced_by_a_file(tmp_path):
+  bundle = Bundle(tmp_path / "room", {})
+  bundle.folder.mkdir()
+  (tmp_path / "folder.glb").mkdir()
+  with pytest.raises(ValueError, match="is a part of a scene bundle"):
+    exporting.export("glb", exporting.Order(bundle, bundle.visual_path))
+  with pytest.raises(ValueError, match="is a folder"):
+    exporting.export("glb", exporting.Order(bundle, tmp_path / "folder.glb"))
