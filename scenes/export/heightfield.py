@@ -7,11 +7,11 @@ matter that begins above a clearance is left out.
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import mujoco
 import numpy as np
 
 from nerf2real.core import files
+from nerf2real.core.picture_files import write_picture
 from nerf2real.scenes.geometry import collision, convex
 
 PICTURE = "heightfield.png"
@@ -80,7 +80,7 @@ def write(
   )
   with files.atomic_folder(folder) as partial:
     grey = np.round(255 * height[::-1] / highest).astype(np.uint8)
-    cv2.imwrite(str(partial / PICTURE), grey)
+    write_picture(partial / PICTURE, grey)
     spec.modelfiledir = str(partial)
     spec.compile()
     (partial / "scene.xml").write_text(spec.to_xml(), encoding="utf-8")

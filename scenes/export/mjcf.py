@@ -8,12 +8,12 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import mujoco
 import numpy as np
 
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
+from nerf2real.core.picture_files import write_picture
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV, yaw_matrix, yaw_quaternion
 from nerf2real.scenes.export.texture import TexturedMesh
 from nerf2real.scenes.geometry import collision, convex
@@ -165,7 +165,7 @@ def write(
         mesh.uservert, mesh.userface, mesh.file = [], [], f"{mesh.name}.obj"
     if visual is not None:
       write_obj(assets / "visual.obj", visual)
-      cv2.imwrite(str(assets / "visual.png"), visual.texture[..., ::-1])
+      write_picture(assets / "visual.png", visual.texture[..., ::-1])
       add_visual(spec, mesh="visual.obj", texture="visual.png")
     spec.compiler.meshdir = spec.compiler.texturedir = "assets"
     spec.modelfiledir = str(partial)

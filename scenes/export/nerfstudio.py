@@ -3,12 +3,12 @@
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
+from nerf2real.core.picture_files import write_picture
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.bundle import Bundle
@@ -76,11 +76,11 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
       target = partial / "images" / name
       if renderer is not None:
         picture = renderer.render(camera, unit_from_world.apply_pose(pose))[0][..., ::-1]
-        cv2.imwrite(str(target), picture)
+        write_picture(target, picture)
       elif localised.shutter is None:
         target.write_bytes((keyframes / name).read_bytes())
       else:
-        cv2.imwrite(str(target), localised.read_picture(keyframes, index))
+        write_picture(target, localised.read_picture(keyframes, index))
       progress((index + 1) / len(names), f"picture {index + 1} of {len(names)}")
     cloud = trimesh.PointCloud(
       bundle.world_from_unit.apply(localised.points), localised.point_colors
