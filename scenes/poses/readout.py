@@ -8,6 +8,7 @@ neighbouring keyframes in place of a pose a frame. Shapes: N pictures, O observa
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -22,7 +23,6 @@ from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.mapping import registered
 from nerf2real.scenes.poses.shutter import Shutter, instants
 
-_LONGEST = 0.034  # s: a frame at 30 Hz; no video reads a frame for longer than it lasts
 _PRECISION = 0.0005  # s of the readout, chosen: a twentieth of a pixel in a fast pan
 _ROUNDS = 6  # of the readout and adjustments at most, chosen: three or four suffice
 _SMALL = 0.001  # s: unit of the readout in its derivatives
@@ -59,12 +59,25 @@ def _local_points(
   return local
 
 
+def frame_period(times: Mapping[str, float]) -> float | None:
+  """Mean time from one of a film's frames to the next [s]; None where times do not strictly grow.
+
+  Args:
+    times: When each keyframe was taken [s]; names end in the frames' numbers.
+  """
+  frames = sorted((int(Path(name).stem.split("_")[-1]), time) for name, time in times.items())
+  numbers, when = np.array(frames).reshape(-1, 2).T
+  if len(frames) < 2 or np.diff(when).min() <= 0:
+    return None
+  return float((when[-1] - when[0]) / (numbers[-1] - numbers[0]))
+
+
 def motion(model: pycolmap.Reconstruction, times: Mapping[str, float], readout: float) -> Shutter:
   """Derives the motion during the readout from the poses of neighbouring keyframes.
 
   Args:
     model: Localised pictures.
-    times: When each was taken [s].
+    times: When each was taken [s]; they strictly grow.
     readout: From the first line to the last [s].
   """
   images = registered(model)
@@ -175,6 +188,7 @@ def take_out(
   model: pycolmap.Reconstruction,
   times: Mapping[str, float],
   *,
+  longest: float,
   principal: bool,
   distortion: bool,
   report: Progress = no_progress,
@@ -183,7 +197,8 @@ def take_out(
 
   Args:
     model: Adjusted as if all lines were read at once.
-    times: When each picture was taken [s].
+    times: When each picture was taken [s]; they strictly grow.
+    longest: Of the readout, the period of the film's frames [s]: none is read for longer.
     principal: Whether the lens's principal point is free in adjustments.
     distortion: Whether its distortion is.
     report: Called with the fraction done and a text.
@@ -196,7 +211,7 @@ def take_out(
     report(done / _ROUNDS, f"rolling shutter of {1e3 * readout:.1f} ms")
     before = readout
     readout += _change(result, measured, times, lens)
-    readout = float(np.clip(readout, -_LONGEST, _LONGEST))
+    readout = float(np.clip(readout, -longest, longest))
     _move_observations(result, measured, motion(result, times, readout))
     mapping.adjust(result, principal=principal, distortion=distortion)
     if abs(readout - before) < _PRECISION:

@@ -56,7 +56,8 @@ def localise(
     out_folder: Receives `sfm/` and `work/`.
     settings: How.
     known: Poses that came with the pictures, in the order of their sorted names; they are kept.
-    times: When each picture of a film was taken [s]: its rolling shutter is taken out.
+    times: When each picture of a film was taken [s]: its rolling shutter is taken out. Names end in
+      the frames' numbers.
     turned: Pictures that were turned counter-clockwise by a quarter.
     progress: Called with the fraction done and a text.
 
@@ -184,13 +185,21 @@ def _map(
 
 
 def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -> Mapped:
-  """Takes the rolling shutter out of a model; the model itself where that spoils the lens."""
+  """Takes the rolling shutter out of a model.
+
+  The model itself where that spoils the lens, and of a film without times, which tells no speed.
+  """
+  period = readout.frame_period(times)
+  if period is None:
+    words = f"{mapped.strategy}; rolling shutter not taken out, because the film has no times"
+    return dataclasses.replace(mapped, strategy=words)
   lens = mapped.lens
   assert lens is not None  # for the type checker: only known poses have none
   steps.begin("shutter")
   model, found = readout.take_out(
     mapped.model,
     times,
+    longest=period,
     principal=lens.principal,
     distortion=lens.distortion,
     report=steps.report,

@@ -10,7 +10,7 @@ from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.readout import _last_unknown, motion, take_out
+from nerf2real.scenes.poses.readout import _last_unknown, frame_period, motion, take_out
 
 CAMERA = Camera(width=640, height=360, fx=500.0, fy=500.0, cx=320.0, cy=180.0)
 PICTURES, PERIOD = 16, 0.2
@@ -54,8 +54,9 @@ def filmed(readout, *, noise=0.0, seed=0):
   return model, times
 
 
-FIXED = {"principal": False, "distortion": False}
-ADJUST = functools.partial(mapping.adjust, **FIXED)
+LENS = {"principal": False, "distortion": False}
+FIXED = {**LENS, "longest": 0.034}
+ADJUST = functools.partial(mapping.adjust, **LENS)
 
 
 @pytest.mark.parametrize("readout", [0.02, -0.012, 0.0])
@@ -69,6 +70,21 @@ def test_the_readout_time_is_found(readout):
   corrected.update_point_3d_errors()
   assert corrected.compute_mean_reprojection_error() < before + 0.01
   assert corrected.compute_mean_reprojection_error() < 0.45  # of noise 0.3 in two directions
+
+
+def test_the_readout_is_at_most_a_frame_of_the_film():
+  model, times = filmed(0.036)
+  ADJUST(model)
+  for longest, expected in ((0.02, 0.02), (1 / 24, 0.036)):
+    found = take_out(model, times, longest=longest, **LENS)[1].readout
+    assert found == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_period_is_that_of_the_films_frames():
+  times = {f"frame_{number:06d}.png": 0.5 + number / 24 for number in (9, 3, 60)}
+  assert frame_period(times) == pytest.approx(1 / 24)
+  assert frame_period(dict.fromkeys(times, 0.0)) is None
+  assert frame_period({"frame_000003.png": 0.1}) is None
 
 
 def test_keyframes_far_apart_say_nothing_of_the_motion():

@@ -318,9 +318,19 @@ def test_a_picture_that_is_weak_without_the_shutter_has_no_place(corner, monkeyp
   )
   monkeypatch.setattr(readout, "take_out", lambda *args, **options: (model, motion))
   mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
-  found = structure_from_motion._without_shutter(mapped, {}, Steps(no_progress))
+  times = {image.name: float(k) for k, image in enumerate(images)}
+  found = structure_from_motion._without_shutter(mapped, times, Steps(no_progress))
   assert found.model.num_reg_images() == count - 1
   assert found.shutter.rotations[:, 0].tolist() == [k for k in range(count) if k != 3]
+
+
+def test_a_film_without_times_keeps_its_shutter(corner):
+  model = pycolmap.Reconstruction(str(corner[0] / "out" / "sfm"))
+  mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
+  times = {image.name: 0.0 for image in mapping.registered(model)}
+  found = structure_from_motion._without_shutter(mapped, times, Steps(no_progress))
+  assert found.model is model and found.shutter is None
+  assert found.strategy == "test; rolling shutter not taken out, because the film has no times"
 
 
 def test_figures_are_plain_json(corner):
