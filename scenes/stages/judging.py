@@ -116,5 +116,6 @@ def baseline(cache: Stages, pictures: PosedPictures) -> Made[dict[str, float]]:
     write_json(folder / "figures.json", {"baseline_psnr_db": float(np.mean(quality))})
 
   inputs = {"poses": poses.stamp}
-  stage = cache.run("baseline", write, settings=pictures.held_out_every, inputs=inputs)
+  everything = {"held_out_every": pictures.held_out_every, "train_width": pictures.width}
+  stage = cache.run("baseline", write, settings=everything, inputs=inputs)
   return Made(json.loads((stage.folder / "figures.json").read_text()), stage)
