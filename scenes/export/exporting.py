@@ -64,6 +64,7 @@ def _usd(order: Order) -> str:
     order.out,
     visual=meshes.load_glb(bundle.visual_path),
     parts=collision.read_parts(bundle.folder / "collision"),
+    extent=bundle.extent,
     camera=camera,
     world_from_camera=world_from_camera,
   )

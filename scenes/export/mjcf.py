@@ -26,6 +26,16 @@ _SENSOR_WIDTH = 0.0048  # of the camera [m]: 1/3 inch; chosen: pictures depend o
 _FLOOR_MARGIN = 1.0  # of the plane around the scene's extent [m]
 
 
+def floor_of(extent: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+  """Returns middle and half size [2] each [m] of the floor below a scene with a margin around it.
+
+  Args:
+    extent: Lower and upper corner of the scene [3] each [m].
+  """
+  lower, upper = extent
+  return (lower + upper)[:2] / 2, (upper - lower)[:2] / 2 + _FLOOR_MARGIN
+
+
 def scene_spec(
   parts: Sequence[convex.Part], *, extent: tuple[np.ndarray, np.ndarray], name: str
 ) -> mujoco.MjSpec:
@@ -39,9 +49,9 @@ def scene_spec(
   spec = collision.spec(parts, floor=False)
   spec.modelname = name
   spec.compiler.degree = False
-  lower, upper = extent
-  center, half = (lower + upper)[:2] / 2, (upper - lower)[:2] / 2
-  spec.stat.center, spec.stat.extent = [*center, 0.5], float(half.max())
+  center, half = floor_of(extent)
+  spec.stat.center = [*center, 0.5]
+  spec.stat.extent = float((extent[1] - extent[0])[:2].max() / 2)
   spec.visual.headlight.ambient = [0.9, 0.9, 0.9]  # the texture has the room's light already
   spec.visual.headlight.diffuse = [0.1, 0.1, 0.1]
   spec.visual.headlight.specular = [0, 0, 0]
@@ -50,7 +60,7 @@ def scene_spec(
     name="floor",
     type=mujoco.mjtGeom.mjGEOM_PLANE,
     pos=[*center, 0],
-    size=[*(half + _FLOOR_MARGIN), 0.05],
+    size=[*half, 0.05],
     group=COLLISION_GROUP,
   )
   for geom in spec.geoms:

@@ -13,11 +13,11 @@ import trimesh
 from nerf2real.core import files
 from nerf2real.core.cameras import Camera
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.scenes.export.mjcf import floor_of
 from nerf2real.scenes.geometry import convex
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 _SENSOR_WIDTH = 20.955  # USD's default horizontal aperture [tenths of a world unit]
-_FLOOR_HALF_SIZE = 10.0  # of the floor's square [m]
 
 
 def _library() -> Any:
@@ -78,6 +78,7 @@ def write(
   *,
   visual: trimesh.Trimesh,
   parts: Sequence[convex.Part],
+  extent: tuple[np.ndarray, np.ndarray],
   camera: Camera,
   world_from_camera: np.ndarray,
 ) -> None:
@@ -87,6 +88,7 @@ def write(
     path: Ends in .usd, .usda or .usdc.
     visual: The surface with vertex colours, world frame.
     parts: Convex parts, world frame.
+    extent: Lower and upper corner of the scene [3] each [m].
     camera: The calibrated camera; USD has no distortion.
     world_from_camera: Its pose [4, 4], OpenCV axes.
 
@@ -112,8 +114,10 @@ def write(
       _add_collider(stage, f"/World/collision/part_{number:03d}", part)
     floor = pxr.UsdGeom.Plane.Define(stage, "/World/floor")
     floor.CreateAxisAttr(pxr.UsdGeom.Tokens.z)
-    floor.CreateWidthAttr(2 * _FLOOR_HALF_SIZE)
-    floor.CreateLengthAttr(2 * _FLOOR_HALF_SIZE)
+    center, half = floor_of(extent)
+    floor.CreateWidthAttr(float(2 * half[0]))
+    floor.CreateLengthAttr(float(2 * half[1]))
+    floor.AddTranslateOp().Set(pxr.Gf.Vec3d(*center.tolist(), 0.0))
     floor.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
     pxr.UsdPhysics.CollisionAPI.Apply(floor.GetPrim())
     _add_camera(stage, "/World/camera", camera, world_from_camera)

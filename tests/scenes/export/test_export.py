@@ -154,7 +154,15 @@ def test_pxr_opens_the_usd(parts, tmp_path):
 
   box = trimesh.creation.box((2.0, 1.0, 0.5))
   box.visual.vertex_colors = np.tile([255, 0, 51, 255], (8, 1))
-  usd.write(tmp_path / "room.usdc", visual=box, parts=parts, camera=LENS, world_from_camera=POSE)
+  far = EXTENT[0] + [20, 0, 0], EXTENT[1] + [20, 0, 0]
+  usd.write(
+    tmp_path / "room.usdc",
+    visual=box,
+    parts=parts,
+    extent=far,
+    camera=LENS,
+    world_from_camera=POSE,
+  )
   stage = Usd.Stage.Open(str(tmp_path / "room.usdc"))
   assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
   shown = UsdGeom.Mesh(stage.GetPrimAtPath("/World/visual"))
@@ -165,6 +173,9 @@ def test_pxr_opens_the_usd(parts, tmp_path):
   assert len(colliders) == len(parts)
   hull = UsdGeom.Mesh(colliders[0])
   np.testing.assert_allclose(np.array(hull.GetPointsAttr().Get()), parts[0].vertices, atol=1e-6)
+  floor = UsdGeom.Plane(stage.GetPrimAtPath("/World/floor"))
+  assert (floor.GetWidthAttr().Get(), floor.GetLengthAttr().Get()) == (7.0, 6.0)
+  assert tuple(floor.GetLocalTransformation().ExtractTranslation()) == (20.0, 0.0, 0.0)
   eye = UsdGeom.Camera(stage.GetPrimAtPath("/World/camera")).GetCamera(Usd.TimeCode.Default())
   np.testing.assert_allclose(eye.transform.ExtractTranslation(), POSE[:3, 3], atol=1e-6)
   # a point of the room falls on the pixel where the calibrated pinhole has it
