@@ -55,7 +55,9 @@ def localise(
     images_folder: Keyframes of one camera.
     out_folder: Receives `sfm/` and `work/`.
     settings: How.
-    known: Poses that came with the pictures, in the order of their sorted names; they are kept.
+    known: Poses that came with the pictures, in the order of their sorted names. Metric ones are
+      adjusted to the pictures where `settings.refine_known` is set; all others are kept, and points
+      are triangulated with them.
     times: When each picture of a film was taken [s]: its rolling shutter is taken out. Names end in
       the frames' numbers.
     turned: Pictures that were turned counter-clockwise by a quarter.
@@ -82,19 +84,26 @@ def localise(
     )
   if refined is not None:
     result, steps = refined, few
-  elif known is not None and len(known.points):
-    model = mapping.model_from_poses(known, names)
-    for point, error in zip(model.points3D.values(), known.point_errors, strict=True):
-      point.error = error
-    result = Mapped(model, f"poses and points of the {known.kind} source", ())
+  elif known is not None and known.is_metric:
+    result = _as_it_came(known, names)
   else:
     database = prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
     result = _map(database, images_folder, names, settings, known, steps, times)
     if times is not None and known is None:
       result = _without_shutter(result, times, steps)
+    if known is not None and not result.model.num_points3D():
+      result = _as_it_came(known, names)
   localisation = _describe(result, len(names), known, images_folder, turned, steps)
   save(result.model, localisation, out_folder / _MODEL_FOLDER)
   return localisation
+
+
+def _as_it_came(known: KnownPoses, names: list[str]) -> Mapped:
+  """The poses and points that came with the pictures; no picture sees a point."""
+  model = mapping.model_from_poses(known, names)
+  for point, error in zip(model.points3D.values(), known.point_errors, strict=True):
+    point.error = error
+  return Mapped(model, f"poses and points of the {known.kind} source", ())
 
 
 def _map(
@@ -297,7 +306,8 @@ def _describe(
   """Moves the model into the unit frame (in place) and gathers the figures."""
   steps.end()
   model = result.model
-  if known is None or not len(known.points):
+  seen = any(point.track.length() for point in model.points3D.values())
+  if seen and (known is None or not known.is_metric):  # else points came with errors and colours
     model.update_point_3d_errors()
     model.extract_colors_for_all_images(str(images_folder))
   images = mapping.registered(model)
