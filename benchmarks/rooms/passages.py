@@ -111,7 +111,8 @@ def main(settings: Settings) -> None:
   depth = views.capture_views(
     bundle, views.renderer_of(bundle), width=SceneSettings().depth_width, count=settings.views
   )
-  grid = collision.solid_grid(depth, lower=lower, upper=upper)
+  threshold = bundle.scene["alignment"]["floor_threshold"]
+  grid = collision.solid_grid(depth, lower=lower, upper=upper, floor_threshold=threshold)
   fine = floor_plan.FreeSpaceSettings(resolution=_FINE)
   shape = tuple(np.ceil((upper[:2] - lower[:2]) / _FINE).astype(int)[::-1])
   figures: dict[str, dict[str, harness.Value]] = {}

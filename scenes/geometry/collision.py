@@ -27,8 +27,6 @@ class CollisionSettings:
   """Matter is at least this thick behind a seen surface."""
   top: float = 1.5
   """Nothing above is needed: three times the height of the robot."""
-  floor_threshold: float = 0.04
-  """Matter below counts as floor."""
   smoothing: float = 1.3
   """Standard deviation of the blur over voxels that takes off depth noise."""
   min_component: float = 0.15
@@ -85,6 +83,7 @@ def solid_grid(
   *,
   lower: np.ndarray,
   upper: np.ndarray,
+  floor_threshold: float,
   settings: CollisionSettings | None = None,
   progress: Progress = no_progress,
 ) -> fusion.Grid:
@@ -94,6 +93,7 @@ def solid_grid(
     views: Depth pictures in the world frame (metres, floor at z = 0).
     lower: Lower corner of the extent [3].
     upper: Upper corner of the extent [3].
+    floor_threshold: Matter below counts as floor [m].
     settings: Settings.
     progress: Called with the fraction done and a text.
   """
@@ -109,7 +109,7 @@ def solid_grid(
     progress=progress,
   )
   grid = thin.with_thin_things(smooth(grid, deviation=settings.smoothing), views)
-  grid = remove_floor(grid, threshold=settings.floor_threshold)
+  grid = remove_floor(grid, threshold=floor_threshold)
   return meshes.drop_floaters(grid, min_component=settings.min_component)
 
 

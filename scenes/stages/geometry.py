@@ -105,15 +105,17 @@ def contact(
   place = world.value
 
   def write(folder: Path, progress: Progress) -> None:
-    shape = dataclasses.replace(collision_settings, floor_threshold=place.floor_threshold)
     grid = collision.solid_grid(
       depth.value,
       lower=place.extent_lower,
       upper=place.extent_upper,
-      settings=shape,
+      floor_threshold=place.floor_threshold,
+      settings=collision_settings,
       progress=part(progress, 0.0, 0.2),
     )
-    parts = decomposition.decompose(grid, settings=shape.parts, progress=part(progress, 0.2, 0.8))
+    parts = decomposition.decompose(
+      grid, settings=collision_settings.parts, progress=part(progress, 0.2, 0.8)
+    )
     collision.write_parts(parts, folder / "collision")
     progress(0.8, "free space")
     space = floor_plan.floor_plan(

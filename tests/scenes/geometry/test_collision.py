@@ -24,7 +24,9 @@ def views():
 
 @pytest.fixture(scope="module")
 def grid(views):
-  return collision.solid_grid(views, lower=LOWER, upper=UPPER, settings=SETTINGS)
+  return collision.solid_grid(
+    views, lower=LOWER, upper=UPPER, floor_threshold=0.04, settings=SETTINGS
+  )
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +132,9 @@ def test_free_space_of_the_room(parts, grid):
 
 
 def test_floor_is_taken_out_and_matter_stands_on_the_ground(views):
-  grid = collision.solid_grid(views, lower=LOWER, upper=UPPER, settings=SETTINGS)
+  grid = collision.solid_grid(
+    views, lower=LOWER, upper=UPPER, floor_threshold=0.04, settings=SETTINGS
+  )
   column = grid.solid[int((0.0 - LOWER[0]) / 0.04), int((0.0 - LOWER[1]) / 0.04)]
   assert not column[:20].any()  # bare floor
   i, j = (

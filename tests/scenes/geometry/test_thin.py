@@ -81,7 +81,7 @@ def test_a_pole_is_matter_all_along_and_nothing_else_is():
 
 def test_it_stands_among_what_collides():
   views = _views(15)
-  grid = collision.solid_grid(views, lower=LOWER, upper=UPPER)
+  grid = collision.solid_grid(views, lower=LOWER, upper=UPPER, floor_threshold=0.04)
   heights = _heights(grid, grid.solid)
   assert heights.min() < 0.13
   assert heights.max() > TOP - 0.1
