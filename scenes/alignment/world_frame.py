@@ -90,11 +90,6 @@ class Alignment:
   """Where a marker lies in the world: what places on the map are measured from in the room."""
   warnings: tuple[str, ...] = ()
 
-  def tilt_deg(self, true_up: np.ndarray) -> float:
-    """Angle between the world's z axis and a true up direction [3] of the unit frame."""
-    up = self.world_from_unit.rotation @ (true_up / np.linalg.norm(true_up))
-    return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
-
 
 def align(
   evidence: Evidence,

@@ -51,6 +51,12 @@ def marker(transform, spread=0.004):
   )
 
 
+def tilt_deg(found, transform):
+  """Angle between the world's z axis and the true up direction."""
+  up = found.world_from_unit.rotation @ transform.rotation @ [0, 0, 1]
+  return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
+
+
 def test_marker_floor_walls_and_extent(room):
   transform = unit_frame()
   found = solve(room, transform, marker=marker(transform))
@@ -59,7 +65,7 @@ def test_marker_floor_walls_and_extent(room):
   )  # world <- true metric frame: yaw multiple of 90 degrees
   assert found.scale_source == "marker" and not found.warnings
   assert total.scale == pytest.approx(1, rel=1e-9)
-  assert found.tilt_deg(transform.rotation @ [0, 0, 1]) < 0.15
+  assert tilt_deg(found, transform) < 0.15
   assert abs(total.translation[2]) < 0.01
   angle = np.degrees(np.arctan2(total.rotation[1, 0], total.rotation[0, 0]))
   assert abs((angle + 45) % 90 - 45) < 0.3
@@ -144,7 +150,7 @@ def test_sparse_points_alone_suffice(room):
   found = world_frame.align(evidence)
   total = found.world_from_unit @ transform
   assert found.yaw_source == "points"
-  assert found.tilt_deg(transform.rotation @ [0, 0, 1]) < 0.5
+  assert tilt_deg(found, transform) < 0.5
   angle = np.degrees(np.arctan2(total.rotation[1, 0], total.rotation[0, 0]))
   assert abs((angle + 45) % 90 - 45) < 1.5
 
@@ -161,7 +167,7 @@ def test_a_foggy_field_does_not_lift_the_floor(room):
   found = world_frame.align(evidence)
   assert "blurred" in found.warnings[0]
   assert abs((found.world_from_unit @ transform).translation[2]) < 0.03
-  assert found.tilt_deg(transform.rotation @ [0, 0, 1]) < 0.5
+  assert tilt_deg(found, transform) < 0.5
 
 
 def test_unknown_scale_is_loud_and_a_known_height_is_used(room):
@@ -202,7 +208,7 @@ def test_every_choice_can_be_overridden(room, tmp_path):
   up = solve(
     room, transform, override=overrides.Overrides(up=transform.rotation @ [0, 0, 1.0], scale=2.5)
   )
-  assert up.scale_source == "manual" and up.tilt_deg(transform.rotation @ [0, 0, 1.0]) < 1e-4
+  assert up.scale_source == "manual" and tilt_deg(up, transform) < 1e-4
   assert abs((up.world_from_unit @ transform).translation[2]) < 0.01
 
 
