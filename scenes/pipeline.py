@@ -35,7 +35,8 @@ def make_scene(
   """Makes a scene bundle from a capture.
 
   Args:
-    source: A video, a folder of pictures, a COLMAP model or a transforms.json.
+    source: A video, a folder of pictures, a COLMAP model, a transforms.json or an RGB-D sequence
+      with poses.
     out: The bundle's folder; stages are cached in it.
     settings: Settings of all stages.
     override: File that fixes what would be found automatically, see `scenes.alignment.overrides`.

@@ -69,7 +69,7 @@ class Alignment:
   extent_upper: np.ndarray
   """[3] m, world frame."""
   scale_source: str
-  """"marker", "points", "camera_height", "manual" or "unknown"."""
+  """"marker", "depth_sensor", "points", "camera_height", "manual" or "unknown"."""
   scale_spread: float | None
   """Relative standard deviation, where it is known."""
   floor_source: str
