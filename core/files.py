@@ -11,7 +11,7 @@ import hashlib
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 _REASONS = {
@@ -160,8 +160,12 @@ def copy_atomically(source: Path, target: Path) -> None:
       shutil.copyfile(source, partial)
 
 
-def hash_path(path: str | Path) -> str:
+def hash_path(path: str | Path, *, named: Iterable[Path] = ()) -> str:
   """Returns the SHA-256 of a file's content, or of all files below a folder with their names.
+
+  Args:
+    path: The file or folder. What is hidden below it (a name that begins with ".") does not count.
+    named: Files that it names, which count with their names where they do not lie below it.
 
   Raises:
     FileNotFoundError: There is neither a file nor a folder.
@@ -170,10 +174,13 @@ def hash_path(path: str | Path) -> str:
   if not path.exists():
     raise FileNotFoundError(f"{path} does not exist; give an existing file or folder.")
   digest = hashlib.sha256()
-  files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-  for file in files:
-    if path.is_dir():
-      digest.update(str(file.relative_to(path)).encode())
+  below = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+  if path.is_dir():
+    below = [p for p in below if not any(s.startswith(".") for s in p.relative_to(path).parts)]
+  folder = path if path.is_dir() else path.parent
+  for file in (*below, *sorted(set(named) - set(below))):
+    if file != path:
+      digest.update(os.path.relpath(file, folder).encode())
     with file.open("rb") as stream:
       digest.update(hashlib.file_digest(stream, "sha256").digest())
   return digest.hexdigest()

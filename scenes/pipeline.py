@@ -4,15 +4,14 @@ Every stage is a function of earlier results and settings and is cached by the h
 (`scenes.stages`), so that a second run continues where the first one stopped.
 """
 
-import json
 from pathlib import Path
 
 from nerf2real.core import files
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.scenes import assembly, bundle
 from nerf2real.scenes.alignment import overrides, room_check
-from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.settings import SceneSettings
+from nerf2real.scenes.source import open_source
 from nerf2real.scenes.stages import geometry, judging, localising, radiance_field, world_frame
 from nerf2real.scenes.stages.cache import Stages
 from nerf2real.scenes.stages.pictures import PosedPictures
@@ -50,14 +49,12 @@ def make_scene(
 
   Raises:
     FolderInUseError: Another process makes a scene in the folder.
-    ValueError: The capture or a setting cannot be used, or the folder holds a scene of another
-      capture; the message is one line.
+    ValueError: The capture or a setting cannot be used, or the folder lies in the capture or holds
+      a scene of another one; the message is one line.
   """
   out, source = Path(out), Path(source)
   fixed = overrides.read(override) if override else overrides.Overrides()
-  source_kind(source)  # raises where it cannot be used
-  film = Source(source, files.hash_path(source))
-  _check_owner(out, film)
+  film = open_source(source, out)
   with lock_folder(out):
     return _run_stages(
       film,
@@ -68,20 +65,6 @@ def make_scene(
       name=name or out.name,
       measure=measure,
       watcher=watcher,
-    )
-
-
-def _check_owner(out: Path, film: Source) -> None:
-  """Raises ValueError where a folder holds a scene of a capture of another name and content."""
-  try:
-    made_from = json.loads((out / "scene.json").read_text())["source"]
-    name, sha256 = made_from["name"], made_from["sha256"]
-  except (OSError, ValueError, KeyError, TypeError):
-    return  # none yet, or a damaged one, which is made again
-  if name != film.path.name and sha256 != film.sha256:
-    raise ValueError(
-      f"{out} holds a scene of {name}, found the capture {film.path.name}: name another folder "
-      "with --out, or remove that one."
     )
 
 

@@ -130,6 +130,23 @@ def test_folder_hash_sees_names_and_content(tmp_path):
     files.hash_path(tmp_path / "absent")
 
 
+def test_hidden_files_do_not_count_and_named_ones_do(tmp_path):
+  source, beside = tmp_path / "source", tmp_path / "beside.png"
+  source.mkdir()
+  (source / "x").write_text("1")
+  beside.write_text("2")
+  before = files.hash_path(source)
+  (source / ".stages").mkdir()
+  (source / ".stages" / "y").write_text("3")
+  (source / ".DS_Store").write_text("3")
+  assert files.hash_path(source) == before == files.hash_path(source, named=[source / "x"])
+  for path in (source, source / "x"):
+    beside.write_text("2")
+    first = files.hash_path(path, named=[beside])
+    beside.write_text("3")
+    assert len({files.hash_path(path), first, files.hash_path(path, named=[beside])}) == 3
+
+
 def test_a_line_is_appended_whole_or_not_at_all(tmp_path):
   path = tmp_path / "lines.jsonl"
   files.append_line(path, "first")
