@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from nerf2real.core import files
+from nerf2real.core.folder_lock import lock_folder
 from nerf2real.scenes.bundle import STAGES
-from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.poses.localisation import LocalisationError
 from nerf2real.scenes.quality import advice
 from nerf2real.scenes.settings import SceneSettings
+from nerf2real.scenes.source import open_source
 from nerf2real.scenes.stages import localising
 from nerf2real.scenes.stages.cache import Stages
 from nerf2real.scenes.stages.results import Source
@@ -26,11 +26,16 @@ def check_capture(
 
   Raises:
     CaptureError: The source cannot become a capture; the message is one line.
+    FolderInUseError: Another process makes a scene in the folder.
+    ValueError: The folder lies in the capture, or holds a scene of another one.
   """
   out, source = Path(out), Path(source)
-  source_kind(source)  # raises where it cannot be used
-  film = Source(source, files.hash_path(source))
-  cache = Stages(out / STAGES, show_progress=show_progress)
+  film = open_source(source, out)
+  with lock_folder(out):
+    return _judge(film, Stages(out / STAGES, show_progress=show_progress), settings)
+
+
+def _judge(film: Source, cache: Stages, settings: SceneSettings) -> advice.Verdict:
   capture = localising.keyframes(cache, film, settings.capture)
   try:
     poses = localising.poses(cache, capture, settings.localise)

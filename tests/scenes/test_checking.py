@@ -1,9 +1,12 @@
 """Checks of captures of other kinds: a reason at once, or a verdict that the scene reuses."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
+from nerf2real.core.folder_lock import FolderInUseError, lock_folder
 from nerf2real.scenes import checking
 from nerf2real.scenes.bundle import STAGES
 from nerf2real.scenes.capture.media.errors import CaptureError
@@ -36,3 +39,15 @@ def test_pictures_of_several_cameras_are_one_clear_line(tmp_path):
     cv2.imwrite(str(folder / f"{number:02d}.jpg"), np.full(size, 60 + 10 * number, np.uint8))
   with pytest.raises(CaptureError, match="expected one camera and one zoom"):
     checking.check_capture(folder, tmp_path / "out", settings=preset("fast"), show_progress=False)
+
+
+def test_a_folder_of_another_capture_or_in_use_is_left_alone(tmp_path):
+  film, out = tmp_path / "hall.mp4", tmp_path / "out"
+  film.write_bytes(b"a film")
+  with lock_folder(out), pytest.raises(FolderInUseError):
+    checking.check_capture(film, out, settings=preset("fast"), show_progress=False)
+  out.mkdir()
+  (out / "scene.json").write_text(json.dumps({"source": {"name": "room.mp4", "sha256": "0"}}))
+  with pytest.raises(ValueError, match=r"holds a scene of room.mp4, found the capture hall.mp4"):
+    checking.check_capture(film, out, settings=preset("fast"), show_progress=False)
+  assert [path.name for path in out.iterdir()] == ["scene.json"]
