@@ -14,6 +14,7 @@ from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views
 from nerf2real.scenes.poses import localisation
+from nerf2real.scenes.stages.cache import key_of
 
 POINTS = "sparse_points.ply"  # the localised points
 
@@ -61,6 +62,9 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
     bundle: The scene.
     progress: Called with the fraction done and a text.
 
+  Raises:
+    ValueError: The keyframes beside the bundle were taken anew since it was made.
+
   Returns:
     Where the pictures come from, for the user: "keyframes" or "rendered from the field".
   """
@@ -68,6 +72,12 @@ def write(folder: Path, bundle: Bundle, *, progress: Progress = no_progress) -> 
   localised = localisation.load(bundle.folder / "sfm")
   keyframes = bundle.keyframes_folder
   found = all((keyframes / name).is_file() for name in names)
+  made_of = bundle.scene.get("hashes", {}).get("keyframes")
+  if found and made_of not in (None, key_of(keyframes.parent)):
+    raise ValueError(
+      f"{keyframes.parent} holds other keyframes than the scene was made of: run "
+      f"launch/make_scene.py with {bundle.folder} as --out to the end, then export again."
+    )
   renderer = None if found else views.renderer_of(bundle)
   unit_from_world = bundle.world_from_unit.inverse()
   with files.atomic_folder(folder) as partial:

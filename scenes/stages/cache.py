@@ -99,7 +99,7 @@ class Stages:
     }
     key = hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
     final = self.folder / name
-    record = self._read_record(final)
+    record = _read_record(final)
     if record.get("key") == key:
       made = str(record.get("made", key))
       result = StageResult(final, key, made, float(record["seconds"]), cached=True)
@@ -113,7 +113,7 @@ class Stages:
       if stale != work:
         shutil.rmtree(stale, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
-    earlier = float(self._read_record(work).get("seconds", 0.0))
+    earlier = float(_read_record(work).get("seconds", 0.0))
     start = time.monotonic()
     try:
       with progress_bar(name, shown=self._show_progress) as report:
@@ -143,15 +143,20 @@ class Stages:
     return result
 
   @staticmethod
-  def _read_record(folder: Path) -> dict[str, Any]:
-    try:
-      return json.loads((folder / _RECORD).read_text())
-    except (OSError, json.JSONDecodeError):
-      return {}
-
-  @staticmethod
   def _write_record(folder: Path, record: Mapping[str, Any]) -> None:
     files.write_atomically(folder / _RECORD, json.dumps(record, indent=1, sort_keys=True))
+
+
+def key_of(folder: Path) -> str | None:
+  """Returns the key of the finished stage that a folder holds; None where it holds none."""
+  return _read_record(folder).get("key")
+
+
+def _read_record(folder: Path) -> dict[str, Any]:
+  try:
+    return json.loads((folder / _RECORD).read_text())
+  except (OSError, json.JSONDecodeError):
+    return {}
 
 
 def _is_empty(folder: Path) -> bool:
