@@ -128,7 +128,7 @@ def _check(arguments: Arguments, source: Path, settings: "SceneSettings") -> int
   """Prints the verdict on the capture; returns the exit status."""
   from nerf2real.scenes.checking import check_capture
 
-  verdict = check_capture(source, arguments.out, settings=settings)
+  verdict = check_capture(source, arguments.out, settings=settings, override=arguments.override)
   print(verdict.words)
   if verdict.picture is not None:
     verdict.save_picture(arguments.out / "check.png")

@@ -6,10 +6,9 @@ Every stage is a function of earlier results and settings and is cached by the h
 
 from pathlib import Path
 
-from nerf2real.core import files
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.scenes import assembly, bundle
-from nerf2real.scenes.alignment import overrides, room_check
+from nerf2real.scenes.alignment import room_check
 from nerf2real.scenes.settings import SceneSettings
 from nerf2real.scenes.source import open_source
 from nerf2real.scenes.stages import geometry, judging, localising, radiance_field, world_frame
@@ -53,7 +52,7 @@ def make_scene(
       a scene of another one; the message is one line.
   """
   out, source = Path(out), Path(source)
-  fixed = overrides.read(override) if override else overrides.Overrides()
+  given = Given.read(override, settings.marker_side)
   film = open_source(source, out)
   with lock_folder(out):
     return _run_stages(
@@ -61,7 +60,7 @@ def make_scene(
       out,
       Stages(out / STAGES, show_progress=show_progress),
       settings=settings,
-      given=Given(fixed, files.hash_path(override) if override else "", settings.marker_side),
+      given=given,
       name=name or out.name,
       measure=measure,
       watcher=watcher,

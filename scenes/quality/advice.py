@@ -13,8 +13,7 @@ import numpy as np
 
 from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
-from nerf2real.scenes.alignment import room_check, world_frame
-from nerf2real.scenes.alignment.evidence import Evidence
+from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks
@@ -229,7 +228,7 @@ def judge(
   settings: CaptureSettings,
   *,
   poses: Localisation | None = None,
-  align: world_frame.AlignSettings | None = None,
+  frame: Alignment | None = None,
   reason: str = "",
 ) -> Verdict:
   """Judges a capture from its keyframes and, where they were found, its poses.
@@ -238,19 +237,15 @@ def judge(
     capture: The keyframes.
     settings: What counts as blurred and as changing exposure.
     poses: The localised keyframes; None where that failed.
-    align: Of the world frame, for a known camera height.
-    reason: Why there are no poses.
+    frame: Their world frame; None where none was found.
+    reason: Why there are no poses, or no world frame.
   """
   findings = judge_pictures(capture, settings)
   if poses is None:
     return Verdict([Finding("poses", False, reason), *findings])
   findings += judge_poses(capture, poses)
-  try:
-    room_check.require_room(poses.world_from_camera, poses.points)
-    evidence = Evidence(poses.points, poses.world_from_camera, up=capture.unit_up)
-    frame = world_frame.align(evidence, settings=align)
-  except ValueError as error:
-    return Verdict([*findings, Finding("floor", False, str(error))])
+  if frame is None:
+    return Verdict([*findings, Finding("floor", False, reason)])
   world = frame.world_from_unit.apply_pose(poses.world_from_camera)
   extent = frame.extent_lower, frame.extent_upper
   found = coverage(poses.camera, world, extent)

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from nerf2real.scenes.alignment.overrides import Overrides
+from nerf2real.core import files
+from nerf2real.scenes.alignment import overrides
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field.field import Field
@@ -35,9 +36,20 @@ class Source(NamedTuple):
 class Given(NamedTuple):
   """What a person gave for the world frame."""
 
-  override: Overrides
+  override: overrides.Overrides
   override_key: str  # hash of the file of overrides
   marker_side: float | None  # of the black square of a marker in the room [m]
+
+  @classmethod
+  def read(cls, override: Path | None, marker_side: float | None) -> "Given":
+    """Reads a file of overrides, if there is one.
+
+    Raises:
+      ValueError: It cannot be read; the message is one line.
+    """
+    if override is None:
+      return cls(overrides.Overrides(), "", marker_side)
+    return cls(overrides.read(override), files.hash_path(override), marker_side)
 
 
 class Watcher(Protocol):

@@ -77,13 +77,7 @@ def outlook(
         frame_from_camera=found.world_from_camera,
         side=given.marker_side,
       )
-    evidence = Evidence(
-      found.points,
-      found.world_from_camera,
-      marker=marker,
-      sensor_scale=_sensed_scale(capture.value, found),
-      up=capture.value.unit_up,
-    )
+    evidence = sparse_evidence(capture.value, found, marker)
     try:
       frame = world_frame.align(
         evidence, settings=settings, override=given.override, progress=part(progress, 0.8, 1.0)
@@ -111,6 +105,19 @@ def outlook(
   for text in found_out.warnings:
     warnings.warn(text, stacklevel=2)
   return Made(found_out, stage)
+
+
+def sparse_evidence(
+  capture: Capture, poses: Localisation, marker: markers.MarkerScale | None
+) -> Evidence:
+  """What is known of the world frame before there is a field."""
+  return Evidence(
+    poses.points,
+    poses.world_from_camera,
+    marker=marker,
+    sensor_scale=_sensed_scale(capture, poses),
+    up=capture.unit_up,
+  )
 
 
 def _key(settings: world_frame.AlignSettings, given: Given) -> dict[str, Any]:
