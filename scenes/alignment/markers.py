@@ -16,6 +16,7 @@ from scipy import optimize
 
 from nerf2real.core import cameras, least_squares
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.alignment.lines import nearest_point
 
 # Groups are tried in this order until one is read: the large sets contain the small ones. The time
 # grows with the picture's size and with the number of codes.
@@ -135,12 +136,6 @@ def _search(
   return found
 
 
-def triangulate(rays: np.ndarray, origins: np.ndarray) -> np.ndarray:
-  """The point [3] nearest to lines through origins [K, 3] along unit rays [K, 3], least squares."""
-  projector = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-  return np.linalg.solve(projector.sum(0), (projector @ origins[:, :, None]).sum(0)[:, 0])
-
-
 def _square(parameters: np.ndarray) -> np.ndarray:
   """Corners [4, 3] of the square with a rotation vector, a centre and the logarithm of its side."""
   half = 0.5 * np.exp(parameters[6])
@@ -163,7 +158,7 @@ def _fit_marker(
     spread = np.degrees(np.arccos(np.clip(rays[:, 0] @ rays[:, 0].T, -1, 1))).max()
     if spread < _MIN_PARALLAX_DEG:
       return None
-    corners = np.stack([triangulate(rays[:, c], poses[:, :3, 3]) for c in range(4)])
+    corners = np.stack([nearest_point(poses[:, :3, 3], rays[:, c]) for c in range(4)])
     local = np.einsum("kji,kcj->kci", poses[:, :3, :3], corners[None] - poses[:, None, :3, 3])
     if (local[..., 2] <= 0).any():
       error = np.where((local[..., 2] <= 0).any(-1), np.inf, 0)

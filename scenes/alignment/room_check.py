@@ -5,6 +5,8 @@ Shapes: N cameras, P points.
 
 import numpy as np
 
+from nerf2real.scenes.alignment.lines import nearest_point
+
 _INWARD = np.cos(np.radians(25.0))  # of the optical axis to the way to the common focus
 _SHARE = 0.9  # of the cameras that look inward, and of the points inside their ring
 _WIDEST_GAP = np.radians(120.0)  # between neighbouring cameras of a ring, seen from its focus
@@ -14,20 +16,11 @@ class NoRoomError(ValueError):
   """The pictures show a thing from all sides and no room; the message is one line."""
 
 
-def common_focus(world_from_camera: np.ndarray) -> np.ndarray:
-  """The point [3] nearest to the optical axes of cameras [N, 4, 4], by least squares."""
-  eyes, axes = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
-  across = np.eye(3) - axes[:, :, None] * axes[:, None]
-  right = np.einsum("nij,nj->i", across, eyes)
-  focus: np.ndarray = np.linalg.lstsq(across.sum(0), right, rcond=None)[0]
-  return focus
-
-
 def circles_a_thing(world_from_camera: np.ndarray, points: np.ndarray) -> bool:
   """Whether cameras [N, 4, 4] stand around nearly all points [P, 3] and look inward; z is up."""
   if not len(points):
     return False
-  focus = common_focus(world_from_camera)
+  focus = nearest_point(world_from_camera[:, :3, 3], world_from_camera[:, :3, 2])
   way = focus - world_from_camera[:, :3, 3]
   distance = np.linalg.norm(way, axis=-1)
   inward = (way * world_from_camera[:, :3, 2]).sum(-1) > _INWARD * distance

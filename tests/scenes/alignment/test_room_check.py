@@ -17,7 +17,6 @@ def _ring(first=0.0, last=2 * np.pi, count=50):
 
 def test_a_thing_from_all_sides_is_no_room():
   thing = np.random.default_rng(0).uniform(-0.3, 0.3, (500, 3))
-  np.testing.assert_allclose(room_check.common_focus(_ring()), [0, 0, 0.1], atol=1e-9)
   with pytest.raises(room_check.NoRoomError, match="50 pictures circle one thing"):
     room_check.require_room(_ring(), thing)
 
