@@ -151,7 +151,7 @@ def export(kind: Kind, order: Order) -> str:
     raise ValueError(f"Found --out {order.out} for {kind}; expected {expected}.")
   if order.robot is not None and kind != "mjcf":
     raise ValueError(f"A robot can be added to mjcf only, found {kind}: leave --robot out.")
+  _check_replaced(kind, order)
   order.out.parent.mkdir(parents=True, exist_ok=True)
   files.check_writable(order.out)
-  _check_replaced(kind, order)
   return _EXPORTERS[kind](order)

@@ -209,7 +209,7 @@ def test_a_wrong_suffix_is_one_line(tmp_path):
 
 
 def test_where_nothing_can_be_written_is_refused_before_the_work(tmp_path):
-  order = exporting.Order(None, tmp_path / f"{'x' * 300}.glb")
+  order = exporting.Order(Bundle(tmp_path, {}), tmp_path / f"{'x' * 300}.glb")
   with pytest.raises(OSError, match="too long"):
     exporting.export("glb", order)
 
