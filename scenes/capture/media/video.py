@@ -43,9 +43,9 @@ class VideoInfo:
   """Facts of a video's header and packets, without decoding."""
 
   num_frames: int
-  """Packets of the video stream."""
-  declared_frames: int
-  """What the header promises; 0 where it has none."""
+  """Packets of the video stream that are shown: those that an edit list cuts off are not."""
+  expected_frames: int
+  """Those, or what the header promises where the packets end early."""
   frames_per_second: float
   """Mean rate [1/s]; 0 where unknown."""
   codec: str
@@ -86,15 +86,21 @@ def inspect_video(path: Path) -> VideoInfo:
       if not container.streams.video:
         raise CaptureError(f"{path} has no video stream (sound only?); give the video itself.")
       stream = container.streams.video[0]
-      count = 0
+      count, end, broken = 0, 0, False
       try:
-        count = sum(1 for packet in container.demux(stream) if packet.size)
+        for packet in container.demux(stream):
+          if packet.size and not packet.is_discard:
+            count += 1
+            shown = packet.dts if packet.pts is None else packet.pts
+            end = max(end, (shown or 0) + (packet.duration or 0))
       except av.error.FFmpegError:
-        count = max(count, 1)  # decoding shows where it breaks
+        count, broken = max(count, 1), True  # decoding shows where it breaks
+      rate = float(stream.average_rate or stream.guessed_rate or 0)
+      early = broken or _ends_early(stream, end, rate)
       return VideoInfo(
         num_frames=count,
-        declared_frames=stream.frames,
-        frames_per_second=float(stream.average_rate or stream.guessed_rate or 0),
+        expected_frames=max(count, stream.frames) if early else count,
+        frames_per_second=rate,
         codec=stream.codec_context.name,
       )
   except av.error.FFmpegError as error:
@@ -103,6 +109,15 @@ def inspect_video(path: Path) -> VideoInfo:
     raise CaptureError(
       f"{path} {what}: copy it from the phone again, or give a folder of images."
     ) from error
+
+
+def _ends_early(stream: av.VideoStream, end: int, rate: float) -> bool:
+  """Whether packets end [the stream's unit] before its header says, or it says nothing."""
+  if stream.duration is None or stream.time_base is None:
+    return True
+  missing = float((stream.duration + (stream.start_time or 0) - end) * stream.time_base)
+  length = float(stream.duration * stream.time_base)
+  return missing > max(1 / rate if rate > 0 else 0.0, DAMAGED_FRACTION * length)
 
 
 def _decode(path: Path, counts: collections.Counter) -> Iterator[av.VideoFrame]:
@@ -187,7 +202,7 @@ def sharpest_frames(
       best = (value, index, frame, travelled)
     if index % 10 == 0:
       progress(min(1.0, index / info.num_frames), f"frame {index} of {info.num_frames}")
-  expected = max(info.num_frames, info.declared_frames)
+  expected = info.expected_frames
   lost = max(expected - counts["decoded"], 0) + counts["broken"]
   if counts["decoded"] == 0 or lost > max(1, DAMAGED_FRACTION * expected):
     raise CaptureError(

@@ -143,6 +143,26 @@ def test_damaged_video_says_until_where(frames, tmp_path):
   assert not list(tmp_path.glob("*partial*")) + list(tmp_path.glob(".*"))
 
 
+def test_a_film_trimmed_without_loss_is_whole(frames, tmp_path):
+  """Its container holds frames that an edit list hides, back to the keyframe before the cut."""
+  synthetic.write_video(tmp_path / "film.mp4", frames)
+  path = tmp_path / "trimmed.mp4"
+  with (
+    av.open(str(tmp_path / "film.mp4")) as whole,
+    av.open(str(path), "w", options={"avoid_negative_ts": "disabled"}) as trimmed,
+  ):
+    stream = trimmed.add_stream_from_template(whole.streams.video[0])
+    for packet in whole.demux(video=0):
+      if packet.dts is not None:
+        cut = round(0.8 / packet.time_base)
+        packet.pts, packet.dts, packet.stream = packet.pts - cut, packet.dts - cut, stream
+        trimmed.mux(packet)
+  info = inspect_video(path)
+  assert (info.num_frames, info.expected_frames) == (16, 16)
+  result = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
+  assert len(result.images) == 8 and not any("damaged" in line for line in result.warnings)
+
+
 def test_overwritten_middle_is_damage(frames, tmp_path):
   path = tmp_path / "film.mp4"
   synthetic.write_video(path, frames)
