@@ -27,6 +27,7 @@ from nerf2real.scenes.capture.media.video import (
 )
 from nerf2real.scenes.capture.posed import agreement
 from nerf2real.scenes.capture.posed.colmap_model import read_colmap
+from nerf2real.scenes.capture.posed.pictures import read_as_posed
 from nerf2real.scenes.capture.posed.rgbd import read_rgbd
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 
@@ -124,7 +125,8 @@ def _read_pictures(
   camera = known.camera
 
   def read(index: int) -> np.ndarray:
-    return limit_size(_read_posed(files[index], camera, settings.max_size), settings.max_size)
+    image = read_as_posed(files[index], camera, least=settings.max_size)
+    return limit_size(image, settings.max_size)
 
   frames = _sharpest_pictures(len(files), read, settings, progress)
   written = _write(frames, folder)
@@ -182,21 +184,6 @@ def _written_camera(camera: Camera, capture: Capture) -> Camera:
       f"{camera.width}x{camera.height}: expected the same aspect."
     )
   return camera.resized(capture.width, capture.height)
-
-
-def _read_posed(path: Path, camera: Camera, least: int) -> np.ndarray:
-  """Reads a picture as BGR as its camera has it: EXIF turns it only where the shapes then agree.
-
-  Args:
-    path: The picture.
-    camera: Its camera, in its full size.
-    least: Long side that is needed [pixel].
-  """
-  image = stills.read_still(path, least=least)
-  if (image.shape[1] > image.shape[0]) != (camera.width > camera.height):
-    raw = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return image if raw is None else raw
-  return image
 
 
 def _sharpest_pictures(

@@ -164,7 +164,7 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   return Stills(kept, np.array(across), common, smallest, warnings)
 
 
-def read_still(path: Path, *, least: int | None = None) -> np.ndarray:
+def read_still(path: Path, *, least: int | None = None, upright: bool = True) -> np.ndarray:
   """Reads a picture upright (EXIF) as BGR uint8 [H, W, 3]; transparent parts become black.
 
   A JPEG that is at least twice as large as needed is decoded at a half, a quarter or an eighth of
@@ -173,6 +173,7 @@ def read_still(path: Path, *, least: int | None = None) -> np.ndarray:
   Args:
     path: The picture.
     least: Long side that is needed [pixel]; the picture's own if None.
+    upright: Whether EXIF turns it; one of Apple's formats always is.
 
   Raises:
     CaptureError: It is damaged or no picture.
@@ -185,7 +186,8 @@ def read_still(path: Path, *, least: int | None = None) -> np.ndarray:
     except (OSError, ValueError, SyntaxError):
       image = None
   else:
-    image = cv2.imread(str(path), _reduction(path, least))
+    how = _reduction(path, least) | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+    image = cv2.imread(str(path), how)
   if image is None:
     raise CaptureError(f"{path} cannot be read as a picture: remove it or copy it again.")
   return image

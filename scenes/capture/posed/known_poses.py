@@ -8,13 +8,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
+from nerf2real.scenes.capture.posed.pictures import read_as_posed
 
 CAMERA_TOLERANCE = 0.01  # relative difference of focal lengths that still is one camera
 _STILL = 1e-6  # m and rad: motions below come from rounding
@@ -114,9 +114,7 @@ class KnownPoses:
 
   def _colors(self, index: int, pixels: np.ndarray) -> np.ndarray:
     """Colours uint8 [A, 3] of a picture at pixels [A, 2] of the camera."""
-    image = cv2.imread(str(self.files[index]))
-    if image is None:
-      raise CaptureError(f"{self.files[index]} cannot be read as a picture.")
+    image = read_as_posed(self.files[index], self.camera)
     scale = np.array([image.shape[1], image.shape[0]]) / [self.camera.width, self.camera.height]
     column, row = np.floor(pixels * scale).astype(int).T
     return image[row, column, ::-1]

@@ -4,13 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from nerf2real.core.cameras import Camera, focal_length
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV, is_rigid
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.media.stills import IMAGE_SUFFIXES
+from nerf2real.scenes.capture.posed.intrinsics import picture_size
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses, one_camera
 
 
@@ -77,10 +77,8 @@ def read_transforms(source: Path) -> KnownPoses:
     raise CaptureError(f"{path} lists no frames.")
   files = tuple(_frame_file(path.parent, frame["file_path"]) for frame in frames)
   if "w" not in values and "w" not in frames[0]:
-    picture = cv2.imread(str(files[0]))
-    if picture is None:
-      raise CaptureError(f"{files[0]} cannot be read as a picture.")
-    values = {**values, "w": picture.shape[1], "h": picture.shape[0]}
+    width, height = picture_size(files[0])
+    values = {**values, "w": width, "h": height}
   camera = one_camera([_transforms_camera({**values, **frame}, path) for frame in frames], path)
   named = [frame.get("depth_file_path") for frame in frames]
   depth_files = tuple(_frame_file(path.parent, name) for name in named if name)
