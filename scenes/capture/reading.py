@@ -116,8 +116,9 @@ def _read_pictures(
     known = readers[kind](source)
   files = list(known.files) if known else list_images(source) or list_images_below(source)
   if len(files) < settings.min_images:
+    lost = f" ({' '.join(known.warnings)})" if known and known.warnings else ""
     raise CaptureError(
-      f"{source} holds {len(files)} pictures, expected at least {settings.min_images} that "
+      f"{source} holds {len(files)} pictures{lost}, expected at least {settings.min_images} that "
       "overlap: take more, from different places in the room."
     )
   if known is None:

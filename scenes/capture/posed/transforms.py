@@ -10,8 +10,13 @@ from nerf2real.core.cameras import Camera, focal_length
 from nerf2real.core.rotations import OPENGL_FROM_OPENCV, is_rigid
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.media.stills import IMAGE_SUFFIXES
+from nerf2real.scenes.capture.posed.depth_pictures import MILLIMETRE
 from nerf2real.scenes.capture.posed.intrinsics import picture_size
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses, one_camera
+from nerf2real.scenes.capture.posed.recording import Recording
+
+_NO_DEPTH = "no depth_file_path"  # stands for a depth picture that a frame does not name
+_UNDISTORT = "undistort the pictures, or give them alone"
 
 
 def find_transforms(source: Path) -> Path | None:
@@ -26,8 +31,17 @@ def find_transforms(source: Path) -> Path | None:
 
 def _transforms_camera(values: dict[str, Any], path: Path) -> Camera:
   """Reads the intrinsics of a transforms.json or of one of its frames."""
-  if values.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
-    raise CaptureError(f"{path}: camera_model {values['camera_model']} found, expected OPENCV.")
+  model = values.get("camera_model", "OPENCV")
+  if values.get("is_fisheye"):  # instant-ngp's word for OpenCV's model
+    model = "OPENCV_FISHEYE"
+  if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+    raise CaptureError(f"{path}: camera_model {model} found, expected OPENCV: {_UNDISTORT}.")
+  more = [name for name in ("k3", "k4") if float(values.get(name, 0.0)) != 0]
+  if more:
+    raise CaptureError(
+      f"{path}: {more[0]} = {values[more[0]]} found, expected a lens of k1, k2, p1, p2 alone: "
+      f"{_UNDISTORT}."
+    )
   if "w" not in values or "h" not in values:
     raise CaptureError(f"{path}: no picture size 'w' and 'h' found; add it.")
   width, height = int(values["w"]), int(values["h"])
@@ -49,12 +63,10 @@ def _transforms_camera(values: dict[str, Any], path: Path) -> Camera:
 
 
 def _frame_file(folder: Path, name: str) -> Path:
-  """Resolves a frame's file_path; synthetic scenes of instant-ngp leave the suffix out."""
+  """Resolves a frame's file_path, which may be missing; instant-ngp may leave its suffix out."""
   path = folder / name
-  for candidate in (path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES)):
-    if candidate.is_file():
-      return candidate
-  raise CaptureError(f"Picture {name} of the transforms file was not found in {folder}.")
+  candidates = (path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES))
+  return next((candidate for candidate in candidates if candidate.is_file()), path)
 
 
 def read_transforms(source: Path) -> KnownPoses:
@@ -63,6 +75,9 @@ def read_transforms(source: Path) -> KnownPoses:
   The file's transform_matrix is world-from-camera with OpenGL camera axes (x right, y up, z back);
   the result has OpenCV axes. Sources: nerfstudio documentation, data conventions; instant-ngp
   documentation, nerf_dataset_tips.
+
+  Raises:
+    CaptureError: The file is damaged, its lens is no OPENCV camera's, or most pictures are missing.
   """
   path = find_transforms(source)
   if path is None:
@@ -75,13 +90,6 @@ def read_transforms(source: Path) -> KnownPoses:
     raise CaptureError(f"{path} is no transforms file of nerfstudio: {error!r}.") from error
   if not frames:
     raise CaptureError(f"{path} lists no frames.")
-  files = tuple(_frame_file(path.parent, frame["file_path"]) for frame in frames)
-  if "w" not in values and "w" not in frames[0]:
-    width, height = picture_size(files[0])
-    values = {**values, "w": width, "h": height}
-  camera = one_camera([_transforms_camera({**values, **frame}, path) for frame in frames], path)
-  named = [frame.get("depth_file_path") for frame in frames]
-  depth_files = tuple(_frame_file(path.parent, name) for name in named if name)
   poses = []
   for frame, matrix in zip(frames, matrices, strict=True):
     if matrix.shape == (3, 4):
@@ -90,14 +98,27 @@ def read_transforms(source: Path) -> KnownPoses:
       raise CaptureError(f"{path}: transform_matrix of {frame['file_path']} is no rigid pose.")
     matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
     poses.append(matrix)
+  named = [frame.get("depth_file_path") for frame in frames]
+  found = Recording(
+    files=[_frame_file(path.parent, frame["file_path"]) for frame in frames],
+    poses=np.stack(poses),
+    depth=[_frame_file(path.parent, name or _NO_DEPTH) for name in named] if any(named) else [],
+    unit=MILLIMETRE,
+  ).present(path)
+  if "w" not in values and "w" not in frames[0]:
+    width, height = picture_size(found.files[0])
+    values = {**values, "w": width, "h": height}
+  camera = one_camera([_transforms_camera({**values, **frame}, path) for frame in frames], path)
   empty = np.zeros((0, 3))
   return KnownPoses(
     kind="transforms",
     camera=camera,
-    files=files,
-    world_from_camera=np.stack(poses),
+    files=tuple(found.files),
+    world_from_camera=found.poses,
     points=empty,
     point_colors=empty.astype(np.uint8),
     point_errors=np.zeros(0),
-    depth_files=depth_files if len(depth_files) == len(frames) else (),
+    depth_files=tuple(found.depth),
+    depth_unit=found.unit,
+    warnings=found.warnings,
   )

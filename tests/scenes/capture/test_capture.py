@@ -313,9 +313,22 @@ def test_transforms_errors(tmp_path):
   write_transforms(tmp_path, sheared, synthetic.CAMERA)
   with pytest.raises(CaptureError, match=r"view_002.png is no rigid pose"):
     read_transforms(tmp_path)
-  write_transforms(tmp_path, poses, synthetic.CAMERA)
+  for extra, words in (
+    ({"is_fisheye": True}, "OPENCV_FISHEYE found, expected OPENCV: undistort the pictures"),
+    ({"k3": 0.01}, "k3 = 0.01 found, expected a lens of k1, k2, p1, p2"),
+    ({"k4": -0.01}, "k4 = -0.01 found"),
+  ):
+    write_transforms(tmp_path, poses, synthetic.CAMERA, **extra)
+    with pytest.raises(CaptureError, match=words):
+      read_transforms(tmp_path)
+  write_transforms(tmp_path, poses, synthetic.CAMERA, k3=0.0, k4=0.0)
+  assert len(read_transforms(tmp_path).files) == 8
   (tmp_path / "images" / "view_003.png").unlink()
-  with pytest.raises(CaptureError, match="view_003.png .* was not found"):
+  with pytest.raises(CaptureError, match=r"holds 7 pictures \(1 of 8 pictures or their depth are"):
+    read_capture(tmp_path, tmp_path / "keyframes", settings=SETTINGS)
+  for number in range(4, 8):
+    (tmp_path / "images" / f"view_{number:03d}.png").unlink()
+  with pytest.raises(CaptureError, match=r"5 of 8 pictures are missing, as view_003.png"):
     read_transforms(tmp_path)
   (tmp_path / "transforms.json").write_text('{"frames": 3}')
   with pytest.raises(CaptureError, match="no transforms file"):

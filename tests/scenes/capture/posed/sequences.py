@@ -1,5 +1,6 @@
 """Small RGB-D sequences in TUM's layout, and what is asked of what is read from them."""
 
+import json
 import shutil
 
 import cv2
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.capture import CaptureSettings
 from tests.scenes import synthetic_capture as synthetic
 
@@ -78,3 +80,17 @@ def tum_sequence(folder):
     rows.append(f"{t:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
   (folder / "groundtruth.txt").write_text("\n".join(rows))
   return folder
+
+
+def write_transforms(folder):
+  """Writes colour, depth and a transforms.json; returns what that says."""
+  pictures(folder, "rgb/{:03d}.png", "depth/{:03d}.png", 1e-3)
+  frames = []
+  for row, pose in enumerate(POSES):
+    matrix = pose.copy()
+    matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
+    names = {"file_path": f"rgb/{row:03d}.png", "depth_file_path": f"depth/{row:03d}.png"}
+    frames.append(names | {"transform_matrix": matrix.tolist()})
+  about = {"w": 320, "h": 240, "fl_x": 280.0, "frames": frames}
+  (folder / "transforms.json").write_text(json.dumps(about))
+  return about

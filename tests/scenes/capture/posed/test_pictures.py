@@ -1,7 +1,5 @@
 """Tests of pictures with known poses: as stored where that is their camera's shape."""
 
-import json
-
 import cv2
 import numpy as np
 import PIL.ExifTags
@@ -9,10 +7,9 @@ import PIL.Image
 import pytest
 
 from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.posed.pictures import read_as_posed
 from nerf2real.scenes.capture.reading import read_capture
-from tests.scenes.capture.posed.sequences import POSES, SETTINGS, pictures
+from tests.scenes.capture.posed.sequences import SETTINGS, write_transforms
 
 CAMERA = Camera(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
 UPRIGHT = Camera(width=48, height=64, fx=60.0, fy=60.0, cx=24.0, cy=32.0)
@@ -39,15 +36,7 @@ def test_a_picture_is_turned_only_where_its_camera_is(tmp_path, orientation, cam
 
 
 def test_keyframes_and_colours_of_posed_pictures_are_as_stored(tmp_path):
-  pictures(tmp_path, "rgb/{:03d}.png", "depth/{:03d}.png", 1e-3)
-  frames = []
-  for row, pose in enumerate(POSES):
-    matrix = pose.copy()
-    matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
-    names = {"file_path": f"rgb/{row:03d}.png", "depth_file_path": f"depth/{row:03d}.png"}
-    frames.append(names | {"transform_matrix": matrix.tolist()})
-  about = {"w": 320, "h": 240, "fl_x": 280.0, "frames": frames}
-  (tmp_path / "transforms.json").write_text(json.dumps(about))
+  write_transforms(tmp_path)
   plain = read_capture(tmp_path, tmp_path / "plain", settings=SETTINGS)
   for path in (tmp_path / "rgb").iterdir():
     _tagged(path, 3)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
@@ -19,6 +18,7 @@ from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
+from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
@@ -34,6 +34,7 @@ from tests.scenes.capture.posed.sequences import (
   copied,
   off_the_planes,
   pictures,
+  write_transforms,
 )
 
 FEW = LocaliseSettings(features=FeatureSettings(few_num_features=1000))
@@ -98,16 +99,28 @@ def test_a_scannet_scene_gives_poses_and_depth(tmp_path):
 
 
 def test_transforms_with_depth_give_points(tmp_path):
-  pictures(tmp_path, "rgb/{:03d}.png", "depth/{:03d}.png", 1e-3)
-  frames = []
-  for row, pose in enumerate(POSES):
-    matrix = pose.copy()
-    matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
-    names = {"file_path": f"rgb/{row:03d}.png", "depth_file_path": f"depth/{row:03d}.png"}
-    frames.append(names | {"transform_matrix": matrix.tolist()})
-  about = {"w": 320, "h": 240, "fl_x": 280.0, "frames": frames}
-  (tmp_path / "transforms.json").write_text(json.dumps(about))
+  write_transforms(tmp_path)
   check(read_capture(tmp_path, tmp_path / "images", settings=SETTINGS))
+
+
+def test_frames_of_transforms_without_picture_or_depth_are_left_out(tmp_path):
+  about = write_transforms(tmp_path)
+  del about["frames"][1]["depth_file_path"]
+  for name in ("rgb/003.png", "depth/007.png"):
+    (tmp_path / name).unlink()
+  (tmp_path / "transforms.json").write_text(json.dumps(about))
+  known = read_transforms(tmp_path)
+  rows = [k for k in range(16) if k not in (1, 3, 7)]
+  assert [path.name for path in known.files] == [f"{k:03d}.png" for k in rows]
+  assert [path.stem for path in known.files] == [path.stem for path in known.depth_files]
+  np.testing.assert_allclose(known.world_from_camera, POSES[rows], atol=1e-12)
+  assert known.warnings == ("3 of 16 pictures or their depth are missing: left out.",)
+  for frame in about["frames"][2:]:
+    frame.pop("depth_file_path")
+  (tmp_path / "transforms.json").write_text(json.dumps(about))
+  known = read_transforms(tmp_path)
+  assert len(known.files) == 15 and not known.depth_files
+  assert "15 of 16 depth pictures are missing: none used." in known.warnings
 
 
 def test_measured_depth_comes_at_the_size_of_the_pictures(capture, tmp_path):
