@@ -22,7 +22,8 @@ class Evidence(NamedTuple):
   surface_points: np.ndarray | None = None  # dense: lifted depth or mesh vertices [Q, 3]
   surface_normals: np.ndarray | None = None  # theirs [Q, 3]
   marker: MarkerScale | None = None
-  sensor_scale: float | None = None  # metres per unit, where a depth sensor measured
+  sensor_scale: float | None = None  # metres per unit, where depth came along
+  metres_assumed: bool = False  # the sensor's unit is named nowhere
   up: np.ndarray | None = None  # roughly [3]; None: the cameras' up direction
 
   @property

@@ -8,6 +8,11 @@ from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.floor import Floor
 from nerf2real.scenes.alignment.overrides import Overrides
 
+_METRES_ASSUMED = (
+  "Metres were assumed for poses and depth, as their file names no unit: where they are of "
+  "structure from motion, give --camera-height, or film a marker and give --marker-side."
+)
+
 
 class Scale(NamedTuple):
   """The metric scale."""
@@ -28,7 +33,8 @@ def choose_scale(
   """Finds the metric scale from the override, a marker, a depth sensor, a camera height or a guess.
 
   Args:
-    evidence: Cameras and marker.
+    evidence: Cameras, marker, and the sensor's scale; a camera height comes before it where its
+      metres are assumed.
     override: Values given by hand.
     floor: The floor, from which the cameras' median height is counted.
     camera_height: That height where it is known [m].
@@ -52,7 +58,10 @@ def choose_scale(
       f"The marker's scale is uncertain by {100 * marker.spread:.1f} %, more than "
       f"{100 * max_marker_spread:g} %: not used. Film it from nearer and more sides.",
     )
-  if evidence.sensor_scale is not None:
+  known_height = camera_height is not None
+  if evidence.sensor_scale is not None and not (evidence.metres_assumed and known_height):
+    if evidence.metres_assumed:
+      warnings += (_METRES_ASSUMED,)
     return Choice(Scale(evidence.sensor_scale), "depth_sensor", warnings)
   if camera_height is not None:
     return Choice(Scale(camera_height / height), "camera_height", warnings)

@@ -20,7 +20,8 @@ from nerf2real.scenes.stages.cache import Made, Stages
 from nerf2real.scenes.stages.results import Given
 
 _OUTLOOK_VERSION = 4  # 3: markers' corners without rolling shutter; 4: tilts by the cameras' up
-_WORLD_VERSION = 6  # 4: all tilts; 5: by the cameras' up; 6: tells the marker's place
+# 4: all tilts; 5: by the cameras' up; 6: tells the marker's place; 7: metres that are assumed
+_WORLD_VERSION = 7
 _NO_FLOOR = "No localised point lies on a floor; it is looked for again in the field's depth."
 
 
@@ -116,6 +117,7 @@ def sparse_evidence(
     poses.world_from_camera,
     marker=marker,
     sensor_scale=_sensed_scale(capture, poses),
+    metres_assumed=_assumes_metres(capture),
     up=capture.unit_up,
   )
 
@@ -129,6 +131,11 @@ def _sensed_scale(capture: Capture, poses: Localisation) -> float | None:
   """Metres a unit of length of poses that came with the capture; None where they are not metric."""
   known = capture.known
   return 1 / poses.unit_from_source.scale if known is not None and known.is_metric else None
+
+
+def _assumes_metres(capture: Capture) -> bool:
+  """Whether poses that came with the capture are metric only by assumption."""
+  return capture.known is not None and not capture.known.names_unit
 
 
 def world(
@@ -164,6 +171,7 @@ def world(
         normals,
         outlook.value.scale,
         sensed,
+        _assumes_metres(capture.value),
         capture.value.unit_up,
       ),
       settings=settings,

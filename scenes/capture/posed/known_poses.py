@@ -70,8 +70,13 @@ class KnownPoses:
 
   @property
   def is_metric(self) -> bool:
-    """Whether a depth sensor measured: poses are then in metres."""
+    """Whether depth came along: poses are then taken to be in metres."""
     return len(self.sightings) > 0
+
+  @property
+  def names_unit(self) -> bool:
+    """Whether the format says metres; transforms.json may have a depth in any, as of COLMAP's."""
+    return self.kind == "rgbd"
 
   @property
   def picture_from_depth(self) -> np.ndarray | None:
