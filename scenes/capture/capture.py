@@ -19,7 +19,8 @@ class CaptureSettings:
   """Parts of the capture; the sharpest frame of each is kept. A video's are spread over its time
   and over what its picture moves, all others' are equal."""
   most_keyframes: int | None = None
-  """Parts of a long video, which has two a second up to these; `num_keyframes` if None."""
+  """Parts of a long video, which has two a second up to these, and of photographs, of which all are
+  kept up to these; `num_keyframes` if None."""
   max_size: int = 1920
   """Long side of a keyframe; larger pictures are reduced [pixel]."""
   min_images: int = MIN_IMAGES
@@ -36,6 +37,11 @@ class CaptureSettings:
   """Of the keyframes that may be blurred without a warning."""
   warn_brightness_range: float = 3.0
   """95th to 5th percentile of the keyframes' mean brightness."""
+
+  @property
+  def most(self) -> int:
+    """Keyframes of the longest video or of the most photographs."""
+    return max(self.most_keyframes or 0, self.num_keyframes)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -75,8 +75,7 @@ def read_capture(
 
 def keyframe_count(settings: CaptureSettings, duration: float) -> int:
   """Returns how many keyframes a video of a length [s] gets."""
-  most = max(settings.most_keyframes or 0, settings.num_keyframes)
-  return min(max(settings.num_keyframes, round(_KEYFRAME_RATE * duration)), most)
+  return min(max(settings.num_keyframes, round(_KEYFRAME_RATE * duration)), settings.most)
 
 
 def _read_video(
@@ -129,12 +128,13 @@ def _read_pictures(
     image = read_as_posed(files[index], camera, least=settings.max_size)
     return limit_size(image, settings.max_size)
 
-  frames = _sharpest_pictures(len(files), read, settings, progress)
+  frames = _sharpest_pictures(len(files), read, settings.num_keyframes, progress)
   written = _write(frames, folder)
-  capture = _gather(kind, written, folder, settings, list(known.warnings))
+  warnings = [*known.warnings, *(_unused(len(written), len(files)) if kind != "rgbd" else ())]
+  capture = _gather(kind, written, folder, settings, warnings)
   known = known.selected(_numbers(capture), _written_camera(camera, capture))
-  known, warnings = agreement.settled(known, capture.images)
-  capture.warnings.extend(warnings)
+  known, changed = agreement.settled(known, capture.images)
+  capture.warnings.extend(changed)
   origins = [path.name for path in known.files]
   return dataclasses.replace(capture, times=None, known=known.lifted(), origins=origins)
 
@@ -158,9 +158,11 @@ def _read_stills(
     same = image.shape[1::-1] == size
     return image if same else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
-  frames = _sharpest_pictures(len(found.files), read, settings, progress)
+  count = len(found.files)
+  frames = _sharpest_pictures(count, read, settings.most, progress)
   written = _write(frames, folder)
-  capture = _gather("images", written, folder, settings, found.warnings)
+  warnings = [*found.warnings, *_unused(len(written), count)]
+  capture = _gather("images", written, folder, settings, warnings)
   numbers = _numbers(capture)
   turned = found.turned[numbers]
   return dataclasses.replace(
@@ -169,6 +171,16 @@ def _read_stills(
     turned=turned if turned.any() else None,
     origins=[found.files[k].name for k in numbers],
   )
+
+
+def _unused(used: int, count: int) -> list[str]:
+  """Says how many of pictures that were taken one by one are used, where not all are."""
+  if used == count:
+    return []
+  return [
+    f"{used} of {count} pictures are used, the sharpest of each few that follow each other: "
+    f"--keyframes {count} uses all, and takes longer."
+  ]
 
 
 def _numbers(capture: Capture) -> list[int]:
@@ -190,11 +202,11 @@ def _written_camera(camera: Camera, capture: Capture) -> Camera:
 def _sharpest_pictures(
   count: int,
   read: Callable[[int], np.ndarray],
-  settings: CaptureSettings,
+  most: int,
   progress: Progress,
 ) -> Iterator[Frame]:
-  """Yields the sharpest of each of equal parts of `count` pictures that `read` reads."""
-  parts = min(settings.num_keyframes, count)
+  """Yields the sharpest of each of `most` equal parts of `count` pictures that `read` reads."""
+  parts = min(most, count)
   edges = np.linspace(0, count, parts + 1).astype(int)
   for first, last in itertools.pairwise(edges):
     best: Frame | None = None

@@ -61,6 +61,21 @@ def test_most_stills_are_kept_and_the_rest_is_named(tmp_path):
     read_capture(tmp_path, tmp_path / "out", settings=CaptureSettings(min_images=10))
 
 
+def test_photographs_that_are_not_used_are_counted(tmp_path):
+  for number in range(12):
+    _still(tmp_path / f"{number:02d}.png", (160, 120), seed=number)
+  settings = CaptureSettings(num_keyframes=8)
+  some = read_capture(tmp_path, tmp_path / "some", settings=settings)
+  assert len(some.images) == 8
+  assert any(
+    text.startswith("8 of 12 pictures are used") and "--keyframes 12 uses all" in text
+    for text in some.warnings
+  )
+  settings = CaptureSettings(num_keyframes=8, most_keyframes=12)
+  whole = read_capture(tmp_path, tmp_path / "whole", settings=settings)
+  assert len(whole.images) == 12 and not any("are used" in text for text in whole.warnings)
+
+
 def test_smaller_stills_are_kept_where_they_show_enough(tmp_path):
   sizes = [(2016, 1512)] * 4 + [(1600, 1200)] * 3 + [(1200, 1600), (1400, 1050), (1920, 1080)]
   sizes += [(1600, 1201)]  # rounded otherwise
