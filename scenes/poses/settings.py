@@ -28,8 +28,10 @@ class LocaliseSettings:
   """Fraction of registered keyframes under which more pairs are matched."""
   min_fraction: float = 0.5
   """Fewer registered keyframes are an error."""
-  min_registered: int = 10
-  """Fewer are an error, unless there are fewer keyframes."""
+  min_registered: int = 8
+  """Fewer are an error, unless there are few keyframes, see `few_fraction`; a capture's least."""
+  few_fraction: float = 0.75
+  """Of few keyframes so many are enough. Chosen: one or two of ten photographs often fail."""
   min_parallax: float = 0.08
   """Share of matches that no turn of the camera explains below which a warning is given."""
   max_contradicting: float = 0.05

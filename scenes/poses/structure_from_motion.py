@@ -18,7 +18,7 @@ from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, readout, refinement
 from nerf2real.scenes.poses.checks import agreement, certainty, continuity
-from nerf2real.scenes.poses.checks.registered import check_registered
+from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.checks.support import best_supported
 from nerf2real.scenes.poses.localisation import (
   Localisation,
@@ -185,7 +185,14 @@ def _map(
   model, lens = mapping.refine(model, report=steps.report)
   dropped = mapping.drop_weak_images(model)
   if not film:
-    dropped += certainty.drop_uncertain(model)
+    least = needed(len(names), settings)
+    uncertain, kept = certainty.drop_uncertain(model, least=least)
+    dropped += uncertain
+    if kept:
+      warnings.append(
+        f"Uncertain: the places of {', '.join(kept)} hang on little. They are used, as fewer than "
+        f"{least} pictures would be left: take more in between."
+      )
   if dropped:
     check_registered(model, names, settings, share, film=film)
   if not lens.principal:

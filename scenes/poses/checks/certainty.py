@@ -40,11 +40,21 @@ def turns(model: pycolmap.Reconstruction) -> dict[int, float]:
   return {k: float(np.sqrt(np.trace(c[:3, :3]))) for k, c in covariances.items() if c is not None}
 
 
-def drop_uncertain(model: pycolmap.Reconstruction) -> int:
-  """Takes the pose from pictures whose place hangs on too little; returns their number."""
+def drop_uncertain(model: pycolmap.Reconstruction, *, least: int = 0) -> tuple[int, list[str]]:
+  """Takes the pose from pictures whose place hangs on too little, the least certain first.
+
+  Args:
+    model: Adjusted poses and points; changed in place.
+    least: So many pictures keep their poses, certain or not.
+
+  Returns:
+    How many have lost their pose, and the names of those that kept it though uncertain.
+  """
   deviations = turns(model)
   usual = np.median(list(deviations.values())) if deviations else 0.0
   uncertain = [key for key, deviation in deviations.items() if deviation > _TIMES * usual]
-  for key in uncertain:
+  uncertain.sort(key=lambda key: -deviations[key])
+  spare = max(model.num_reg_images() - least, 0)
+  for key in uncertain[:spare]:
     model.deregister_frame(model.images[key].frame_id)
-  return len(uncertain)
+  return len(uncertain[:spare]), [model.images[key].name for key in uncertain[spare:]]

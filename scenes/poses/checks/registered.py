@@ -1,6 +1,6 @@
 """Judges whether enough keyframes have a place, and says what to film where they have not."""
 
-import numpy as np
+import math
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
@@ -13,6 +13,12 @@ _BETWEEN = (
 )
 
 
+def needed(count: int, settings: LocaliseSettings) -> int:
+  """How many of `count` keyframes must have a place."""
+  few = min(settings.min_registered, math.ceil(settings.few_fraction * count))
+  return max(math.ceil(settings.min_fraction * count), few)
+
+
 def check_registered(
   model: pycolmap.Reconstruction | None,
   names: list[str],
@@ -23,10 +29,8 @@ def check_registered(
 ) -> None:
   """Raises LocalisationError if too few keyframes have a place."""
   number = 0 if model is None else model.num_reg_images()
-  needed = max(
-    int(np.ceil(settings.min_fraction * len(names))), min(settings.min_registered, len(names))
-  )
-  if number >= needed:
+  least = needed(len(names), settings)
+  if number >= least:
     return
   if share is None:
     why = "hardly any two pictures show the same textured surface (blur, plain walls, fast turns)"
@@ -47,7 +51,7 @@ def check_registered(
       else _BETWEEN
     )
   error = LocalisationError(
-    f"{number} of {len(names)} keyframes were localised, expected at least {needed}: probably "
+    f"{number} of {len(names)} keyframes were localised, expected at least {least}: probably "
     f"{why}; {advice}."
   )
   placed = set() if model is None else {image.name for image in mapping.registered(model)}
