@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -128,9 +128,12 @@ def _read_pictures(
     image = read_as_posed(files[index], camera, least=settings.max_size)
     return limit_size(image, settings.max_size)
 
-  frames = _sharpest_pictures(len(files), read, settings.num_keyframes, progress)
+  warnings = list(known.warnings)
+  frames = _sharpest_pictures(files, read, settings.num_keyframes, warnings, progress)
   written = _write(frames, folder)
-  warnings = [*known.warnings, *(_unused(len(written), len(files)) if kind != "rgbd" else ())]
+  _check_count(source, len(written), settings, warnings)
+  if kind != "rgbd":
+    warnings.extend(_unused(len(written), len(files), settings.num_keyframes))
   capture = _gather(kind, written, folder, settings, warnings)
   known = known.selected(_numbers(capture), _written_camera(camera, capture))
   known, changed = agreement.settled(known, capture.images)
@@ -144,11 +147,7 @@ def _read_stills(
 ) -> Capture:
   """Writes the keyframes of a folder of photographs."""
   found = stills.of_one_camera(files)
-  if len(found.files) < settings.min_images:
-    raise CaptureError(
-      f"{source}: {' '.join(found.warnings)} At least {settings.min_images} different pictures of "
-      "one camera are needed."
-    )
+  _check_count(source, len(found.files), settings, found.warnings)
   size = found.size(settings.max_size)
 
   def read(index: int) -> np.ndarray:
@@ -158,10 +157,11 @@ def _read_stills(
     same = image.shape[1::-1] == size
     return image if same else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
-  count = len(found.files)
-  frames = _sharpest_pictures(count, read, settings.most, progress)
+  warnings = list(found.warnings)
+  frames = _sharpest_pictures(found.files, read, settings.most, warnings, progress)
   written = _write(frames, folder)
-  warnings = [*found.warnings, *_unused(len(written), count)]
+  _check_count(source, len(written), settings, warnings)
+  warnings.extend(_unused(len(written), len(found.files), settings.most))
   capture = _gather("images", written, folder, settings, warnings)
   numbers = _numbers(capture)
   turned = found.turned[numbers]
@@ -173,9 +173,18 @@ def _read_stills(
   )
 
 
-def _unused(used: int, count: int) -> list[str]:
-  """Says how many of pictures that were taken one by one are used, where not all are."""
-  if used == count:
+def _check_count(source: Path, count: int, settings: CaptureSettings, warnings: list[str]) -> None:
+  """Raises CaptureError, with what was left out, where too few pictures remain."""
+  if count < settings.min_images:
+    raise CaptureError(
+      f"{source}: {' '.join(warnings)} At least {settings.min_images} different pictures of one "
+      "camera are needed."
+    )
+
+
+def _unused(used: int, count: int, most: int) -> list[str]:
+  """Says how many of `count` pictures are used where that are more than there may be."""
+  if count <= most:
     return []
   return [
     f"{used} of {count} pictures are used, the sharpest of each few that follow each other: "
@@ -200,24 +209,39 @@ def _written_camera(camera: Camera, capture: Capture) -> Camera:
 
 
 def _sharpest_pictures(
-  count: int,
+  files: Sequence[Path],
   read: Callable[[int], np.ndarray],
   most: int,
+  warnings: list[str],
   progress: Progress,
 ) -> Iterator[Frame]:
-  """Yields the sharpest of each of `most` equal parts of `count` pictures that `read` reads."""
+  """Yields the sharpest of each of `most` equal parts of pictures.
+
+  Args:
+    files: The pictures.
+    read: Reads one by its number.
+    most: Parts, at most one per picture.
+    warnings: Receives a line when some cannot be read.
+    progress: Called with the fraction done and a text.
+  """
+  count, lost = len(files), []
   parts = min(most, count)
   edges = np.linspace(0, count, parts + 1).astype(int)
   for first, last in itertools.pairwise(edges):
     best: Frame | None = None
     for index in range(first, last):
-      image = read(index)
+      try:
+        image = read(index)
+      except CaptureError:
+        lost.append(files[index])
+        continue
       value = sharpness(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
       if best is None or value > best.sharpness:
         best = Frame(index, 0.0, value, image)
     progress(last / count, f"picture {last} of {count}")
     if best is not None:
       yield best
+  warnings.extend(stills.unreadable(lost, count))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,9 @@ quarter, so that its sensor lies as theirs; of several lenses the most common on
 """
 
 import collections
+import contextlib
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ _REDUCED = (
   (2, cv2.IMREAD_REDUCED_COLOR_2),
 )
 _ENOUGH = 1600  # long side at which features are sought: smaller pictures lose some [pixel]
+_NAMED = 4  # files in a warning
 _TURNED = (5, 6, 7, 8)  # EXIF orientations with width and height exchanged
 # Camera axes of the upright picture in those of the one that was turned counter-clockwise.
 _TURNED_FROM_UPRIGHT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -36,8 +38,15 @@ pi_heif.register_heif_opener()
 
 
 def list_images(folder: Path) -> list[Path]:
-  """Lists the pictures of a folder (not of its subfolders), sorted by name."""
-  return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+  """Lists the pictures of a folder (not of its subfolders), sorted by name, without hidden files.
+
+  macOS writes a file "._IMG_1.JPG", which is no picture, beside a picture on a foreign disk.
+  """
+  return sorted(
+    path
+    for path in folder.iterdir()
+    if path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != "." and path.is_file()
+  )
 
 
 def list_images_below(source: Path) -> list[Path]:
@@ -89,6 +98,18 @@ class Stills(NamedTuple):
     return (long_side, short_side) if wide else (short_side, long_side)
 
 
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[PIL.Image.Image]:
+  """Opens a picture of any size; PIL refuses those of more than 178 megapixels by default."""
+  limit = PIL.Image.MAX_IMAGE_PIXELS
+  PIL.Image.MAX_IMAGE_PIXELS = None
+  try:
+    with PIL.Image.open(path) as image:
+      yield image
+  finally:
+    PIL.Image.MAX_IMAGE_PIXELS = limit
+
+
 def look_of(path: Path) -> Look:
   """Reads a still's size and lens from its header.
 
@@ -96,11 +117,11 @@ def look_of(path: Path) -> Look:
     CaptureError: It is no picture.
   """
   try:
-    with PIL.Image.open(path) as image:
+    with opened(path) as image:
       width, height = image.size
       exif = image.getexif()
       detail = exif.get_ifd(PIL.ExifTags.IFD.Exif)
-  except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
+  except (OSError, ValueError, SyntaxError) as error:
     raise CaptureError(
       f"{path} cannot be read as a picture: remove it or copy it again ({error})."
     ) from error
@@ -108,6 +129,15 @@ def look_of(path: Path) -> Look:
     width, height = height, width
   focal = detail.get(PIL.ExifTags.Base.FocalLengthIn35mmFilm)
   return Look(width, height, float(focal) if focal else None)
+
+
+def unreadable(lost: Sequence[Path], count: int) -> list[str]:
+  """Says which of `count` files cannot be read, if any."""
+  if not lost:
+    return []
+  rest = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+  names = ", ".join(path.name for path in lost[:_NAMED])
+  return [f"{len(lost)} of {count} files cannot be read as a picture, left out: {names}{rest}."]
 
 
 def _without_copies(files: Sequence[Path]) -> list[Path]:
@@ -135,13 +165,22 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   """Keeps the pictures of the most common camera, each once.
 
   Pictures in several sizes, as messengers make them, are all kept while the smallest shows as many
-  features as the others.
+  features as the others. What is no picture is left out.
 
   Raises:
-    CaptureError: One is no picture.
+    CaptureError: None is a picture.
   """
-  once = _without_copies(files)
-  looks = [look_of(path) for path in once]
+  look_at, lost = {}, []
+  for path in files:
+    try:
+      look_at[path] = look_of(path)
+    except CaptureError:
+      lost.append(path)
+  warnings = unreadable(lost, len(files))
+  if not look_at:
+    raise CaptureError(f"{files[0].parent}: {' '.join(warnings)} Copy the pictures again.")
+  once = _without_copies(list(look_at))
+  looks = [look_at[path] for path in once]
   common = _most_common(looks)
   least = min(common.long_side, _ENOUGH)
   alike = [look.shares_camera(common) and look.long_side >= least for look in looks]
@@ -150,9 +189,8 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   across = [
     (look.width >= look.height) != wide for look, same in zip(looks, alike, strict=True) if same
   ]
-  warnings = []
-  if len(once) < len(files):
-    warnings.append(f"{len(files) - len(once)} of {len(files)} pictures are copies of others.")
+  if copies := len(look_at) - len(once):
+    warnings.append(f"{copies} of {len(files)} pictures are copies of others.")
   others = collections.Counter(look for look, same in zip(looks, alike, strict=True) if not same)
   if others:
     rest = ", ".join(f"{count} of {look}" for look, count in others.most_common(3))
@@ -181,7 +219,7 @@ def read_still(path: Path, *, least: int | None = None, upright: bool = True) ->
   image = None
   if path.suffix.lower() in APPLE_SUFFIXES:
     try:
-      with PIL.Image.open(path) as picture:  # libheif has turned it
+      with opened(path) as picture:  # libheif has turned it
         image = np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
     except (OSError, ValueError, SyntaxError):
       image = None

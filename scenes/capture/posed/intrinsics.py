@@ -5,10 +5,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-import PIL.Image
 
 from nerf2real.core.camera_info import read_camera_info
 from nerf2real.core.cameras import Camera
+from nerf2real.scenes.capture.media import stills
 from nerf2real.scenes.capture.media.errors import CaptureError
 
 CAMERA_INFO = "camera_info.yaml"
@@ -52,7 +52,7 @@ def picture_size(path: Path) -> tuple[int, int]:
     CaptureError: It is damaged.
   """
   try:
-    with PIL.Image.open(path) as image:
+    with stills.opened(path) as image:
       return image.size
   except (OSError, ValueError, SyntaxError) as error:
     raise CaptureError(f"{path} cannot be read as a picture ({error}).") from error

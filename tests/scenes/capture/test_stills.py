@@ -151,7 +151,37 @@ def test_apples_pictures_are_read(tmp_path):
   ]
   (tmp_path / "IMG_0002.HEIC").write_bytes(b"ftypheic")
   with pytest.raises(CaptureError, match=r"IMG_0002\.HEIC cannot be read as a picture"):
-    stills.of_one_camera(sorted(tmp_path.iterdir()))
+    stills.look_of(tmp_path / "IMG_0002.HEIC")
+
+
+def test_what_is_no_picture_is_left_out_and_named(tmp_path):
+  for number in range(8):
+    _still(tmp_path / f"{number}.png", (160, 120), seed=number)
+  (tmp_path / "._0.png").write_bytes(b"Mac OS X resource fork")
+  assert "._0.png" not in [path.name for path in stills.list_images(tmp_path)]
+  (tmp_path / "7a.png").touch()
+  capture = read_capture(tmp_path, tmp_path / "out")
+  assert len(capture.images) == 8
+  assert "1 of 9 files cannot be read as a picture, left out: 7a.png." in capture.warnings
+  _still(tmp_path / "8.bmp", (160, 120), seed=8)
+  data = (tmp_path / "8.bmp").read_bytes()
+  (tmp_path / "8.bmp").write_bytes(data[:300])  # its header is whole
+  capture = read_capture(tmp_path, tmp_path / "out")
+  assert len(capture.images) == 8 and not any("are used" in text for text in capture.warnings)
+  assert any("1 of 9 files" in text and "8.bmp" in text for text in capture.warnings)
+  (tmp_path / "7.png").write_bytes(b"broken")
+  with pytest.raises(CaptureError, match="left out: 7.png, 7a.png.* At least 8 different"):
+    read_capture(tmp_path, tmp_path / "out")
+  with pytest.raises(CaptureError, match="1 of 1 files cannot be read as a picture, left out: 7a"):
+    stills.of_one_camera([tmp_path / "7a.png"])
+
+
+def test_a_picture_that_pil_takes_for_a_bomb_is_read(tmp_path, monkeypatch):
+  _still(tmp_path / "huge.jpg", (64, 48))
+  monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 1000)
+  assert stills.look_of(tmp_path / "huge.jpg") == (64, 48, None)
+  assert stills.read_still(tmp_path / "huge.jpg", least=32).shape == (24, 32, 3)
+  assert PIL.Image.MAX_IMAGE_PIXELS == 1000
 
 
 def test_an_apple_picture_of_a_turned_phone_is_upright():
