@@ -168,7 +168,11 @@ class Camera:
 
   @classmethod
   def from_opencv(
-    cls, width: int, height: int, matrix: np.ndarray, distortion: Sequence[float]
+    cls,
+    width: int,
+    height: int,
+    matrix: np.ndarray | Sequence[float],
+    distortion: Sequence[float],
   ) -> "Camera":
     """Returns the camera that OpenCV calibrated, or that ROS's CameraInfo describes.
 

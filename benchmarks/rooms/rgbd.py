@@ -134,7 +134,8 @@ def write_lists(folder: Path, poses: np.ndarray, camera: Camera, *, rate: float 
     (folder / f"{kind}.txt").write_text("".join(rows))
   values = np.c_[times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()]
   np.savetxt(folder / "groundtruth.txt", values, fmt="%.6f")
-  lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
+  cx, cy = camera.opencv_matrix[:2, 2]
+  lens = [camera.fx, camera.fy, cx, cy, *camera.distortion]
   np.savetxt(folder / "calibration.txt", [lens], fmt="%.6f")
 
 

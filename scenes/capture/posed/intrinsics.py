@@ -1,4 +1,9 @@
-"""Intrinsics that lie beside a sequence of pictures, in the files that data sets have."""
+"""Intrinsics that lie beside a sequence of pictures, in the files that data sets have.
+
+All of them have the centre of the first pixel at (0, 0), as OpenCV: Open3D, whose own camera of
+640x480 has its principal point at (319.5, 239.5), and the tools of TUM, ScanNet, 3DMatch and ETH3D
+lift a depth pixel of column u by (u - cx) / fx.
+"""
 
 import json
 import math
@@ -86,6 +91,5 @@ def _of_numbers(path: Path, values: np.ndarray, picture: Path) -> Camera:
       f"{path} holds {values.size} numbers, expected a 3x3 or 4x4 camera matrix or fx, fy, cx, cy."
     )
   width, height = picture_size(picture)
-  names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-  lens = {name: float(value) for name, value in zip(names, flat, strict=False)}
-  return Camera(width=width, height=height, **lens)
+  fx, fy, cx, cy, *lens = flat.tolist()
+  return Camera.from_opencv(width, height, [fx, 0, cx, 0, fy, cy, 0, 0, 1], lens or [0.0] * 4)

@@ -83,7 +83,7 @@ def test_a_scannet_scene_gives_poses_and_depth(tmp_path):
   for name in ("pose", "intrinsic"):
     (folder / name).mkdir()
   matrix = np.diag([280.0, 280.0, 1.0, 1.0])
-  matrix[:2, 2] = 160.0, 120.0
+  matrix[:2, 2] = 159.5, 119.5
   np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
   for row, pose in enumerate(POSES):
     np.savetxt(folder / "pose" / f"{row}.txt", pose)

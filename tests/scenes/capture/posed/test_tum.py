@@ -148,12 +148,12 @@ def test_a_camera_is_read_from_other_tools_files_or_assumed(tum, tmp_path):
   (folder / "camera_info.yaml").unlink()
   with pytest.raises(CaptureError, match="320x240, not TUM's 640x480: add camera_info.yaml"):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
-  (folder / "calibration.txt").write_text("280 280 160 120")
+  (folder / "calibration.txt").write_text("280 280 159.5 119.5")
   check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
   (folder / "calibration.txt").write_text("280 280")
   with pytest.raises(CaptureError, match="holds 2 numbers, expected"):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
-  columns = np.array([[280.0, 0, 160], [0, 280, 120], [0, 0, 1]]).T.ravel().tolist()
+  columns = np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]).T.ravel().tolist()
   (folder / "camera_intrinsic.json").write_text(json.dumps({"intrinsic_matrix": columns}))
   check(read_capture(folder, tmp_path / "images", settings=SETTINGS))
 
