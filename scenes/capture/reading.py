@@ -278,8 +278,10 @@ def _write(frames: Iterator[Frame], folder: Path) -> list[_Written]:
 
 def _spread(written: list[_Written], count: int) -> list[_Written]:
   """Keeps `count` of a film's frames, see `spacing.spread`, and removes the others."""
-  index, travelled, sharp = np.array([[w.index, w.travelled, w.sharpness] for w in written]).T
-  kept = spread(index, travelled, sharp, min(count, len(written)))
+  rows = [[w.time, w.index, w.travelled, w.sharpness] for w in written]
+  time, index, travelled, sharp = np.array(rows).T
+  when = time if np.ptp(time) > 0 else index  # a bare stream has no times
+  kept = spread(when, travelled, sharp, min(count, len(written)))
   for number in set(range(len(written))) - set(kept.tolist()):
     written[number].path.unlink()
   return [written[number] for number in kept]

@@ -26,8 +26,9 @@ from nerf2real.scenes.stages.results import Source
 
 # 2: stills turned and without copies, depth checked with the pictures, a video's keyframes where
 # the picture moves; rgbd 3: depth has its own poses; video 3, rgbd 4, others 3: kept without loss;
-# rgbd 5, others 4: posed pictures as stored, principal points of text files by half a pixel
-_PICTURES_VERSIONS = {"video": 3, "rgbd": 5}
+# video 4: spread over its frames' times; rgbd 5, others 4: posed pictures as stored, principal
+# points of text files by half a pixel
+_PICTURES_VERSIONS = {"video": 4, "rgbd": 5}
 _PICTURES_VERSION = 4  # of all others
 # 2: the unit frame's yaw; 3: the rolling shutter is taken out; 4: up by level right axes;
 # 5: wrong places found, fainter features; 6: places that came hold what sees little;

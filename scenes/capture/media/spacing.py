@@ -53,15 +53,15 @@ class ImageMotion:
 
 
 def spread(
-  index: np.ndarray, travelled: np.ndarray, sharpness: np.ndarray, count: int
+  time: np.ndarray, travelled: np.ndarray, sharpness: np.ndarray, count: int
 ) -> np.ndarray:
   """Chooses candidates: the sharpest of each of `count` parts that are as long.
 
   A part's length is half that of time and half that of motion, each as a share of the film's. So no
-  part is longer than twice an even one in either.
+  part is longer than twice an even one in either. What does not grow has no share.
 
   Args:
-    index: Number of each candidate's frame, increasing [C].
+    time: Of each candidate [s], or its frame's number where the film has no times [C].
     travelled: How far the picture had moved by then, see `ImageMotion` [C].
     sharpness: Of each [C].
     count: How many are chosen, at most C.
@@ -69,7 +69,9 @@ def spread(
   Returns:
     Their rows, increasing [count].
   """
-  length = sum((x - x[0]) / max(np.ptp(x), 1e-12) for x in (index.astype(float), travelled)) / 2
+  grown = [np.maximum.accumulate(x - x[0]) for x in (time.astype(float), travelled)]
+  length = sum(x / max(x[-1], 1e-12) for x in grown)
+  length = length / max(length[-1], 1e-12)
   parts = np.arange(count + 1)
   edges = np.searchsorted(length, parts / count)
   edges[-1] = len(length)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from fractions import Fraction
 
 import av
 import cv2
@@ -63,6 +64,21 @@ def test_a_long_film_has_more_keyframes(frames, tmp_path, most, kept):
   synthetic.write_video(path, frames, codec="libx264")
   settings = CaptureSettings(num_keyframes=3, most_keyframes=most, min_images=3)
   assert len(read_capture(path, tmp_path / "keyframes", settings=settings).images) == kept
+
+
+def test_keyframes_of_a_variable_rate_are_spread_over_time(frames, tmp_path):
+  path = tmp_path / "film.mp4"
+  with av.open(str(path), "w") as container:
+    stream = container.add_stream("libx264", rate=100)
+    stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+    stream.codec_context.time_base = Fraction(1, 100)
+    for row, picture in enumerate(frames):
+      frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+      frame.pts, frame.time_base = max(row, 30 * row - 12 * 29), Fraction(1, 100)
+      container.mux(stream.encode(frame))
+    container.mux(stream.encode())
+  times = read_capture(path, tmp_path / "keyframes", settings=SETTINGS).times
+  assert times[-1] > 3.0 and (times < 0.115).sum() == 2  # half of the frames, in a thirtieth of it
 
 
 @pytest.mark.parametrize("rotation", [90, 180, -90])

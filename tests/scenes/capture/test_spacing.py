@@ -47,6 +47,18 @@ def test_no_gap_is_longer_than_twice_an_even_one_in_time_or_in_motion():
   assert fast.sum() > 35  # of 17 where time alone counts
 
 
+def test_a_film_without_motion_is_cut_into_equal_parts():
+  sharp = np.tile([1.0, 3.0, 2.0], 10)
+  np.testing.assert_array_equal(spread(np.arange(30), np.zeros(30), sharp, 10), np.arange(1, 30, 3))
+
+
+def test_frames_of_a_variable_rate_count_by_their_times():
+  time = np.concatenate([np.arange(100) / 100, 1 + np.arange(100) / 10])  # 1 s, then 10 s
+  rows = spread(time, time, np.zeros(200), 11)
+  assert (rows < 100).sum() == 1
+  assert np.diff(time[rows]).max() < 1.2
+
+
 @pytest.mark.parametrize("travelled", [np.zeros(5), np.array([0.0, 0.0, 0.0, 0.0, 9.0])])
 def test_as_many_are_chosen_as_asked_for_whatever_moves(travelled):
   rows = spread(np.arange(5), travelled, np.ones(5), 5)
