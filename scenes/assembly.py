@@ -59,7 +59,7 @@ def assemble(
     figures |= results.baseline.value
   capture, poses, alignment = results.capture.value, results.poses.value, results.world.value
   seconds = {stage: result.seconds for stage, result in stages.items()}
-  warnings = [*capture.warnings, *poses.warnings, *alignment.warnings]
+  warnings = [*capture.warnings, *map(capture.told, poses.warnings), *alignment.warnings]
   if (lost := capture.without_place(poses.names)) is not None:
     warnings.append(lost)
   ratio = figures.get("exposure_ratio", 1.0)
@@ -89,6 +89,7 @@ def assemble(
       warnings=warnings,
       settings=to_plain(settings),
       keyframes=capture.images,
+      names=capture.names,
       strategy=poses.strategy,
       cameras=alignment.world_from_unit.apply(poses.world_from_camera[:, :3, 3]),
       filmed=capture.times is not None or tracked,

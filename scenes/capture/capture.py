@@ -1,6 +1,7 @@
 """Keyframes of a capture: what is known of them, and what may ruin a reconstruction from them."""
 
 import dataclasses
+import re
 from collections.abc import Collection
 from pathlib import Path
 
@@ -77,10 +78,20 @@ class Capture:
   """Deviation of the blur along its widest direction at the standard size [N] [pixel]; None in a
   record of an earlier version."""
 
+  @property
+  def names(self) -> dict[str, str]:
+    """The name of each keyframe's file, and of the file that whoever took it knows."""
+    given = [path.name for path in self.images]
+    return dict(zip(given, self.origins or given, strict=True))
+
+  def told(self, text: str) -> str:
+    """Replaces keyframes' names in a text by those that whoever took them knows."""
+    names = self.names
+    return re.sub("|".join(map(re.escape, names)), lambda found: names[found[0]], text)
+
   def called(self, chosen: np.ndarray, *, most: int) -> str:
     """Names up to `most` of chosen keyframes (bool [N]) as whoever took them knows them."""
-    names = self.origins or [path.name for path in self.images]
-    found = [name for name, wanted in zip(names, chosen, strict=True) if wanted]
+    found = [name for name, wanted in zip(self.names.values(), chosen, strict=True) if wanted]
     rest = f" and {len(found) - most} more" if len(found) > most else ""
     return ", ".join(found[:most]) + rest
 

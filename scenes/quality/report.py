@@ -172,6 +172,12 @@ class ReportData:
   """Without goals and cameras."""
   goals: np.ndarray
   """[G, 2]."""
+  names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+  """Name of a keyframe's file -> of the file that whoever took it knows."""
+
+  def called(self, name: str) -> str:
+    """What a view is called in the report."""
+    return self.names.get(name, name)
 
 
 def write(path: Path, data: ReportData) -> None:
@@ -179,7 +185,7 @@ def write(path: Path, data: ReportData) -> None:
   sections = [
     in_short.section(data.figures),
     _views(data),
-    *([_robot_views(data.robot_views)] if data.robot_views else []),
+    *([_robot_views(data)] if data.robot_views else []),
     *_geometry(data),
     _free_space(data),
     _keyframes(data),
@@ -210,7 +216,8 @@ def _keyframes(data: ReportData) -> Section:
   cells = []
   for file in (data.keyframes[index] for index in chosen):
     image: Any = cv2.imread(str(file))
-    cells.append(Picture(pictures.shrink(image[..., ::-1], _THUMBNAIL_WIDTH), file.stem))
+    small = pictures.shrink(image[..., ::-1], _THUMBNAIL_WIDTH)
+    cells.append(Picture(small, data.called(file.name)))
   return Section(
     "Keyframes", f"{len(data.keyframes)} keyframes; {data.strategy}.", [Grid(cells, 6)]
   )
@@ -223,7 +230,7 @@ def _views(data: ReportData) -> Section:
   cells: list[Block] = []
   for view in (order[index] for index in chosen):
     shown = [
-      (view.truth, f"{view.name}: picture"),
+      (view.truth, f"{data.called(view.name)}: picture"),
       (view.image, f"field: {view.psnr_db:.1f} dB, SSIM {view.ssim:.3f}"),
       (pictures.error_map(view.truth, view.image), "error (white: 64 of 255)"),
       (pictures.depth_map(view.depth), "depth (near is red)"),
@@ -238,14 +245,14 @@ def _views(data: ReportData) -> Section:
   )
 
 
-def _robot_views(views: Sequence[ViewScore]) -> Section:
+def _robot_views(data: ReportData) -> Section:
   cells: list[Block] = []
-  for view in views[:_SHOWN_ROBOT_VIEWS]:
+  for view in data.robot_views[:_SHOWN_ROBOT_VIEWS]:
     cells += [
-      Picture(view.truth, f"{view.name}: truth", pixelated=True),
+      Picture(view.truth, f"{data.called(view.name)}: truth", pixelated=True),
       Picture(view.image, f"field: {view.psnr_db:.1f} dB", pixelated=True),
     ]
-  height, width = views[0].truth.shape[:2]
+  height, width = data.robot_views[0].truth.shape[:2]
   return Section(
     f"At the robot's resolution ({height}x{width})",
     "What the policy would see beside the same picture averaged over its pixels.",

@@ -248,7 +248,10 @@ def test_stills_without_a_place_are_named_as_their_files(tmp_path):
   assert said is not None and said.startswith("1 of 10 pictures have no place and are not used: ")
   assert names[3] in said and names[2] not in said
   assert "and 2 more" in (capture.without_place(keyframes[6:]) or "")
-  assert dataclasses.replace(capture, origins=None).without_place([]) is None
+  text = f"{keyframes[3]} sees fewest points (20)."
+  assert capture.told(text) == f"{names[3]} sees fewest points (20)."
+  film = dataclasses.replace(capture, origins=None)
+  assert film.without_place([]) is None and film.told(text) == text
 
 
 def test_an_error_leaves_the_last_good_keyframes(frames, tmp_path, monkeypatch):
