@@ -49,7 +49,8 @@ def read_capture(
   """Reads a source and writes its keyframes.
 
   Args:
-    source: A video, a folder of pictures, a folder with a COLMAP model, or a transforms.json.
+    source: A video, a folder of pictures, a folder with a COLMAP model, a transforms.json, or the
+      folder of an RGB-D sequence in TUM's, 7-Scenes' or ScanNet's layout.
     folder: Where the keyframes are written; replaced as a whole and only when all went well.
     settings: What to keep and when to warn.
     progress: Called with the fraction done and a text.

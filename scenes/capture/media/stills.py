@@ -203,7 +203,7 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
 
 
 def read_still(path: Path, *, least: int | None = None, upright: bool = True) -> np.ndarray:
-  """Reads a picture upright (EXIF) as BGR uint8 [H, W, 3]; transparent parts become black.
+  """Reads a picture upright (EXIF) as BGR uint8 [H, W, 3]; transparent parts keep their colour.
 
   A JPEG that is at least twice as large as needed is decoded at a half, a quarter or an eighth of
   its size, each pixel the mean over its area (libjpeg's scaled inverse transform).

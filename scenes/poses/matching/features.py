@@ -185,7 +185,7 @@ def largest_descriptors(database: Path, ids: list[int], count: int) -> np.ndarra
 def find_pairs(
   database: Path, settings: PairSettings, *, report: Progress = no_progress
 ) -> tuple[list[Pair], str]:
-  """Chooses which pictures of the database to match: see `scenes.poses.pairs`."""
+  """Chooses which pictures of the database to match: see `scenes.poses.matching.pairs`."""
   ids = list(image_ids(database).values())
 
   def score(keyframes: np.ndarray) -> np.ndarray:

@@ -176,6 +176,12 @@ def test_what_is_no_picture_is_left_out_and_named(tmp_path):
     stills.of_one_camera([tmp_path / "7a.png"])
 
 
+def test_transparent_parts_keep_their_colour(tmp_path):
+  pixels = np.full((4, 6, 4), (10, 20, 30, 0), np.uint8)
+  PIL.Image.fromarray(pixels).save(tmp_path / "clear.png")
+  np.testing.assert_array_equal(stills.read_still(tmp_path / "clear.png")[0, 0], [30, 20, 10])
+
+
 def test_a_picture_that_pil_takes_for_a_bomb_is_read(tmp_path, monkeypatch):
   _still(tmp_path / "huge.jpg", (64, 48))
   monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 1000)
