@@ -18,6 +18,8 @@ from nerf2real.scenes.capture.posed.tum import is_tum, read_tum
 
 _COLOR = ("color", "rgb", "images")  # ScanNet's folder of pictures, and what others call it
 
+_POSES = "pose/[!.]*.txt"  # ScanNet's, without the hidden files that macOS adds
+
 
 def find_rgbd(source: Path) -> str | None:
   """Layout of an RGB-D sequence's folder: "tum", "7scenes" or "scannet"; None if it is none."""
@@ -27,7 +29,7 @@ def find_rgbd(source: Path) -> str | None:
     return "tum"
   if any(source.glob("frame-*.pose.txt")):
     return "7scenes"
-  return "scannet" if any(source.glob("pose/*.txt")) and _color_folder(source) else None
+  return "scannet" if any(source.glob(_POSES)) and _color_folder(source) else None
 
 
 def _color_folder(source: Path) -> Path | None:
@@ -91,7 +93,7 @@ def read_scannet(source: Path) -> Recording:
   assert folder is not None  # `find_rgbd` has found it
   named = {path.stem: path for path in sorted(folder.iterdir())}
   found = _posed(
-    sorted(source.glob("pose/*.txt"), key=lambda path: (len(path.stem), path.stem)),
+    sorted(source.glob(_POSES), key=lambda path: (len(path.stem), path.stem)),
     lambda path: named.get(path.stem, folder / f"{path.stem}.jpg"),
     lambda path: source / "depth" / f"{path.stem}.png",
   )

@@ -87,6 +87,7 @@ def test_a_scannet_scene_gives_poses_and_depth(tmp_path):
   np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
   for row, pose in enumerate(POSES):
     np.savetxt(folder / "pose" / f"{row}.txt", pose)
+  (folder / "pose" / "._0.txt").write_bytes(b"Mac OS X resource fork")
   assert source_kind(folder) == "rgbd"
   with pytest.raises(CaptureError, match="give one of them, such as .*scene0000_00"):
     source_kind(tmp_path)
