@@ -34,8 +34,6 @@ class LocaliseSettings:
   """Of few keyframes so many are enough. Chosen: one or two of ten photographs often fail."""
   min_parallax: float = 0.08
   """Share of matches that no turn of the camera explains below which a warning is given."""
-  max_contradicting: float = 0.05
-  """Share of matching pairs that contradict their places above which a warning is given."""
   refine_known: bool = True
   """Whether poses that came with measured depth are adjusted to the pictures."""
   seed: int = 0

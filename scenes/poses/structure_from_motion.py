@@ -17,7 +17,7 @@ from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, readout, refinement
-from nerf2real.scenes.poses.checks import agreement, certainty, continuity
+from nerf2real.scenes.poses.checks import agreement, certainty, continuity, division
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.checks.support import best_supported
 from nerf2real.scenes.poses.localisation import (
@@ -37,6 +37,7 @@ from nerf2real.scenes.poses.unit_frame import unit_from_source as choose_unit_fr
 from nerf2real.scenes.poses.work import KNOWN_SHARES, Mapped, Steps, prepare_work
 
 _MODEL_FOLDER, _WORK_FOLDER = "sfm", "work"
+_NAMED = 6  # pictures in a warning
 
 
 def localise(
@@ -174,12 +175,12 @@ def _map(
       f"to {apart:.0%} of the room's width. {weakest.name} sees fewest points "
       f"({weakest.num_points3D}): take more pictures there, slowly and with more in view."
     )
-  against = agreement.contradicting(model, database)
-  if against > settings.max_contradicting:
+  if group := division.contradicting_group(model, database):
+    rest = f" and {len(group) - _NAMED} more" if len(group) > _NAMED else ""
     warnings.append(
-      f"Things that look alike: {against:.0%} of the matching pairs of pictures contradict where "
-      "these were placed. Where the report's worst view shows another thing than the picture, "
-      "cover one of the two and take the pictures anew."
+      f"Things that look alike: {', '.join(group[:_NAMED])}{rest} and the other pictures "
+      "contradict each other over more of what they show than they agree, so that some may be "
+      "placed before the wrong one of two: cover one of the two, and take those of both anew."
     )
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)

@@ -57,6 +57,7 @@ class FitSettings:
 _RATES = np.repeat([0.04, 0.04, 0.03, 0.1, 0.02], [3, 3, 4, 1, 3]).astype(np.float32)
 _MOMENTUM, _SQUARES, _EPSILON = 0.9, 0.99, 1e-12  # of Adam (Kingma and Ba 2015)
 _FINAL = 0.05  # of the learning rates, at the last step
+_AVERAGED = 1 / 3  # share of the fit, at its end, whose mean is taken (Polyak and Juditsky 1992)
 _LOWEST_TILT, _HIGHEST_TILT = 0.1, 0.55  # rad downwards: the paper's head tilt and a gait's sway
 _KEPT = 64  # pictures that are used again, in any order
 _MARGIN = 1.15  # of the field of view within which splats may reach into the picture
@@ -235,7 +236,9 @@ def _pictures(
 def _run(
   fitted: Fit, pictures: Iterator[Picture], settings: FitSettings, progress: Progress
 ) -> None:
+  """Takes the steps; the splats are the mean of those that the last ones left."""
   began, mean = time.monotonic(), 0.0
+  average, count = np.zeros_like(fitted.rows), 0
   for step in range(settings.steps):
     camera, pose, truth = next(pictures)
     spent = time.monotonic() - began
@@ -245,5 +248,10 @@ def _run(
     rate = settings.rate * _FINAL**done
     error = fitted.step(camera, pose, truth, rate=rate)
     mean += (error - mean) / min(step + 1, 100)
+    if done >= 1 - _AVERAGED:
+      count += 1
+      average += (fitted.rows - average) / count
     if step % 20 == 0:
       progress(done, f"step {step}, {-10 * np.log10(max(mean, 1e-10)):.1f} dB")
+  if count:
+    fitted.rows = average

@@ -25,8 +25,6 @@ from nerf2real.scenes.poses.matching.features import image_ids, quiet
 MAJORITY = 0.5  # share of a picture's matched area, or of a pair's matches, that must agree
 _TOLERANCE = 12.0  # pixels between a match and the point it leads to; COLMAP's for a new place
 _CELLS = 12  # into so many parts the longer side of a picture is divided, chosen
-_ASKED = 15  # matches of a pair that says something, as many as a place needs
-_CONTRADICTS = 0.25  # share of them that agree below which a pair contradicts, chosen
 _ROUNDS = 3  # at most: pictures that were placed well are new witnesses
 
 
@@ -118,26 +116,6 @@ def evidence(model: pycolmap.Reconstruction, database: Path) -> dict[int, Eviden
       cells = row * (_CELLS + 1) + column
       found[key] = Evidence(cells, features, others, ahead & (off < _TOLERANCE))
   return found
-
-
-def contradicting(model: pycolmap.Reconstruction, database: Path) -> float:
-  """Share of the matching pairs of pictures that contradict where the two were placed.
-
-  None do where all that looks the same is the same: a phone's film of a living room. Where two
-  things are alike a tenth may, whether pictures were placed before the right one or not.
-
-  Args:
-    model: Poses and points.
-    database: Its features and verified matches.
-  """
-  asked = against = 0
-  for said in evidence(model, database).values():
-    for other in np.unique(said.others):
-      agrees = said.agrees[said.others == other]
-      if len(agrees) >= _ASKED:
-        asked += 1
-        against += agrees.mean() < _CONTRADICTS
-  return against / max(asked, 1)
 
 
 def place_again(

@@ -168,11 +168,6 @@ def _mistake(model, database, image):
   return image
 
 
-def test_pairs_of_pictures_of_things_alike_contradict(model, corner, alike_matched):
-  assert agreement.contradicting(model, corner[0] / "out" / "work" / "database.db") == 0
-  assert agreement.contradicting(*alike_matched) > LocaliseSettings().max_contradicting
-
-
 def test_of_two_things_alike_the_area_decides(alike, alike_matched):
   truth, database = alike_matched
   images_folder = alike[0] / "images"
