@@ -6,8 +6,11 @@ keyframes, P points.
 """
 
 import dataclasses
+import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +20,7 @@ from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, readout, refinement
-from nerf2real.scenes.poses.checks import agreement, certainty, continuity, division
+from nerf2real.scenes.poses.checks import agreement, certainty, continuity, division, rotations
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.checks.support import best_supported
 from nerf2real.scenes.poses.localisation import (
@@ -168,6 +171,10 @@ def _map(
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
   check_registered(model, names, settings, share, film=film)
   assert model is not None  # for the type checker: check_registered has raised
+  if not film:
+    steps.begin("mapping")
+    found = Found(model, mapper, apart)
+    model, mapper, apart = _undeceived(found, database, images_folder, len(names), settings, steps)
   if apart > settings.max_apart:
     weakest = min(mapping.registered(model), key=lambda image: image.num_points3D)
     warnings.append(
@@ -276,6 +283,46 @@ def _best_model(
     if best is not None and best.num_reg_images() >= settings.repair_below * count:
       break
   return best, chosen, apart
+
+
+class Found(NamedTuple):
+  """A model, and how it came about."""
+
+  model: pycolmap.Reconstruction
+  mapper: str
+  apart: float  # how far attempts are apart, see `support`
+
+
+def _undeceived(
+  found: Found,
+  database: Path,
+  images_folder: Path,
+  count: int,
+  settings: LocaliseSettings,
+  steps: Steps,
+) -> Found:
+  """Maps photographs anew without pairs of things alike, where the model rests on such.
+
+  Those contradict the rotations that pairs of the largest area agree on, and so does the model.
+  """
+  camera = next(iter(found.model.cameras.values()))
+  pairs = rotations.relative_rotations(database, camera, seed=settings.seed)
+  agreed = rotations.consensus(pairs, seed=settings.seed)
+  against = rotations.contradiction(found.model, pairs, agreed)
+  if against is None:
+    return found
+  with tempfile.TemporaryDirectory(dir=database.parent) as folder:
+    copy = Path(shutil.copyfile(database, Path(folder) / "database.db"))
+    with pycolmap.Database.open(str(copy)) as db:
+      for pair in against.refuted:
+        db.delete_two_view_geometry(*pair)
+    model, mapper, apart = _best_model(copy, images_folder, count, settings, steps, None)
+  if model is None or model.num_reg_images() < needed(count, settings):
+    return found
+  left = rotations.contradiction(model, pairs, agreed)
+  if left is not None and len(left.turned) >= len(against.turned):
+    return found
+  return Found(model, f"{mapper} without {len(against.refuted)} pairs of things alike", apart)
 
 
 def _checked(

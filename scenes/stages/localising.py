@@ -35,8 +35,8 @@ _PICTURES_VERSION = 4  # of all others
 # 7: areas of matches are compared, photographs matched with guidance, uncertain ones left out;
 # 8: guidance of our own, attempts; 9: the readout with all that it moves;
 # 10: the readout is a frame's period at most; points of a COLMAP model are seen by pictures; of few
-# pictures some may have no place
-_POSES_VERSION = 10
+# pictures some may have no place; 11: photographs without pairs whose rotations contradict
+_POSES_VERSION = 11
 _SENSOR_VERSION = 2  # 2: depth at the pictures' times
 _SENSOR_RECORD = "sensor.json"  # what was done to the depth
 

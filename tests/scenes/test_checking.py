@@ -72,7 +72,7 @@ def _sized(monkeypatch, tmp_path, *, sensed=False, override=None):
     camera=None,
     unit_from_source=Similarity(2.0, np.eye(3), np.zeros(3)),
   )
-  known = types.SimpleNamespace(is_metric=True) if sensed else None
+  known = types.SimpleNamespace(is_metric=True, names_unit=True) if sensed else None
   capture = types.SimpleNamespace(known=known, unit_up=None)
   made = types.SimpleNamespace(value=capture, stamp="keyframes")
   monkeypatch.setattr(localising, "keyframes", lambda *_: made)
