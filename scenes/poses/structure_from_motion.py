@@ -322,7 +322,7 @@ def _undeceived(
   left = rotations.contradiction(model, pairs, agreed)
   if left is not None and len(left.turned) >= len(against.turned):
     return found
-  return Found(model, f"{mapper} without {len(against.refuted)} pairs of things alike", apart)
+  return Found(model, f"{mapper}, without {len(against.refuted)} pairs of things alike", apart)
 
 
 def _checked(
