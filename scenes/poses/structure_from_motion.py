@@ -317,8 +317,8 @@ def _undeceived(
       for pair in against.refuted:
         db.delete_two_view_geometry(*pair)
     model, mapper, apart = _best_model(copy, images_folder, count, settings, steps, None)
-  if model is None or model.num_reg_images() < needed(count, settings):
-    return found
+  if model is None or model.num_reg_images() < found.model.num_reg_images():
+    return found  # no picture needs a pair of things alike: some of these were none
   left = rotations.contradiction(model, pairs, agreed)
   if left is not None and len(left.turned) >= len(against.turned):
     return found
