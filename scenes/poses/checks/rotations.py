@@ -3,7 +3,7 @@
 Two windows with one view, or two shelves of like books, match as well as one thing seen twice. Seen
 as one they turn the pictures' frames against each other: around a loop of pairs with such a one
 rotations do not come to nothing. So rotations are looked for that agree with the pairs of the
-largest matched area; what does not agree is of things alike. Positions play no part, and no mapper,
+largest matched area; what does not agree is taken for things alike. Positions play no part, and no mapper,
 which may begin with the wrong pair and build on it.
 
 Sources: Zach et al. 2010, Disambiguating Visual Relations Using Loop Constraints; Govindu 2006,
