@@ -3,8 +3,8 @@
 Two windows with one view, or two shelves of like books, match as well as one thing seen twice. Seen
 as one they turn the pictures' frames against each other: around a loop of pairs with such a one
 rotations do not come to nothing. So rotations are looked for that agree with the pairs of the
-largest matched area; what does not agree is taken for things alike. Positions play no part, and no mapper,
-which may begin with the wrong pair and build on it.
+largest matched area; what does not agree is taken for things alike. Positions play no part, and no
+mapper, which may begin with the wrong pair and build on it.
 
 Sources: Zach et al. 2010, Disambiguating Visual Relations Using Loop Constraints; Govindu 2006,
 Robustness in Motion Averaging (consensus over random spanning trees). Shapes: N pictures, E pairs.
