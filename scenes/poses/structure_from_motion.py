@@ -6,11 +6,8 @@ keyframes, P points.
 """
 
 import dataclasses
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +17,8 @@ from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, readout, refinement
-from nerf2real.scenes.poses.checks import agreement, certainty, continuity, division, rotations
+from nerf2real.scenes.poses.checks import agreement, certainty, continuity, things_alike
+from nerf2real.scenes.poses.checks.overlap import overlap
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.checks.support import best_supported
 from nerf2real.scenes.poses.localisation import (
@@ -171,10 +169,16 @@ def _map(
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
   check_registered(model, names, settings, share, film=film)
   assert model is not None  # for the type checker: check_registered has raised
+  alike: list[str] = []
   if not film:
     steps.begin("mapping")
-    found = Found(model, mapper, apart)
-    model, mapper, apart = _undeceived(found, database, images_folder, len(names), settings, steps)
+
+    def map_again(database: Path) -> tuple[pycolmap.Reconstruction | None, str, float]:
+      return _best_model(database, images_folder, len(names), settings, steps, times)
+
+    found = things_alike.Found(model, mapper, apart)
+    model, mapper, apart = things_alike.undeceived(found, database, map_again, seed=settings.seed)
+    alike = things_alike.doubtful(model)
   if apart > settings.max_apart:
     weakest = min(mapping.registered(model), key=lambda image: image.num_points3D)
     warnings.append(
@@ -182,12 +186,12 @@ def _map(
       f"to {apart:.0%} of the room's width. {weakest.name} sees fewest points "
       f"({weakest.num_points3D}): take more pictures there, slowly and with more in view."
     )
-  if group := division.contradicting_group(model, database):
-    rest = f" and {len(group) - _NAMED} more" if len(group) > _NAMED else ""
+  if alike:
+    rest = f" and {len(alike) - _NAMED} more" if len(alike) > _NAMED else ""
     warnings.append(
-      f"Things that look alike: {', '.join(group[:_NAMED])}{rest} and the other pictures "
-      "contradict each other over more of what they show than they agree, so that some may be "
-      "placed before the wrong one of two: cover one of the two, and take those of both anew."
+      f"Things that look alike: {', '.join(alike[:_NAMED])}{rest} do not show most of what others "
+      "show that stand as close to it, so that they may be placed before the wrong one of two: "
+      "cover one of the two, and take those of both anew."
     )
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
@@ -285,46 +289,6 @@ def _best_model(
   return best, chosen, apart
 
 
-class Found(NamedTuple):
-  """A model, and how it came about."""
-
-  model: pycolmap.Reconstruction
-  mapper: str
-  apart: float  # how far attempts are apart, see `support`
-
-
-def _undeceived(
-  found: Found,
-  database: Path,
-  images_folder: Path,
-  count: int,
-  settings: LocaliseSettings,
-  steps: Steps,
-) -> Found:
-  """Maps photographs anew without pairs of things alike, where the model rests on such.
-
-  Those contradict the rotations that pairs of the largest area agree on, and so does the model.
-  """
-  camera = next(iter(found.model.cameras.values()))
-  pairs = rotations.relative_rotations(database, camera, seed=settings.seed)
-  agreed = rotations.consensus(pairs, seed=settings.seed)
-  against = rotations.contradiction(found.model, pairs, agreed)
-  if against is None:
-    return found
-  with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-    copy = Path(shutil.copyfile(database, Path(folder) / "database.db"))
-    with pycolmap.Database.open(str(copy)) as db:
-      for pair in against.refuted:
-        db.delete_two_view_geometry(*pair)
-    model, mapper, apart = _best_model(copy, images_folder, count, settings, steps, None)
-  if model is None or model.num_reg_images() < found.model.num_reg_images():
-    return found  # no picture needs a pair of things alike: some of these were none
-  left = rotations.contradiction(model, pairs, agreed)
-  if left is not None and len(left.turned) >= len(against.turned):
-    return found
-  return Found(model, f"{mapper}, without {len(against.refuted)} pairs of things alike", apart)
-
-
 def _checked(
   model: pycolmap.Reconstruction,
   database: Path,
@@ -335,15 +299,17 @@ def _checked(
 ) -> tuple[pycolmap.Reconstruction, str]:
   """Returns a model without the wrong places that its matches show, and what was done, in words.
 
-  What is out of a film's line is placed once more, by what all others see.
+  Pictures keep their places where those that are found anew see less of what they ought to. What is
+  out of a film's line is placed once more, by what all others see.
   """
   placed, dropped = 0, 0
   for _ in range(2):
-    model, moved = agreement.place_again(
+    again, moved = agreement.place_again(
       model, database, images_folder, seed=settings.seed, report=steps.report
     )
+    if moved and overlap(again).balance >= overlap(model).balance:
+      model, placed = again, placed + moved
     dropped = 0 if times is None else continuity.drop_out_of_line(model, database, times)
-    placed += moved
     if not dropped:
       break
   words = f", {placed} pictures placed by what the others see" if placed else ""

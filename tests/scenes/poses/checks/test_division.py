@@ -1,4 +1,4 @@
-"""Pictures that contradict all others as a group."""
+"""Pictures are divided where they have least to do with each other."""
 
 import itertools
 
@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 
 from nerf2real.scenes.poses.checks import division
-from nerf2real.scenes.poses.checks.agreement import Evidence
-
-CELLS = np.arange(60)  # every feature in a cell of its own
 
 
 def _weights(count, group, *, within, across, seed=0):
@@ -44,16 +41,3 @@ def test_no_division_of_few_pictures_has_a_lesser_sum_across():
 def test_pictures_that_agree_or_have_nothing_in_common_are_not_divided():
   assert division.divide(_weights(9, [0, 1], within=3.0, across=0.5)) is None
   assert division.divide(np.zeros((4, 4))) is None
-
-
-def test_areas_count_cells_of_pairs_that_say_something():
-  few, many = np.arange(10), np.arange(20, 60)
-  features = np.concatenate([few, many, many])
-  others = np.repeat([2, 3, 4], [10, 40, 40])
-  agrees = np.concatenate([np.ones(50, bool), np.arange(40) < 8])
-  said = {1: Evidence(CELLS, features, others, agrees)}
-  said |= {key: Evidence(CELLS, few[:0], few[:0], agrees[:0]) for key in (2, 3, 4)}
-  found = division.areas(said)
-  assert found.ids == [1, 2, 3, 4]
-  assert found.agreeing[0].tolist() == found.agreeing[:, 0].tolist() == [0, 0, 40, 0]
-  assert found.against[0].tolist() == [0, 0, 0, 32]
