@@ -123,12 +123,14 @@ def make_updates(settings: DistillSettings, layout: Layout) -> Updates:
   ) -> tuple[TrainingState, LstmState, Metrics]:
     def loss(params: dict[str, Params]):
       if keeps_memory:
-        params = _with_frozen_memory(params)
+        params = _with_memory(params, jax.lax.stop_gradient(params))
       return unroll_loss(params, state, batch, batch["features"], carried, settings)
 
     params = _without_encoder(state.student)
     gradients, (carried, metrics) = jax.grad(loss, has_aux=True)(params)
     params, optimiser_state = step(params, gradients, state.policy_optimiser, rate)
+    if keeps_memory:  # what the optimiser remembers of an earlier stage would move it on
+      params = _with_memory(params, state.student)
     new = state._replace(student=state.student | params, policy_optimiser=optimiser_state)
     return new, carried, metrics
 
@@ -290,10 +292,10 @@ def _without_encoder(params: dict[str, Params]) -> dict[str, Params]:
   return {name: params[name] for name in ("policy", "belief")}
 
 
-def _with_frozen_memory(params: dict[str, Params]) -> dict[str, Params]:
-  """Returns the same parameters, of which no gradient reaches LSTM and belief."""
-  frozen = jax.lax.stop_gradient((params["policy"]["lstm"], params["belief"]))
-  return {"policy": params["policy"] | {"lstm": frozen[0]}, "belief": frozen[1]}
+def _with_memory(params: dict[str, Params], other: dict[str, Params]) -> dict[str, Params]:
+  """Returns parameters with the LSTM and the belief of others."""
+  policy = params["policy"] | {"lstm": other["policy"]["lstm"]}
+  return {"policy": policy, "belief": other["belief"]}
 
 
 def _scaled(images: jax.Array) -> jax.Array:

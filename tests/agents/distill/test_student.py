@@ -160,3 +160,20 @@ def test_updates_lower_the_loss_and_reach_their_own_parameters(kind):
   if kind == "walk":
     lstm = jax.tree.leaves(before["policy"]["lstm"]), jax.tree.leaves(after["policy"]["lstm"])
     assert all(np.array_equal(a, b) for a, b in zip(*lstm, strict=True))
+
+
+def test_the_walk_alone_learns_after_a_stage_in_which_the_memory_did():
+  """Adam goes on along what it remembers of gradients, though there are none any more."""
+  updates, state = make_state()
+  batch = _batch()
+  batch["features"] = np.random.default_rng(3).normal(size=(2, 6, 8)).astype(np.float32)
+  carried = student.initial_state(2, TINY.agent.network)
+  for _ in range(5):
+    state, carried, _ = updates.policy(state, batch, carried, 1e-3)
+  before = jax.device_get(state.student)
+  for _ in range(3):
+    state, carried, _ = updates.walk(state, batch, carried, 1e-3)
+  after = jax.device_get(state.student)
+  for kept in (lambda found: found["policy"]["lstm"], lambda found: found["belief"]):
+    jax.tree.map(np.testing.assert_array_equal, kept(before), kept(after))
+  assert not np.array_equal(before["policy"]["mean"]["w"], after["policy"]["mean"]["w"])
