@@ -161,11 +161,12 @@ class DistillSettings:
       raise ValueError(f"The stages' shares must sum to 1, found {total:g}.")
     if self.keep_minutes < 0:
       raise ValueError(f"keep_minutes must be 0 or more, found {self.keep_minutes:g}.")
-    if self.teacher_frames < self.first_frames:
-      raise ValueError(
-        f"teacher_frames must be {self.first_frames} (first_frames) or more, found "
-        f"{self.teacher_frames}: training would wait for frames that nobody collects."
-      )
+    for name in ("max_frames", "teacher_frames"):
+      if getattr(self, name) < self.first_frames:
+        raise ValueError(
+          f"{name} must be {self.first_frames} (first_frames) or more, found "
+          f"{getattr(self, name)}: training would wait for frames that nobody collects."
+        )
 
 
 def nerf_nav() -> DistillSettings:

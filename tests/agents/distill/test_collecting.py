@@ -42,6 +42,12 @@ def test_room_is_left_for_frames_of_students():
   assert settings.nerf_nav_60x80().teacher_frames < settings.nerf_nav_60x80().max_frames
 
 
+@pytest.mark.parametrize("name", ["max_frames", "teacher_frames"])
+def test_frames_that_nobody_would_collect_are_refused(name):
+  with pytest.raises(ValueError, match=rf"{name} must be 8000 \(first_frames\) or more, found 4"):
+    dataclasses.replace(settings.nerf_nav(), **{name: 4_000})
+
+
 def test_pushes_come_in_steps():
   tiny = settings.preset("tiny")
   assert schedule.push_level(tiny, 39) == (0.0, 0.0)
