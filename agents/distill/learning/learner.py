@@ -25,6 +25,7 @@ from nerf2real.agents.distill.learning.training import Trainer
 from nerf2real.agents.distill.schedule import BORROWED, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
 from nerf2real.agents.distill.views import kept_views
+from nerf2real.agents.dmpo import scaling
 from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments.loading import in_scene, make_environment
@@ -103,8 +104,7 @@ class Learner:
       LimiterSettings(
         steps_per_update=1.0,
         min_replay_steps=settings.max_frames,
-        trajectory_steps=1,
-        max_steps=settings.max_frames,
+        trajectory_steps=1,  # no `max_steps`: a run goes on when its last frame is there
       ),
       steps=self._data.frames,
     )
@@ -113,7 +113,8 @@ class Learner:
     self._periods = Periods()
     self._validation_period = _VALIDATION_PERIOD
     self._evaluation: dict[str, Any] = {}  # the last one
-    self._is_fit = bool(settings.init_from)  # whether encoder and policy belong together now
+    # Whether encoder and policy belong together now; in a saved state they may not.
+    self._is_fit = bool(settings.init_from) and not self._counters.updates
     self._compiled: set[str] = set()  # kinds of stages whose update was called
     self._recent: list[dict[str, jax.Array]] = []
     self._rates = Rates(self._data.frames, self._counters.updates)
@@ -180,7 +181,7 @@ class Learner:
       self._stop.wait(_WAIT)
     if self._settings.views and not self._stop.is_set():
       self._trainer.views = self._make_views()
-    if self._counters.updates or self._stop.is_set():
+    if self._stop.is_set() or scaling.is_measured(self._trainer.state.scales):
       return
     self._trainer.standardise()
     _log.info("Training begins with %d frames.", self._data.frames)

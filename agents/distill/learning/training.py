@@ -63,7 +63,7 @@ class Trainer:
     """Measures the scaling of inputs and labels on the frames that are not held out; fits the heads
     that a policy to begin with does not have."""
     frames = self._training_frames()
-    self.state = standardised(
+    state = standardised(
       self.state,
       state_rows=self._data.arrays["state"][frames],
       labels=self._data.arrays["label"][frames],
@@ -72,7 +72,8 @@ class Trainer:
       keep_policy=bool(self._settings.init_from),
     )
     if self._settings.init_from:
-      self.state = with_fitted_heads(self.state, self._updates, data=self._data, cache=self._cache)
+      state = with_fitted_heads(state, self._updates, data=self._data, cache=self._cache)
+    self.state = state
 
   def begin_stage(self, kind: str) -> None:
     """Begins a stage: new streams through the episodes, and features of the present encoder."""

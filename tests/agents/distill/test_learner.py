@@ -16,12 +16,15 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.distill import schedule, settings
-from nerf2real.agents.distill.learning import checkpoint
+from nerf2real.agents.distill.dataset import Dataset, fields, transition_fields
+from nerf2real.agents.distill.learning import checkpoint, student
 from nerf2real.agents.distill.learning.learner import Learner
 from nerf2real.agents.distill.learning.updates import make_updates
 from nerf2real.agents.distill.settings import Stage
-from nerf2real.agents.dmpo.policy.export import load_policy
-from tests.agents.distill.test_student import LAYOUT, TINY
+from nerf2real.agents.dmpo.policy.export import export_policy, load_policy
+from nerf2real.agents.link import sessions
+from nerf2real.core.serialization import to_plain
+from tests.agents.distill.test_student import LAYOUT, TINY, make_state
 
 SCRIPT = Path(__file__).parents[3] / "launch" / "distill.py"
 
@@ -118,6 +121,83 @@ def test_a_student_is_kept_once_a_period(tmp_path, monkeypatch):
   assert written == ["newest", "kept_000", "newest", "newest", "kept_001"] + ["newest"] * 2 + [
     "kept_003"
   ]
+
+
+class _Link:
+  """Takes no episodes and keeps what is served."""
+
+  failure = ""
+
+  def __init__(self, session, settings, *, limiter, **_):
+    self.limiter, self.served = limiter, []
+    self.set_status = self.take_metrics = self.stop_actors = lambda *_: []
+
+  def publish_parameters(self, arrays, *, version):
+    self.served.append(version)
+
+
+@pytest.fixture
+def make_learner(tmp_path, monkeypatch):
+  """Makes learners that begin with a policy, in one run's folder with two episodes."""
+  environment = SimpleNamespace(close=lambda: None)
+  for name, value in {
+    "make_environment": lambda name, seed: environment,
+    "Layout": SimpleNamespace(of=lambda environment: LAYOUT),
+    "LearnerLink": _Link,
+    "sessions": SimpleNamespace(listen=lambda endpoint, link: None, LinkSettings=None),
+  }.items():
+    monkeypatch.setattr(f"nerf2real.agents.distill.learning.learner.{name}", value)
+  _, begun = make_state(seed=4)
+  source = tmp_path / "policy"
+  arrays = student.served_parameters(begun.student, begun.scales)
+  about = {"environment": "suite:nerf_nav", "settings": to_plain(TINY.agent), "info": {}}
+  export_policy(source, arrays, layout=LAYOUT, **about)
+  run, rng = tmp_path / "run", np.random.default_rng(0)
+  data = Dataset(run / "data", LAYOUT, capacity=100, holdout=3)
+  kept = fields(LAYOUT) | transition_fields(LAYOUT)
+  for number in (1, 2):
+    data.insert({n: rng.random((20, *s)).astype(d) for n, (s, d) in kept.items()}, 7, number)
+
+  def make(*, resume, **changes):
+    found = dataclasses.replace(TINY, init_from=str(source), **changes)
+    return Learner(
+      found, run, endpoint="", link=sessions.LinkSettings(), seed=0, minutes=1.0, resume=resume
+    )
+
+  return make
+
+
+def test_a_run_goes_on_when_its_last_frame_is_there(make_learner):
+  learner = make_learner(resume=False, max_frames=40)
+  assert learner._data.frames == 40
+  assert not learner._link.limiter.finished  # or the evaluator would leave
+
+
+def test_inputs_are_standardised_once_also_where_the_run_stopped_right_after(make_learner):
+  """A policy that a run begins with would be rewritten for them twice."""
+  learner = make_learner(resume=False)
+  learner._wait_for_first_frames()
+  learner._save()
+  wanted = jax.device_get(learner._trainer.state.student["policy"])
+  resumed = make_learner(resume=True)
+  resumed._wait_for_first_frames()
+  found = jax.device_get(resumed._trainer.state.student["policy"])
+  jax.tree.map(np.testing.assert_array_equal, wanted, found)
+
+
+@pytest.mark.parametrize(("updates", "exports"), [(0, True), (5, False)])
+def test_a_resumed_run_that_stops_at_once_gives_no_student_that_may_not_fit(
+  make_learner, updates, exports
+):
+  """It may have been saved while the encoder learned."""
+  learner = make_learner(resume=False)
+  learner._counters = checkpoint.Counters(updates=updates)
+  learner._is_fit = False
+  learner._save()
+  resumed = make_learner(resume=True)
+  resumed.stop()
+  resumed.run()
+  assert (resumed._run / "policy" / "newest").exists() == exports
 
 
 def _start(run, *extra):
