@@ -4,6 +4,7 @@ Every call has a deadline. When no answer comes, the learner is away (killed, fr
 machine's last core away): the actor waits and queries again, and keeps what it made.
 """
 
+import math
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -157,8 +158,12 @@ class ActorLink:
     return None if message is None else message.values
 
   def report(self, values: Mapping[str, Any]) -> None:
-    """Sends metrics; they are lost without a learner."""
-    self._metrics.put(schema.encode("metrics", {"who": self.actor, **values}))
+    """Sends metrics, null for a number that is not finite; they are lost without a learner."""
+    finite = {
+      name: None if isinstance(value, float) and not math.isfinite(value) else value
+      for name, value in values.items()
+    }
+    self._metrics.put(schema.encode("metrics", {"who": self.actor, **finite}))
 
   def close(self) -> None:
     """Leaves."""

@@ -99,7 +99,7 @@ def decode(data: bytes, *, kind: str | None = None) -> Message:
 def _header(data: bytes) -> dict[str, Any]:
   try:
     header = json.loads(data.decode())
-  except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+  except (ValueError, RecursionError) as error:  # ValueError: an integer too long, too
     raise MessageError(f"The header is not JSON: {error}.") from error
   if not isinstance(header, dict) or set(header) != {"kind", "values", "arrays"}:
     raise MessageError("The header must have kind, values and arrays.")

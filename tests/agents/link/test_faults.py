@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -237,6 +238,17 @@ def test_a_refused_trajectory_is_acknowledged_and_what_follows_arrives(learner, 
   status = link.status()["status"]
   assert (status["steps"], status["refused"], status["gaps"]) == (10 * 47, 1, 0)
   assert sorted(n for _, n in _stored(learner, tmp_path)) == list(range(2, 12))
+
+
+def test_figures_that_are_not_finite_are_null_and_end_no_actor():
+  """An environment's NaN is in its return, too."""
+  sent = []
+  session = mock.Mock()
+  session.declare_publisher.return_value.put = sent.append
+  link = client.ActorLink(session, sessions.LinkSettings(), actor="sick")
+  link.report({"return": float("nan"), "low": -np.inf, "length": 3, "success": True})
+  values = schema.decode(sent[0], kind="metrics").values
+  assert values == {"who": "sick", "return": None, "low": None, "length": 3, "success": True}
 
 
 def test_a_failing_replay_is_reported_and_ends_the_taking_in(tmp_path):

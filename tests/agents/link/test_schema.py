@@ -68,6 +68,7 @@ def _described(arrays) -> bytes:
     _with_header(b'{"kind": 1, "values": {}, "arrays": []}'),
     _with_header(b'{"kind": "k", "values": {}, "arrays": [], "more": 1}'),
     _with_header(b"[" * 100_000),
+    _with_header(b'{"kind": "k", "values": {"n": ' + b"9" * 5000 + b'}, "arrays": []}'),
     _with_header(_described([["x", "object", [1]]]), b"12345678"),
     _with_header(_described([["x", "float32", [-1]]])),
     _with_header(_described([["x", "float32", [2**29, 2**29, 2**29]]])),
