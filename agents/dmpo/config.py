@@ -10,8 +10,19 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from nerf2real.core.serialization import from_plain, to_plain
+
 ZERO, STANDING = "zero", "standing"
 FIRST_ACTIONS = (ZERO, STANDING)
+_COUNTS = (
+  "batch_size",
+  "n_step",
+  "num_samples",
+  "target_actor_period",
+  "target_critic_period",
+  "feature_copies",
+  "history",
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -168,8 +179,16 @@ class DmpoConfig:
       )
     if self.trajectory_length < 2:
       raise ValueError(f"trajectory_length must be 2 or more, found {self.trajectory_length}.")
-    if self.n_step < 1:
-      raise ValueError(f"n_step must be 1 or more, found {self.n_step}.")
+    for name in _COUNTS:
+      if getattr(self, name) < 1:
+        raise ValueError(f"{name} must be 1 or more, found {getattr(self, name)}.")
+    if not 0 <= self.discount <= 1:
+      raise ValueError(f"discount must be 0 to 1, found {self.discount}.")
+    for name in ("policy_layers", "critic_layers", "belief_layers"):
+      if not getattr(self.network, name):
+        raise ValueError(f"network.{name} must have a layer or more, found none.")
+    if self.network.num_atoms < 2:
+      raise ValueError(f"num_atoms must be 2 or more, found {self.network.num_atoms}.")
     if self.frozen_memory and not (self.frozen_encoder and self.network.recurrent):
       raise ValueError(
         "frozen_memory keeps the LSTM behind a frozen encoder: it needs frozen_encoder=true and "
@@ -373,14 +392,18 @@ def preset(name: str) -> DmpoConfig:
 
 
 def override(config: DmpoConfig, assignments: Mapping[str, Any]) -> DmpoConfig:
-  """Returns the settings with some changed; a dot reaches inside: {"network.vmax": 10.0}."""
+  """Returns the settings with some changed; a dot reaches inside: {"network.vmax": 10.0}.
+
+  Raises:
+    ValueError: a setting is unknown, or a value is of another type or out of its range.
+  """
+  plain = to_plain(config)
   for path, value in assignments.items():
-    head, _, rest = path.partition(".")
-    if head not in {f.name for f in dataclasses.fields(config)}:
+    *parents, name = path.split(".")
+    node = plain
+    for parent in parents:
+      node = node.get(parent) if isinstance(node, dict) else None
+    if not isinstance(node, dict) or name not in node:
       raise ValueError(f"Unknown setting {path!r} of {type(config).__name__}.")
-    if rest:
-      value = override(getattr(config, head), {rest: value})
-    elif isinstance(value, list):
-      value = tuple(value)
-    config = dataclasses.replace(config, **{head: value})
-  return config
+    node[name] = to_plain(value)
+  return from_plain(plain, type(config))

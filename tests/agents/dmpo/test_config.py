@@ -70,5 +70,20 @@ def test_overrides_reach_inside_and_unknown_names_are_refused():
     config.override(config.DmpoConfig(), {"network.vmax": -200.0})
   with pytest.raises(ValueError, match="frozen_memory keeps the LSTM behind a frozen encoder"):
     config.override(config.DmpoConfig(), {"frozen_memory": True})
+  for name, value, message in (
+    ("batch_size", 1.5, "expected int, found 1.5"),
+    ("n_step", "x", "expected int, found 'x'"),
+    ("network.policy_layers", [8, "a"], "expected int, found 'a'"),
+    ("network", 5, "DmpoConfig"),
+    ("batch_size.x", 1, "Unknown setting 'batch_size.x'"),
+    ("target_actor_period", 0, "target_actor_period must be 1 or more, found 0"),
+    ("num_samples", 0, "num_samples must be 1 or more, found 0"),
+    ("discount", 99, "discount must be 0 to 1, found 99"),
+    ("network.num_atoms", 1, "num_atoms must be 2 or more, found 1"),
+    ("network.policy_layers", [], "network.policy_layers must have a layer"),
+  ):
+    with pytest.raises(ValueError, match=message) as found:
+      config.override(config.DmpoConfig(), {name: value})
+    assert "\n" not in str(found.value)
   with pytest.raises(ValueError, match="another version"):
     from_plain({"colour": 1}, config.DmpoConfig)
