@@ -46,8 +46,8 @@ def with_policy(state: TrainingState, parameters: Mapping[str, np.ndarray]) -> T
   """Returns a fresh state whose policy and belief are those of an exported policy.
 
   The head of the standard deviation and all optimisers stay fresh. Where observations are scaled
-  and the policy was exported without a scaling, its first layer is to be rewritten when one is
-  measured (`with_scaling`).
+  and the policy was exported without a scaling, or with that of another critic's observations, its
+  first layer is to be rewritten when one is measured (`with_scaling`).
 
   Args:
     state: a state that has seen no update.
@@ -58,7 +58,7 @@ def with_policy(state: TrainingState, parameters: Mapping[str, np.ndarray]) -> T
   """
   tree = nest(parameters)
   policy, beliefs, scales = tree["policy"], tree.get("belief", {}), state.scaling
-  if scales and "scaling" in tree:
+  if scales and _shapes(tree.get("scaling", {})) == _shapes(scales):
     scales = tree["scaling"]
     policy = scaling.unfold(policy, scales)
   policy = policy | {"stddev": state.policy["stddev"]}

@@ -1,5 +1,7 @@
 """Scaled observations: what is measured, that folding changes no action, that training sees it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,6 +80,23 @@ def _target_action(state, image, row):
     initial=initial,
   )
   return np.asarray(output.action.mean)[0, 0], np.asarray(output.action.stddev)[0, 0]
+
+
+def test_a_policy_of_another_critic_s_observations_begins_unscaled(state, tmp_path):
+  """Its scaling does not fit; the policy, which sees the same, acts as before and trains."""
+  policy = _exported(state, tmp_path)
+  other = dataclasses.replace(LAYOUT, privileged_sizes=(7,))
+  learner = learning.make_learning(CONFIG, other)
+  fresh = jax.jit(learner.init)(jax.random.PRNGKey(5))
+  begun = training_state.with_policy(fresh, export.load_arrays(tmp_path))
+  assert not scaling.is_measured(begun.scaling)
+  rows = _rows() | {"privileged": np.random.default_rng(3).normal(size=(4000, 7))}
+  measured = training_state.with_scaling(begun, scaling.measure(rows, other), keep_policy=True)
+  image, row = np.full((6, 8, 3), 90, np.uint8), CENTRE.astype(np.float32)
+  wanted = policy.step(image, row, policy.initial_state()).mean
+  for found in (begun, measured):
+    np.testing.assert_allclose(_target_action(found, image, row)[0], wanted, rtol=1e-3, atol=1e-3)
+  assert measured.scaling["privileged"]["mean"].shape == (7,)
 
 
 def test_columns_are_standardised_but_hardly_varying_ones_are_not_blown_up():
