@@ -19,6 +19,7 @@ from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
 _MAX_RESTARTS = 5  # of one process within the restart window
 _OTHERS_END_TIMEOUT = 10.0  # s for actors to deliver what they have
 _BEFORE_LEARNING = (-signal.SIGTERM, 128 + signal.SIGTERM)  # ended while it was starting
+_UNFINISHED = ".orbax-checkpoint-tmp"  # in the name of what a save that was cut off leaves
 _MEANINGS = {
   REFUSED: " (it cannot start with its arguments)",
   NOT_SAVED: " (what it learned last is not saved: make room where the run is, then --resume)",
@@ -182,7 +183,7 @@ class Supervisor:
         return _death(kept, status)
       self.restarts += 1
       if kept is self._learner:
-        saved = any(self._checkpoints.glob("newest-*"))
+        saved = has_saved(self._checkpoints)
         kept.job = _resumed(self._learner_job) if saved else self._learner_job
       kept.process.release()
       self._begin(kept)
@@ -208,6 +209,11 @@ class Supervisor:
     for process in running:
       process.terminate(timeout)
     return [process.wait() for process in running]
+
+
+def has_saved(checkpoints: Path) -> bool:
+  """Returns whether a learner left a whole checkpoint in its folder to go on from."""
+  return any(_UNFINISHED not in path.name for path in checkpoints.glob("newest-*"))
 
 
 def _resumed(learner: Job) -> Job:

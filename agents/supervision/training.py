@@ -18,7 +18,13 @@ from rich.live import Live
 
 from nerf2real.agents.link import sessions
 from nerf2real.agents.supervision.status_view import StatusView
-from nerf2real.agents.supervision.supervisor import Job, LocalProcess, Process, Supervisor
+from nerf2real.agents.supervision.supervisor import (
+  Job,
+  LocalProcess,
+  Process,
+  Supervisor,
+  has_saved,
+)
 from nerf2real.core.files import append_line, atomic_path
 from nerf2real.core.folder_lock import FolderInUseError, discarded_on, lock_folder
 
@@ -74,7 +80,7 @@ def check(settings: TrainingSettings) -> None:
   """Raises RunRefusedError for settings that cannot be run; touches nothing."""
   if settings.actors < 1:
     raise RunRefusedError(f"at least one actor is needed, found --actors {settings.actors}")
-  saved = any((settings.run / "checkpoints").glob("newest-*"))
+  saved = has_saved(settings.run / "checkpoints")
   if saved and not settings.resume:
     raise RunRefusedError(
       f"{settings.run} holds a run: add --resume, or name another folder with --run"

@@ -84,6 +84,13 @@ def test_what_died_is_started_again_and_a_learner_goes_on_from_its_checkpoint(tm
   assert run.supervisor.restarts == 4
 
 
+def test_what_a_save_that_was_cut_off_leaves_is_nothing_to_go_on_from(tmp_path):
+  run = Run(tmp_path)
+  (tmp_path / "newest-0000000000-000000000000.orbax-checkpoint-tmp").mkdir()
+  assert run.die(0, -signal.SIGKILL) is None
+  assert run.started[2].job == LEARNER
+
+
 def test_the_first_start_resumes_where_that_was_said(tmp_path):
   assert Run(tmp_path, resume=True).started[0].job.arguments[-1] == "--resume"
 
