@@ -129,12 +129,14 @@ def make_limiter(
         end,
       )
     return RateLimiter(limits)
+  # Updates that were done cost what they did, also where further ones have another price.
+  price = info.get("config", {}).get("steps_per_update", config.steps_per_update)
   limiter = RateLimiter(
     limits,
     steps=steps,
     updates=updates,
     refill_until=info.get("refill_until", 0),
-    unpaid=info.get("unpaid_steps", 0),
+    unpaid=info.get("unpaid_steps", 0) + updates * (price - config.steps_per_update),
   )
   if replay.steps < config.min_replay_steps:
     limiter.refill(held=replay.steps)

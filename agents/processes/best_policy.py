@@ -19,8 +19,13 @@ class BestPolicy:
     self.success: float | None = info.get("best_success")
     self.evaluated: float | None = None  # last mean return that was no confirmation
 
-  def take(self, values: Mapping[str, Any]) -> bool:
-    """Takes an evaluation in; returns whether its policy is the best so far."""
+  def take(self, values: Mapping[str, Any], *, is_held: bool) -> bool:
+    """Takes an evaluation in; returns whether its policy is the best so far.
+
+    Args:
+      values: the evaluator's figures.
+      is_held: whether the policy's parameters are here; one that cannot be kept is no best.
+    """
     result, version = values.get("return"), values.get("version")
     if not isinstance(result, int | float) or not isinstance(version, int):
       return False
@@ -32,6 +37,7 @@ class BestPolicy:
       better = bool(values.get("confirmation")) and (success, result) > (best, self.best_return)
     if not values.get("confirmation"):
       self.evaluated = float(result)
+    better = better and is_held
     if better:
       self.best_return, self.success = float(result), success
     return better

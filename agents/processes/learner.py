@@ -63,17 +63,26 @@ class Learner:
       link: the link's settings.
       resume: continues from the newest checkpoint.
       join: joins the router at the endpoint instead of being one.
+
+    Raises:
+      ValueError: the folder holds a run that is not resumed, or settings do not fit together.
+      CheckpointError: there is no checkpoint to resume from, or it does not fit the settings.
+      LinkError: the endpoint is taken, or open to the network without users.
     """
     self._settings, self._config = settings, config
     self._stop = threading.Event()
     settings.run.mkdir(parents=True, exist_ok=True)
+    self._checkpoints = Checkpoints(settings.run / "checkpoints")
+    if self._checkpoints.list() and not resume:
+      raise ValueError(
+        f"{settings.run} holds a run: add --resume, or name another folder with --run."
+      )
     environment = make_environment(settings.environment, seed=0, history=config.history)
     self.layout = Layout.of(environment)
     first_action = beginning.first_action(environment, config, settings.environment)
     environment.close()
     self._learning = learning.make_learning(config, self.layout, first_action=first_action)
     self._state = jax.jit(self._learning.init)(jax.random.PRNGKey(settings.seed))
-    self._checkpoints = Checkpoints(settings.run / "checkpoints")
     self._begin, self._seconds_before = time.monotonic(), 0.0
     self._init_from = "" if settings.init_from is None else str(settings.init_from)
     info: dict[str, Any] = {}
@@ -238,17 +247,18 @@ class Learner:
         self._recent.append(values)
 
   def _take_evaluation(self, values: dict[str, Any]) -> None:
-    if not self._best.take(values):
+    version = values.get("version")
+    # None: of a learner before this one.
+    parameters = self.link.held_parameters(version) if isinstance(version, int) else None
+    if not self._best.take(values, is_held=parameters is not None):
       return
-    version = values["version"]
     self._attempt(
       lambda: self._checkpoints.save(
         self._state, self._info() | {"best_version": version}, kind=BEST
       )
     )
-    parameters = self.link.held_parameters(version)
-    if parameters is not None:
-      self._attempt(lambda: self._export("best", parameters, {"version": version}))
+    self._attempt(lambda: self._export("best", parameters, {"version": version}))
+    self.save()  # a learner that goes on from an older state would take a worse one for the best
 
   def _export(self, name: str, parameters: Any, info: dict[str, Any]) -> None:
     export.export_policy(

@@ -40,3 +40,12 @@ class RunSettings:
   """Episodes of an evaluation; None: half of its protocol's trials, or 5 without a protocol."""
   evaluation_env: str | None = None
   """The environment of the evaluations; None: that of `loading.evaluation_name`."""
+
+  def __post_init__(self):
+    for name in ("evaluation_period", "evaluation_episodes"):
+      value = getattr(self, name)
+      if value is not None and value < 1:
+        raise ValueError(
+          f"--{name.replace('_', '-')} must be 1 or more, found {value}; without evaluations start "
+          "no evaluator (--no-evaluator)."
+        )

@@ -4,6 +4,7 @@ import errno
 import json
 import threading
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -15,11 +16,12 @@ from nerf2real.agents.dmpo.replay.ring import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link import sessions
 from nerf2real.agents.link.client import ActorLink
-from nerf2real.agents.processes import actor
+from nerf2real.agents.processes import actor, beginning
 from nerf2real.agents.processes.checkpoints import read_info
 from nerf2real.agents.processes.learner import Learner, LearnerError
 from nerf2real.agents.processes.settings import RunSettings
 from nerf2real.agents.supervision.training import free_port
+from nerf2real.core.serialization import to_plain
 from tests.agents.processes.stubs import documented
 
 ENVIRONMENT = "dm_control:cartpole:swingup"
@@ -180,6 +182,8 @@ def test_a_run_goes_on_from_a_policy_with_earlier_data(finished, tmp_path):
     ({"frozen_encoder": True}, {}, "frozen_encoder needs a policy to begin with"),
     ({}, {"prior_share": 1.5}, "--prior-share must be 0 to 1"),
     ({}, {"prior_data": "nowhere"}, "nowhere holds no prior data"),
+    ({}, {"evaluation_period": 0}, "--evaluation-period must be 1 or more, found 0"),
+    ({}, {"evaluation_episodes": 0}, "--evaluation-episodes must be 1 or more, found 0"),
   ],
 )
 def test_a_beginning_that_cannot_be_is_refused(tmp_path, settings, run, message):
@@ -248,10 +252,53 @@ def test_best_is_the_most_successful_on_fresh_trials(tmp_path):
 
 def test_best_without_success_is_the_highest_mean_return(tmp_path):
   run = Run(tmp_path)
+  run.learner.link._held[0] = run.learner.link._parameters
   for result, expected in ((5.0, 5.0), (4.0, 5.0), (6.0, 6.0)):
     _report(run.learner, confirmation=0, version=0, **{"return": result})
     assert run.learner._best.best_return == expected
+    assert read_info(tmp_path)["best_return"] == expected  # also where the learner is killed now
   run.close()
+
+
+def test_a_policy_that_is_gone_is_no_best(tmp_path):
+  """The evaluator had it from a learner that was killed meanwhile."""
+  run = Run(tmp_path)
+  _report(run.learner, confirmation=0, version=7, **{"return": 99.0})
+  assert run.learner._best.evaluated == 99.0
+  assert run.learner._best.record()["best_return"] is None
+  run.learner.link._held[0] = run.learner.link._parameters
+  _report(run.learner, confirmation=0, version=0, **{"return": 5.0})
+  assert export.load_policy(tmp_path / "policy" / "best").info["best_return"] == 5.0
+  run.close()
+
+
+def test_a_folder_that_holds_a_run_is_resumed_or_refused(finished):
+  """Its checkpoints are newer than the first ones of another run, which would be removed."""
+  folder, _ = finished
+  before = read_info(folder)
+  with pytest.raises(ValueError, match="holds a run: add --resume"):
+    Run(folder)
+  assert read_info(folder) == before
+
+
+def test_another_price_of_updates_holds_from_where_a_run_is_resumed(tmp_path):
+  settings, replay = RunSettings(environment="", run=tmp_path), SimpleNamespace(on_disk=False)
+  replay.steps = CONFIG.min_replay_steps
+  info = {"steps": 8200, "refill_until": 200, "unpaid_steps": 200, "config": to_plain(CONFIG)}
+  updates = (8200 - 200) // 4
+  for price, paid in ((4.0, 8204), (2.0, 8202), (16.0, 8216)):
+    limiter = beginning.make_limiter(
+      settings,
+      config.override(CONFIG, {"steps_per_update": price}),
+      replay=replay,
+      info=info,
+      updates=updates,
+    )
+    assert not limiter.update_due and limiter.limit <= 8200 + limiter.lead
+    limiter.delivered("a", paid - 1 - limiter.steps)
+    assert not limiter.update_due
+    limiter.delivered("a", 1)
+    assert limiter.update_due
 
 
 def _update_metrics():
