@@ -8,6 +8,7 @@ import time
 from typing import Any
 
 import numpy as np
+import zenoh
 
 from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.dmpo.policy.acting import Agent, run_episode, task_of
@@ -18,6 +19,7 @@ from nerf2real.agents.environments.loading import (
   trials_of,
 )
 from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.link.schema import MessageError
 from nerf2real.agents.processes.evaluator import summary
 from nerf2real.agents.processes.joining import JoinedProcess
 from nerf2real.core.serialization import from_plain
@@ -57,7 +59,11 @@ class Evaluator(JoinedProcess):
     self._chosen = other_trials(found.spread(self._settings.evaluation_trials))
 
   def run(self) -> None:
-    """Evaluates until the run is over or `stop` is called."""
+    """Evaluates until the run is over or `stop` is called.
+
+    Raises:
+      EpisodesFailed: several evaluations in a row ended in an exception.
+    """
     due = -np.inf
     while not self._stop.is_set():
       grant = self.link.request(0)
@@ -70,8 +76,17 @@ class Evaluator(JoinedProcess):
         due = time.monotonic() + self._settings.evaluation_period
         answer = self.link.parameters()
         if answer is not None:
-          self._evaluate(*answer)
+          self._try_to_evaluate(*answer)
       self._stop.wait(_POLL)
+
+  def _try_to_evaluate(self, version: int, parameters: dict[str, np.ndarray]) -> None:
+    try:
+      self._evaluate(version, parameters)
+      self._failures.reset()
+    except (MessageError, zenoh.ZError):  # the link failed, not the episode
+      raise
+    except Exception as error:
+      self._failures.add(error)
 
   def _evaluate(self, version: int, parameters: dict[str, np.ndarray]) -> None:
     policy = Policy.of_network(parameters, self._settings.agent.network)

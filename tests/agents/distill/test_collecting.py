@@ -14,6 +14,7 @@ from nerf2real.agents.distill.teacher import Label
 from nerf2real.agents.dmpo.policy.inference import PolicyState, PolicyStep
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments.loading import make_environment
+from nerf2real.agents.processes import joining
 from nerf2real.suite import protocols
 
 
@@ -83,6 +84,22 @@ def test_the_evaluator_reports_success_with_its_interval_and_how_episodes_end(mo
   assert report["success_low"] < 0.2 and report["success_high"] > 0.95
   assert (report["falls"], report["collisions"], report["median_time"]) == (1, 0, 6.0)
   assert report["version"] == 8 and report["length"] == 4
+
+
+def test_an_evaluation_that_fails_is_followed_by_another(monkeypatch):
+  """The last of several in a row ends the evaluator; one alone must not, nor its run."""
+  reports = []
+  link = SimpleNamespace(version=1, report=reports.append, parameters=lambda: (2, {}))
+  link.request = lambda wanted: {"stop": False, "version": 2}
+  found = evaluator.Evaluator.__new__(evaluator.Evaluator)
+  found.link, found._failures = link, joining.Failures(link)
+  found._settings = dataclasses.replace(settings.preset("tiny"), evaluation_period=0.0)
+  found._stop = threading.Event()
+  found._evaluate = lambda version, parameters: 1 / 0
+  monkeypatch.setattr(evaluator, "_POLL", 0.0)
+  with pytest.raises(joining.EpisodesFailed, match="5 episodes in a row failed.*ZeroDivision"):
+    found.run()
+  assert reports == [{"failed_episode": 1}] * 5
 
 
 def test_trials_during_a_run_are_not_those_that_are_reported():
