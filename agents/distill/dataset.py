@@ -8,7 +8,6 @@ Shape letters: N frames, B streams, T steps of an unroll.
 """
 
 import threading
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
-from nerf2real.agents.dmpo.replay.prior import write_layout
+from nerf2real.agents.dmpo.replay.prior import read_arrays, write_layout
 from nerf2real.agents.dmpo.specs import BALL, Layout
 from nerf2real.core import files
 
@@ -162,13 +161,13 @@ class Dataset:
 
   def _read(self, path: Path) -> None:
     try:
-      with np.load(path, allow_pickle=False) as stored:
-        episode = {name: stored[name] for name in stored.files if name in self._fields}
+      episode = read_arrays(path, self._fields)
       frames = self._check(episode, self._fields)
-    except (zipfile.BadZipFile, ValueError) as error:
+      _, key, number = path.stem.split("_")
+      origin = int(key, 16), int(number)
+    except ValueError as error:
       raise ValueError(f"{path} is no episode of this run: {error}") from error
-    _, key, number = path.stem.split("_")
-    self._append(episode, frames, (int(key, 16), int(number)))
+    self._append(episode, frames, origin)
 
 
 class Unroll(NamedTuple):

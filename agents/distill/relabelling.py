@@ -18,6 +18,7 @@ from nerf2real.agents.distill.settings import DistillSettings
 from nerf2real.agents.distill.teacher import Teacher, make_teacher
 from nerf2real.agents.distill.turned_heads import TILT, TurnedHead
 from nerf2real.agents.dmpo.policy.acting import task_of
+from nerf2real.agents.dmpo.replay.prior import read_arrays
 from nerf2real.agents.dmpo.specs import BALL, FlatObservation, Layout
 from nerf2real.agents.environments.loading import make_environment
 from nerf2real.core import files
@@ -100,7 +101,7 @@ def relabel(
     seed: of the light in which an episode's pictures are rendered, where its light is drawn.
 
   Raises:
-    ValueError: the folder holds no episodes, or they are of another environment.
+    ValueError: the folder holds no episodes, damaged ones, or those of another environment.
   """
   wanted = fields(layout) | transition_fields(layout)
   paths = sorted(source.glob("[0-9]*.npz"))
@@ -108,8 +109,7 @@ def relabel(
     raise ValueError(f"{source} holds no episodes: give the folder data of a distillation.")
   frames, rng = 0, np.random.default_rng(seed)
   for path in paths:
-    with np.load(path, allow_pickle=False) as stored:
-      episode = {name: stored[name] for name in stored.files}
+    episode = read_arrays(path)
     shapes = {name: episode[name].shape[1:] for name in wanted if name in episode}
     if shapes != {name: shape for name, (shape, _) in wanted.items()}:
       raise ValueError(f"{path} is of another environment than {target} is for: found {shapes}.")

@@ -12,7 +12,7 @@ Shape letters: B trajectories, T observations, N observations in all.
 
 import logging
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -223,19 +223,32 @@ def _newest_first(
     _log.warning("%s: %d episodes lack an array of %s.", folder, skipped, ", ".join(names))
 
 
+def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+  """Reads the arrays of an episode's file.
+
+  Args:
+    path: the file.
+    names: of the arrays that are wanted, of which those that are there are read; None for all.
+
+  Raises:
+    ValueError: it is damaged, or another file.
+  """
+  try:
+    with np.load(path, allow_pickle=False) as stored:
+      return {name: stored[name] for name in stored.files if names is None or name in names}
+  except (zipfile.BadZipFile, EOFError, ValueError) as error:
+    raise ValueError(f"{path} is no episode: {error}") from error
+
+
 def _read_episode(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray] | None:
   """Reads an episode of N observations and as many transitions; None if it lacks an array.
 
   What followed the last action is not stored: the last observation stands for it where the episode
   terminated, for nothing is read from a terminal one, and the transition is left out elsewhere.
   """
-  try:
-    with np.load(path, allow_pickle=False) as stored:
-      if not set(names) <= set(stored.files):
-        return None
-      episode = {name: stored[name] for name in names}
-  except (zipfile.BadZipFile, ValueError) as error:
-    raise ValueError(f"{path} is no episode: {error}") from error
+  episode = read_arrays(path, names)
+  if not set(names) <= set(episode):
+    return None
   if len(episode["discount"]) and episode["discount"][-1] == 0:
     return {name: np.concatenate([array, array[-1:]]) for name, array in episode.items()}
   return episode

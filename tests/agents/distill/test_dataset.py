@@ -83,6 +83,15 @@ def test_a_damaged_file_is_named(tmp_path):
   path.write_bytes(path.read_bytes()[:40])
   with pytest.raises(ValueError, match="is no episode of this run"):
     _open(tmp_path)
+  path.write_bytes(b"")
+  with pytest.raises(ValueError, match="is no episode of this run"):
+    _open(tmp_path)
+  with pytest.raises(ValueError, match="is no episode"):
+    PriorData(tmp_path, LAYOUT, max_steps=100)
+  path.rename(tmp_path / "000000.npz")
+  np.savez(tmp_path / "000000.npz", **_episode(2, 0))
+  with pytest.raises(ValueError, match="000000.npz is no episode of this run"):
+    _open(tmp_path)
 
 
 def test_streams_carry_on_and_say_where_episodes_begin():

@@ -61,3 +61,7 @@ def test_other_environments_and_empty_folders_are_refused(world, tmp_path):
   other = dataclasses.replace(layout, image_shape=(30, 40, 3))
   with pytest.raises(ValueError, match="another environment"):
     relabelling.relabel(tmp_path, tmp_path / "data", layout=other, teacher=teacher)
+  path = tmp_path / "000000_0000000000000001_1.npz"
+  path.write_bytes(path.read_bytes()[:100])
+  with pytest.raises(ValueError, match=f"{path.name} is no episode"):
+    relabelling.relabel(tmp_path, tmp_path / "data", layout=layout, teacher=teacher)
