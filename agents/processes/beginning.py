@@ -44,15 +44,8 @@ def with_exported_policy(folder: Path, state: TrainingState, layout: Layout) -> 
   Raises:
     ValueError: The policy does not fit the environment or the networks.
   """
-  exported, arrays = export.load_policy(folder), export.load_arrays(folder)
-  sizes = ("image_shape", "state_names", "state_sizes", "action_size")
-  for name in sizes:
-    found, expected = getattr(exported.layout, name), getattr(layout, name)
-    if found != expected:
-      raise ValueError(
-        f"{folder} cannot be begun with: its {name} is {found}, this environment's {expected}."
-      )
-  return training_state.with_policy(state, arrays)
+  export.check_beginning(folder, layout)
+  return training_state.with_policy(state, export.load_arrays(folder))
 
 
 def check_beginning(config: configs.DmpoConfig, init_from: str) -> None:

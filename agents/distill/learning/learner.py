@@ -26,7 +26,7 @@ from nerf2real.agents.distill.schedule import BORROWED, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
 from nerf2real.agents.distill.views import kept_views
 from nerf2real.agents.dmpo import scaling
-from nerf2real.agents.dmpo.policy.export import export_policy, load_arrays
+from nerf2real.agents.dmpo.policy.export import check_beginning, export_policy, load_arrays
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments.loading import in_scene, make_environment
 from nerf2real.agents.link import sessions
@@ -71,7 +71,8 @@ class Learner:
       resume: continues the run in the folder.
 
     Raises:
-      ValueError: the folder holds a run already, or none to continue.
+      ValueError: the folder holds a run already, or none to continue; the policy to begin with is
+        of other observations or actions.
       LinkError: the endpoint is taken, or open to the network without users.
     """
     self._settings, self._run, self._minutes, self._seed = settings, run, minutes, seed
@@ -93,11 +94,14 @@ class Learner:
     self._times = StageTimes()
     self._trainer = Trainer(settings, self._layout, self._data, seed=seed, times=self._times)
     self._counters = Counters()
-    borrowed = load_arrays(Path(settings.init_from)) if settings.init_from else None
-    if borrowed is not None:
-      self._trainer.state = begin_with(self._trainer.state, borrowed)
     if resume:
       self._trainer.state, self._counters = load_state(run / STATE, like=self._trainer.state)
+    borrowed = None
+    if settings.init_from and self._counters.begun is None:  # it drives from the first frame on
+      check_beginning(settings.init_from, self._layout)
+      borrowed = load_arrays(settings.init_from)
+      if not resume:
+        self._trainer.state = begin_with(self._trainer.state, borrowed)
     write_json(run / SETTINGS, settings)
     save_state(run / STATE, self._trainer.state, self._counters)
     limiter = RateLimiter(
@@ -134,7 +138,7 @@ class Learner:
       },
     )
     self._set_status()
-    if borrowed is not None and self._counters.begun is None:  # drives from the first frame on
+    if borrowed is not None:
       self._link.publish_parameters(borrowed, version=self._version)
     elif (run / POLICY).exists():
       self._link.publish_parameters(load_arrays(run / POLICY), version=self._version)

@@ -98,6 +98,25 @@ def load_policy(folder: Path | str) -> ExportedPolicy:
   )
 
 
+def check_beginning(folder: Path | str, layout: Layout) -> None:
+  """Checks that what a policy observes and does is what an environment gives and takes.
+
+  Args:
+    folder: of an exported policy that a run is to begin with.
+    layout: the environment's.
+
+  Raises:
+    ValueError: it is not, or as `load_policy` does.
+  """
+  found_layout = load_policy(folder).layout
+  for name in ("image_shape", "state_names", "state_sizes", "action_size"):
+    found, expected = getattr(found_layout, name), getattr(layout, name)
+    if found != expected:
+      raise ValueError(
+        f"{folder} cannot be begun with: its {name} is {found}, this environment's {expected}."
+      )
+
+
 def load_arrays(folder: Path | str) -> dict[str, np.ndarray]:
   """Loads the flat named arrays of a policy; raises ValueError as `load_policy` does."""
   return _read(Path(folder))[1]
@@ -130,6 +149,8 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
   record = read_record(folder)
+  if not (folder / _ARRAYS).is_file():
+    raise ValueError(f"{folder} holds no {_ARRAYS} beside its {RECORD}: export it again.")
   data = (folder / _ARRAYS).read_bytes()
   if hashlib.sha256(data).hexdigest() != record["sha256"]:
     raise ValueError(f"{folder}: the arrays are not those of {RECORD}; export it again.")

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -171,6 +172,28 @@ def test_a_run_goes_on_when_its_last_frame_is_there(make_learner):
   learner = make_learner(resume=False, max_frames=40)
   assert learner._data.frames == 40
   assert not learner._link.limiter.finished  # or the evaluator would leave
+
+
+def test_a_policy_of_other_observations_is_refused_with_what_differs(make_learner, tmp_path):
+  path = tmp_path / "policy" / "policy.json"
+  record = json.loads(path.read_text())
+  record["layout"]["image_shape"] = [24, 32, 3]
+  path.write_text(json.dumps(record))
+  with pytest.raises(ValueError, match=r"image_shape is \(24, 32, 3\), this .* \(12, 16, 3\)"):
+    make_learner(resume=False)
+
+
+def test_a_run_with_a_student_of_its_own_goes_on_without_the_policy_it_began_with(
+  make_learner, tmp_path
+):
+  learner = make_learner(resume=False)
+  assert learner._link.served == [schedule.BORROWED]
+  learner._counters = checkpoint.Counters(updates=5, begun=40)
+  learner._save()
+  shutil.rmtree(tmp_path / "policy")
+  resumed = make_learner(resume=True)
+  assert resumed._counters == learner._counters
+  assert resumed._link.served == [schedule.BORROWED + 5]
 
 
 def test_inputs_are_standardised_once_also_where_the_run_stopped_right_after(make_learner):

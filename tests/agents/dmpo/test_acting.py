@@ -112,6 +112,9 @@ def test_damaged_or_missing_policy_is_refused(tmp_path):
     stream.write(b"xxxx")
   with pytest.raises(ValueError, match="arrays are not those"):
     export.load_policy(tmp_path)
+  (tmp_path / "policy.npz").unlink()
+  with pytest.raises(ValueError, match="holds no policy.npz beside its policy.json"):
+    export.load_policy(tmp_path)
 
 
 @pytest.mark.parametrize(
