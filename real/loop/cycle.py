@@ -99,10 +99,13 @@ class Cycle:
     Raises:
       BusError: A servo refuses.
     """
+    if self._dry_run:
+      return
+    counts = self._servos.prepare()  # without the lock: a stop must not wait for joints to rest
     with self._commands:
-      if self.stop is None and not self._dry_run:
+      if self.stop is None:
         self._torque_off = False
-        self._servos.start()
+        self._servos.start(counts)
 
   def send(self, angles: np.ndarray) -> bool:
     """Sends goals [J] [rad] unless the robot was stopped; returns whether they were sent."""
@@ -138,9 +141,10 @@ class Cycle:
     return self._torque_off
 
   def rearm(self) -> None:
-    """Clears the stop."""
+    """Clears the stop. Without torque the robot lies or is held: its tilt does not matter yet."""
     with self._commands:
       self._monitor.arm(self._bus.clock.now())
+      self._monitor.held = True
       self.stop = None
 
   def close(self) -> None:

@@ -232,7 +232,7 @@ class Bus:
     self._port.expect(size, delay=delay, margin=self.settings.margin)
 
   def _try(self, transaction: Callable[[], tuple], *, attempts: int = _ATTEMPTS) -> tuple | None:
-    """Repeats a transaction (result second last, error last) until it is answered."""
+    """Repeats a transaction (result second last, error last) until it is done without an error."""
     for _ in range(attempts):
       with self._lock:
         try:
@@ -241,12 +241,13 @@ class Bus:
           return None
         finally:
           self._port.is_using = False
-      if found[-2] == sdk.COMM_SUCCESS:
+      # Behind an error there is no data: the SDK would take the packet's CRC for it.
+      if found[-2] == sdk.COMM_SUCCESS and not found[-1] & ~_ALERT:
         return found
     return None
 
   def ping(self, device: int) -> int | None:
-    """Returns the model number of a device; None if it does not answer."""
+    """Returns the model number of a device; None if it does not answer, or with an error."""
     found = self._try(lambda: self._handler.ping(self._port, device), attempts=_PINGS)
     return None if found is None else found[0]
 
@@ -254,25 +255,31 @@ class Bus:
     """Returns the bytes of a device's registers.
 
     Raises:
-      BusError: It does not answer.
+      BusError: It does not answer, or with an error.
     """
     found = self._try(
       lambda: self._handler.readTxRx(self._port, device, address, size), attempts=attempts
     )
     if found is None:
-      raise BusError(f"Device {device} ({self.wiring.name_of(device)}) does not answer.")
+      raise self._no_answer(device)
     return bytes(found[0])
 
   def write(self, device: int, address: int, size: int, value: int) -> None:
     """Writes a register of a device.
 
     Raises:
-      BusError: It does not answer.
+      BusError: It does not answer, or with an error.
     """
     data = list(value.to_bytes(size, "little", signed=value < 0))
     found = self._try(lambda: self._handler.writeTxRx(self._port, device, address, size, data))
     if found is None:
-      raise BusError(f"Device {device} ({self.wiring.name_of(device)}) does not answer.")
+      raise self._no_answer(device)
+
+  def _no_answer(self, device: int) -> BusError:
+    return BusError(
+      f"Device {device} ({self.wiring.name_of(device)}) does not answer, or with an error alone: "
+      "check its cable and its model."
+    )
 
   def reboot(self, device: int) -> None:
     """Restarts a device."""

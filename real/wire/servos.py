@@ -72,8 +72,7 @@ class Servos:
     """
     values = self._bus.settings
     self.torque(False)
-    self._bus.write_all(BUS_WATCHDOG, 1, [0] * self._count)
-    wanted = {  # address: (size, value, name)
+    kept = {  # address: (size, value, name)
       9: (1, values.return_delay, "return delay time"),
       10: (1, 0, "drive mode"),
       11: (1, 3, "operating mode"),  # position control
@@ -81,9 +80,18 @@ class Servos:
       36: (2, values.pwm_limit, "PWM limit"),
       48: (4, 4095, "max position limit"),
       52: (4, 0, "min position limit"),
+    }
+    for address, (size, value, name) in kept.items():
+      self._set_all(address, size, [value] * self._count, name=name)
+    self._set_volatile()
+
+  def _set_volatile(self) -> None:
+    """Writes the registers that a servo loses when it restarts, and its watchdog off."""
+    wanted = {  # address: (size, value, name)
+      BUS_WATCHDOG: (1, 0, "bus watchdog"),  # one that has run out refuses goals
       80: (2, 0, "position D gain"),
       82: (2, 0, "position I gain"),
-      84: (2, values.position_gain, "position P gain"),
+      84: (2, self._bus.settings.position_gain, "position P gain"),
       108: (4, 0, "profile acceleration"),
       112: (4, 0, "profile velocity"),
     }
@@ -107,13 +115,28 @@ class Servos:
       "are locked or it has an error; see its hardware error status."
     )
 
-  def start(self) -> None:
-    """Switches torque on with every joint's goal where it is, and the servos' watchdog on.
+  def prepare(self) -> list[int]:
+    """Gets the servos ready to be switched on; returns their positions at rest [J] [counts].
+
+    What a restart or a lost bus has changed since `set_up` is written anew. Torque stays off.
 
     Raises:
       BusError: The joints cannot be read or do not come to rest, or a servo refuses.
     """
-    counts = self._resting_counts()
+    self._set_volatile()
+    return self._resting_counts()
+
+  def start(self, counts: list[int] | None = None) -> None:
+    """Switches torque on with every joint's goal where it is, and the servos' watchdog on.
+
+    Args:
+      counts: What `prepare` returned just now; it is called if None.
+
+    Raises:
+      BusError: The joints cannot be read or do not come to rest, or a servo refuses.
+    """
+    if counts is None:
+      counts = self.prepare()
     self._set_all(GOAL_POSITION, 4, counts, name="goal position")
     self._set_all(TORQUE_ENABLE, 1, [1] * self._count, name="torque enable")
     watchdog = round(self._bus.settings.watchdog / _WATCHDOG_UNIT)

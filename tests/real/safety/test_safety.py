@@ -170,6 +170,29 @@ def test_the_operators_key_stops_the_slow_move_too(robot, load):
   assert not robot.body.motors.enabled.any()
 
 
+def test_the_operators_key_stops_while_the_joints_come_to_rest(robot, load, monkeypatch):
+  """The torque is off then; it must stay off, and the key must not wait for the joints."""
+  environment = load()
+  resting = environment.servos._resting_counts
+
+  def press_and_wait():
+    robot.operator.press()
+    return resting()
+
+  monkeypatch.setattr(environment.servos, "_resting_counts", press_and_wait)
+  enabled = []
+  after = robot.body.after_step
+  robot.body.after_step = lambda time: (
+    after(time),
+    enabled.append(robot.body.motors.enabled.any()),
+  )
+  with pytest.raises(SafetyError, match="operator"):
+    environment.reset()
+  robot.clock.sleep_until(robot.clock.now() + 0.05)
+  robot.truth()
+  assert enabled and not any(enabled)
+
+
 def test_a_stuck_encoder(robot, standing):
   robot.faults.stuck.add(IDS["head_pan"])
   action = standing.standing_action
@@ -205,6 +228,36 @@ def test_the_robot_can_be_started_again_when_the_cause_is_gone(robot, standing):
   robot.place(0.0, 0.0, 0.0)
   assert standing.reset().first() and standing.stop is None
   assert not _run(standing, 20).last()
+
+
+def test_the_robot_can_be_started_again_after_a_lost_bus(robot, standing):
+  """The servos' watchdogs have run out: until they are cleared no goal is taken."""
+  robot.faults.cut = True
+  _run(standing, 10)
+  robot.faults.cut = False
+  robot.clock.sleep_until(robot.clock.now() + 0.3)
+  assert {s.table["bus_watchdog"] for s in robot.devices.servos.values()} == {-1}
+  robot.place(0.0, 0.0, 0.0)
+  assert standing.reset().first() and standing.stop is None
+  assert {s.table["bus_watchdog"] for s in robot.devices.servos.values()} == {5}
+
+
+def test_a_fallen_robot_may_lie_until_a_person_has_come(robot, standing):
+  robot.push(np.array([0.0, 60.0, 0.0]))
+  _run(standing, 80)
+  robot.push(np.zeros(3))
+  hold = robot.operator._hold
+
+  def come(held):
+    if held:
+      robot.clock.sleep_until(robot.clock.now() + 0.3)
+      assert robot.truth().rotation[2, 2] < 0.5
+      robot.place(0.0, 0.0, 0.0)
+    hold(held)
+
+  robot.operator._hold = come
+  assert standing.reset().first() and standing.stop is None
+  robot.operator._hold = hold
 
 
 def test_a_servo_with_an_error_must_be_rebooted_first(robot, standing):

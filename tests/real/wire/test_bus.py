@@ -191,6 +191,25 @@ def test_waiting_ends_at_the_deadline(robot, ready):
   assert robot.clock.now() - start < 0.0015
 
 
+def test_an_error_is_no_answer(robot, ready):
+  """A servo answers a damaged instruction with an error and no data; the SDK returns the CRC."""
+  robot.faults.corruption = 0.1
+  assert {ready.ping(7) for _ in range(40)} <= {1020, None}
+  assert {ready.read(7, 70, 1) for _ in range(40)} == {b"\0"}
+  robot.faults.corruption = 0.0
+  with pytest.raises(BusError, match=r"7 \(r_hip_yaw\) does not answer, or with an error"):
+    ready.read(7, 146, 8)  # beyond the control table
+
+
+def test_a_servo_that_has_restarted_gets_its_gains_again(robot, bus, servos):
+  bus.settings = BusSettings(position_gain=400)
+  servos.power_on()
+  servos.set_up()
+  servos.reboot("l_knee")
+  servos.start()
+  assert {s.table["position_p_gain"] for s in robot.devices.servos.values()} == {400}
+
+
 def test_hardware_errors_are_named(robot, ready, servos):
   robot.faults.heat[13] = 90.0
   _wait(robot, 0.1)
