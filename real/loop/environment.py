@@ -46,6 +46,8 @@ class RobotEnvironment(dm_env.Environment):
   ):
     """Switches the supply on, sets the servos up and begins to read; nothing moves.
 
+    Where an earlier program has left the torque on, the robot is held before it is switched off.
+
     Args:
       bus: The open bus.
       task: What is observed, and for how long.
@@ -97,6 +99,8 @@ class RobotEnvironment(dm_env.Environment):
     self.servos = Servos(bus)
     self.servos.power_on()
     if not self.dry_run:
+      if any(self.servos.torque_states()):  # a program died: without torque the robot would fall
+        operator.support(True)
       self.servos.set_up()
     self._cycle = Cycle(
       bus,
@@ -169,7 +173,7 @@ class RobotEnvironment(dm_env.Environment):
     stop = self._cycle.stop
     if stop is not None:
       return self._end(dm_env.termination(reward=0.0, observation=observation))
-    if self._steps >= round(self._time_limit / constants.CONTROL_TIMESTEP):
+    if self._steps >= self._time_limit / constants.CONTROL_TIMESTEP - 0.5:  # to the nearest step
       return self._end(dm_env.truncation(reward=0.0, observation=observation))
     return dm_env.transition(reward=0.0, observation=observation)
 

@@ -78,6 +78,31 @@ def test_an_episode_of_standing(robot, load, caplog):
   assert environment.step(environment.standing_action).first()  # dm_env: a step after the last
 
 
+def test_an_episode_may_have_no_end(load):
+  environment = load(time_limit=float("inf"))
+  environment.reset()
+  assert not environment.step(environment.standing_action).last()
+
+
+def test_a_robot_that_a_program_has_left_standing_is_held_before_its_torque_goes(robot, load):
+  environment = load()
+  environment.reset()
+  environment._cycle.close()  # as the program dies
+  environment._bus.close()
+  seen = []
+  hold = robot.operator._hold
+
+  def note(held):
+    seen.append((held, bool(robot.body.motors.enabled.all())))
+    hold(held)
+
+  robot.operator._hold = note
+  load()
+  assert seen == [(True, True)] and not robot.body.motors.enabled.any()
+  robot.operator._hold = hold
+  environment._closed = True
+
+
 def test_control_runs_at_40_hz_and_the_bus_at_125(robot, load):
   environment = load(time_limit=60.0)
   environment.reset()
