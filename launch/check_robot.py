@@ -12,9 +12,14 @@ import contextlib
 import dataclasses
 import logging
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from nerf2real.launch import command
+
+if TYPE_CHECKING:
+  from nerf2real.real.recorder.recorder import Recorder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Arguments:
   lens: Path | None = None
   """The camera's camera_info YAML of launch/calibrate_camera.py, for the recording."""
   record: Path | None = None
-  """Where to record everything (.mcap)."""
+  """Where to record everything (.mcap); a file that is there is kept, and the name refused."""
 
 
 def run(arguments: Arguments) -> int:
@@ -43,11 +48,9 @@ def run(arguments: Arguments) -> int:
 
   logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
   with contextlib.ExitStack() as stack:
-    recorder = None
-    if arguments.record is not None:
-      from nerf2real.real.recorder.recorder import Recorder
-
-      recorder = stack.enter_context(Recorder(arguments.record))
+    recorder = (
+      None if arguments.record is None else stack.enter_context(_recorded(arguments.record))
+    )
     lines = check.check(
       stack.enter_context(check.connected(arguments.robot)),
       camera=arguments.camera,
@@ -59,6 +62,26 @@ def run(arguments: Arguments) -> int:
     )
   print("\n".join(lines))
   return 0 if lines[-1] == check.PASSED else command.FAILED
+
+
+@contextlib.contextmanager
+def _recorded(path: Path) -> Iterator["Recorder"]:
+  """Gives a recorder; of a robot that is not reached nothing is left.
+
+  Raises:
+    RefusedError: The file is there already.
+  """
+  from nerf2real.real.recorder.recorder import Recorder
+
+  if path.is_file():
+    raise command.RefusedError(f"{path} is there already: name another file with --record.")
+  with Recorder(path) as recorder:
+    try:
+      yield recorder
+    except BaseException:
+      if recorder.empty:
+        recorder.abandon()
+      raise
 
 
 def main() -> int:

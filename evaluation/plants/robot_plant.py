@@ -37,8 +37,7 @@ class RobotPlant(Plant):
   def _abandon_recording(self) -> None:
     """Ends the recording of a robot that was not reached: it holds nothing."""
     if self._recorder is not None:
-      self._recorder.close()
-      self._recorder.path.unlink(missing_ok=True)
+      self._recorder.abandon()
 
   @property
   def environment(self) -> dm_env.Environment:

@@ -18,6 +18,7 @@ from nerf2real.core.cameras import Camera
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 MIN_VIEWS = 8  # chosen: eight numbers of the lens need well more than two views
+_MIN_CORNERS = 3  # along a row or a column: OpenCV's
 _OUTLIER = 2.5  # views with more than this times the median error are left out: chosen
 _BLOCKS = 10  # of the jackknife: neighbouring frames of a video err alike
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -74,8 +75,10 @@ def read_pictures(source: Path, *, every: int = 1) -> Iterator[tuple[str, np.nda
     every: Takes every n-th picture only.
 
   Raises:
-    ValueError: There is nothing readable.
+    ValueError: There is nothing readable, or `every` is less than 1.
   """
+  if every < 1:
+    raise ValueError(f"Every {every}-th picture was asked for, expected 1 (each) or more.")
   source = Path(source)
   if source.is_dir():
     paths = sorted(p for p in source.iterdir() if p.suffix.lower() in _PICTURES)
@@ -115,7 +118,15 @@ def find_board(name: str, picture: np.ndarray, *, corners: tuple[int, int]) -> V
 
   Returns:
     The view, or None if the board was not found.
+
+  Raises:
+    ValueError: OpenCV finds no board of so few corners.
   """
+  if min(corners) < _MIN_CORNERS:
+    raise ValueError(
+      f"Found {corners[0]} x {corners[1]} inner corners, expected {_MIN_CORNERS} or more each: "
+      "8 x 8 squares have 7 x 7."
+    )
   flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
   found, rough = cv2.findChessboardCorners(picture, corners, flags=flags)
   if not found:

@@ -51,6 +51,8 @@ class Recorder:
       OSError: The file cannot be written; the message holds the reason.
     """
     self.path = Path(path)
+    above = (self.path.parent, *self.path.parent.parents)
+    self._made = [folder for folder in above if not folder.exists()]
     self.path.parent.mkdir(parents=True, exist_ok=True)
     # A session of its own: Ctrl-C at the terminal ends the control loop, which then closes this.
     self._process = subprocess.Popen(
@@ -63,6 +65,7 @@ class Recorder:
     self._queue: queue.Queue[tuple[Call, ...] | None] = queue.Queue(_QUEUE)
     self.failure = ""  # why the file is not whole, known once it is closed
     self.dropped = 0  # readings that found the queue full or the process gone
+    self.empty = True  # nothing has been noted
     self._closed = False
     self._sender = threading.Thread(target=self._send, daemon=True, name="recorder")
     self._sender.start()
@@ -93,6 +96,7 @@ class Recorder:
     return self._process.poll() is None
 
   def _put(self, *calls: Call) -> None:
+    self.empty = False
     if self._closed or not self.alive:
       self.dropped += 1
       return
@@ -208,6 +212,14 @@ class Recorder:
       self.failure = self._describe(words)
     if self.dropped:
       _log.warning("The recorder of %s dropped %d readings.", self.path, self.dropped)
+
+  def abandon(self) -> None:
+    """Ends the recording of a robot that was not reached: nothing is left of it."""
+    self.close()
+    self.path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # it holds something else by now
+      for folder in self._made:
+        folder.rmdir()
 
   def _describe(self, words: str) -> str:
     """Returns why the file is not whole; one that holds no message is removed."""

@@ -6,6 +6,7 @@ import socket
 import threading
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -196,3 +197,34 @@ def test_a_log_that_can_be_read_is_served(run, tmp_path):
   log = _log(tmp_path / "log.mcap")
   ended = run("replay_log", log, "--html", tmp_path / "log.html")
   assert ended.status == 0 and (tmp_path / "log.html").stat().st_size > 10_000
+
+
+def test_a_recording_that_is_there_is_kept(run, tmp_path):
+  log = tmp_path / "log.mcap"
+  log.write_bytes(b"a recording")
+  ended = run("check_robot", "--robot", "/dev/none", "--record", log)
+  assert ended.status == 2 and f"{log} is there already" in ended.err, ended
+  assert log.read_bytes() == b"a recording"
+
+
+def test_of_a_robot_that_is_not_reached_no_recording_is_left(run, tmp_path):
+  ended = run("check_robot", "--robot", "/dev/none", "--record", tmp_path / "new" / "log.mcap")
+  assert ended.status == 1 and "/dev/none" in ended.err, ended
+  assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+  ("option", "words"),
+  [
+    (("--every", 0), "expected 1 (each) or more"),
+    (("--corners", 2, 7), "Found 2 x 7 inner corners, expected 3 or more each"),
+  ],
+)
+def test_boards_that_nobody_can_find(run, tmp_path, option, words):
+  film = cv2.VideoWriter(
+    str(tmp_path / "board.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (80, 60)
+  )
+  film.write(np.zeros((60, 80, 3), np.uint8))
+  film.release()
+  ended = run("calibrate_camera", tmp_path / "board.avi", *option)
+  assert ended.status == 1 and words in ended.err, ended
