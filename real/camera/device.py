@@ -8,6 +8,8 @@ back. Shapes: H height, W width.
 import dataclasses
 import json
 import logging
+import os
+import re
 import threading
 import time
 import urllib.error
@@ -27,6 +29,7 @@ _TOLERANCE = 0.02  # relative: drivers round to their own steps
 _MAX_DRIVER_AGE = 1.0  # s: an older driver's stamp is of another clock
 _HTTP = ("http://", "https://")
 _NETWORK = (*_HTTP, "rtsp://", "udp://", "tcp://")
+_DEVICE = re.compile(r"/dev/video(\d+)")  # by-id and by-path are links to it
 _MANUAL_EXPOSURE = 1.0  # V4L2's value of "manual" in CAP_PROP_AUTO_EXPOSURE
 _log = logging.getLogger(__name__)
 
@@ -117,7 +120,8 @@ class Camera:
     """Opens a camera and waits for its first picture.
 
     Args:
-      source: Number of a device, a video file (played at its own rate), or the URL of a stream.
+      source: Number or path of a device, a video file (played at its own rate), or the URL of a
+        stream.
       settings: Settings of the camera.
       capture: Opens a source as cv2.VideoCapture does; for tests.
 
@@ -126,8 +130,9 @@ class Camera:
       ValueError: The file does not exist.
     """
     if isinstance(source, Path) or (isinstance(source, str) and not source.startswith(_NETWORK)):
-      if isinstance(source, str) and source.isdigit():
-        source = int(source)
+      number = _device_number(source)
+      if number is not None:
+        source = number
       elif not Path(source).exists():
         raise ValueError(f"Found no {source}: expected a device's number, a video file or a URL.")
     settings = settings or CaptureSettings()
@@ -246,6 +251,17 @@ class Camera:
       if 0 <= arrived - taken <= _MAX_DRIVER_AGE:
         return taken
     return arrived
+
+
+def _device_number(source: str | Path) -> int | None:
+  """Returns the number of a device given by "0", /dev/video0 or a link to that; None of others.
+
+  As a file it would be played at the rate that its driver states, and its queue would grow old.
+  """
+  if str(source).isdecimal():
+    return int(str(source))
+  found = _DEVICE.fullmatch(os.path.realpath(source))
+  return None if found is None else int(found[1])
 
 
 def open_capture(source: Source) -> Any:

@@ -166,6 +166,15 @@ def test_device_controls_and_the_drivers_stamps():
     assert 0.2 <= camera.read()[1] < 0.4
 
 
+@pytest.mark.parametrize("name", ["7", "/dev/video7", "link"])
+def test_a_device_is_one_by_whatever_name(tmp_path, name):
+  link = tmp_path / "usb-Logitech-index0"
+  link.symlink_to("/dev/video7")
+  with cameras.Camera.open(str(link) if name == "link" else name, capture=Driver) as camera:
+    assert camera.source == 7
+    assert camera.read()[1] >= 0.2  # by the driver's stamp
+
+
 def test_errors_say_what_to_do(tmp_path):
   with pytest.raises(ValueError, match="Found no .*nowhere.mp4"):
     cameras.Camera.open(tmp_path / "nowhere.mp4")
