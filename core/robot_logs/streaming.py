@@ -115,14 +115,16 @@ def _readings(
     elif isinstance(record, Schema):
       types[record.id] = record
     elif isinstance(record, Channel):
-      kind = types[record.schema_id]
-      if topics is not None and record.topic not in topics and kind.name not in schemas:
+      kind = types.get(record.schema_id)  # None: a topic without a schema, such as of JSON
+      chosen = kind is not None and kind.name in schemas
+      if topics is not None and record.topic not in topics and not chosen:
         continue
       decoder = factory.decoder_for(record.message_encoding, kind)
-      if decoder is None:
+      if kind is None or decoder is None:
         raise LogError(
           f"{name} has {record.topic} in the encoding {record.message_encoding!r} of "
-          f"{kind.encoding!r}, expected ROS 2 messages (cdr): record that topic with ROS 2."
+          f"{kind.encoding if kind else None!r}, expected ROS 2 messages (cdr): record that topic "
+          "with ROS 2."
         )
       decoders[record.id] = (record.topic, kind.name, decoder)
 

@@ -26,6 +26,10 @@ _JOINT_TOPICS = {
   messages.PWM: ("effort", "duty", ""),
   messages.STAMPS: ("effort", "time of reading after the stamp", "s"),
 }
+_TOPICS = (
+  *_JOINT_TOPICS,
+  *(messages.IMU, messages.GRAVITY, messages.BATTERY, messages.IMAGE, messages.TEMPERATURE),
+)
 
 
 @dataclasses.dataclass
@@ -73,7 +77,7 @@ def load(path: Path | str) -> Replay:
       times.append(time)
       rows.append(values)
 
-  for reading in recording.read_messages(path, recover=True):
+  for reading in recording.read_messages(path, topics=_TOPICS, recover=True):
     topic, time, message = reading.topic, reading.time, reading.message
     if topic in _JOINT_TOPICS:
       field, name, unit = _JOINT_TOPICS[topic]

@@ -11,8 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from mcap_ros2.writer import Writer
 
-from nerf2real.core.robot_logs import messages
+from nerf2real.core.robot_logs import messages, reading
 from nerf2real.core.robot_logs.writer import open_log
 from nerf2real.real.recorder import process as recorder_process
 from nerf2real.real.recorder import replay, replay_server
@@ -126,3 +127,24 @@ def test_a_log_without_our_extra_topics(tmp_path):
   shown = replay.load(measured)
   assert {"position", "commanded effort"} <= set(shown.series) and not shown.frames
   assert shown.series["position"].names == shown.series["commanded effort"].names
+
+
+def test_topics_that_are_not_shown_may_be_anything(tmp_path):
+  """A robot's whole bag holds messages without a header, and channels without a schema."""
+  path = tmp_path / "bag.mcap"
+  with path.open("wb") as stream:
+    writer = Writer(stream)
+    joints = writer.register_msgdef(messages.JOINT_STATE, messages.definition(messages.JOINT_STATE))
+    text = writer.register_msgdef("std_msgs/msg/String", "string data\n")
+    note = writer._writer.register_channel(topic="/note", message_encoding="json", schema_id=0)
+    for k in range(200):
+      ns = 10**18 + k * 10**7
+      times = {"log_time": ns, "publish_time": ns}
+      for topic in (messages.STATES, messages.COMMANDS):
+        told = messages.joint_state(ns, topic, NAMES, position=[0.1 * k, 0.0])[2]
+        writer.write_message(topic, joints, told, **times)
+      writer.write_message("/rosout", text, {"data": "x"}, **times)
+      writer._writer.add_message(channel_id=note, data=b"{}", **times)
+    writer.finish()
+  assert {"position", "command"} == set(replay.load(path).series)
+  assert reading.read_log(path).joints == NAMES
