@@ -50,6 +50,21 @@ def check_writable(path: str | Path) -> None:
 
 
 @contextlib.contextmanager
+def _under_its_name(partial: Path, path: Path) -> Iterator[None]:
+  """Raises an OSError about a temporary path, or what is in it, with the name it stands for."""
+  try:
+    yield
+  except DiskFullError:
+    raise
+  except OSError as error:
+    named = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | Path) else None
+    if named is None or not named.is_relative_to(partial):
+      raise
+    where = path / named.relative_to(partial)
+    raise OSError(error.errno, error.strerror, str(where)) from error
+
+
+@contextlib.contextmanager
 def explain_disk_full(path: str | Path) -> Iterator[None]:
   """Raises DiskFullError, naming `path`, where the block raises ENOSPC, EDQUOT or EFBIG."""
   try:
@@ -83,7 +98,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
   owner = f"{os.getpid()}-{threading.get_native_id()}"
   partial = path.with_name(f".{path.stem}.{owner}.partial{path.suffix}")
   try:
-    with explain_disk_full(path):
+    with explain_disk_full(path), _under_its_name(partial, path):
       yield partial
       with partial.open("rb") as stream:
         os.fsync(stream.fileno())
@@ -132,7 +147,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
   partial = path.with_name(f".{path.name}.partial")
   shutil.rmtree(partial, ignore_errors=True)
   try:
-    with explain_disk_full(path):
+    with explain_disk_full(path), _under_its_name(partial, path):
       partial.mkdir(parents=True)
       yield partial
       replace_folder(partial, path)

@@ -24,6 +24,16 @@ def test_what_is_written_is_read(tmp_path_factory, content):
   assert listing(path.parent) == ["file.bin"]
 
 
+def test_an_error_names_the_file_that_was_asked_for(tmp_path):
+  path = tmp_path / "none" / "page.html"
+  with pytest.raises(FileNotFoundError) as caught:
+    files.write_atomically(path, "x")
+  assert caught.value.filename == str(path)
+  with pytest.raises(FileNotFoundError) as caught, files.atomic_folder(tmp_path / "new") as partial:
+    (partial / "sfm" / "cameras.txt").write_text("x")
+  assert caught.value.filename == str(tmp_path / "new" / "sfm" / "cameras.txt")
+
+
 def test_writer_by_name_gets_the_suffix(tmp_path):
   with files.atomic_path(tmp_path / "picture.png") as partial:
     assert partial.suffix == ".png" and partial.parent == tmp_path

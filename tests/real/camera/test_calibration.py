@@ -135,3 +135,22 @@ def test_measured_film_of_a_phone():
   # Measured independently: 667.8 +- 5.5 (SOURCE.md beside the film).
   assert found.values[0] == pytest.approx(668, abs=6)
   assert 1 < found.stddevs[0] < 12
+
+
+@pytest.mark.parametrize(
+  ("matrix", "coefficients"),
+  [
+    ("[600, 0, 320, 0, 601, 240, 0, 0]", "[0, 0, 0, 0]"),
+    ("[0, 0, 320, 0, 601, 240, 0, 0, 1]", "[0, 0, 0, 0]"),
+    ("[600, 0, 320, 0, 601, 240, 0, 0, 1]", "[k1, 0, 0, 0]"),
+    ("[600, 0, 320, 0, 601, 240, 0, 0, 1]", "null"),
+  ],
+)
+def test_a_camera_info_with_wrong_numbers_is_named(tmp_path, matrix, coefficients):
+  path = tmp_path / "lens.yaml"
+  path.write_text(
+    "image_width: 640\nimage_height: 480\ndistortion_model: plumb_bob\n"
+    f"camera_matrix: {{data: {matrix}}}\ndistortion_coefficients: {{data: {coefficients}}}\n"
+  )
+  with pytest.raises(ValueError, match=r"lens\.yaml is no camera_info YAML"):
+    read_camera_info(path)
