@@ -27,6 +27,7 @@ _LEARNER = ".learner.lock"  # beside the lock of the run's supervisor
 _PATIENCE = 20.0  # s for a learner whose supervisor was killed to save what it has
 _LAST_PORT = 65535
 _IMPORT_PERIOD = 0.05  # s between interruptions of an import
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SIGNALLED = 128  # plus the signal's number: the shell's convention
 
 
@@ -93,15 +94,16 @@ def main(
 ) -> int:
   """Parses the command line, calls the function, and returns the exit status.
 
-  Ctrl-C and SIGTERM raise KeyboardInterrupt in the function, so that what it opened is closed; they
-  end in one line. Errors of other kinds than those listed show their trace.
+  Ctrl-C, SIGTERM and the end of the terminal (SIGHUP) raise KeyboardInterrupt in the function, so
+  that what it opened is closed; they end in one line. Errors of other kinds than those listed show
+  their trace.
 
   Args:
     arguments: dataclass of the arguments; its module's docstring is the help's description.
     function: called with the parsed arguments; returns an exit status, or None for 0.
     environment: environment variables that are set unless they are set already.
     errors: exceptions of the user's making, which end in `error: <message>` and status 1.
-    interrupted: the line after Ctrl-C or SIGTERM.
+    interrupted: the line after one of these signals.
     forwards: calls the function with a list of unknown arguments besides.
 
   Raises:
@@ -129,7 +131,7 @@ def main(
   except errors as error:
     message, status = _words(error), FAILED
   except KeyboardInterrupt:
-    for number in (signal.SIGINT, signal.SIGTERM):  # a second one would only add a trace
+    for number in _ENDING:  # a second one would only add a trace
       signal.signal(number, signal.SIG_IGN)
     _say(f"\n{interrupted}")
     return _SIGNALLED + received[-1]
@@ -195,7 +197,7 @@ def _say(text: str) -> None:
 
 @contextlib.contextmanager
 def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]:
-  """Raises KeyboardInterrupt at Ctrl-C and SIGTERM, and appends the signal to `received`.
+  """Raises KeyboardInterrupt at Ctrl-C, SIGTERM and SIGHUP, and appends it to `received`.
 
   Where it comes during an import, it is raised until it is heeded: libraries that import others on
   trial (trimesh for one) take every exception there for a missing library, and go on. Where
@@ -223,6 +225,8 @@ def _terminated_as_interrupted(received: list[signal.Signals]) -> Iterator[None]
   numbers = [signal.SIGTERM]
   if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell may have it ignored
     numbers.append(signal.SIGINT)
+  if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # `nohup` has it ignored
+    numbers.append(signal.SIGHUP)  # the terminal is gone: a robot must not be left under torque
   before = {number: signal.signal(number, interrupt) for number in numbers}
   before[signal.SIGALRM] = signal.signal(signal.SIGALRM, interrupt_again)
   try:

@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM end commands without traces, leaving what is whole."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -57,6 +58,20 @@ def test_an_interrupted_rollout_leaves_a_video_that_plays(tmp_path):
   with av.open(str(video)) as container:
     assert sum(1 for _ in container.decode(video=0)) >= 1
   assert [path.name for path in tmp_path.iterdir()] == ["out.mp4"]
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_what_is_open_is_closed_when_the_terminal_goes(ignored):
+  """A robot would stay under torque; where `nohup` has the signal ignored, it stays so."""
+  before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
+  received: list[signal.Signals] = []
+  try:
+    with contextlib.suppress(KeyboardInterrupt), command._terminated_as_interrupted(received):
+      signal.raise_signal(signal.SIGHUP)
+    assert received == ([] if ignored else [signal.SIGHUP])
+    assert signal.getsignal(signal.SIGHUP) == (signal.SIG_IGN if ignored else signal.SIG_DFL)
+  finally:
+    signal.signal(signal.SIGHUP, before)
 
 
 def test_a_signal_that_comes_in_a_destructor_is_not_lost():
