@@ -79,12 +79,13 @@ def run(arguments: Arguments) -> int:
 
 def _print_content(content: dict[str, Any], out: Path) -> None:
   import rich
+  from rich.markup import escape
   from rich.table import Table
 
   from nerf2real.sysid.model import simulation as evaluation
   from nerf2real.sysid.report.alike import together
 
-  rich.print(f"[bold]{content['verdict']}[/bold] in {content['seconds']:.0f} s")
+  rich.print(f"[bold]{escape(content['verdict'])}[/bold] in {content['seconds']:.0f} s")
   table = Table("effect", "where", "parameter", "value", "95 %", "unit")
   for effect in together(content["effects"]):
     for name, value in effect["parameters"].items():
@@ -92,18 +93,23 @@ def _print_content(content: dict[str, Any], out: Path) -> None:
         continue
       interval = "" if value["low"] is None else f"{value['low']:.4g} .. {value['high']:.4g}"
       table.add_row(
-        effect["kind"], _place(effect), name, _number(value["value"]), interval, value["unit"]
+        effect["kind"],
+        escape(_place(effect)),
+        name,
+        _number(value["value"]),
+        interval,
+        value["unit"],
       )
   if table.rows:
     rich.print(table)
   for note in content["notes"]:
-    rich.print(f"note: {note}")
+    print(f"note: {note}")
   for name in ("train", "held"):
     error = content["error"][name]
     if error:
       worse = " (worse: do not use it)" if evaluation.is_worse(error) else ""
-      rich.print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE{worse}")
-  rich.print(f"floor: {content['error']['floor']:.5f}; report: {out / 'report.html'}")
+      print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE{worse}")
+  print(f"floor: {content['error']['floor']:.5f}; report: {out / 'report.html'}")
 
 
 def _place(effect: dict[str, Any]) -> str:
@@ -116,6 +122,7 @@ def _number(value: float | None) -> str:
 
 def _print_errors(folder: Path, held: Sequence[Path]) -> None:
   import rich
+  from rich.markup import escape
   from rich.table import Table
 
   from nerf2real import sysid
@@ -123,22 +130,24 @@ def _print_errors(folder: Path, held: Sequence[Path]) -> None:
   table = Table("log", "declared", "extended", "lower by")
   for row in sysid.evaluate(folder, held):
     ratio = row["before"] / max(row["after"], 1e-12)
-    table.add_row(row["log"], f"{row['before']:.6f}", f"{row['after']:.6f}", f"{ratio:.2f} times")
+    errors = f"{row['before']:.6f}", f"{row['after']:.6f}"
+    table.add_row(escape(row["log"]), *errors, f"{ratio:.2f} times")
   rich.print(table)
 
 
 def _check_drift(folder: Path, held: Sequence[Path], out: Path | None) -> int:
   """Prints whether later logs fit a stored result; returns the exit status."""
   import rich
+  from rich.markup import escape
 
   from nerf2real import sysid
   from nerf2real.sysid.drift import page
 
   found = sysid.check_drift(folder, held, out=out)
-  rich.print(f"[bold]{page.sentence(found)}[/bold]")
+  rich.print(f"[bold]{escape(page.sentence(found))}[/bold]")
   for kind in found.not_judged:
-    rich.print(f"not compared: {kind}")
-  rich.print(f"page: {(out or folder) / 'drift.html'}")
+    print(f"not compared: {kind}")
+  print(f"page: {(out or folder) / 'drift.html'}")
   return 0 if found.holds else DRIFTED
 
 

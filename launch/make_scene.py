@@ -110,18 +110,19 @@ def settings_of(arguments: Arguments) -> "SceneSettings":
 
 def _print_figures(scene: "Bundle") -> None:
   import rich
+  from rich.markup import escape
   from rich.table import Table
 
-  table = Table("figure", "value", title=f"scene {scene.name}")
+  table = Table("figure", "value", title=f"scene {escape(scene.name)}")
   for key, value in scene.figures.items():
     if isinstance(value, (int, float)):
       table.add_row(key, f"{value:.4g}")
     elif isinstance(value, str):
-      table.add_row(key, value)
+      table.add_row(key, escape(value))
   table.add_row("seconds", f"{sum(scene.scene['seconds'].values()):.0f}")
   rich.print(table)
   for warning in scene.scene["warnings"]:
-    rich.print(f"[yellow]warning:[/] {warning}")
+    rich.print(f"[yellow]warning:[/] {escape(warning)}")
 
 
 def _check(arguments: Arguments, source: Path, settings: "SceneSettings") -> int:

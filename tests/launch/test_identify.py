@@ -131,3 +131,19 @@ def test_held_logs_of_other_joints_are_one_line(option, identify, tmp_path):
   )
   assert code != 0
   assert err.startswith("error: b.mcap has no commands for ['shoulder']") and err.count("\n") == 1
+
+
+def test_words_and_paths_are_told_as_they_are(capsys, tmp_path):
+  """Rich takes brackets for styles, and breaks a path where a line of a pipe would end."""
+  content = {
+    "verdict": "none",
+    "seconds": 1.0,
+    "effects": [],
+    "notes": ["held[a].mcap has a bias of 0.1 [rad]."],
+    "error": {"train": None, "held": None, "floor": 0.001},
+  }
+  out = tmp_path / "a folder with a long name" / "another one that is as long [as this]"
+  script._print_content(content, out)
+  told = capsys.readouterr().out
+  assert "note: held[a].mcap has a bias of 0.1 [rad].\n" in told
+  assert f"report: {out / 'report.html'}\n" in told
