@@ -44,7 +44,7 @@ def run(arguments: Arguments) -> None:
   """Searches, and prints and writes every round."""
   import numpy as np
 
-  from nerf2real.core.files import write_atomically
+  from nerf2real.core.files import check_writable, write_atomically
   from nerf2real.suite.gaits import tuning, walk
 
   settings = walk.GaitSettings()
@@ -55,6 +55,9 @@ def run(arguments: Arguments) -> None:
     except (ValueError, KeyError, TypeError) as error:
       raise ValueError(f"{arguments.start} is no result of an earlier search: {error}.") from error
     settings = dataclasses.replace(settings, **kept)
+  if arguments.out is not None:
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(arguments.out)  # a round takes minutes
   names = ("generations", "population", "seconds", "worlds", "turning", "spread", "seed")
   begin = time.monotonic()
   for found in tuning.search(start=settings, **{n: getattr(arguments, n) for n in names}):

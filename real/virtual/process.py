@@ -93,8 +93,11 @@ class VirtualRobotProcess:
     self.close()
 
   def _ask(self, name: str, *arguments: Any) -> Any:
-    self._pipe.send((name, arguments))
-    return self._receive()
+    try:
+      self._pipe.send((name, arguments))
+      return self._receive()
+    except (EOFError, OSError) as error:
+      raise RuntimeError("The virtual robot's process has ended: start it again.") from error
 
   def _receive(self) -> Any:
     found = self._pipe.recv()

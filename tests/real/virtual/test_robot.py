@@ -123,6 +123,9 @@ def test_in_a_process_of_its_own_it_does_what_it_is_told():
     with pytest.raises(RuntimeError, match="ball=True"):
       robot.place_ball(0.0, 0.0)
     assert robot.processor_time() > 0
+    robot._process.kill()
+    with pytest.raises(RuntimeError, match="process has ended: start it again"):
+      robot.truth()
   with pytest.raises(RuntimeError, match="Unknown world"):
     VirtualRobotProcess(world="moon")
 
