@@ -45,15 +45,16 @@ class _Range(NamedTuple):
 
 
 _TIME = _Range(0, math.inf, "more than 0", open=True)
+_STEPPED_TIME = _Range(0, sys.float_info.max, "more than 0, and finite", open=True)
 _SEED = _Range(0, 2**32 - 1, f"0 to {2**32 - 1}")  # of NumPy's RandomState
 _RANGES = {
   "port": _Range(0, _LAST_PORT, f"0 (a free one) to {_LAST_PORT}, such as 8080"),
   "seed": _SEED,
   "robot_seed": _SEED,
-  "seconds": _TIME,
+  "seconds": _STEPPED_TIME,
   "splat_seconds": _TIME,
   "minutes": _TIME,
-  "time_limit": _TIME,
+  "time_limit": _STEPPED_TIME,
 }
 """By the name of an argument, the same in all commands: a wrong one would be noticed late or never,
 or end in words that do not name it."""

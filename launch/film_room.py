@@ -37,6 +37,8 @@ def run(arguments: Arguments) -> None:
   from nerf2real.scenes.builtin import ground_truth
   from nerf2real.scenes.builtin.mujoco_renderer import EglMissingError
 
+  if arguments.out.suffix != ".mp4":
+    raise ValueError(f"{arguments.out} is no name of a film: expected one that ends in .mp4.")
   console = rich.console.Console(stderr=True)
   try:
     with progress_bar("filming", console=console) as progress:

@@ -98,7 +98,8 @@ def settings_of(arguments: Arguments) -> "SceneSettings":
   side = arguments.marker_side
   place = None if arguments.marker_at is None else MarkerPlace(*arguments.marker_at)
   if arguments.capture == BUILT_IN:
-    side, place = side or ground_truth.MARKER_SIDE, place or ground_truth.MARKER_AT
+    side = ground_truth.MARKER_SIDE if side is None else side
+    place = place or ground_truth.MARKER_AT
   if side is not None:
     settings = dataclasses.replace(settings, marker_side=side)
   if place is not None:

@@ -41,12 +41,14 @@ def run(arguments: Arguments) -> None:
   import cv2
   import numpy as np
 
-  from nerf2real.core.files import write_atomically
+  from nerf2real.core.files import check_writable, write_atomically
   from nerf2real.evaluation.policies.names import SHIPPED, policy_folder
   from nerf2real.evaluation.report.belief_pictures import draw_episode
 
   if not cv2.haveImageWriter(str(arguments.out)):
     raise ValueError(f"{arguments.out} is no name of a picture: expected one such as belief.png.")
+  arguments.out.parent.mkdir(parents=True, exist_ok=True)
+  check_writable(arguments.out)
   name = arguments.policy
   drawn = draw_episode(
     policy_folder(name, task="nerf_nav") if name.startswith(SHIPPED) else Path(name),
@@ -55,7 +57,6 @@ def run(arguments: Arguments) -> None:
     moments=arguments.moments,
     max_steps=arguments.max_steps,
   )
-  arguments.out.parent.mkdir(parents=True, exist_ok=True)
   _, data = cv2.imencode(arguments.out.suffix, drawn.picture[..., ::-1])
   write_atomically(arguments.out, data.tobytes())
   print(

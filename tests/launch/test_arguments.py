@@ -15,6 +15,11 @@ from tests.launch.test_identify import _log
     ("virtual_robot", ("--x", "nan"), "--x nan: expected a number"),
     ("virtual_robot", ("--seed", "-1"), "--seed -1: expected 0 to"),
     ("check_robot", ("--robot", "virtual", "--seconds", "0"), "--seconds 0: expected more than 0"),
+    (
+      *("check_robot", ("--robot", "virtual", "--seconds", "inf")),
+      "--seconds inf: expected more than 0, and finite",
+    ),
+    ("evaluate", ("--time-limit", "inf"), "--time-limit inf: expected more than 0, and finite"),
     ("evaluate", ("--robot-seed", "1", "-2"), "--robot-seed -2: expected 0 to"),
     ("evaluate", ("--time-limit", "-1"), "--time-limit -1: expected more than 0"),
     ("distill", ("--run", "none", "--minutes", "0"), "--minutes 0: expected more than 0"),
