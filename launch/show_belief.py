@@ -47,8 +47,8 @@ def run(arguments: Arguments) -> None:
 
   if not cv2.haveImageWriter(str(arguments.out)):
     raise ValueError(f"{arguments.out} is no name of a picture: expected one such as belief.png.")
-  arguments.out.parent.mkdir(parents=True, exist_ok=True)
-  check_writable(arguments.out)
+  if arguments.out.parent.exists():  # else it is made when there is a picture
+    check_writable(arguments.out)
   name = arguments.policy
   drawn = draw_episode(
     policy_folder(name, task="nerf_nav") if name.startswith(SHIPPED) else Path(name),
@@ -57,6 +57,7 @@ def run(arguments: Arguments) -> None:
     moments=arguments.moments,
     max_steps=arguments.max_steps,
   )
+  arguments.out.parent.mkdir(parents=True, exist_ok=True)
   _, data = cv2.imencode(arguments.out.suffix, drawn.picture[..., ::-1])
   write_atomically(arguments.out, data.tobytes())
   print(

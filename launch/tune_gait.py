@@ -55,8 +55,7 @@ def run(arguments: Arguments) -> None:
     except (ValueError, KeyError, TypeError) as error:
       raise ValueError(f"{arguments.start} is no result of an earlier search: {error}.") from error
     settings = dataclasses.replace(settings, **kept)
-  if arguments.out is not None:
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+  if arguments.out is not None and arguments.out.parent.exists():
     check_writable(arguments.out)  # a round takes minutes
   names = ("generations", "population", "seconds", "worlds", "turning", "spread", "seed")
   begin = time.monotonic()
@@ -73,6 +72,7 @@ def run(arguments: Arguments) -> None:
         "walks": found.walks,
         "mean": dataclasses.asdict(found.mean),
       }
+      arguments.out.parent.mkdir(parents=True, exist_ok=True)
       write_atomically(arguments.out, json.dumps(record, indent=1))
 
 

@@ -54,7 +54,7 @@ def test_a_search_begins_with_a_searchs_result_alone(run, tmp_path, content):
 def test_a_search_that_cannot_be_written_is_refused_before_its_first_round(run, tmp_path):
   (tmp_path / "file").write_text("")
   ended = run("tune_gait", "--out", tmp_path / "file" / "gait.json")
-  assert ended.status == 1 and str(tmp_path / "file") in ended.err, ended
+  assert ended.status == 1 and str(tmp_path / "file" / "gait.json") in ended.err, ended
 
 
 def test_the_link_of_a_robot_that_was_killed_is_taken_over(run, tmp_path):
