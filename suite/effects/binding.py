@@ -176,14 +176,24 @@ class Binding:
     self._ctrl_low, self._ctrl_high = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
     self._low, self._high = _limits(model.actuator_forcelimited, model.actuator_forcerange)
     self._forcerange = model.actuator_forcerange.copy()
+    self._written_limit = np.ones(model.nu)
     self._work = np.zeros(model.nu)
+
+  def clear(self) -> None:
+    """Forgets what effects added and scaled in the last step."""
+    self.force.fill(0.0)
+    self.friction.fill(0.0)
+    self.encoder_shift.fill(0.0)
+    self.strength.fill(1.0)
+    self.limit.fill(1.0)
 
   def write_actuators(self, *, shifted: bool) -> None:
     """Writes strength, and encoder shift if `shifted`, into the model's actuator constants."""
     strength = self.strength
     np.multiply(self._gain, strength, out=self._gain_view)
-    if self.limit.min(initial=1.0) < 1.0:
+    if (self.limit != self._written_limit).any():
       np.multiply(self._forcerange, self.limit[:, None], out=self.model.actuator_forcerange)
+      self._written_limit[:] = self.limit
     np.multiply(self._bias, strength[:, None], out=self._bias_view)
     if shifted and len(self.joints):
       shift = self._per_position * self.encoder_shift[self._of_joint]

@@ -89,9 +89,15 @@ class EffectStack:
     return next((op for op in self.operators if op.kind.name == kind), None)
 
   def reset(self) -> None:
-    """Starts an episode: empties delays, cools motors, closes gaps."""
+    """Starts an episode: empties delays, cools motors, closes gaps.
+
+    The model gets back the friction and strength that it was bound with, so that an episode does
+    not begin with those of the last step of the one before.
+    """
     if self.binding is not None:
       self.binding.last_force.fill(0.0)
+      self.binding.clear()
+      self._write(self.binding)
     for operator in self.operators:
       operator.reset()
 
@@ -115,17 +121,17 @@ class EffectStack:
     binding.note_last_force()
     binding.position[:] = data.qpos[binding.qpos]
     binding.velocity[:] = data.qvel[binding.dofs]
-    binding.force.fill(0.0)
-    binding.friction.fill(0.0)
-    binding.encoder_shift.fill(0.0)
-    binding.strength.fill(1.0)
-    binding.limit.fill(1.0)
+    binding.clear()
     for operator in self._steps:
       operator.step(binding)
-    if self._adds_friction:
-      binding.write_friction()
     if self._adds_force:
       data.qfrc_applied[binding.dofs] = binding.force
+    self._write(binding)
+
+  def _write(self, binding: Binding) -> None:
+    """Writes dry friction and actuator strength into the model."""
+    if self._adds_friction:
+      binding.write_friction()
     if self._scales:
       binding.write_actuators(shifted=self._shifts)
 

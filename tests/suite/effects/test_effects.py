@@ -140,6 +140,20 @@ def test_all_effects_at_once_stay_finite_and_reset_repeats():
   np.testing.assert_array_equal(runs[0], runs[1])
 
 
+@pytest.mark.parametrize("name", sorted(KINDS))
+def test_reset_leaves_nothing_of_the_last_step_in_the_model(name):
+  model = _model()
+  effect = _strong(name)
+  if name == "supply_sag":
+    effect = effect.replace(scales_limit=1.0)
+  stack = EffectStack([effect]).bind(model)
+  bound = _arrays(model)
+  rollout(stack, mujoco.MjData(model), _controls()[:100])
+  stack.reset()
+  for field, value in _arrays(model).items():
+    np.testing.assert_array_equal(value, bound[field], err_msg=field)
+
+
 def test_registry_is_complete_and_consistent():
   issue = """command_delay measurement_delay clock_drift coulomb_friction viscous_friction
     stribeck_friction load_friction asymmetric_friction quadratic_drag backlash encoder_offset

@@ -213,6 +213,20 @@ def test_a_source_with_a_resistance_feeds_a_bridge(pulsed, strength):
   assert data.actuator_force[0] == pytest.approx(2 * strength, rel=1e-3)
 
 
+def test_limits_recover_with_the_supply():
+  model = _hinge()
+  model.actuator_forcelimited[:], model.actuator_forcerange[:] = 1, (-5, 5)
+  values = {"droop": 0.1, "back_emf": 1.0, "pulsed": 1.0, "scales_limit": 1.0}
+  stack = EffectStack([Effect("supply_sag", None, values)]).bind(model)
+  data = mujoco.MjData(model)
+  limits = []
+  for force in (2.0, 0.0):  # of the last step; without load the supply is whole again
+    data.actuator_force[:] = force
+    stack.before_step(data, np.zeros(1))
+    limits.append(model.actuator_forcerange[0, 1])
+  assert limits[0] < 4.5 and limits[1] == 5.0
+
+
 def test_spring_beside_a_spring():
   model = _hinge(joint='damping="0.2" stiffness="1" springref="28.64788975654116"')  # 0.5 rad
   effect = Effect("spring", "hinge", {"stiffness": 3.0, "reference": -0.1})

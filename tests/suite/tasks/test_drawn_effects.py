@@ -105,3 +105,29 @@ def test_values_without_intervals_are_those_of_the_effects(room):
   np.testing.assert_array_equal(
     _play(drawn, 2), _play(_load(room, effects=fixed, draw_effects=False), 2)
   )
+
+
+@pytest.mark.parametrize(
+  ("kind", "values"),
+  [
+    ("stribeck_friction", {"breakaway": 0.3}),
+    ("load_friction", {"coefficient": 0.2}),
+    ("thermal_derating", {"heating": 3.0, "derating": 0.02}),
+    ("supply_sag", {"droop": 0.05, "scales_limit": 1.0}),
+    ("backlash", {"gap": 0.03}),
+  ],
+)
+def test_a_seed_gives_the_same_episode_whatever_was_before(room, kind, values):
+  environment = _load(room, effects=[Effect(kind, None, values)])
+
+  def play(seed, steps):
+    environment.random_state.seed(seed)
+    timesteps = [environment.reset()]
+    timesteps += [environment.step(environment.task.standing_action + 0.1) for _ in range(steps)]
+    return timesteps
+
+  first = play(1, 4)
+  play(2, 10)
+  for found, expected in zip(play(1, 4), first, strict=True):
+    for name, value in expected.observation.items():
+      np.testing.assert_array_equal(found.observation[name], value, err_msg=name)
