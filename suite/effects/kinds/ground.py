@@ -38,7 +38,8 @@ class FloorFriction(Operator):
   """Sliding friction of the floor is `scale` times the declared one.
 
   MuJoCo takes the larger friction of two touching geoms unless one has priority: a named geom gets
-  priority over all others, so that its friction counts. Without a target, every geom is scaled.
+  priority over those that had its own, so that its friction counts. A geom with a higher one, such
+  as a ball that resists rolling, keeps its contacts. Without a target, every geom is scaled.
   """
 
   def bind(self, binding: Binding) -> None:
@@ -50,7 +51,8 @@ class FloorFriction(Operator):
       geoms = _geoms(binding, effect, planes=False)
       model.geom_friction[geoms, 0] *= scale
       if effect.target is not None:
-        model.geom_priority[geoms] = model.geom_priority.max() + 1
+        model.geom_priority *= 2  # makes room below those with a higher one
+        model.geom_priority[geoms] += 1
       listed = np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms)
       model.pair_friction[listed, :2] *= scale
 

@@ -50,6 +50,22 @@ def test_floor_friction_scales_the_deceleration():
     assert slide == pytest.approx(-0.6 * 0.5 * 9.81, rel=0.02)
 
 
+def test_a_slippery_floor_leaves_a_ball_its_rolling_friction():
+  # The ball has priority, as the one of ball pushing.
+  ball = f'{_BALL} condim="6" priority="1"'
+  for effects in ([], [Effect("floor_friction", "floor", {"scale": 0.6})]):
+    model = mujoco.MjModel.from_xml_string(
+      _GROUND.format(geom=ball, height=0.1).replace("0001", "004")
+    )
+    EffectStack(effects).bind(model)
+    data = mujoco.MjData(model)
+    data.qvel[0], data.qvel[4] = 1.5, 15.0
+    mujoco.mj_step(model, data, 600)
+    slowed = (data.qvel[0] - 1.5) / 0.6
+    assert slowed == pytest.approx(-5 / 7 * 0.004 * 9.81 / 0.1, rel=0.1)
+  assert (model.geom("floor").priority, model.geom("object").priority) == (1, 2)
+
+
 def test_rolling_resistance():
   # m a = -F, I w' = F r - c N, I = 2/5 m r^2: a = -(5/7) c g / r.
   effect = Effect("rolling_resistance", "object", {"coefficient": 0.004})
