@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from dm_env import specs
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 
 from nerf2real import suite
 from nerf2real.suite.op3 import constants
@@ -61,6 +62,9 @@ class GymnasiumEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     self.observation_space = space
     self.action_space = space_of(environment.action_spec())
     self._view: ThirdPerson | None = None
+    self._begun = False  # whether there is an episode to see
+    self._over = True  # whether it has ended, or none has begun
+    self._closed = False
 
   def reset(
     self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -70,6 +74,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     if seed is not None:
       self.environment.random_state.seed(seed)
     timestep = self.environment.reset()
+    self._begun, self._over = True, False
     if self._view is not None:
       self._view.restart()
     return self._observe(timestep), {}
@@ -82,7 +87,13 @@ class GymnasiumEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     Returns:
       Observation; reward; terminated: the episode failed (a fall, a collision); truncated: the time
       limit; info with the reward's terms, `success` and, at the end, the `ending`.
+
+    Raises:
+      ResetNeeded: No episode has begun, or it has ended.
+      ValueError: The action has another shape than its space or holds a NaN.
     """
+    if self._over:
+      raise ResetNeeded("Found a step outside of an episode: call reset() first, and at its end.")
     timestep = self.environment.step(action)
     task = self.environment.task
     terminated = timestep.last() and timestep.discount == 0.0
@@ -90,24 +101,30 @@ class GymnasiumEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     if timestep.last():
       info["ending"] = task.outcome.ending or "time limit"
     truncated = timestep.last() and not terminated
+    self._over = timestep.last()
     return self._observe(timestep), float(timestep.reward), terminated, truncated, info
 
   def render(self) -> np.ndarray | None:  # type: ignore[override]
     """Returns a third person's view, uint8 [240, 320, 3]; None without a render mode.
 
     Raises:
+      ResetNeeded: No episode has begun.
       ValueError: The environment was loaded without pictures.
     """
     if self.render_mode is None:
       return None
+    if not self._begun:
+      raise ResetNeeded("Found no episode to render: call reset() first.")
     if self._view is None:
       environment = self.environment
       self._view = ThirdPerson(environment.task, environment.physics, height=_HEIGHT, width=_WIDTH)
     return self._view.draw()
 
   def close(self) -> None:
-    """Frees the simulation."""
-    self.environment.close()
+    """Frees the simulation; does nothing the second time."""
+    if not self._closed:
+      self._closed = True
+      self.environment.close()
 
   def _observe(self, timestep: dm_env.TimeStep) -> dict[str, np.ndarray]:
     found = timestep.observation

@@ -62,6 +62,22 @@ def test_failing_terminates_and_time_truncates(load):
   assert truncated and not terminated and info["ending"] == "time limit"
 
 
+def test_what_is_called_outside_of_an_episode_says_so(load):
+  short = GymnasiumEnv(load(time_limit=0.025), render_mode="rgb_array")
+  standing = short.environment.task.standing_action
+  with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+    short.render()
+  with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+    short.step(standing)
+  short.reset(seed=0)
+  assert short.step(standing)[3]
+  with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+    short.step(standing)
+  assert short.render().shape == (240, 320, 3)  # what the episode ended with
+  short.close()
+  short.close()
+
+
 def test_registered_tasks_are_known_to_both():
   class Other:
     pass
