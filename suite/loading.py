@@ -1,6 +1,6 @@
 """Builds an environment from a task's name and a scene bundle."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +39,7 @@ def load(
   Args:
     task: "nerf_nav", "ball_push", or one that was registered; `suite.known_tasks` lists them.
     scene: Folder of a scene bundle, or an opened `scenes.bundle.Bundle`; None is the built-in room.
-    effects: An `effects.json`, or a sequence of effects: what the nominal model lacks.
+    effects: An `effects.json`, an effect or a sequence of effects: what the nominal model lacks.
     draw_effects: Whether every episode draws the effects' values from their intervals.
     image_size: (height, width) of the robot's camera; None for an environment without pictures.
     random: A seed or `np.random.RandomState`: the same seed gives the same episodes.
@@ -93,10 +93,11 @@ def load(
 
 
 def _effects(effects: Any) -> tuple[Effect, ...]:
-  """Returns effects from a file or a sequence."""
+  """Returns effects from a file, a sequence or one alone."""
   if isinstance(effects, str | Path):
     return tuple(read_effects(effects))
-  found = tuple(effects or ())
+  listed = () if effects is None else effects
+  found = tuple(listed) if isinstance(listed, Iterable) else (listed,)
   for effect in found:
     if not isinstance(effect, Effect):
       raise ValueError(

@@ -131,13 +131,19 @@ def _parse(item: Any) -> Effect:
       )
     parameters[name] = entry["value"]
     low, high = entry.get("low"), entry.get("high")
+    for bound in (low, high):
+      number = isinstance(bound, int | float) and not isinstance(bound, bool)
+      if bound is not None and (not number or math.isnan(bound)):
+        raise ValueError(
+          f"Found the bound {bound!r} for {name!r} of {kind.name!r}, expected a number or null."
+        )
     if low is not None and high is not None:
       intervals[name] = (low, high)
     if "samples" in entry:
-      if not isinstance(entry["samples"], list) or parameter.is_list:
+      if not isinstance(entry["samples"], list) or not entry["samples"] or parameter.is_list:
         raise ValueError(
-          f"Found {type(entry['samples']).__name__} as samples of {name!r} of {kind.name!r},"
-          " expected a list of numbers, of a value that is a number."
+          f"Found {entry['samples']!r} as samples of {name!r} of {kind.name!r}, expected a list of"
+          " numbers, one or more, of a value that is a number."
         )
       samples[name] = entry["samples"]
   effect = Effect(kind.name, target, parameters, intervals, samples)

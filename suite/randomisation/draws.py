@@ -21,6 +21,10 @@ from nerf2real.suite.sensors.light import FIXED, Light, draw_light
 Array = np.ndarray
 
 BALL_MASS, BALL_RADIUS = 0.651, 0.12  # kg, m: the real ball, paper
+_LONGEST_DELAY = 0.45  # s: the delay lines of IMU and encoders hold 64 samples of 8 ms
+_POSITIVE = ("ball_mass_range", "ball_radius_range", "push_interval")
+_RANGES = (*_POSITIVE, "delay_range", "push_duration", "push_force")
+_LARGEST = ("jitter_half_width", "max_torso_mass", "max_imu_shift", "max_imu_tilt")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +72,24 @@ class RandomisationSettings:
   """s; chosen: shorter than a step of the gait, an impulse."""
   push_force: tuple[float, float] = (5.0, 15.0)
   """N, horizontal; chosen: 0.08 to 0.7 m/s for the 3.2 kg robot if nothing held it."""
+
+  def __post_init__(self):
+    for name in _RANGES:
+      low, high = getattr(self, name)
+      if not (0 <= low <= high < np.inf and (low > 0 or name not in _POSITIVE)):
+        least = "above 0" if name in _POSITIVE else "from 0"
+        raise ValueError(
+          f"The {name} must be two finite numbers {least}, the smaller first, found {low}, {high}."
+        )
+    for name in _LARGEST:
+      if not 0 <= getattr(self, name) < np.inf:
+        raise ValueError(f"The {name} must be 0 or more, found {getattr(self, name)}.")
+    longest = self.delay_range[1] + self.jitter_half_width
+    if longest > _LONGEST_DELAY:
+      raise ValueError(
+        f"The delay_range with the jitter_half_width ends at {longest:g} s, expected at most "
+        f"{_LONGEST_DELAY} s: give both in seconds."
+      )
 
 
 NOMINAL = RandomisationSettings(

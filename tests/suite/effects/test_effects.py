@@ -310,6 +310,9 @@ def _entry(kind="viscous_friction", target="elbow", **parameter):
     ([{"target": "elbow"}], r"expected an object with kind"),
     ([_entry(target=3)], r"target 3"),
     ({"kind": "spring"}, r"expected a list"),
+    ([_entry(low="0.05", high=0.2)], r"bound '0.05'.*expected a number or null"),
+    ([_entry(low=float("nan"), high=0.2)], r"bound nan.*expected a number or null"),
+    ([_entry(samples=[])], r"\[\] as samples.*one or more"),
   ],
 )
 def test_wrong_files_say_what_is_wrong(tmp_path, content, message):

@@ -55,6 +55,23 @@ def episodes():
   return [randomisation.draw_episode(settings, rng) for _ in range(2000)]
 
 
+@pytest.mark.parametrize(
+  ("wrong", "message"),
+  [
+    ({"delay_range": (10, 50)}, "at most 0.45 s: give both in seconds"),
+    ({"delay_range": (0.05, 0.01)}, "delay_range.*the smaller first"),
+    ({"push_interval": (0.0, 5.0)}, "push_interval.*above 0"),
+    ({"ball_radius_range": (0.0, 0.1)}, "ball_radius_range.*above 0"),
+    ({"push_force": (5.0, np.inf)}, "push_force.*finite"),
+    ({"max_torso_mass": -0.5}, "max_torso_mass must be 0 or more, found -0.5"),
+    ({"jitter_half_width": np.nan}, "jitter_half_width must be 0 or more"),
+  ],
+)
+def test_impossible_ranges_are_refused(wrong, message):
+  with pytest.raises(ValueError, match=message):
+    randomisation.RandomisationSettings(**wrong)
+
+
 def test_ranges_of_the_paper(episodes):
   def column(name):
     return np.array([getattr(e, name) for e in episodes])

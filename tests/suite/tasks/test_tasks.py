@@ -148,12 +148,21 @@ def test_bad_input_is_one_clear_error(room, tmp_path, nav):
     load("nerf_nav", room, image_size=(0, 40))
   with pytest.raises(ValueError, match="time_limit"):
     load("nerf_nav", room, time_limit=0.0)
+  with pytest.raises(ValueError, match="time_limit must be positive and finite"):
+    load("nerf_nav", room, time_limit=np.inf)
   with pytest.raises(ValueError, match="physics_timestep must divide"):
     load("nerf_nav", room, physics_timestep=0.002)
+  with pytest.raises(ValueError, match="physics_timestep must be below 0.0122 s"):
+    load("nerf_nav", room, physics_timestep=0.0125)
   with pytest.raises(ValueError, match="l_kne"):
     load("nerf_nav", room, effects=[Effect("encoder_offset", "l_kne", {"offset": 0.1})])
   with pytest.raises(ValueError, match="sequence of suite.effects.Effect, found 3"):
     load("nerf_nav", room, effects=[3])
+  with pytest.raises(ValueError, match="sequence of suite.effects.Effect, found 3"):
+    load("nerf_nav", room, effects=3)
+  alone = Effect("encoder_offset", "l_knee", {"offset": 0.1})
+  built = load("nerf_nav", room, image_size=None, effects=alone)
+  assert built.task.settings.effects == (alone,)
   with pytest.raises(ValueError, match="folder of a scene bundle.*found 5"):
     suite.load("nerf_nav", scene=5)
   with pytest.raises(ValueError, match="not a folder"):
