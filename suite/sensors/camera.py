@@ -59,8 +59,13 @@ class CameraSettings:
         f"Unknown compositing {self.compositing!r}: expected {DEPTH!r} or {OVERLAY!r}."
       )
     for name in ("gain", "exposure"):
-      if not getattr(self, name) > 0:
+      if not 0 < getattr(self, name) < np.inf:
         raise ValueError(f"The camera's {name} must be positive, found {getattr(self, name)}.")
+    if np.shape(self.white_balance) != (3,) or not (np.asarray(self.white_balance) > 0).all():
+      raise ValueError(
+        "The camera's white_balance must be three positive factors on red, green and blue, found "
+        f"{self.white_balance}."
+      )
     for name in ("noise", "latency"):
       if not 0 <= getattr(self, name) < np.inf:
         raise ValueError(f"The camera's {name} must be 0 or more, found {getattr(self, name)}.")
@@ -236,6 +241,7 @@ class RobotCamera:
     """
     self.camera = self._declared = camera
     self.settings = settings or CameraSettings()
+    self._declared_gain = self.settings.gain
     self._renderer = renderer
     self._unit_from_world = world_from_unit.inverse()
     self._meters_per_unit = world_from_unit.scale
@@ -249,9 +255,9 @@ class RobotCamera:
     """The picture's shape (H, W, 3)."""
     return self.camera.height, self.camera.width, 3
 
-  def set_gain(self, gain: float) -> None:
-    """Changes the gain from the next picture on."""
-    self.settings = dataclasses.replace(self.settings, gain=gain)
+  def set_gain(self, ratio: float) -> None:
+    """Makes the gain a multiple of the declared one, from the next picture on."""
+    self.settings = dataclasses.replace(self.settings, gain=ratio * self._declared_gain)
     self._response = self.settings.response()
 
   def set_light(self, light: Light) -> None:

@@ -195,7 +195,10 @@ def test_noise_has_the_deviation_that_is_set(world):
   [
     ({"compositing": "front"}, "expected 'depth' or 'overlay'"),
     ({"gain": 0.0}, "gain must be positive"),
+    ({"gain": np.inf}, "gain must be positive"),
     ({"noise": -1.0}, "noise must be 0 or more"),
+    ({"white_balance": (1.0, -1.0, 1.0)}, "white_balance must be three positive factors"),
+    ({"white_balance": (1.0, 1.0)}, "white_balance must be three positive factors"),
   ],
 )
 def test_impossible_settings_are_refused(settings, message):

@@ -11,6 +11,7 @@ from nerf2real.suite.effects import Effect
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL
+from nerf2real.suite.sensors.camera import CameraSettings
 from tests.suite.tasks.small_room import load
 
 
@@ -92,6 +93,13 @@ def test_protocol_trials_can_be_set(nav, ball):
   nav.task.set_trial(protocols.camera_gain()[0])
   assert nav.task.robot_camera.settings.gain == pytest.approx(128 / 50)
   nav.task.robot_camera.set_gain(1.0)
+
+
+def test_the_gain_of_a_trial_multiplies_the_declared_one(room):
+  environment = load("nerf_nav", room, image_size=(6, 8), camera=CameraSettings(gain=0.5))
+  for trial, gain in ((protocols.navigation()[0], 0.5), (protocols.camera_gain()[0], 64 / 50)):
+    environment.task.set_trial(trial)
+    assert environment.task.robot_camera.settings.gain == pytest.approx(gain)
 
 
 def test_effects_change_motion_and_readings(room, tmp_path):
