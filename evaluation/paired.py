@@ -3,6 +3,7 @@
 Shape letters: N trials, R resamples.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,10 +34,18 @@ def difference(found: Sequence[Episode], reference: Sequence[Episode]) -> Differ
   A trial of a virtual robot is paired with the same robot's, or with the simulation's.
 
   Raises:
-    ValueError: They have no trial in common.
+    ValueError: They have no trial in common, or one has a trial twice.
   """
+  for episodes in (found, reference):
+    twice = [trial for trial, count in Counter(map(_trial, episodes)).items() if count > 1]
+    if twice:
+      robot, _, index = twice[0]
+      raise ValueError(
+        f"Found trial {index} twice{f' of {robot}' if robot else ''}, expected episodes of one "
+        "policy, protocol and seed: select them, or evaluate each into a folder of its own."
+      )
   others = {_trial(episode): episode for episode in reference}
-  partners = [(a, others.get(_trial(a)) or others.get(("", a.index))) for a in found]
+  partners = [(a, others.get(_trial(a)) or others.get(("", *_trial(a)[1:]))) for a in found]
   pairs = [(a, b) for a, b in partners if b is not None]
   if not pairs:
     raise ValueError("The two conditions have no trial in common: evaluate both on the same.")
@@ -53,10 +62,10 @@ def difference(found: Sequence[Episode], reference: Sequence[Episode]) -> Differ
   return Difference(len(pairs), won, lost, success, mean(times), mean(errors))
 
 
-def _trial(episode: Episode) -> tuple[str, int]:
-  """Returns what pairs an episode: the virtual robot's seed, and the trial in the protocol."""
+def _trial(episode: Episode) -> tuple[str, str, int]:
+  """Returns what pairs an episode: the virtual robot's seed, the protocol and the trial in it."""
   robot = episode.setting.plant_id.partition(",")[0] if episode.setting.plant == "virtual" else ""
-  return robot, episode.index
+  return robot, episode.setting.protocol, episode.index
 
 
 def mean(values: Sequence[float], *, resamples: int = 10_000, seed: int = 0) -> Interval | None:

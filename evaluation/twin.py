@@ -55,6 +55,7 @@ def _kinds(plain: Sequence[Episode], plant: str) -> list[_Kind]:
 def pairs_of(found: Sequence[Episode]) -> list[Pair]:
   """Counts the undisturbed episodes of every policy that has some on both plants.
 
+  One policy under several names is one.
   Protocol and conditions (scene, effects, ...) are the same for all: those that both plants have.
 
   Raises:
@@ -73,7 +74,10 @@ def pairs_of(found: Sequence[Episode]) -> list[Pair]:
     )
   plain = select(plain, **shared[0]._asdict())
   pairs = []
-  for name, digest in dict.fromkeys((e.setting.policy, e.setting.policy_id) for e in plain):
+  names: dict[str, str] = {}
+  for episode in plain:
+    names.setdefault(episode.setting.policy_id, episode.setting.policy)
+  for digest, name in names.items():
     counts = []
     for plant in ("sim", "virtual"):
       own = select(plain, policy_id=digest, plant=plant)
@@ -119,9 +123,11 @@ def agreement(pairs: Sequence[Pair], *, resamples: int = 10_000, seed: int = 0) 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
   """Pearson's correlation [R] of rows [R, P]; NaN where a row is constant."""
+  # Of the rates themselves: less their mean, equal ones are off zero by rounding.
+  varied = (np.ptp(a, axis=1) > 0) & (np.ptp(b, axis=1) > 0)
   a, b = (x - x.mean(axis=1, keepdims=True) for x in (a, b))
   spread = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
-  return np.where(spread > 0, (a * b).sum(axis=1), np.nan) / np.where(spread > 0, spread, 1.0)
+  return np.where(varied, (a * b).sum(axis=1), np.nan) / np.where(varied, spread, 1.0)
 
 
 def _interval(value: float, drawn: np.ndarray) -> Interval:

@@ -63,3 +63,13 @@ def test_trials_are_paired_by_index_and_robot():
   assert (both.trials, both.won, both.lost) == (3, 2, 1)
   with pytest.raises(ValueError, match="no trial in common"):
     paired.difference(simulated, reference)
+
+
+def test_trials_of_several_conditions_are_not_paired():
+  simulated = [episode(index=0)]
+  twice = [episode(index=0, policy_id="d1"), episode("fall", index=0, policy_id="d2")]
+  for found, reference in ((twice, simulated), (simulated, twice)):
+    with pytest.raises(ValueError, match="trial 0 twice, expected episodes of one policy"):
+      paired.difference(found, reference)
+  with pytest.raises(ValueError, match="no trial in common"):
+    paired.difference([episode(index=0, protocol="gain")], simulated)

@@ -43,6 +43,14 @@ def test_unrelated_rates_have_an_interval_about_zero():
   assert found.low < 0 < found.high
 
 
+def test_resamples_of_one_rate_are_left_out():
+  # 0.7 less the mean of seven times 0.7 is no zero in floating point.
+  pairs = [Pair(str(i), (7, 10), (7, 10)) for i in range(6)] + [Pair("6", (10, 10), (10, 10))]
+  constant = np.full((1, 7), 0.7)
+  assert np.isnan(twin._correlation(constant, np.array([[p.virtual[0] / 10 for p in pairs]])))
+  assert np.isnan(twin._correlation(constant, constant))
+
+
 def test_too_few_or_equal_policies_are_refused():
   with pytest.raises(ValueError, match="Found 2 policies"):
     twin.agreement(_pairs([0.2, 0.4], [0.2, 0.4], 10))
@@ -61,6 +69,8 @@ def test_episodes_are_counted_by_policy_and_plant():
     episode(index=0, policy_id="d2"),
   ]
   assert twin.pairs_of(found) == [Pair("p (d1)", (1, 2), (1, 2))]
+  renamed = [episode(policy="q", index=2, plant=plant) for plant in ("sim", "virtual")]
+  assert twin.pairs_of(found + renamed) == [Pair("p (d1)", (2, 3), (2, 3))]  # one policy
   # Of other conditions that one plant alone has, nothing is counted.
   others = [episode("fall", conditions="effects 0a"), episode("fall", protocol="ball")]
   assert twin.pairs_of(found + others) == twin.pairs_of(found)
