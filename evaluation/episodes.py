@@ -102,7 +102,7 @@ class Store:
     """Opens a folder, and reads what earlier runs left.
 
     Raises:
-      ValueError: A line other than the last is damaged.
+      ValueError: A line is damaged that was not cut off at the file's end.
     """
     self.path = Path(folder) / FILE
     self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,11 +117,12 @@ class Store:
 
   def _read(self, text: str) -> None:
     lines, keys = text.splitlines(), self.done()
+    cut_off = not text.endswith("\n")
     for number, line in enumerate(lines):
       try:
         episode = from_plain(json.loads(line), Episode)
       except ValueError as error:
-        if number == len(lines) - 1:  # the run was cut off while it wrote: that episode is rerun
+        if cut_off and number == len(lines) - 1:  # while the run wrote: that episode is rerun
           kept = "".join(f"{whole}\n" for whole in lines[:-1])
           files.write_atomically(self.path, kept)
           return
@@ -134,7 +135,7 @@ class Store:
         continue
       keys.add(episode.key)
       self.episodes.append(episode)
-    if text and not text.endswith("\n"):
+    if text and cut_off:
       files.write_atomically(self.path, text + "\n")
 
   def done(self) -> set[tuple[Any, ...]]:

@@ -83,7 +83,7 @@ def choose(
     indices: Of the trials; all if there are none.
 
   Raises:
-    ValueError: No start is repeated so often, or there is no such group or trial.
+    ValueError: No start is repeated so often, there is no such group or trial, or none is of all.
   """
   known = sorted({trial.trial for _, trial in listed})
   if repetition is not None and repetition not in known:
@@ -101,6 +101,11 @@ def choose(
     and group in (None, name)
     and (not indices or index in indices)
   ]
+  if not chosen:
+    raise ValueError(
+      f"Found no trial of --repetition {repetition}, --group {group} and --indices "
+      f"{' '.join(map(str, indices))} together: leave one out."
+    )
   if count is not None and count < len(chosen):
     spread = np.unique(np.linspace(0, len(chosen) - 1, count).round().astype(int))
     chosen = [chosen[place] for place in spread]

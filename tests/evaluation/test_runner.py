@@ -178,3 +178,5 @@ def test_trials_may_be_spread():
     session.choose(ball, None, indices=(46,))
   with pytest.raises(ValueError, match="--group walls: expected one of center, wall"):
     session.choose(ball, None, group="walls")
+  with pytest.raises(ValueError, match="no trial of .*--group wall and --indices 3 together"):
+    session.choose(ball, None, indices=(3,), group="wall")

@@ -134,6 +134,12 @@ def test_store_goes_on_where_a_run_was_cut_off(tmp_path):
   again.path.write_text("\n".join([lines[0], "{", *lines[1:]]) + "\n")
   with pytest.raises(ValueError, match="line 2 is damaged"):
     episodes.Store(tmp_path)
+  # A whole line of another version is no rest of a write: it is not removed.
+  again.path.write_text(f"{lines[0]}\n" + lines[1].replace('"outcome"', '"ended_as"') + "\n")
+  before = again.path.read_text()
+  with pytest.raises(ValueError, match="line 2 is damaged.*ended_as"):
+    episodes.Store(tmp_path)
+  assert again.path.read_text() == before
 
 
 def test_report_holds_tables_paths_and_every_episode(tmp_path):
