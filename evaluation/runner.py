@@ -104,7 +104,7 @@ def run_trial(
   timestep = plant.start(trial)
   watch(timestep, policy)
   sight = plant.sight()
-  policy.reset(sight)
+  policy.reset(sight, seed=trial.seed)
   trace, step, reached = _Trace(), 0, False
   while True:
     action = policy.act(timestep.observation, goal=plant.goal, sight=sight)

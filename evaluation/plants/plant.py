@@ -122,7 +122,9 @@ def conditions_of(settings: EvaluationSettings) -> str:
   if settings.time_limit is not None:
     found.append(f"at most {settings.time_limit:g} s")
   if settings.stochastic:
-    found.append("drawn actions")
+    # In simulation the plant is named by the same seed.
+    other = settings.seed != EvaluationSettings.seed and settings.plant != "sim"
+    found.append(f"drawn actions of seed {settings.seed}" if other else "drawn actions")
   if settings.plant == "virtual" and settings.placing != EvaluationSettings.placing:
     found.append("placed within {:g} m, {:g} rad".format(*settings.placing))
   if settings.swap:

@@ -38,8 +38,8 @@ class ControlledPolicy:
     """Of the policy."""
     return self._policy.belief
 
-  def reset(self, sight: Sight) -> None:
-    self._policy.reset(sight)
+  def reset(self, sight: Sight, *, seed: int = 0) -> None:
+    self._policy.reset(sight, seed=seed)
 
   def act(
     self, observation: Mapping[str, np.ndarray], *, goal: np.ndarray, sight: Sight

@@ -48,10 +48,11 @@ class LearnedPolicy:
     self._seed, self._stochastic = seed, stochastic
     self.belief: Belief | None = None
 
-  def reset(self, sight: Sight) -> None:
-    """Begins an episode."""
+  def reset(self, sight: Sight, *, seed: int = 0) -> None:
+    """Begins an episode; drawn actions follow from the policy's seed and that of the trial."""
+    drawn = int(np.random.SeedSequence([self._seed, seed]).generate_state(1)[0])
     self._agent = Agent(
-      self._loaded.policy, self._layout, seed=self._seed, deterministic=not self._stochastic
+      self._loaded.policy, self._layout, seed=drawn, deterministic=not self._stochastic
     )
     self.belief = None
 

@@ -38,8 +38,8 @@ class EvaluatedPolicy(Protocol):
   control: str  # one of `controls.CONTROLS`; "none": its observations are the plant's
   trained_on: str  # name of its environment; empty for a policy that was not trained
 
-  def reset(self, sight: Sight) -> None:
-    """Begins an episode."""
+  def reset(self, sight: Sight, *, seed: int = 0) -> None:
+    """Begins an episode, at what is seen of the robot; the seed is of its trial's drawn actions."""
 
   def act(
     self, observation: Mapping[str, np.ndarray], *, goal: np.ndarray, sight: Sight
@@ -90,7 +90,7 @@ class GaitPolicy:
     text = json.dumps(to_plain(made_of), sort_keys=True)
     self.policy_id = hashlib.sha256(text.encode()).hexdigest()[:12]
 
-  def reset(self, sight: Sight) -> None:
+  def reset(self, sight: Sight, *, seed: int = 0) -> None:
     if sight.pose is None:
       raise ValueError("The gait must know where it starts: place the robot at the trial's start.")
     self._walker.reset(sight.pose)

@@ -76,7 +76,7 @@ class StillPolicy:
   def __init__(self, belief=None):
     self.belief = belief
 
-  def reset(self, sight):
+  def reset(self, sight, *, seed=0):
     pass
 
   def act(self, observation, *, goal, sight):

@@ -71,6 +71,8 @@ def test_other_scenes_effects_and_times_are_other_conditions(tmp_path):
   assert len(found) == 4 and all("room" in text or "effects" in text for text in found)
   changed = EvaluationSettings(plant="virtual", time_limit=20, stochastic=True, placing=(0.0, 0.0))
   assert plants.conditions_of(changed) == "at most 20 s, drawn actions, placed within 0 m, 0 rad"
+  seeded = EvaluationSettings(plant="virtual", stochastic=True, seed=2)
+  assert plants.conditions_of(seeded) == "drawn actions of seed 2"
   # The paper's tables are of one condition each: parts of another plant must not be among them.
   swapped = EvaluationSettings(plant="virtual", swap=("physics", "lens"))
   assert plants.conditions_of(swapped) == "swapped lens and physics"

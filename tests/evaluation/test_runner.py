@@ -159,6 +159,26 @@ def test_learned_policy_needs_nothing_privileged_and_its_belief_is_drawn(exporte
   assert page.count("data:image/jpeg") == 1 + 3
 
 
+def test_drawn_actions_differ_by_trial_and_repeat(exported):
+  policy = LearnedPolicy(exported, seed=0, stochastic=True)
+  actions = []
+
+  class Noting(ScriptedPlant):
+    def step(self, action):
+      actions.append(action)
+      return super().step(action)
+
+  firsts = []
+  for index in (0, 1, 0):  # the second is a repetition of the first's start
+    actions.clear()
+    trial = plants.trials("navigation")[index][1]
+    plant = Noting([FAR] * 3, image=(30, 40, 3))
+    runner.run_trial(plant, policy, trial, group="navigation", index=index)
+    firsts.append(actions[0])
+  np.testing.assert_array_equal(firsts[0], firsts[2])
+  assert (firsts[0] != firsts[1]).any()
+
+
 def test_trials_may_be_spread():
   listed = plants.trials("navigation")
   chosen = session.choose(listed, 4)
