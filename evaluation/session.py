@@ -166,6 +166,7 @@ def _evaluate(settings: EvaluationSettings, scene: Any, say: Callable[[str], Non
         path,
         store.episodes,
         scene=scene,
+        condition=plants.scene_condition(settings.scene),
         settings=dataclasses.asdict(settings),
       )
   shown = [*tables.paper_tables(store.episodes), tables.outcome_table(store.episodes)]

@@ -112,11 +112,7 @@ def conditions_of(settings: EvaluationSettings) -> str:
     Scene, effects, length of an episode, drawn actions, errors of placing and swapped parts, in
     words with digests of the files; empty for what the paper evaluates, in the built-in room.
   """
-  found = []
-  if settings.scene is not None:
-    folder = Path(settings.scene)
-    digest = files.hash_path(folder / "scene.json")
-    found.append(f"scene {folder.resolve().name} ({digest[:8]})")
+  found = [] if settings.scene is None else [scene_condition(settings.scene)]
   if settings.effects is not None and settings.plant == "sim":
     found.append(f"effects {files.hash_path(settings.effects)[:8]}")
   if settings.time_limit is not None:
@@ -130,6 +126,24 @@ def conditions_of(settings: EvaluationSettings) -> str:
   if settings.swap:
     found.append("swapped " + " and ".join(sorted(set(settings.swap))))
   return ", ".join(found)
+
+
+_SCENE = "scene "
+
+
+def scene_condition(folder: Path | None) -> str:
+  """Returns what conditions say of a scene; empty for the built-in room."""
+  if folder is None:
+    return ""
+  digest = files.hash_path(Path(folder) / "scene.json")
+  return f"{_SCENE}{Path(folder).resolve().name} ({digest[:8]})"
+
+
+def is_in_scene(conditions: str, scene: str) -> bool:
+  """Returns whether conditions are of a scene, by its own condition."""
+  if not scene:
+    return not conditions.startswith(_SCENE)
+  return conditions == scene or conditions.startswith(f"{scene}, ")
 
 
 def trials(protocol: str) -> tuple[tuple[str, Trial], ...]:

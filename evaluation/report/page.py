@@ -25,6 +25,7 @@ from nerf2real.core.pages.blocks import (
 )
 from nerf2real.core.pages.page import Section
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Moment
+from nerf2real.evaluation.plants.plant import is_in_scene
 from nerf2real.evaluation.report import maps, meanings, tables
 
 _MOMENTS = 5  # shown of an episode's belief
@@ -38,6 +39,7 @@ def write(
   found: Sequence[Episode],
   *,
   scene: Any,
+  condition: str = "",
   settings: Mapping[str, Any] | None = None,
 ) -> None:
   """Writes the page.
@@ -45,13 +47,15 @@ def write(
   Args:
     path: The file.
     found: All episodes.
-    scene: The bundle, for the map.
+    scene: The bundle, for the map: paths and beliefs are of the episodes in it.
+    condition: What those say of it, `plants.plant.scene_condition`.
     settings: Of the run, shown at the end.
   """
   sections = [_table(table) for table in tables.paper_tables(found)]
   sections.append(_table(tables.outcome_table(found), _OUTCOME_TEXT))
-  sections += _paths(found, maps.draw_floor(scene, height=_PATHS_HEIGHT))
-  sections += _beliefs(found, maps.draw_floor(scene, height=_BELIEF_HEIGHT))
+  here = [episode for episode in found if is_in_scene(episode.setting.conditions, condition)]
+  sections += _paths(here, maps.draw_floor(scene, height=_PATHS_HEIGHT))
+  sections += _beliefs(here, maps.draw_floor(scene, height=_BELIEF_HEIGHT))
   sections.append(_episodes(found))
   sections.append(meanings.section())
   if settings is not None:
@@ -61,6 +65,8 @@ def write(
     f"{len(found)} episodes. What is called virtual robot is a program behind the robot's wires, "
     "with physics, pictures and faults of its own; no figure marked so is of hardware."
   )
+  if len(here) < len(found):
+    lead += " The maps show the episodes in the scene of the last command alone."
   origin = page.Origin.of_process()
   page.write(path, page.Page("Evaluation", lead, sections, origin=origin))
 

@@ -153,6 +153,23 @@ def test_report_holds_tables_paths_and_every_episode(tmp_path):
   assert json.loads(json.dumps(found[0].path)) == path
 
 
+def test_paths_are_drawn_over_the_map_of_their_own_scene(tmp_path):
+  path = [[0.2 * k, 0.1 * k, 0.0, 0.0] for k in range(9)]
+  office = "scene office (1a2b3c4d)"
+  found = [
+    episode(path=path),
+    episode(path=path, index=1, conditions="drawn actions"),
+    episode(path=path, index=2, conditions=office),
+    episode(path=path, index=3, conditions=f"{office}, at most 20 s"),
+    episode(path=path, index=4, conditions="scene office (5e6f7a8b)"),
+  ]
+  for condition, maps_drawn in (("", 2), (office, 2)):
+    report.write(tmp_path / "report.html", found, scene=EmptyFloor(), condition=condition)
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/jpeg") == maps_drawn
+    assert "in the scene of the last command alone" in page
+
+
 def test_a_trial_that_is_there_twice_is_counted_once(tmp_path):
   """Two processes that wrote into one folder would turn three trials into six."""
   store = episodes.Store(tmp_path)
