@@ -49,7 +49,10 @@ def load(
     time_limit: Length of an episode [s]; the task's own if None.
     physics_timestep: s.
     renderer: Renders the scene instead of the bundle's field, in the bundle's unit frame.
-    furnish: Called with the arena's MJCF model before it is compiled, to put things into it.
+    furnish: Called with the arena's MJCF model before it is compiled, to put things into it. The
+      robot's camera sees geoms of group 0, MuJoCo's own, on bodies that have a joint or are mocap;
+      what is fixed to the world is taken for a part of the scene, which the field shows: it
+      collides unseen.
     surface: Whether the model holds the room's coloured surface mesh, so that `physics.render()`
       and MuJoCo's own viewers show the room; see suite/README.md for what it costs.
 

@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Evolution:
-  """CMA-ES without step-size control by path: recombination, rank-mu and rank-one update.
+  """CMA-ES: recombination, step size by its path, rank-mu and rank-one update, which never stalls.
 
   Source: Hansen, The CMA evolution strategy: a tutorial (arXiv 1604.00772), defaults of table 1.
   """
