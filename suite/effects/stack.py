@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from nerf2real.suite.effects import files
 from nerf2real.suite.effects.binding import Binding
@@ -88,11 +89,14 @@ class EffectStack:
     """Returns the operator of a kind, None if the stack has none."""
     return next((op for op in self.operators if op.kind.name == kind), None)
 
-  def reset(self) -> None:
+  def reset(self, ctrl: Array | None = None) -> None:
     """Starts an episode: empties delays, cools motors, closes gaps.
 
     The model gets back the friction and strength that it was bound with, so that an episode does
     not begin with those of the last step of the one before.
+
+    Args:
+      ctrl: what was commanded until now [U], which delays go on with; the first command if None.
     """
     if self.binding is not None:
       self.binding.last_force.fill(0.0)
@@ -100,6 +104,9 @@ class EffectStack:
       self._write(self.binding)
     for operator in self.operators:
       operator.reset()
+    if ctrl is not None:
+      for operator in self._commands:
+        operator.command(0.0, np.array(ctrl, np.float64))
 
   def before_step(self, data: Any, ctrl: Array) -> None:
     """Writes command, forces and actuator strength for the coming physics step.

@@ -217,11 +217,11 @@ class RobotTask(composer.Task):
     self._randomiser.apply(self.draws)
     if self.robot_camera is not None:
       self.robot_camera.set_light(self.draws.light)
-    self._effects.reset()
-    self._place(random_state)
     self._control = self._standing.copy()
     self._action_filter.reset(self._control)
     self._targets = self._middle + self._half_range * self._control
+    self._effects.reset(self._targets)
+    self._place(random_state)
     physics.set_control(self._targets)
     self._touch.reset()
     self.success, self.success_time, self.ending = False, float("nan"), None

@@ -43,7 +43,7 @@ class CommandDelay(Operator):
 
   Commands are held between control steps. A delay that is not a whole number of physics steps mixes
   the two neighbouring commands, which is the mean of the delayed command over the step. Before the
-  first command has arrived, the first one is taken.
+  first command has arrived, the one before the episode is taken, or the first where none is known.
   """
 
   def bind(self, binding: Binding) -> None:

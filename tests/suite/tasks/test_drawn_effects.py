@@ -107,6 +107,18 @@ def test_values_without_intervals_are_those_of_the_effects(room):
   )
 
 
+def test_a_late_command_is_late_from_the_start(room):
+  environment = _load(room, effects=[Effect("command_delay", None, {"delay": 0.05})])
+  for _ in range(2):
+    environment.reset()
+    control = environment.physics.data.ptr.ctrl
+    before, moved = control[KNEE], []
+    for _ in range(4):
+      environment.step(environment.task.standing_action + 0.1)
+      moved.append(control[KNEE] != before)
+    assert moved == [False, False, True, True]
+
+
 @pytest.mark.parametrize(
   ("kind", "values"),
   [
