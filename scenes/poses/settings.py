@@ -16,7 +16,7 @@ class LocaliseSettings:
   """"global", "incremental", or "auto": incremental, and global where that leaves too many
   keyframes out."""
   attempts: int = 3
-  """Of the mapper at most, of which the one that the matches support most is taken."""
+  """Of the mapper at most, of which the one that lacks least of what it ought to see is taken."""
   attempted: int = 300
   """More keyframes are mapped once: a thousand take half an hour."""
   max_apart: float = 0.05

@@ -18,9 +18,9 @@ from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, readout, refinement
 from nerf2real.scenes.poses.checks import agreement, certainty, continuity, things_alike
+from nerf2real.scenes.poses.checks.attempts import best_of
 from nerf2real.scenes.poses.checks.overlap import overlap
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
-from nerf2real.scenes.poses.checks.support import best_supported
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -256,7 +256,7 @@ def _best_model(
   """Runs the mapper of the settings, and the other one if that leaves too many keyframes out.
 
   Returns:
-    The model, how it came about, and how far attempts are apart, see `support`.
+    The model, how it came about, and how far attempts are apart, see `attempts`.
   """
   mappers = {"incremental": mapping.map_incrementally, "global": mapping.map_globally}
   if settings.mapper not in ("auto", *mappers):
@@ -279,7 +279,7 @@ def _best_model(
       mapping.drop_weak_images(models[0])
       return models[0]
 
-    found, unsure = best_supported(attempt, database, attempts=attempts, same=settings.max_apart)
+    found, unsure = best_of(attempt, attempts=attempts, same=settings.max_apart)
     if found is not None:
       model, what = _checked(found, database, images_folder, settings, steps, times)
       if best is None or model.num_reg_images() > best.num_reg_images():

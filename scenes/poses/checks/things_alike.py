@@ -19,12 +19,8 @@ from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.checks import rotations
 from nerf2real.scenes.poses.checks.agreement import evidence
 from nerf2real.scenes.poses.checks.division import divide
-from nerf2real.scenes.poses.checks.overlap import Overlap, overlap
+from nerf2real.scenes.poses.checks.overlap import CLEAR, Overlap, overlap
 
-# Of what a model's pictures see of each other, chosen. Of drawn rooms as photographs groups lack
-# 0.05 of it at most where all places are right, 0.2 to 0.5 where a third are wrong; right places
-# have a balance of 1.6 to 1.9 times such wrong ones'.
-_CLEAR = 0.1
 _HOLDS = (
   0.25  # share of a pair's matches that agree with the two places, from which on it holds them
 )
@@ -35,7 +31,7 @@ class Found(NamedTuple):
 
   model: pycolmap.Reconstruction
   mapper: str
-  apart: float  # how far attempts are apart, see `support`
+  apart: float  # how far attempts are apart, see `attempts`
 
 
 def undeceived(
@@ -69,7 +65,7 @@ def undeceived(
     if model is None:
       continue
     sees = overlap(model)
-    if sees.balance - seen.balance > _CLEAR * seen.balance:
+    if sees.balance - seen.balance > CLEAR * seen.balance:
       found = Found(model, f"{mapper}, without {len(pairs)} pairs of things alike", apart)
       seen, without = sees, pairs
   return found
@@ -84,7 +80,7 @@ def _group(seen: Overlap) -> set[int]:
   """Ids of the pictures that as a group clearly lack what they ought to see."""
   weights = seen.common - seen.missing
   part = divide(weights)
-  if part is None or weights[part][:, ~part].sum() > -_CLEAR * weights.sum() / 2:
+  if part is None or weights[part][:, ~part].sum() > -CLEAR * weights.sum() / 2:
     return set()
   return set(np.array(seen.ids)[part].tolist())
 

@@ -115,6 +115,29 @@ def test_right_places_see_more_of_what_they_ought_to(alike_matched):
   assert overlap.overlap(wrong).common.sum() > 1.5 * right.common.sum()
 
 
+def _torn(model):
+  """The model in two halves: what both see is points of each half's own."""
+  torn = pycolmap.Reconstruction(model)
+  half = {image for image in torn.images if image <= len(torn.images) // 2}
+  for number, point in list(torn.points3D.items()):
+    seen = [(e.image_id, e.point2D_idx) for e in point.track.elements if e.image_id in half]
+    if 2 <= len(seen) <= len(point.track.elements) - 2:
+      for image, feature in seen:
+        torn.delete_observation(image, feature)
+      track = pycolmap.Track(elements=[pycolmap.TrackElement(*place) for place in seen])
+      torn.add_point3D(point.xyz, track, point.color)
+      assert number in torn.points3D
+  return torn
+
+
+def test_a_model_in_two_halves_lacks_what_they_have_in_common(folder):
+  whole = pycolmap.Reconstruction(str(folder / "out" / "sfm"))
+  torn = _torn(whole)
+  assert torn.num_reg_images() == whole.num_reg_images()
+  assert torn.compute_num_observations() == whole.compute_num_observations()
+  assert overlap.overlap(torn).balance < 0.9 * overlap.overlap(whole).balance
+
+
 def test_a_model_without_points_has_nothing_in_common():
   model = _model(np.zeros((2, 3)), np.zeros((0, 3)), np.zeros((2, 0), bool))
   found = overlap.overlap(model)

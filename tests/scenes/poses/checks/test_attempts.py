@@ -1,0 +1,58 @@
+"""Of several models of the same matches the one is taken that lacks least."""
+
+import numpy as np
+import pytest
+
+from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.checks import attempts, overlap
+
+
+@pytest.mark.parametrize(
+  ("balances", "places", "taken", "unsure"),
+  [
+    ((0.83, 0.87, 0.86), (0.0, 0.2, 0.5), 1, 0.2),  # all differ: the best
+    ((0.87, 0.86), (0.0, 0.01), 0, 0.01),  # two are the same: no third
+    ((0.83, 0.86, 0.87), (0.2, 0.0, 0.01), 2, 0.01),
+    ((0.87, 0.83, 0.84), (0.0, 0.2, 0.21), 0, 0.2),  # two are, and another is better
+    ((0.87, 0.5, 0.6), (0.0, 0.2, 0.5), 0, 0.0),  # what sees clearly less says nothing of the best
+    ((0.87, 0.5, 0.86), (0.0, 0.2, 0.5), 0, 0.5),
+    ((None, 0.5, None), (None, 0.0, None), 1, 0.0),  # an attempt that found nothing
+    ((None, None, None), (None, None, None), None, 0.0),
+  ],
+)
+def test_attempts_end_with_two_that_are_the_same(monkeypatch, balances, places, taken, unsure):
+  tried = []
+
+  def seen(model):
+    return overlap.Overlap([], np.zeros((0, 0)), np.zeros((0, 0)), balances[model])
+
+  monkeypatch.setattr(attempts, "overlap", seen)
+  monkeypatch.setattr(attempts, "apart", lambda one, two: abs(places[one] - places[two]))
+
+  def attempt(number):
+    tried.append(number)
+    return None if balances[number] is None else number
+
+  best, apart = attempts.best_of(attempt, attempts=3, same=0.05)
+  assert best == taken and apart == pytest.approx(unsure)
+  assert tried == list(range(len(balances)))
+
+
+def test_one_attempt_is_not_judged(monkeypatch):
+  monkeypatch.setattr(attempts, "overlap", None)
+  assert attempts.best_of(lambda number: "model", attempts=1, same=0.05) == ("model", 0.0)
+
+
+def test_places_of_two_attempts_are_compared_whatever_their_frames(folder):
+  one = pycolmap.Reconstruction(str(folder / "out" / "sfm"))
+  two = pycolmap.Reconstruction(one)
+  two.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0, 0, 1, 0.0])), np.ones(3)))
+  assert attempts.apart(one, two) < 1e-6
+  assert attempts.apart(one, pycolmap.Reconstruction()) == 1.0
+  image = mapping.registered(two)[3]
+  width = np.ptp([i.projection_center() for i in mapping.registered(two)], axis=0).max()
+  pose = image.cam_from_world()
+  moved = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0.2 * width, 0, 0]))
+  image.frame.set_cam_from_world(image.camera_id, moved)
+  assert 0.1 < attempts.apart(one, two) < 0.3
