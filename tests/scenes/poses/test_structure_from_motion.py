@@ -30,7 +30,7 @@ from tests.scenes import synthetic_capture as synthetic
 from tests.scenes.capture.test_capture import write_transforms
 
 FOUNTAIN = Path(__file__).parents[4] / "shared" / "data" / "captures" / "fountain-P11"
-FEW = LocaliseSettings(features=FeatureSettings(few_num_features=800))
+FEW = LocaliseSettings(features=FeatureSettings(few_num_features=800), attempts=1)
 
 
 @pytest.fixture(scope="module")
