@@ -58,26 +58,25 @@ def overlap(model: pycolmap.Reconstruction) -> Overlap:
   keys = np.array(sorted(model.points3D), int)
   positions = np.array([model.points3D[key].xyz for key in keys]).reshape(-1, 3)
   seen = [_seen(image, model.cameras[image.camera_id], keys) for image in images]
-  rays = [positions - image.projection_center() for image in images]
+  centers = [image.projection_center() for image in images]
   common, missing = np.zeros((2, len(images), len(images)))
   asked, sighted = np.zeros((2, len(images), (_CELLS + 1) ** 2))
   for other, image in enumerate(images):
     visible = _visible(model.cameras[image.camera_id], image, seen[other], positions)
     sees = np.zeros(len(keys), bool)
     sees[seen[other].points] = True
-    away = np.linalg.norm(rays[other], axis=1)
     for own, (points, cells) in enumerate(seen):
       there = np.flatnonzero(visible[points])
-      if own == other:
+      if own == other or not len(there):
         continue
-      rows = points[there]
-      lengths = np.linalg.norm(rays[own][rows], axis=1), away[rows]
-      cosine = (rays[own][rows] * rays[other][rows]).sum(1) / (lengths[0] * lengths[1])
+      rays = [positions[points[there]] - centers[row] for row in (own, other)]
+      lengths = [np.linalg.norm(ray, axis=1) for ray in rays]
+      cosine = (rays[0] * rays[1]).sum(1) / (lengths[0] * lengths[1])
       ratio = lengths[0] / lengths[1]
-      alike = (cosine > np.cos(_ANGLE)) & (ratio < _RATIO) & (ratio > 1 / _RATIO)
-      rows = rows[alike]
-      expected = np.bincount(cells[there[alike]], minlength=(_CELLS + 1) ** 2) >= _EXPECTED
-      found = np.bincount(cells[there[alike]][sees[rows]], minlength=(_CELLS + 1) ** 2) > 0
+      near = there[(cosine > np.cos(_ANGLE)) & (ratio < _RATIO) & (ratio > 1 / _RATIO)]
+      shared = near[sees[points[near]]]
+      expected = np.bincount(cells[near], minlength=(_CELLS + 1) ** 2) >= _EXPECTED
+      found = np.bincount(cells[shared], minlength=(_CELLS + 1) ** 2) > 0
       common[own, other] = (expected & found).sum()
       missing[own, other] = (expected & ~found).sum()
       asked[own] += expected

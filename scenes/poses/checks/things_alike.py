@@ -21,9 +21,7 @@ from nerf2real.scenes.poses.checks.agreement import evidence
 from nerf2real.scenes.poses.checks.division import divide
 from nerf2real.scenes.poses.checks.overlap import CLEAR, Overlap, overlap
 
-_HOLDS = (
-  0.25  # share of a pair's matches that agree with the two places, from which on it holds them
-)
+_HOLDS = 0.25  # share of a pair's matches that agree with its places, from which on it holds them
 
 
 class Found(NamedTuple):
