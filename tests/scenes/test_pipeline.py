@@ -70,6 +70,7 @@ def settings():
       train_preset("fast"), field=field, max_steps=150, max_seconds=None, batch_samples=1 << 14
     ),
     align=dataclasses.replace(base.align, camera_height=1.0),
+    stereo=dataclasses.replace(base.stereo, width=80),
     depth_width=80,
     mesh=MeshSettings(voxel=0.08, truncation=0.24),
     collision=contact.CollisionSettings(
