@@ -24,7 +24,8 @@ from nerf2real.scenes.poses.matching.features import image_ids, quiet
 
 MAJORITY = 0.5  # share of a picture's matched area, or of a pair's matches, that must agree
 _TOLERANCE = 12.0  # pixels between a match and the point it leads to; COLMAP's for a new place
-_CELLS = 12  # into so many parts the longer side of a picture is divided, chosen
+_SIDE = 12  # into so many parts the longer side of a picture is divided, chosen
+CELLS = (_SIDE + 1) ** 2  # of a square that holds any picture, its far edges in cells of their own
 _ROUNDS = 3  # at most: pictures that were placed well are new witnesses
 
 
@@ -53,6 +54,13 @@ def matched_points(
       matches = geometry.inlier_matches.reshape(-1, 2)
       seen = np.stack([points[key][matches[:, k]] for k, key in enumerate(ids)], axis=1)
       yield ids, matches, seen
+
+
+def cells_of(camera: pycolmap.Camera, pixels: np.ndarray) -> np.ndarray:
+  """Cells of a grid over a picture in which pixels [M, 2] lie: [M], below `CELLS`, row by row."""
+  column, row = (pixels * _SIDE / max(camera.width, camera.height)).astype(np.int64).T
+  found: np.ndarray = row * (_SIDE + 1) + column
+  return found
 
 
 class Evidence(NamedTuple):
@@ -108,13 +116,11 @@ def evidence(model: pycolmap.Reconstruction, database: Path) -> dict[int, Eviden
       image = images[key]
       camera = model.cameras[image.camera_id]
       pixels = np.array([point.xy for point in image.points2D])
-      column, row = (pixels * _CELLS / max(camera.width, camera.height)).astype(np.int64).T
       local = image.cam_from_world() * positions[points]
       ahead = local[:, 2] > 0
       local[~ahead] = 0, 0, 1
       off = np.linalg.norm(camera.img_from_cam(local) - pixels[features], axis=1)
-      cells = row * (_CELLS + 1) + column
-      found[key] = Evidence(cells, features, others, ahead & (off < _TOLERANCE))
+      found[key] = Evidence(cells_of(camera, pixels), features, others, ahead & (off < _TOLERANCE))
   return found
 
 

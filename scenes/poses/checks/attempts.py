@@ -57,5 +57,5 @@ def best_of(
     return None, 0.0
   found.sort(key=lambda pair: -pair[0])
   (most, best), *others = found
-  rivals = [model for balance, model in others if balance >= (1 - CLEAR) * most]
+  rivals = [model for balance, model in others if balance >= most - CLEAR * abs(most)]
   return best, min((apart(best, other) for other in rivals), default=0.0)

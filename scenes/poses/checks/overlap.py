@@ -11,18 +11,19 @@ Source: Zach, Irschara and Bischof 2008, What Can Missing Correspondences Tell U
 and Motion. Shapes: N pictures, P points.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from nerf2real.scenes.colmap import pycolmap
+from nerf2real.scenes.poses.checks.agreement import CELLS, cells_of
 from nerf2real.scenes.poses.mapping import registered
 
 # Of what pictures see of each other: a difference that tells. Chosen: of drawn rooms as photographs
 # groups lack 0.05 of it at most where all places are right, 0.2 to 0.5 where a third are wrong;
 # right places have a balance of 1.6 to 1.9 times such wrong ones'.
 CLEAR = 0.1
-_CELLS = 12  # into so many parts the longer side of a picture is divided, chosen
 _EXPECTED = 3  # points in a cell that another picture ought to see, chosen
 _ANGLE = np.radians(25.0)  # between two pictures' directions to a point that both find, chosen
 _RATIO = 1.4  # of their distances from it, chosen
@@ -60,7 +61,7 @@ def overlap(model: pycolmap.Reconstruction) -> Overlap:
   seen = [_seen(image, model.cameras[image.camera_id], keys) for image in images]
   centers = [image.projection_center() for image in images]
   common, missing = np.zeros((2, len(images), len(images)))
-  asked, sighted = np.zeros((2, len(images), (_CELLS + 1) ** 2))
+  asked, sighted = np.zeros((2, len(images), CELLS))
   for other, image in enumerate(images):
     visible = _visible(model.cameras[image.camera_id], image, seen[other], positions)
     sees = np.zeros(len(keys), bool)
@@ -75,8 +76,8 @@ def overlap(model: pycolmap.Reconstruction) -> Overlap:
       ratio = lengths[0] / lengths[1]
       near = there[(cosine > np.cos(_ANGLE)) & (ratio < _RATIO) & (ratio > 1 / _RATIO)]
       shared = near[sees[points[near]]]
-      expected = np.bincount(cells[near], minlength=(_CELLS + 1) ** 2) >= _EXPECTED
-      found = np.bincount(cells[shared], minlength=(_CELLS + 1) ** 2) > 0
+      expected = np.bincount(cells[near], minlength=CELLS) >= _EXPECTED
+      found = np.bincount(cells[shared], minlength=CELLS) > 0
       common[own, other] = (expected & found).sum()
       missing[own, other] = (expected & ~found).sum()
       asked[own] += expected
@@ -90,17 +91,11 @@ def overlap(model: pycolmap.Reconstruction) -> Overlap:
   )
 
 
-def _cells(camera: pycolmap.Camera, pixels: np.ndarray) -> np.ndarray:
-  column, row = (pixels * _CELLS / max(camera.width, camera.height)).astype(int).T
-  found: np.ndarray = row * (_CELLS + 1) + column
-  return found
-
-
 def _seen(image: pycolmap.Image, camera: pycolmap.Camera, keys: np.ndarray) -> _Seen:
   features = [point for point in image.points2D if point.has_point3D()]
   pixels = np.array([point.xy for point in features]).reshape(-1, 2)
   rows = np.searchsorted(keys, [point.point3D_id for point in features])
-  return _Seen(rows, _cells(camera, pixels))
+  return _Seen(rows, cells_of(camera, pixels))
 
 
 def _visible(
@@ -113,10 +108,10 @@ def _visible(
   pixels = np.full((len(positions), 2), -1.0)
   pixels[ahead] = camera.img_from_cam(local[ahead])
   inside = np.all((pixels >= 0) & (pixels < [camera.width, camera.height]), axis=1)
-  nearest = np.full((_CELLS + 1) ** 2, np.inf)
+  nearest = np.full(CELLS, np.inf)
   for cell in np.unique(seen.cells):
     nearest[cell] = np.quantile(depths[seen.points[seen.cells == cell]], 0.25)
-  grid = np.pad(nearest.reshape(_CELLS + 1, _CELLS + 1), 1, constant_values=np.inf)
+  grid = np.pad(nearest.reshape(math.isqrt(CELLS), -1), 1, constant_values=np.inf)
   around = np.lib.stride_tricks.sliding_window_view(grid, (3, 3)).min((2, 3)).ravel()
-  inside[inside] = depths[inside] < _BEHIND * around[_cells(camera, pixels[inside])]
+  inside[inside] = depths[inside] < _BEHIND * around[cells_of(camera, pixels[inside])]
   return inside

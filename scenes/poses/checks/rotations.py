@@ -19,8 +19,8 @@ import numpy as np
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.checks.agreement import cells_of
 
-_CELLS = 12  # into so many parts the longer side of a picture is divided, chosen
 _FEWEST = 15  # matches of a pair that says something, as many as a place needs
 _CERTAIN = 4.0  # pixels within which matches agree with a relative pose
 _AGREES = np.radians(
@@ -78,8 +78,7 @@ def relative_rotations(database: Path, camera: pycolmap.Camera, *, seed: int = 0
       continue
     count, rotation, _, _ = cv2.recoverPose(essential, rays, others, np.eye(3), mask=inside)
     if count >= _FEWEST:
-      cells = (np.array(pixels) * _CELLS / max(camera.width, camera.height)).astype(int)
-      area = min(len(np.unique(seen, axis=0)) for seen in cells)
+      area = min(len(np.unique(cells_of(camera, seen))) for seen in pixels)
       found.append((row[pair[0]], row[pair[1]], rotation, area))
   first, second, turns, areas = zip(*found, strict=True) if found else ((), (), (), ())
   return Pairs(

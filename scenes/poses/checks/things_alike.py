@@ -63,7 +63,7 @@ def undeceived(
     if model is None:
       continue
     sees = overlap(model)
-    if sees.balance - seen.balance > CLEAR * seen.balance:
+    if sees.balance - seen.balance > CLEAR * abs(seen.balance):
       found = Found(model, f"{mapper}, without {len(pairs)} pairs of things alike", apart)
       seen, without = sees, pairs
   return found
@@ -78,7 +78,7 @@ def _group(seen: Overlap) -> set[int]:
   """Ids of the pictures that as a group clearly lack what they ought to see."""
   weights = seen.common - seen.missing
   part = divide(weights)
-  if part is None or weights[part][:, ~part].sum() > -CLEAR * weights.sum() / 2:
+  if part is None or weights[part][:, ~part].sum() > -CLEAR * abs(weights.sum()) / 2:
     return set()
   return set(np.array(seen.ids)[part].tolist())
 

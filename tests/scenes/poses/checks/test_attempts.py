@@ -17,6 +17,7 @@ from nerf2real.scenes.poses.checks import attempts, overlap
     ((0.87, 0.83, 0.84), (0.0, 0.2, 0.21), 0, 0.2),  # two are, and another is better
     ((0.87, 0.5, 0.6), (0.0, 0.2, 0.5), 0, 0.0),  # what sees clearly less says nothing of the best
     ((0.87, 0.5, 0.86), (0.0, 0.2, 0.5), 0, 0.5),
+    ((-0.87, -0.86, -2.0), (0.0, 0.2, 0.5), 1, 0.2),  # of blurred pictures most may lack
     ((None, 0.5, None), (None, 0.0, None), 1, 0.0),  # an attempt that found nothing
     ((None, None, None), (None, None, None), None, 0.0),
   ],

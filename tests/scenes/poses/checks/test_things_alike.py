@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 
 from nerf2real.scenes.poses.checks import things_alike
+from nerf2real.scenes.poses.checks.overlap import Overlap
 from nerf2real.scenes.poses.mapping import registered
 from tests.scenes.poses.checks import alike_things
 
@@ -50,6 +51,23 @@ def test_a_model_that_is_not_better_is_not_taken(alike_matched, wrong, answer):
   found = things_alike.Found(wrong, "a mapper", 0.02)
   other = pycolmap.Reconstruction(wrong) if answer == "the same" else None
   kept = things_alike.undeceived(found, database, lambda _: (other, "another", 0.5), seed=0)
+  assert kept is found
+
+
+def test_a_model_that_lacks_more_is_not_taken_where_most_is_lacking(alike_matched, monkeypatch):
+  truth, database = alike_matched
+  other = pycolmap.Reconstruction(truth)
+  nothing = np.zeros((0, 0))
+  monkeypatch.setattr(
+    things_alike,
+    "overlap",
+    lambda model: Overlap([], nothing, nothing, -100.0 if model is truth else -105.0),
+  )
+  pairs = {next(iter(_verified(database)))}
+  monkeypatch.setattr(things_alike, "_turning", lambda *_: pairs)
+  monkeypatch.setattr(things_alike, "_holding", lambda *_: set())
+  found = things_alike.Found(truth, "a mapper", 0.0)
+  kept = things_alike.undeceived(found, database, lambda _: (other, "another", 0.0), seed=0)
   assert kept is found
 
 
