@@ -62,7 +62,8 @@ def write(
     text = json.dumps(dict(settings), indent=1, default=str)
     sections.append(Section("Settings", "", [Details("all settings", [Preformatted(text)])]))
   lead = (
-    f"{len(found)} episodes. What is called virtual robot is a program behind the robot's wires, "
+    f"{len(found)} episode{'' if len(found) == 1 else 's'}. "
+    "What is called virtual robot is a program behind the robot's wires, "
     "with physics, pictures and faults of its own; no figure marked so is of hardware."
   )
   if len(here) < len(found):
