@@ -7,8 +7,10 @@ import numpy as np
 from nerf2real.sysid.fit.layout import Fit
 from nerf2real.sysid.fit.posterior import FINE, Fitter
 
+STAIRS = ("delay", "rate")
+"""Values of effects by which held commands come at other times."""
 _SHIFTS = tuple(0.0005 * k for k in (-8, -6, -4, -3, -2, -1, 1, 2, 3, 4, 6, 8))
-"""s by which latencies are shifted to look about."""
+"""s by which latencies are shifted to look about, and the ends of logs by a clock's rate."""
 _WORTH = 0.5  # nats that other latencies, or values drawn, must be better by, chosen
 _GENERATIONS, _DRAWN, _ELITE = 12, 120, 20  # of values that are drawn where costs are rough, chosen
 _IDLE = 3  # generations in a row without a better one after which no more are drawn, chosen
@@ -23,7 +25,7 @@ def look_about(fitter: Fitter, fit: Fit, names: Collection[str], *, iterations: 
   Args:
     fitter: of the hypothesis.
     fit: where steps have ended.
-    names: of the latencies to shift.
+    names: of the latencies and rates to shift.
     iterations: Jacobians at most of the fit from the best shifted values.
   """
   layout = fitter.layout
@@ -31,7 +33,9 @@ def look_about(fitter: Fitter, fit: Fit, names: Collection[str], *, iterations: 
   moved = [at for at, name in enumerate(kinds) if name in names]
   if not moved:
     return fit
-  tried = fit.x + np.array([s * np.eye(len(kinds))[at] for at in moved for s in _SHIFTS])
+  ends = max(log.time[-1] - log.time[0] for j in fitter.joints for log in j.plant.logs)
+  by = np.diag([1.0 / ends if name == "rate" else 1.0 for name in kinds])
+  tried = fit.x + np.array([s * by[at] for at in moved for s in _SHIFTS])
   tried = np.clip(tried, layout.low, layout.high)
   costs, rows = fitter.simulated(tried)
   k = int(np.argmin(costs))

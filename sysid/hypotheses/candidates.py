@@ -47,7 +47,7 @@ def library(plant: JointPlant) -> list[Term]:
   speed = typical_speed(plant)
   terms = [
     _one("command_delay", joint, "delay", 0.0, 0.25, 0.01, _DELAYS),
-    _one("clock_drift", None, "rate", -0.05, 0.05, 0.003, (0.003, -0.003)),
+    _drift(plant),
     _one(
       "coulomb_friction", joint, "torque", 0.0, strongest(plant), 0.1 * torque, (0.05 * torque,)
     ),
@@ -165,6 +165,13 @@ def library(plant: JointPlant) -> list[Term]:
     )
   )
   return terms + [force_law.term_of(plant, kind) for kind in KINDS.values() if kind.law is not None]
+
+
+def _drift(plant: JointPlant) -> Term:
+  """Returns a clock's drift; by the end of the longest log it is as late as late commands begin."""
+  longest = max(float(log.time[-1] - log.time[0]) for log in plant.logs)
+  rates = tuple(sign * late / longest for late in _DELAYS for sign in (1.0, -1.0))
+  return _one("clock_drift", None, "rate", -0.05, 0.05, 0.003, rates)
 
 
 def _weakenings(plant: JointPlant, term: Term) -> list[Term]:

@@ -3,11 +3,12 @@
 With the command u, the reading q and k the declared stiffness over the declared limit,
 
     duty(t) = clip(gain B(x(t); w) + integral I(t) + c, -saturation, saturation)
-    x(t) = k (u(t - delay) - q(t + ahead)),  I = integral of x dt
+    x(t) = k (u(t / (1 + rate) - delay) - q(t + ahead)),  I = integral of x dt
 
-where B takes a dead band w off, and ahead is by how much a duty is read later than a position, or
-the law's derivative over its gain: the readings do not tell these apart. The readings feed the law,
-so that no motion is simulated: one regression for every delay and dead band of a grid. Deviations
+where B takes a dead band w off, rate is of the readings' clock, and ahead is by how much a duty is
+read later than a position, or the law's derivative over its gain: the readings do not tell these
+apart. The readings feed the law, so that no motion is simulated: one regression for every delay,
+rate and dead band of a grid. Deviations
 are of the blocks' scatter (Liang and Zeger 1986), or of the logs' where that is more. Shapes: N
 samples of a log or of all, K columns, P kernel parameters (`kernel.NAMES`).
 """
@@ -16,6 +17,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+from scipy.linalg import orth
 
 from nerf2real.core import least_squares
 from nerf2real.suite.effects import kind_of
@@ -29,7 +31,8 @@ Array = np.ndarray
 _STEP, _COARSE, _NEAR = 0.001, 0.004, 0.016
 """s between delays that are tried, chosen: firmware and bus work in cycles of a millisecond; in a
 first round, a quarter of a period at 60 Hz, faster than position errors change; and how far about
-its best delay a second round goes, which a held command's plateau must not leave."""
+its best delay a second round goes, which a held command's plateau must not leave. Where a clock's
+rate is sought, too, they are of the shifts at a log's middle and at its end."""
 _BANDS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Dead bands that are tried, in steps of the position's reading."""
 _FEWEST = 50  # samples of a line
@@ -68,6 +71,8 @@ class ServoLaw:
   """rms of what gain, delay and ahead leave, of full duty."""
   unexplained: float
   """The same over the rms of what they make."""
+  rate: float = 0.0
+  """s gained per second by the readings' clock, zero where that is not clear of none."""
 
   @property
   def interval(self) -> tuple[float, float]:
@@ -79,8 +84,10 @@ class ServoLaw:
     """Tells whether the gain is off the declared one by more than a share, all of its interval.
 
     What the law leaves of the duty may hide as much of the gain: no deviation by scatter shows it.
+    More where it leaves more than it makes: what is wrong with the position errors lowers the gain
+    by as much as the regression of these on the duty raises it (Frisch 1934).
     """
-    reach = tolerance + self.gain * self.unexplained
+    reach = tolerance + self.gain * max(self.unexplained, self.unexplained**2)
     low, high = self.interval
     return low > 1.0 + reach or high < 1.0 - reach
 
@@ -106,19 +113,37 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
   step = min(quantum(log.position) for log in logs)
   slope = abs(plant.declared[INDEX["position"]] / plant.declared[INDEX["highest"]])
 
-  def line(delay: float, band: float = 0.0) -> tuple[float, Array]:
-    columns = np.column_stack([_shrunk(_declared(plant, delay), slope * band), beside])
+  second = [np.floor(log.time / SETTINGS.block_s) + 1e6 * i for i, log in enumerate(logs)]
+  block = np.concatenate(second)
+
+  basis = orth(beside[kept])
+
+  def less_basis(values: Array) -> Array:
+    return values[kept] - basis @ (basis.T @ values[kept])
+
+  asked = less_basis(duty)
+
+  def squares(delay: float, rate: float = 0.0) -> float:
+    column = less_basis(_declared(plant, delay, rate))
+    return float(asked @ asked - (column @ asked) ** 2 / max(float(column @ column), 1e-300))
+
+  def line(delay: float, rate: float, band: float) -> tuple[float, Array]:
+    columns = np.column_stack([_shrunk(_declared(plant, delay, rate), slope * band), beside])
     beta = np.linalg.lstsq(columns[kept], duty[kept], rcond=None)[0]
     return float(np.sum((duty - columns @ beta)[kept] ** 2)), columns
 
-  delay = _best_delay(lambda delay: line(delay)[0])
-  best, band = min((line(delay, steps * step)[0], steps * step) for steps in _BANDS)
-  second = [np.floor(log.time / SETTINGS.block_s) + 1e6 * i for i, log in enumerate(logs)]
-  block = np.concatenate(second)
-  ratio = (line(delay)[0] - best) / best * len(np.unique(block[kept]))  # of likelihoods
-  if ratio < SETTINGS.worth**2:
+  def is_worth(squares: float, plain: float) -> bool:  # by the likelihoods' ratio
+    return (plain - squares) / squares * len(np.unique(block[kept])) > SETTINGS.worth**2
+
+  delay, rate = _best_delay(squares), 0.0
+  longest = max(float(log.time[-1] - log.time[0]) for log in logs)
+  late, drift = _best_clock(squares, longest)
+  if is_worth(squares(late, drift), squares(delay)):
+    delay, rate = late, drift
+  best, band = min((line(delay, rate, steps * step)[0], steps * step) for steps in _BANDS)
+  if not is_worth(best, squares(delay, rate)):
     band = 0.0
-  columns = line(delay, band)[1]
+  columns = line(delay, rate, band)[1]
   beta, spread = _regressed(columns[kept], duty[kept], block[kept])
   total = np.concatenate(
     [_integral(columns[log_of == i, 0], log.time) for i, log in enumerate(logs)]
@@ -148,6 +173,7 @@ def servo_law(plant: JointPlant) -> tuple[ServoLaw, Array] | None:
     saturation=top,
     left=(rms := float(np.sqrt(np.mean(left[kept] ** 2)))),
     unexplained=rms / max(float(np.sqrt(np.mean((duty - left)[kept] ** 2))), 1e-12),
+    rate=rate,
   )
   return (law, left) if law.interval[0] > 0.0 else None
 
@@ -163,6 +189,36 @@ def _best_delay(squares: Callable[[float], float]) -> float:
   fine = np.arange(max(near - _NEAR, 0.0), near + _NEAR + _STEP / 2, _STEP)
   found = np.array([squares(delay) for delay in fine])
   return float(np.median(fine[found <= found.min() * (1.0 + 1e-6)]))
+
+
+def _best_clock(squares: Callable[[float, float], float], longest: float) -> tuple[float, float]:
+  """Returns the delay [s] at the beginning of logs and the clock's rate of least squares, within
+  what is plausible of both.
+
+  Rates are sought by the shifts that they make at the end of the longest log [s], and delays by
+  those at its middle: nearly independent of each other.
+  """
+  most, fastest = (
+    kind_of(kind).parameter(name).high
+    for kind, name in (("command_delay", "delay"), ("clock_drift", "rate"))
+  )
+  ends = np.arange(-fastest * longest, fastest * longest + _NEAR, 2.0 * _NEAR)
+  middles = np.arange(ends[0] / 2.0, most + ends[-1] / 2.0, _NEAR)
+  step = 2.0 * _NEAR
+  while True:
+    found = {}
+    for end in ends:
+      rate = min(max(end / longest, -fastest), fastest)
+      for middle in middles:
+        delay = middle - 0.5 * rate * longest
+        if 0.0 <= delay <= most:
+          found[squares(delay, rate), middle, end] = delay, rate
+    least = min(found)
+    if step <= 2.0 * _STEP:
+      return found[least]
+    step /= 4.0
+    ends = least[2] + step * np.arange(-4, 5)
+    middles = least[1] + step / 2.0 * np.arange(-4, 5)
 
 
 def duty_of(plant: JointPlant, p: Array, index: int, *, ahead: float = 0.0) -> Array:
@@ -234,10 +290,11 @@ def _held(log: Measured, time: Array) -> Array:
   return log.command[np.clip(at, 0, None)]
 
 
-def _declared(plant: JointPlant, delay: float) -> Array:
-  """Returns the declared model's duty [N] without limits, at a command delay [s]."""
+def _declared(plant: JointPlant, delay: float, rate: float) -> Array:
+  """Returns the declared model's duty [N] without limits, at a command delay [s] and a clock's
+  rate."""
   p = plant.declared.copy()
-  p[INDEX["command_delay"]] = delay
+  p[INDEX["command_delay"]], p[INDEX["clock_rate"]] = delay, rate
   p[INDEX["lowest"]], p[INDEX["highest"]] = -np.inf, np.inf
   return np.concatenate([duty_of(plant, p, i) for i in range(len(plant.logs))])
 

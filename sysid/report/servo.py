@@ -117,6 +117,8 @@ def _sentence(joint: str, law: ServoLaw, item: Changed) -> str:
     f"{1e3 * law.delay:.0f} ms after the command",
     f"{100.0 * law.saturation:.0f} % of full duty at most",
   ]
+  if law.rate:
+    parts.append(f"by a clock of the readings that gains {1e3 * law.rate:.1f} ms a second")
   if law.dead_band > 0.0:
     parts.append(
       f"a dead band of {law.dead_band:.2g} {'rad' if item.likelihood.plant.hinge else 'm'}"

@@ -188,7 +188,7 @@ class Explainer:
     ]
     chosen = _best_of_kinds(tried)
     return [
-      self.score(terms, rough.look_about(fitter, fitter.fit(fit, iterations=4), ("delay",)))
+      self.score(terms, rough.look_about(fitter, fitter.fit(fit, iterations=4), rough.STAIRS))
       for fitter, terms, fit in chosen[:keep]
     ]
 
@@ -264,7 +264,7 @@ class Explainer:
       self.joint.rescale(best.fit.residuals[0])
       before = fitter.again(best.fit).cost
       best = self.score(
-        best.terms, rough.look_about(fitter, fitter.fit(best.fit, iterations=4), ("delay",))
+        best.terms, rough.look_about(fitter, fitter.fit(best.fit, iterations=4), rough.STAIRS)
       )
       if best.fit.cost > before - self.settings.settled:
         break

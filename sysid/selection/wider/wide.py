@@ -226,8 +226,7 @@ def fitted(item: Wide) -> Wide:
   """Returns a screened effect fitted to the end, with its predictions of left-out blocks."""
   fitter = Fitter([m.now for m in item.members], item.fit.layout)
   fit = fitter.fit(item.fit, iterations=_ENOUGH)
-  if _late(item.term):
-    fit = rough.look_about(fitter, fit, ("delay",), iterations=_ENOUGH)
+  fit = rough.look_about(fitter, fit, rough.STAIRS, iterations=_ENOUGH)
   return dataclasses.replace(item, fit=fitter.leave_out(fit))
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.fit import intervals, whitening
-from nerf2real.sysid.fit.layout import CONSTANTS
+from nerf2real.sysid.fit import intervals, rough, whitening
+from nerf2real.sysid.fit.layout import CONSTANTS, Layout
+from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.measured import fresh, quantum
@@ -83,6 +84,21 @@ def test_fit_recovers_an_effect(kind: str, values: dict, tolerance: dict) -> Non
     low, high = bounds[name]
     assert low - tolerance[name] < value < high + tolerance[name]
     assert high - low < 0.5 * abs(value)
+
+
+def test_a_clock_is_sought_by_how_late_it_makes_the_end_of_a_log() -> None:
+  """Held commands make stairs of its rate, too, in which steps end."""
+  true = 0.004
+  _, joint = joint_of(KINDS, [Effect("clock_drift", None, {"rate": true})])
+  (drift,) = [t for t in candidates.library(joint.plant) if t.kind == "clock_drift"]
+  ends = np.abs(drift.starts) * max(log.time[-1] for log in joint.plant.logs)
+  assert ends.min() < 0.005 and ends.max() > 0.15  # s, as of late commands
+  fitter = Fitter([joint], Layout([[constants(joint.plant), drift]]))
+  off = np.append(np.array(constants(joint.plant).starts[0]), true - 3e-4)
+  fit = fitter.linearise(off)
+  found = rough.look_about(fitter, fit, rough.STAIRS, iterations=0)
+  assert found.cost < fit.cost
+  assert abs(found.x[-1] - true) < 1e-4
 
 
 def test_friction_is_known_no_better_than_the_damping_that_was_declared() -> None:

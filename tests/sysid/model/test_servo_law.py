@@ -75,12 +75,24 @@ def test_a_command_as_late_as_is_plausible_is_no_weaker_gain(delay):
   assert not law.is_off(0.05)
 
 
-def test_a_clock_that_drifts_is_no_weaker_gain():
-  drifting = law_of(drift=0.002, noise=0.002)
-  assert not drifting.is_off(0.05)
-  assert drifting.unexplained > 10.0 * law_of(noise=0.002).unexplained
-  assert servo_law(plant_of(drift=0.04, noise=0.002)) is None
+@pytest.mark.parametrize("drift", [0.004, -0.006, 0.015])
+def test_a_clock_that_drifts_is_found_and_is_no_weaker_gain(drift):
+  law = law_of(drift=drift, delay=0.01, noise=0.002)
+  assert law.rate == pytest.approx(drift, abs=8e-4)
+  assert law.delay == pytest.approx(0.01, abs=0.008)
+  assert law.gain == pytest.approx(1.0, abs=0.01)
+  assert not law.is_off(0.05)
+
+
+def test_a_clock_that_does_not_drift_has_no_rate():
+  assert law_of(gain=0.5, noise=0.002).rate == 0.0
   assert law_of(gain=0.5, noise=0.002).is_off(0.05)
+
+
+def test_a_law_that_leaves_more_than_it_makes_is_not_off():
+  assert not dataclasses.replace(law_of(), gain=0.3, unexplained=1.6).is_off(0.2)
+  law = servo_law(plant_of(drift=0.04, noise=0.002))
+  assert law is None or not law[0].is_off(0.05)
 
 
 def test_a_gain_whose_interval_holds_the_declared_one_is_not_off():
