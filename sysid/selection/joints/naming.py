@@ -2,7 +2,7 @@
 
 One rule, one level of significance: an effect of the best hypothesis is named where every tried
 hypothesis without it is clearly worse (paired differences of left-out likelihood, `clearness`) than
-the best one, or than itself with the effect in the place of one of its own, at the family-wise
+the best one, or than itself with the effect beside or in the place of its own, at the family-wise
 level of all effects tried; beside a clearer one, of all pairs of them, and so on:
 among so many more is one sooner that fits what no hypothesis holds. Where a hypothesis without it
 predicts the same motion, these logs cannot tell the two apart; both are said.
@@ -30,7 +30,8 @@ command is more usual than a late reading, a shifted zero than a machine that ha
 that a load, with its place, looks like a shifted zero would be a coincidence."""
 
 SPECIAL = {"asymmetric_friction": "coulomb_friction"}
-"""Kinds that have another as their special case: they are named where they are clear of it."""
+"""Kinds that have another as their special case: they are named where they are clear of it, else
+the special case is, which hypotheses with the general kind do not lack."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,13 +107,28 @@ def conclude(
         best = top
   last = beyond[max(len(best.names), 1) - 1]
   best = _usual(joint, best, ranked, last)
+  names = _names(joint, best, ranked, beyond)
+  for general, special in SPECIAL.items():
+    if any(n.kind == general and not n.certain for n in names):
+      simpler = [s for s in ranked if s.names == best.names - {general} | {special}]
+      for item in sorted(simpler, key=lambda s: -s.evidence)[:1]:
+        others = _names(joint, item, ranked, beyond)
+        if any(n.kind == special and n.certain for n in others):
+          best, names = item, others
+  left = best.fit.held[0][0]
+  share = _share(left, bare.fit.held[0][0] if without is None else without)
+  return Explanation(best, names, left, *share)
+
+
+def _names(
+  joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: Sequence[float]
+) -> tuple[Name, ...]:
+  """Returns the effects of a hypothesis, and whether each is certain."""
+  last = beyond[max(len(best.names), 1) - 1]
   names = [_name(joint, best, kind, ranked, last) for kind in sorted(best.names)]
   clearest = sorted(names, key=lambda n: -n.clear)
   certain = {n.kind for n, z in zip(clearest, beyond, strict=False) if n.certain and n.clear >= z}
-  names = [dataclasses.replace(n, certain=n.kind in certain) for n in names]
-  left = best.fit.held[0][0]
-  share = _share(left, bare.fit.held[0][0] if without is None else without)
-  return Explanation(best, tuple(names), left, *share)
+  return tuple(dataclasses.replace(n, certain=n.kind in certain) for n in names)
 
 
 def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
@@ -133,14 +149,18 @@ def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyon
 def _name(
   joint: JointLikelihood, best: Scored, kind: str, ranked: Sequence[Scored], beyond: float
 ) -> Name:
-  rivals = [s for s in ranked if kind not in s.names and not s.beside_force]
-  behind = [(max(clear(t, s) for t in (best, *_with_instead(s, kind, ranked))), s) for s in rivals]
+  forms = _forms(kind)
+  rivals = [s for s in ranked if not forms & s.names and not s.beside_force]
+  behind = [
+    (max(clear(t, s) for t in (best, *_instead(s, kind, ranked), *_beside(s, kind, ranked))), s)
+    for s in rivals
+  ]
   near = [s for z, s in behind if z < beyond]
   alike = tuple(
     s
     for s in near
     if not s.names < best.names
-    and (_same(joint, best, s) or any(_same(joint, s, t) for t in _with_instead(s, kind, ranked)))
+    and (_same(joint, best, s) or any(_same(joint, s, t) for t in _instead(s, kind, ranked)))
   )
   alike = tuple(a for a in alike if not any(_holds(a, b) for b in alike))
   told = [z for z, s in behind if not any(s is a or _holds(s, a) for a in alike)]
@@ -151,12 +171,24 @@ def _name(
   return Name(kind, least, carries_over(joint, best, plain), alike, tuple(more))
 
 
-def _with_instead(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:
-  """Returns a rival's hypotheses with a kind in the place of one of its own. One that predicts what
-  the rival does is as good an explanation: what the rival is ahead by speaks not against the kind,
-  but for what both have besides."""
-  same = of_size(ranked, len(rival.names))
-  return [s for s in same if s.names - rival.names == {kind}]
+def _forms(kind: str) -> frozenset[str]:
+  """Returns a kind and those that it is a special case of."""
+  return frozenset([kind, *(general for general, special in SPECIAL.items() if special == kind)])
+
+
+def _instead(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:
+  """Returns a rival's hypotheses with a kind, in any form, in the place of one of its own. One that
+  predicts what the rival does is as good an explanation: what the rival is ahead by speaks not
+  against the kind, but for what both have besides."""
+  forms = [{form} for form in _forms(kind)]
+  return [s for s in of_size(ranked, len(rival.names)) if s.names - rival.names in forms]
+
+
+def _beside(rival: Scored, kind: str, ranked: Sequence[Scored]) -> list[Scored]:
+  """Returns a rival's hypotheses with a kind, in any form, beside all of its own: where one is
+  clearly better than the rival, so is what the rival explains no reason to do without the kind."""
+  both = [rival.names | {form} for form in _forms(kind)]
+  return [s for s in ranked if s.names in both and not s.neutral]
 
 
 def _holds(item: Scored, twin: Scored) -> bool:

@@ -105,6 +105,21 @@ def test_a_rival_that_is_clearly_worse_than_itself_with_the_effect_instead_is_be
   assert name.certain and name.confounded == ()
 
 
+def test_a_rival_that_needs_the_effect_beside_all_of_its_own_is_beaten():
+  """b is as likely as a, by a few blocks; with a beside it it is better on all."""
+  random = np.random.default_rng(0)
+  noise = random.normal(0, 0.1, 30)
+  few = np.where(np.arange(30) % 10 == 0, 8.0, -0.9)
+  null, right = _scored((), noise - 3.0), _scored(("a",), noise)
+  rival = _scored(("b",), noise + few, prediction=8.0)
+  both = _scored(("a", "b"), noise + few + 0.8 + random.normal(0, 0.1, 30), prediction=9.0)
+  needless = _scored(("a", "b"), noise + few + random.normal(0, 0.1, 30), prediction=8.5)
+  beyond = (3.0, 1e3, 1e3)  # b is never clear beside a
+  assert naming.conclude(_Joint, [null, right, rival], beyond).named == ()
+  assert naming.conclude(_Joint, [null, right, rival, needless], beyond).named == ()
+  assert naming.conclude(_Joint, [null, right, rival, both], beyond).named == ("a",)
+
+
 def test_an_effect_without_which_the_same_is_predicted_is_needless():
   null = _scored((), np.linspace(-4, -3, 30))
   both = _scored(("a", "b"), np.linspace(0, 0.1, 30))
@@ -182,6 +197,24 @@ def test_a_special_case_is_said_where_the_general_kind_is_not_clear_of_it(
   monkeypatch.setattr(naming, "clear", lambda *_: behind)
   best = naming._usual(_Joint, general, [general, other, case], 3.0)
   assert best.names == {said}
+
+
+def test_a_special_case_is_certain_where_all_have_it_in_either_form():
+  """Friction that differs by direction is ahead, and a tilt beside plain friction does as well."""
+  random = np.random.default_rng(0)
+  noise = random.normal(0, 0.1, 30)
+  null = _scored((), noise - 3.0)
+  general = _scored(("asymmetric_friction",), noise)
+  plain = _scored(("coulomb_friction",), noise - 0.3 + random.normal(0, 0.1, 30), prediction=7.0)
+  tilted = _scored(("coulomb_friction", "gravity_tilt"), noise - 0.01, prediction=9.0)
+  other = _scored(("viscous_friction",), noise - 2.0 + random.normal(0, 0.1, 30), prediction=3.0)
+  ranked = [null, general, plain, tilted, other]
+  found = naming.conclude(_Joint, ranked, BEYOND)
+  assert found.named == ("coulomb_friction",) and found.best is plain
+  clear_of_all = naming.conclude(_Joint, [null, general, plain, other], BEYOND)
+  assert clear_of_all.named == ("asymmetric_friction",)
+  as_good = _scored(("spring",), noise - 0.01, prediction=11.0)
+  assert naming.conclude(_Joint, [*ranked, as_good], BEYOND).named == ()
 
 
 @pytest.mark.parametrize(("behind", "said"), [(0.0, "encoder_offset"), (1.7, "payload")])
