@@ -113,7 +113,7 @@ def conclude(
       simpler = [s for s in ranked if s.names == best.names - {general} | {special}]
       for item in sorted(simpler, key=lambda s: -s.evidence)[:1]:
         others = _names(joint, item, ranked, beyond)
-        if any(n.kind == special and n.certain for n in others):
+        if _certain(others) >= _certain(names) | {special}:
           best, names = item, others
   left = best.fit.held[0][0]
   share = _share(left, bare.fit.held[0][0] if without is None else without)
@@ -129,6 +129,10 @@ def _names(
   clearest = sorted(names, key=lambda n: -n.clear)
   certain = {n.kind for n, z in zip(clearest, beyond, strict=False) if n.certain and n.clear >= z}
   return tuple(dataclasses.replace(n, certain=n.kind in certain) for n in names)
+
+
+def _certain(names: Sequence[Name]) -> set[str]:
+  return {n.kind for n in names if n.certain}
 
 
 def _usual(joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: float) -> Scored:
