@@ -49,6 +49,7 @@ def write(
     The effects that MJCF cannot hold.
   """
   spec = mujoco.MjSpec.from_file(str(source))
+  _settle_servos(spec)
   # Constants first: friction and play take over what a joint has by then.
   order = [*EXPRESSED, *native_effects.KINDS]
   left, written = [], []
@@ -66,6 +67,15 @@ def write(
   head, body = spec.to_xml().split("\n", 1)
   write_atomically(target, f"{head}\n{_comment(written, left, clocks or {})}{body}")
   return left
+
+
+def _settle_servos(spec: mujoco.MjSpec) -> None:
+  """Writes the damping of servos that are declared by a ratio as a constant: the machine keeps the
+  one it has, whatever its gains and masses are found to be."""
+  model = spec.compile()
+  for actuator in spec.actuators:
+    if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE:
+      actuator.biasprm = model.actuator_biasprm[actuator.id]
 
 
 def _comment(
@@ -161,6 +171,7 @@ def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float
       if value.get("mass", 1.0) != 1.0:
         joint.parent.mass *= value["mass"]
         joint.parent.inertia = np.array(joint.parent.inertia) * value["mass"]
+        joint.parent.fullinertia = np.array(joint.parent.fullinertia) * value["mass"]  # NaN: none
         for geom in joint.parent.geoms:
           geom.mass *= value["mass"]
           geom.density *= value["mass"]

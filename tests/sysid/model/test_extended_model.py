@@ -88,6 +88,28 @@ def test_a_gain_of_position_alone_is_written_with_the_servos_own_damping(tmp_pat
   assert rms(natives(path, SWEEP) - suites(damped, [whole], SWEEP)) > 1e-3
 
 
+@pytest.mark.parametrize(
+  "effect",
+  [
+    Effect("motor_gain", "elbow", {"gain": 0.6}),
+    Effect("payload", "lower", {"mass": 0.3, "x": 0.0, "y": 0.0, "z": -0.1}),
+    Effect("parameter_error", "elbow", {"mass": 1.2, "armature": 1.3}),
+  ],
+  ids=lambda effect: effect.kind,
+)
+def test_a_servo_keeps_its_damping_and_a_body_its_axes_however_they_are_declared(effect, tmp_path):
+  other = ARM.replace('kp="21"', 'kp="21" dampratio="0.7"')
+  diagonal = 'diaginertia="8e-4 8e-4 1e-4"'
+  other = other.replace(diagonal, 'fullinertia="8e-4 8e-4 4e-4 1e-4 0 -1e-4"')
+  path, left = written(tmp_path, other, [effect])
+  assert left == []
+  want, got = mujoco.MjModel.from_xml_string(other), mujoco.MjModel.from_xml_path(str(path))
+  EffectStack([effect]).bind(want)
+  np.testing.assert_allclose(got.actuator_biasprm, want.actuator_biasprm, rtol=1e-5)
+  if effect.kind != "payload":  # which is a body of its own
+    np.testing.assert_allclose(got.body("lower").inertia, want.body("lower").inertia, rtol=1e-5)
+
+
 def test_late_readings_are_late_sensors(tmp_path):
   effect = Effect("measurement_delay", "joint", {"delay": 0.0234})
   path, left = written(tmp_path, PENDULUM, [effect])
