@@ -14,6 +14,7 @@ from nerf2real.core.robot_logs.streaming import LogError
 from nerf2real.sysid.data.bam import UNNAMED, read_bam
 from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.tables import read_csv
+from nerf2real.sysid.model.drive import joint_of
 
 
 def read_log(path: str | Path) -> Log:
@@ -39,7 +40,7 @@ def named(log: Log, model: mujoco.MjModel) -> Log:
   """
   if log.joints != (UNNAMED,):
     return log
-  driven = sorted({model.joint(int(index)).name for index in model.actuator_trnid[:, 0]})
+  driven = sorted({joint for u in range(model.nu) if (joint := joint_of(model, u)) is not None})
   if len(driven) != 1:
     raise LogError(
       f"{log.name} has one joint without a name, the model drives {driven}: give a model of that "

@@ -16,6 +16,13 @@ def holds_position(model: mujoco.MjModel, actuator: int) -> bool:
   return float(model.actuator_biasprm[actuator, 1]) < 0.0
 
 
+def joint_of(model: mujoco.MjModel, actuator: int) -> str | None:
+  """Returns the joint that an actuator drives; None of one that pulls a tendon, site or body."""
+  if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+    return None
+  return str(model.joint(int(model.actuator_trnid[actuator, 0])).name)
+
+
 def actuators_of(model: mujoco.MjModel, joint: str) -> list[int]:
   """Returns all actuators on a joint."""
   on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)

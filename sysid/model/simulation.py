@@ -14,7 +14,7 @@ from mujoco import rollout
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, EffectStack
-from nerf2real.sysid.model.drive import actuator_of, holds_position, mean_commands
+from nerf2real.sysid.model.drive import actuator_of, holds_position, joint_of, mean_commands
 from nerf2real.sysid.model.measured import fresh
 from nerf2real.sysid.model.motion import smooth_motion, start_velocity
 
@@ -55,7 +55,9 @@ def merge_delays(
   named = {e.target: float(e.parameters["delay"]) for e in effects if e.kind == "command_delay"}  # type: ignore[arg-type]
   common = named.get(None, 0.0)
   for u in range(model.nu):
-    joint = model.joint(int(model.actuator_trnid[u, 0])).name
+    joint = joint_of(model, u)
+    if joint is None:
+      continue
     total = named.get(joint, common) + clocks.get(joint, Clocks()).latency
     if total > 0:
       result.append(Effect("command_delay", joint, {"delay": total}))
@@ -149,8 +151,8 @@ def _delays(effects: Sequence[Effect], model: mujoco.MjModel) -> Array:
   """Returns the command delay of every actuator [U], s."""
   result = np.zeros(model.nu)
   for u in range(model.nu):
-    joint = model.joint(int(model.actuator_trnid[u, 0])).name
-    result[u] = _of_joint(effects, "command_delay", "delay", joint)
+    joint = joint_of(model, u)
+    result[u] = 0.0 if joint is None else _of_joint(effects, "command_delay", "delay", joint)
   return result
 
 

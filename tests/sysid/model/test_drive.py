@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from nerf2real.suite.effects import Effect
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.drive import mean_commands
 from nerf2real.sysid.model.measured import measured
@@ -42,3 +43,16 @@ def test_a_joint_that_is_not_commanded_is_held_where_it_was_and_not_judged():
   assert np.abs(positions[:, 1] - 0.5).max() < 0.1  # gravity and the other joint move it a little
   own = np.sqrt(np.mean((positions - still)[:, 0] ** 2))
   assert simulation.error(model, [log]) == pytest.approx(own)
+
+
+def test_what_pulls_no_joint_is_late_for_none():
+  """A tendon's and a body's number are no joint's, and may be beyond the last joint's."""
+  pulls = "<actuator><adhesion body='lower' ctrlrange='0 1'/><position tendon='both' kp='2'/>"
+  ties = "<tendon><fixed name='both'><joint joint='elbow' coef='1'/></fixed></tendon>"
+  xml = ARM.replace("<actuator>", ties + pulls)
+  model, log = mujoco.MjModel.from_xml_string(xml), log_of(ARM, "sweep", duration=1.2)
+  late = [Effect("command_delay", "shoulder", {"delay": 0.02})]
+  merged = simulation.merge_delays(late, {"elbow": simulation.Clocks(latency=0.01)}, model)
+  assert {e.target: e.parameters["delay"] for e in merged} == {"shoulder": 0.02, "elbow": 0.01}
+  assert len(merged) == 2
+  assert simulation.simulate(model, log, late).shape == log.states.position.shape
