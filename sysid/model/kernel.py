@@ -9,9 +9,10 @@ Whatever is reported at the end is simulated by MuJoCo itself.
                               - friction
 
 The scheme is MuJoCo's `implicitfast`: forces at the old position, damping implicit, then the new
-speed moves the position. A scheme of higher order would be nearer to the machine, but constants
-that are fitted with it would not fit MuJoCo. Dry friction is MuJoCo's constraint, solved in closed
-form for its one row: f = -(a_free + b v) / (1/m + R), at most F.
+speed moves the position. Of a model that Euler's scheme integrates the joint's damping alone is
+implicit, the servo's is not, as there. A scheme of higher order would be nearer to the machine, but
+constants that are fitted with it would not fit MuJoCo. Dry friction is MuJoCo's constraint, solved
+in closed form for its one row: f = -(a_free + b v) / (1/m + R), at most F.
 
 Shapes: C commands, S samples, T grid points, W windows.
 """
@@ -59,6 +60,8 @@ NAMES = (
   "strength",
   # s by which the other joints' readings, which prescribe the surroundings, are late
   "surroundings_delay",
+  # whether the servo's damping acts at the speed before the step: Euler, MuJoCo's default
+  "servo_explicit",
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 _RECORD = np.dtype([(name, np.float64) for name in NAMES])
@@ -201,7 +204,7 @@ def simulate(
   load_kind, load_share, load_square = p.load_kind, p.load_coefficient, p.load_square
   load_at_rest, load_velocity = p.load_at_rest, p.load_velocity
   tooth_stiffness, tooth_damping = p.tooth_stiffness, p.tooth_damping
-  friction_on_link = p.friction_on_link
+  friction_on_link, explicit = p.friction_on_link, p.servo_explicit > 0.5
   follow, follow_speed = p.follow, p.follow_speed
   sag_by_current, sag_pulsed = p.sag_back_emf > 0.5 and highest < math.inf, p.sag_pulsed > 0.5
   sag_limits, sag_tells = p.sag_scales_limit > 0.5, p.sag_tells > 0.5
@@ -354,7 +357,7 @@ def simulate(
       # A step of velocity: the friction that stops it, then damping implicit.
       resist = slowed + drag * abs(v)
       slope_v = slowed + 2.0 * drag * abs(v)
-      if half == 0.0:
+      if half == 0.0 and not explicit:
         slope_v -= back_emf
       freely = 1.0 / mass
       yielding, pace = 1.0 / (freely + softness), step / (mass + step * slope_v)

@@ -56,6 +56,8 @@ def declared_parameters(model: mujoco.MjModel, joint: str) -> Array:
   values["softness"] = (1.0 - impedance) / impedance * float(model.dof_invweight0[dof])
   values["stopping_rate"] = rate
   values["lowest"], values["highest"] = -np.inf, np.inf
+  euler = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_EULER)
+  values["servo_explicit"] = float(euler)
   u = actuator_of(model, joint)
   if u >= 0:
     gear = float(model.actuator_gear[u, 0])

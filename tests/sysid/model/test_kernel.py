@@ -113,6 +113,17 @@ def test_a_gain_of_position_alone_keeps_the_servos_own_damping() -> None:
   assert np.sqrt(np.mean((_position(plant, [forms[0]], [0.6]) - want) ** 2)) > 1e-3
 
 
+def test_a_servos_damping_acts_as_eulers_scheme_has_it() -> None:
+  damped = PENDULUM.replace('kp="21"', 'kp="21" kv="2"').replace("implicitfast", "Euler")
+  model = mujoco.MjModel.from_xml_string(damped)
+  log = log_of(damped, "steps", rounding=0.0, duration=4.0)
+  course = _position(JointModel(model, "joint", [log]))
+  assert np.sqrt(np.mean((course - log.states.position[:, 0]) ** 2)) < 1e-6
+  model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+  other = _position(JointModel(model, "joint", [log]))
+  assert np.sqrt(np.mean((course - other) ** 2)) > 1e-4
+
+
 def test_a_gear_is_loaded_by_what_a_scaled_back_emf_leaves() -> None:
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "sweep", rounding=0.0, duration=4.0)
