@@ -43,6 +43,9 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
   if healthy:
     tolerance |= {name: settings.servo for name in ("gain", "limit", "damping")}
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
+  # A machine lacks the inertia that the model's step adds to its rotor: no fault of the rotor's.
+  rotor = max(float(p[INDEX["armature"]]), 1e-12)
+  tolerance["armature"] = float(np.hypot(tolerance["armature"], plant.numerical_inertia / rotor))
   present = {
     "damping": p[INDEX["damping"]] > 0,
     "armature": p[INDEX["armature"]] > 0.1 * inertia,

@@ -137,6 +137,17 @@ class JointPlant:
     self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
     self._nominal = [(s.inertia, s.here, s.across, s.at, s.bias) for s in self.surroundings]
 
+  @property
+  def numerical_inertia(self) -> float:
+    """Inertia, kg m^2 (or kg), that the scheme's step adds to the joint's.
+
+    An implicit step has the force of damping at its end, half a step from its middle, as if half a
+    step of it were mass; an explicit one has it at its start.
+    """
+    damping, servo = self.declared[kernel.INDEX["damping"]], self.declared[kernel.INDEX["velocity"]]
+    explicit = self.declared[kernel.INDEX["servo_explicit"]] > 0
+    return float(0.5 * self.step * (damping + (servo if explicit else -servo)))
+
   def _windows(self, log: Measured, window_s: float, first_velocity: float) -> Windows:
     if self.holds:
       return Windows(np.array([0]), log.position[:1].astype(float), np.array([first_velocity]))

@@ -207,7 +207,7 @@ def constants_off(subject: Subject, best: Scored, settings: Settings) -> bool:
   term = best.terms[0]
   if subject.before is not None or term.freed:
     return False
-  tolerance, values = dict(settings.tolerances), best.fit.values(term)
+  tolerance, values = dict(zip(term.names, term.prior, strict=True)), best.fit.values(term)
   bounds = intervals.intervals(subject.now, best.fit, term, own_latency=True)
 
   def off(name: str) -> bool:

@@ -33,6 +33,20 @@ def test_healthy_machine_is_not_accused() -> None:
   assert found.effects == []
 
 
+def test_a_models_long_step_is_no_fault_of_the_machine() -> None:
+  machine = PENDULUM.replace('damping="1.0"', 'damping="2.5"').replace("-4 4", "-12 12")
+  machine = machine.replace('kp="21"', 'kp="60"').replace('timestep="0.001"', 'timestep="0.0005"')
+  kinds = ("sweep", "slow", "steps")
+  logs = [log_of(machine, kind, rounding=2e-5, seed=i) for i, kind in enumerate(kinds)]
+  model = mujoco.MjModel.from_xml_string(machine)
+  model.opt.timestep = 0.004
+  found = analyse(model, logs)
+  assert (found.verdict, found.effects) == ("none", [])
+  (joint,) = found.joints
+  constants = joint.found.best.terms[0]
+  assert joint.found.best.fit.values(constants)["armature"] < -0.06
+
+
 def test_delay_is_named_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   logs = logs_of(PENDULUM, [Effect("command_delay", "joint", {"delay": 0.04})])
   held = log_of(PENDULUM, "sweep", [Effect("command_delay", "joint", {"delay": 0.04})], seed=9)

@@ -22,7 +22,9 @@ from nerf2real.sysid.settings import SETTINGS
   ],
 )
 def test_a_constant_is_off_by_more_than_copies_differ_by(monkeypatch, name, value, half, off):
-  term = SimpleNamespace(names=(name, "zero"), freed=False)
+  tolerance = dict(SETTINGS.tolerances)
+  prior = (tolerance[name], tolerance["zero"])
+  term = SimpleNamespace(names=(name, "zero"), freed=False, prior=prior)
   values = {name: value, "zero": 0.5}
   best = SimpleNamespace(terms=[term], fit=SimpleNamespace(values=lambda term: values))
   bounds = {name: (value - half, value + half), "zero": (0.4, 0.6)}
