@@ -1,7 +1,7 @@
 """Opens models, and measured logs of any format that is read: MCAP, CSV, BAM's JSON."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import mujoco
@@ -15,6 +15,7 @@ from nerf2real.sysid.data.bam import UNNAMED, read_bam
 from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.tables import read_csv
 from nerf2real.sysid.model.drive import joint_of
+from nerf2real.sysid.model.supported import left_out
 
 
 def read_log(path: str | Path) -> Log:
@@ -99,11 +100,27 @@ def from_first_command(log: Log) -> Log:
   return dataclasses.replace(log, states=begun, recorded=states)
 
 
+def without_commands(log: Log, joints: Collection[str]) -> Log:
+  """Returns a log in which joints are measured and not commanded."""
+  commands = log.commands
+  kept = [n for n, name in enumerate(commands.joints) if name not in joints]
+  fields = (commands.position, commands.velocity, commands.effort)
+  told = JointSeries(
+    *(tuple(commands.joints[n] for n in kept), commands.stamp, commands.log_time),
+    *(None if values is None else values[:, kept] for values in fields),
+  )
+  return dataclasses.replace(log, commands=told)
+
+
 def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:
-  """Reads logs, whose states begin with their commands, and checks them against the model."""
+  """Reads logs, whose states begin with their commands, and checks them against the model; joints
+  that cannot be simulated alone are not commanded there, unless all are such."""
   logs = []
   for path in paths:
     log = from_first_command(without_fillers(named(read_log(path), model)))
     check_against_model(log, model)
+    beyond = left_out(model, log.commands.joints)
+    if len(beyond) < len(log.commands.joints):
+      log = without_commands(log, beyond)
     logs.append(log)
   return logs

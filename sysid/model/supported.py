@@ -1,6 +1,8 @@
-"""What of a declared model the simulation of one joint holds; anything else is refused.
+"""What of a declared model the simulation of one joint holds; joints with more are not judged.
 
-A feature that is left out silently makes a healthy machine look as if it had an effect.
+A feature that is left out silently makes a healthy machine look as if it had an effect. A joint
+with one, as the finger of a gripper that is tied to another, stands in the way of no other joint:
+it is one that is measured and not commanded.
 """
 
 from collections.abc import Sequence
@@ -14,20 +16,28 @@ from nerf2real.sysid.model.drive import actuator_of
 _CHAIN = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
-def check_supported(model: mujoco.MjModel, joints: Sequence[str]) -> None:
-  """Raises a ValueError where the model has a feature at joints that identification leaves out.
+def left_out(model: mujoco.MjModel, joints: Sequence[str]) -> dict[str, str]:
+  """Returns which joints have a feature that identification leaves out, and which.
 
   Args:
     model: declared model.
-    joints: hinges and slides that logs command, each with an actuator.
+    joints: hinges and slides, each with an actuator.
   """
-  for name in joints:
-    found = _beyond(model, name)
-    if found is not None:
-      raise ValueError(
-        f"The model has {found} at joint {name!r}, which identification leaves out: expected a "
-        "hinge or slide with one motor or servo without a state; give a model without it."
-      )
+  found = {name: _beyond(model, name) for name in joints}
+  return {name: what for name, what in found.items() if what is not None}
+
+
+def check_supported(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+  """Raises a ValueError where no joint is without a feature that identification leaves out; see
+  `left_out`."""
+  found = left_out(model, joints)
+  if len(found) < len(joints):
+    return
+  for name, what in found.items():
+    raise ValueError(
+      f"The model has {what} at joint {name!r}, which identification leaves out: expected a hinge "
+      "or slide with one motor or servo without a state; give a model without it."
+    )
 
 
 def _beyond(model: mujoco.MjModel, joint: str) -> str | None:

@@ -3,9 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.sysid.model.drive import actuators_of
+from nerf2real.sysid.model.supported import left_out
 from nerf2real.sysid.selection.joints.changed import Changed
 from nerf2real.sysid.settings import SETTINGS
 
@@ -26,6 +29,17 @@ def still(joints: Sequence[str]) -> list[str]:
     f"Commanded and not moving in the logs or in the reference, and so not judged: "
     f"{', '.join(joints)}. Command a motion, or look whether they are stuck or switched off."
   ]
+
+
+def beyond(model: mujoco.MjModel, log: Log) -> list[str]:
+  """Returns a sentence on measured joints that are driven and cannot be simulated alone; none where
+  there are none."""
+  driven = [name for name in log.joints if actuators_of(model, name)]
+  found = left_out(model, driven)
+  if not found:
+    return []
+  each = ", ".join(f"{name} ({what})" for name, what in found.items())
+  return [f"Not judged, as the model has there what identification leaves out: {each}."]
 
 
 def another_session(item: Changed) -> list[str]:

@@ -4,10 +4,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from nerf2real.sysid.data import opening
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.supported import check_supported, on_a_stand
+from nerf2real.sysid.outputs import notes
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 SERVO = '<position name="joint" joint="joint"'
@@ -52,6 +54,26 @@ def test_ranges_of_force_and_command_hold_at_one_joint_as_in_mujoco(old, new):
   free = log_of(PENDULUM, "steps", duration=4.0).states.position[:, 0]
   assert np.abs(course - free).max() > 0.05, "the limit must act"
   assert np.sqrt(np.mean((course - log.states.position[:, 0]) ** 2)) < 1e-6
+
+
+def test_a_joint_that_cannot_be_simulated_alone_stands_in_no_others_way(tmp_path, monkeypatch):
+  tied = ARM.replace(END, f'<equality><joint joint1="elbow"/></equality>{END}')
+  model = mujoco.MjModel.from_xml_string(tied)
+  told = log_of(ARM, "sweep", duration=2.0)
+  monkeypatch.setattr(opening, "read_log", lambda _: told)
+  (log,) = opening.read_logs([tmp_path], model)
+  assert log.commands.joints == ("shoulder",) and log.joints == told.joints
+  np.testing.assert_array_equal(log.commands.position, told.commands.position[:, :1])
+  check_supported(model, log.commands.joints)
+  (note,) = notes.beyond(model, log)
+  assert "elbow (an equality constraint)" in note
+  both = mujoco.MjModel.from_xml_string(
+    tied.replace('"elbow"/></eq', '"elbow" joint2="shoulder"/></eq')
+  )
+  (log,) = opening.read_logs([tmp_path], both)
+  with pytest.raises(ValueError, match="an equality constraint at joint 'shoulder'"):
+    check_supported(both, log.commands.joints)
+  assert notes.beyond(mujoco.MjModel.from_xml_string(ARM), told) == []
 
 
 def test_a_free_base_is_held_where_the_model_has_it(tmp_path):
