@@ -72,12 +72,12 @@ class _Lines:
     self._name, self._console = name, console
     self._begin = self._printed = time.monotonic()
     self._told = False
-    self._last = (0.0, "")
+    self._last = (0.0, "", self._begin)
     self._lock = threading.Lock()
 
   def __call__(self, fraction: float, text: str) -> None:
     with self._lock:
-      self._last = (fraction, text)
+      self._last = (fraction, text, time.monotonic())
       ends = fraction >= 1.0 and self._told  # a short stage says nothing
       if time.monotonic() - self._printed >= _LINE_PERIOD or ends:
         self._print()
@@ -90,9 +90,11 @@ class _Lines:
           self._print()
 
   def _print(self) -> None:
-    fraction, text = self._last
+    fraction, text, reported = self._last
     self._printed, self._told = time.monotonic(), True
     took = self._printed - self._begin
-    left = f", about {took / fraction - took:.0f} s left" if 0.01 < fraction < 1.0 else ""
+    # A silence is a part of what was left at the last report, it does not make all else longer.
+    rest = (reported - self._begin) / fraction - took if 0.01 < fraction < 1.0 else 0.0
+    left = f", about {rest:.0f} s left" if rest > 0.0 else ""
     line = f"{self._name}: {fraction:.0%} after {took:.0f} s{left}: {text}"
     self._console.print(line, soft_wrap=True, highlight=False, markup=False)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import Log, moves
 from nerf2real.sysid.design import excitation
 from nerf2real.sysid.design.information import Place, beside, information, places
@@ -96,6 +97,7 @@ def of_machine(
   repeated: bool,
   settings: Settings,
   reductions: Sequence[Reduction] | None = None,
+  progress: Progress = no_progress,
 ) -> list[Identifiability]:
   """Returns what logs can show of every joint that all of them command and that moves, before
   anything is fitted.
@@ -106,6 +108,7 @@ def of_machine(
     repeated: whether reference logs tell the constants, so that they vary by `settings.repeat`.
     settings: tolerances.
     reductions: of the logs, where they were made before.
+    progress: called with the fraction done and a text.
   """
   joints = [
     name
@@ -118,7 +121,8 @@ def of_machine(
     settings = dataclasses.replace(settings, tolerances=settings.repeat)
   reductions = reductions or [Reduction(model, log) for log in logs]
   result = []
-  for joint in joints:
+  for k, joint in enumerate(joints):
+    progress(k / len(joints), f"what the logs can show of {joint}, {k + 1} of {len(joints)} joints")
     plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)
     library = own_library(plant, alone=len(joints) == 1)
     result.append(identifiability(JointLikelihood(plant, settings=settings), library))

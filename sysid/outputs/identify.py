@@ -17,7 +17,7 @@ import numpy as np
 from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.core.pages import page
-from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import write_effects
@@ -39,11 +39,12 @@ from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.sensors import sensing
 from nerf2real.sysid.settings import SETTINGS, Settings
 
-_SHOWN, _ANALYSIS, _SENSORS, _ERRORS = (
+_REDUCED, _SHOWN, _ANALYSIS, _SENSORS, _ERRORS = (
   0.05,
-  0.8,
-  0.85,
-  0.95,
+  0.25,
+  0.9,
+  0.92,
+  0.97,
 )  # shares of the work done after each, about
 
 
@@ -86,9 +87,9 @@ def identify(
   logs, others = read_logs(train, compiled), read_logs(held, compiled)
   healthy = read_logs(reference, compiled)
   check_supported(compiled, logs[0].commands.joints)
-  for part in filter(None, (logs, healthy)):
-    check_motion(part)
-    check_length(part, settings.block_s)
+  for recorded in filter(None, (logs, healthy)):
+    check_motion(recorded)
+    check_length(recorded, settings.block_s)
   _check_joints(logs, [*others, *healthy])
   with lock_folder(out):
     return _identify(
@@ -116,14 +117,25 @@ def _identify(
 ) -> dict[str, Any]:
   """Analyses logs that were read, and writes; see `identify`."""
   began = time.perf_counter()
-  progress(0.0, "what the logs can show")
+  progress(0.0, "one joint of many: what each feels of the others")
   stand = on_a_stand(model, compiled)
   reductions = [Reduction(stand, log) for log in logs]
   shown = identifiability.of_machine(
-    stand, logs, repeated=bool(reference), settings=settings, reductions=reductions
+    stand,
+    logs,
+    repeated=bool(reference),
+    settings=settings,
+    reductions=reductions,
+    progress=part(progress, _REDUCED, _SHOWN),
   )
-  progress(_SHOWN, "comparing with the reference" if reference else "explaining every joint")
-  found = analyse(stand, logs, reference, reductions=reductions, settings=settings)
+  found = analyse(
+    stand,
+    logs,
+    reference,
+    reductions=reductions,
+    settings=settings,
+    progress=part(progress, _SHOWN, _ANALYSIS),
+  )
   by_duty, before = servo.rows(found)
   found.in_reference += before
   _add(found, by_duty)

@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import Log, moves
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
@@ -28,6 +29,7 @@ from nerf2real.sysid.selection.wider.scopes import Shared
 from nerf2real.sysid.settings import SETTINGS, Settings
 
 _GRADES = ("none", "effects", "partly", "unexplained")
+_PREPARED, _SHARED = 0.2, 0.4  # shares of the work done after constants and wider scopes, about
 _ALL_OFF = 0.6  # share of joints with constants that are off that stands for all
 
 
@@ -38,6 +40,7 @@ def analyse(
   *,
   reductions: Sequence[Reduction] | None = None,
   settings: Settings = SETTINGS,
+  progress: Progress = no_progress,
 ) -> Identified:
   """Returns what a machine has that its model, or reference logs, have not.
 
@@ -50,6 +53,7 @@ def analyse(
     reference: logs of the same machine without what is looked for.
     reductions: of the logs, where they were made before.
     settings: tolerances and effort.
+    progress: called with the fraction done and a text.
 
   Raises:
     ValueError: no joint has an actuator and commands in all logs, and moves.
@@ -68,11 +72,13 @@ def analyse(
     )
   made = reductions or [Reduction(model, log) for log in logs]
   both = list(made), [Reduction(model, log) for log in reference]
-  subjects = [
-    prepare(model, joint, logs, reference, reductions=both, tried=len(joints), settings=settings)
-    for joint in joints
-  ]
-  shared, changed = _explained(model, subjects, settings)
+  subjects = []
+  for k, joint in enumerate(joints):
+    progress(_PREPARED * k / len(joints), f"constants of {joint}, {k + 1} of {len(joints)} joints")
+    subjects.append(
+      prepare(model, joint, logs, reference, reductions=both, tried=len(joints), settings=settings)
+    )
+  shared, changed = _explained(model, subjects, settings, part(progress, _PREPARED, 1.0))
   origins = [s.origin.joint for s in shared]
   changed.sort(
     key=lambda c: (
@@ -97,23 +103,30 @@ def analyse(
 
 
 def _explained(
-  model: mujoco.MjModel, subjects: Sequence[Subject], settings: Settings
+  model: mujoco.MjModel, subjects: Sequence[Subject], settings: Settings, progress: Progress
 ) -> tuple[list[Shared], list[Changed]]:
   """Returns what joints share and what each has of its own, until nothing shared is needless."""
+  alone = part(progress, (_SHARED - _PREPARED) / (1.0 - _PREPARED), 1.0)
   before = [s.state for s in subjects]
   refuted: set[str] = set()
   certain: set[str] = set()
   while True:
     shared: list[Shared] = []
     if len(subjects) > 1:
+      progress(0.0, "effects of bodies and of the whole machine")
       shared = scopes.shared_effects(model, subjects, settings, refuted=refuted, certain=certain)
     for subject in subjects:
       if subject.alone or changes.leaves(subject, subject.explainer.null, settings):
         explain_reference(subject, settings)
-    changed = [changes.explain(subject, settings) for subject in subjects]
+    changed = []
+    for k, subject in enumerate(subjects):
+      text = f"explaining {subject.joint}, {k + 1} of {len(subjects)} joints"
+      alone(k / len(subjects), text)
+      changed.append(changes.explain(subject, settings))
     needless = scopes.needless(shared, changed)
     fresh = scopes.open_scopes(changed) - certain - refuted
     if not needless and not fresh:
+      alone(1.0, "what joints share beside what is their own")
       shared, changed = _reopened(model, shared, changed, settings, refuted)
       shared = scopes.with_twins(shared, changed)
       changed = zeros.reread(model, changed, settings)

@@ -60,6 +60,22 @@ def test_a_pipe_gets_lines_with_the_time_left(monkeypatch):
   ]
 
 
+def test_a_silence_does_not_make_the_rest_longer(monkeypatch):
+  now = [0.0]
+  monkeypatch.setattr(time, "monotonic", lambda: now[0])
+  stream = io.StringIO()
+  lines = progress_module._Lines("depth", Console(file=stream))
+  now[0] = 20.0
+  lines(0.25, "picture")
+  for now[0] in (50.0, 90.0):
+    lines._print()
+  assert stream.getvalue().splitlines() == [
+    "depth: 25% after 20 s, about 60 s left: picture",
+    "depth: 25% after 50 s, about 30 s left: picture",
+    "depth: 25% after 90 s: picture",
+  ]
+
+
 def test_a_short_stage_says_nothing_in_a_pipe():
   stream = io.StringIO()
   with progress_bar("depth", console=Console(file=stream)) as progress:

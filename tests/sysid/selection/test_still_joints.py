@@ -44,8 +44,11 @@ def test_a_joint_that_does_not_move_is_noted_and_not_judged(where, monkeypatch):
   parts = {"logs": [log], "reference": [log]} | {where: [_frozen(log, "elbow")]}
   monkeypatch.setattr(analysis, "prepare", lambda model, joint, *_, **__: judged.append(joint))
   monkeypatch.setattr(analysis, "_explained", lambda *_: ([], []))
-  found = analysis.analyse(MODEL, parts["logs"], parts["reference"])
+  told: list[tuple[float, str]] = []
+  reports = lambda *report: told.append(report)  # noqa: E731
+  found = analysis.analyse(MODEL, parts["logs"], parts["reference"], progress=reports)
   assert judged == ["shoulder"] and found.still == ["elbow"]
+  assert told == [(0.0, "constants of shoulder, 1 of 1 joints")]
   (note,) = notes.still(found.still)
   assert "elbow" in note and not notes.still([])
 
