@@ -4,7 +4,8 @@ One row a reading. Columns are `time` [s] and, with a joint's name after the col
 `command_position:J`, `command_velocity:J`, `command_effort:J`, `position:J`, `velocity:J`,
 `effort:J`, `duty:J` and `temperature:J` (SI, degrees Celsius), and `voltage`. An empty field is a
 value that was not read at that time, so commands and states may have rows of their own; a column
-without values is as none. `velocity:J` is not looked at: velocities are those of the positions.
+without values is as none. Joints may be commanded by different quantities, as wheels by velocity
+beside an arm by position. `velocity:J` is not looked at: velocities are those of the positions.
 """
 
 import csv
@@ -45,7 +46,7 @@ def read_csv(path: Path) -> Log:
     quantity, _, joint = name.partition(":")
     quantities.setdefault(quantity, {})[joint] = values
   stamps = time - start
-  commands = _series(path, stamps, quantities, COMMANDED)
+  commands = _series(path, stamps, quantities, COMMANDED, mixed=True)
   states = _series(path, stamps, quantities, ("position", None, "effort"))
   if commands is None or states is None or states.position is None:
     lacks = (
@@ -116,21 +117,35 @@ def _series(
   stamps: np.ndarray,
   quantities: dict[str, dict[str, np.ndarray]],
   fields: Sequence[str | None],
+  *,
+  mixed: bool = False,
 ) -> JointSeries | None:
-  """Returns the rows in which quantities were read, as position, velocity and effort."""
+  """Returns the rows in which quantities were read, as position, velocity and effort.
+
+  Args:
+    path: for messages.
+    stamps: of all rows [N], s.
+    quantities: columns [N] by joint, by quantity.
+    fields: the quantities that are position, velocity and effort there.
+    mixed: whether joints may have different ones: NaN stands where a joint has none.
+  """
   present = [name for name in fields if name is not None and name in quantities]
   if not present:
     return None
-  joints = tuple(quantities[present[0]])
-  arrays: dict[str, np.ndarray] = {}
+  joints = tuple(dict.fromkeys(joint for name in present for joint in quantities[name]))
   for name in present:
-    if set(quantities[name]) != set(joints):
+    if not mixed and set(quantities[name]) != set(joints):
+      others = next(n for n in present if set(quantities[n]) != set(quantities[name]))
       raise LogError(
-        f"{path.name} has {name} of {sorted(quantities[name])} and {present[0]} of "
-        f"{sorted(joints)}, expected the same joints."
+        f"{path.name} has {name} of {sorted(quantities[name])} and {others} of "
+        f"{sorted(quantities[others])}, expected the same joints."
       )
-    arrays[name] = np.stack([quantities[name][joint] for joint in joints], axis=1)
-  read = ~np.isnan(np.concatenate(list(arrays.values()), axis=1))
+  none = np.full(len(stamps), math.nan)
+  arrays = {
+    name: np.stack([quantities[name].get(joint, none) for joint in joints], axis=1)
+    for name in present
+  }
+  read = ~np.isnan(np.stack([c for name in present for c in quantities[name].values()], axis=1))
   rows = read.any(axis=1)
   if not read[rows].all():
     line = int(np.flatnonzero(rows & ~read.all(axis=1))[0]) + 2

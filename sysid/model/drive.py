@@ -52,6 +52,8 @@ def command_of(log: Log, model: mujoco.MjModel, joint: str) -> Array | None:
   if values is None:
     return None
   column: Array = values[:, log.commands.column(joint)]
+  if np.isnan(column).all():  # it is told another quantity
+    return None
   return np.clip(column, *model.actuator_ctrlrange[u]) if model.actuator_ctrllimited[u] else column
 
 

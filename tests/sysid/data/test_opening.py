@@ -15,6 +15,7 @@ from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.opening import from_first_command, named, read_log, read_logs
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.model import simulation
+from nerf2real.sysid.model.drive import command_of
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.measured import measured
 from nerf2real.sysid.model.motion import smooth_motion
@@ -145,6 +146,25 @@ def test_columns_without_values_and_gaps_in_velocities_are_no_errors(tmp_path):
   empty = [lines[0], *(",".join([(f := line.split(","))[0], "", *f[2:]]) for line in lines[1:])]
   with pytest.raises(LogError, match="no column command_position:JOINT or .* with values, found"):
     read_log(csv_of(tmp_path, empty))
+
+
+def test_joints_of_one_machine_are_commanded_by_what_each_takes(tmp_path):
+  lines = ["time,command_position:shoulder,command_velocity:elbow,position:shoulder,position:elbow"]
+  lines += [
+    f"{t:.4f},{0.5 * p:.6f},{2 * p:.6f},{p:.6f},{3 * p:.6f}"
+    for t, p in zip(TIME, PATH, strict=True)
+  ]
+  servo = ARM[ARM.index('<position name="elbow"') : ARM.index("</actuator>")]
+  wheel = mujoco.MjModel.from_xml_string(ARM.replace(servo, '<velocity joint="elbow" kv="2"/>'))
+  (log,) = read_logs([csv_of(tmp_path, lines)], wheel)
+  assert log.commands.joints == ("shoulder", "elbow")
+  np.testing.assert_allclose(command_of(log, wheel, "shoulder"), 0.5 * PATH, atol=1e-6)
+  np.testing.assert_allclose(command_of(log, wheel, "elbow"), 2 * PATH, atol=1e-6)
+  with pytest.raises(LogError, match=r"no positions in .* which the model's actuator on 'elbow'"):
+    read_logs([tmp_path / "log.csv"], mujoco.MjModel.from_xml_string(ARM))
+  other = [lines[0].replace("position:elbow", "effort:elbow"), *lines[1:]]
+  with pytest.raises(LogError, match=r"position of \['shoulder'\] and effort of \['elbow'\]"):
+    read_log(csv_of(tmp_path, other))
 
 
 @pytest.mark.parametrize(
