@@ -16,9 +16,27 @@ _GAP = 0.0044
 """rad of play that healthy gears have: 0.25 degrees (data sheet of the XM430-W350)."""
 
 
-def own_size(plant: JointModel, kind: str, name: str) -> float:
-  """Returns how much of an effect's parameter is no fault: models leave it out of all machines."""
-  return _GAP if (kind, name) == ("backlash", "gap") and plant.hinge else 0.0
+def own_size(
+  plant: JointModel, kind: str, name: str, settings: Settings = SETTINGS, *, repeated: bool = False
+) -> float:
+  """Returns how much of an effect's parameter is no fault: models leave it out of all machines.
+
+  A position servo's own damping is declared no better than a joint's, and no constant is it: its
+  gain alone is.
+
+  Args:
+    plant: the joint.
+    kind: of the effect.
+    name: of the parameter.
+    settings: tolerances.
+    repeated: whether a reference shows the machine.
+  """
+  if (kind, name) == ("backlash", "gap"):
+    return _GAP if plant.hinge else 0.0
+  if (kind, name) == ("viscous_friction", "coefficient") and plant.holds:
+    share = dict(settings.repeat if repeated else settings.tolerances)["damping"]
+    return share * max(0.0, -float(plant.declared[INDEX["velocity"]]))
+  return 0.0
 
 
 _USUAL = 2.0

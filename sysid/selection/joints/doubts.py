@@ -114,7 +114,9 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   sizes = {p.name: p.nominal for p in kind_of(kind).parameters if not p.shape}
   bounds = intervals.intervals(subject.now, best.fit, term, own_latency=alone)
   return any(
-    not low - own_size(subject.now.plant, kind, name) <= sizes[name] <= high
+    not low - own_size(subject.now.plant, kind, name, subject.now.settings, repeated=not alone)
+    <= sizes[name]
+    <= high
     for name, (low, high) in bounds.items()
     if name in sizes
   )

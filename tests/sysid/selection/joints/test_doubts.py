@@ -7,6 +7,7 @@ import pytest
 
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.selection.joints import doubts
 from nerf2real.sysid.settings import SETTINGS
 
@@ -117,6 +118,24 @@ def test_play_of_a_healthy_gear_is_nothing(monkeypatch, reference, low, hinge, s
   judged = SimpleNamespace(before=reference, now=now)
   best = SimpleNamespace(terms=[term], fit=None)
   assert doubts.is_something(judged, best, "backlash") == something
+
+
+@pytest.mark.parametrize(
+  ("reference", "low", "something"),
+  [(None, 5.0, False), (None, 7.0, True), (object(), 1.0, False), (object(), 2.0, True)],
+)
+def test_damping_that_a_servos_own_is_off_by_is_nothing(monkeypatch, reference, low, something):
+  bounds = {"coefficient": (low, low + 1.0)}  # N m s/rad, of a servo that is declared with 100
+  monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
+  declared = np.zeros(len(INDEX))
+  declared[INDEX["velocity"]] = -100.0
+  now = SimpleNamespace(settings=SETTINGS, plant=SimpleNamespace(declared=declared, holds=True))
+  term = SimpleNamespace(name="viscous_friction", names=("coefficient",), freed=False)
+  judged = SimpleNamespace(before=reference, now=now)
+  best = SimpleNamespace(terms=[term], fit=None)
+  assert doubts.is_something(judged, best, "viscous_friction") == something
+  declared[:] = 0.0
+  assert doubts.is_something(judged, best, "viscous_friction")
 
 
 @pytest.mark.parametrize("without, new", [(-0.1, True), (-5.0, False)])
