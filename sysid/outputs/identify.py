@@ -30,7 +30,15 @@ from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.supported import check_supported, on_a_stand
 from nerf2real.sysid.outputs.details import claimed_effects, details_of
 from nerf2real.sysid.outputs.errors import errors, floor
-from nerf2real.sysid.outputs.notes import another_session, beyond, of_one, spread, still, supply
+from nerf2real.sysid.outputs.notes import (
+  another_session,
+  beyond,
+  long_step,
+  of_one,
+  spread,
+  still,
+  supply,
+)
 from nerf2real.sysid.outputs.rivals import alternatives, next_motion, residual_at
 from nerf2real.sysid.report import capability, samples, servo
 from nerf2real.sysid.report import page as report
@@ -165,6 +173,7 @@ def _identify(
       *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
       *still(found.still),
       *beyond(compiled, logs[0]),
+      *long_step(found.joints),
       *supply(logs, reference),
       *(note for item in found.found for note in another_session(item)),
       *sensed.notes,

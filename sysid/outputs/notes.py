@@ -8,6 +8,7 @@ import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model.drive import actuators_of
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.supported import left_out
 from nerf2real.sysid.selection.joints.changed import Changed
 from nerf2real.sysid.settings import SETTINGS
@@ -40,6 +41,27 @@ def beyond(model: mujoco.MjModel, log: Log) -> list[str]:
     return []
   each = ", ".join(f"{name} ({what})" for name, what in found.items())
   return [f"Not judged, as the model has there what identification leaves out: {each}."]
+
+
+def long_step(joints: Sequence[Changed]) -> list[str]:
+  """Returns a sentence on joints whose damping the model's step holds badly; none without such."""
+  shares = {}
+  for item in joints:
+    plant = item.likelihood.plant
+    inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
+    inertia += float(plant.declared[INDEX["armature"]])
+    shares[item.joint] = abs(plant.numerical_inertia) / inertia
+  most = dict(SETTINGS.tolerances)["armature"]
+  names = [joint for joint, share in shares.items() if share > most]
+  if not names:
+    return []
+  step = 1e3 * joints[0].likelihood.plant.step
+  return [
+    f"The model's step of {step:.3g} ms is long for the damping at {', '.join(names)}: that acts as"
+    f" up to {100 * max(shares.values()):.0f} % more inertia, which the machine has not, and as"
+    f" {step / 2:.3g} ms of lag. Constants, damping and latencies that are off by as much are the"
+    " step's: set a shorter timestep in the model."
+  ]
 
 
 def another_session(item: Changed) -> list[str]:

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf2real.sysid.outputs.notes import another_session, supply
+from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.outputs.notes import another_session, long_step, supply
 
 
 @pytest.mark.parametrize(
@@ -17,6 +18,23 @@ def test_a_reference_of_another_session_is_said(paired, apart, said):
   notes = another_session(SimpleNamespace(joint="knee", subject=subject))  # type: ignore[arg-type]
   assert len(notes) == said
   assert all("reference of knee" in note and "friction by 15 %" in note for note in notes)
+
+
+def test_a_step_that_is_long_for_a_joints_damping_is_said():
+  declared = np.zeros(len(INDEX))
+  declared[INDEX["armature"]] = 0.04
+  around = [SimpleNamespace(inertia=np.array([0.05, 0.07]))]
+  plants = [
+    SimpleNamespace(declared=declared, surroundings=around, numerical_inertia=added, step=0.002)
+    for added in (0.001, 0.015)
+  ]
+  found = [
+    SimpleNamespace(joint=name, likelihood=SimpleNamespace(plant=plant))
+    for name, plant in zip(("elbow", "wrist"), plants, strict=True)
+  ]
+  (said,) = long_step(found)  # type: ignore[arg-type]
+  assert "step of 2 ms is long for the damping at wrist: that acts as up to 15 % more" in said
+  assert not long_step(found[:1])  # type: ignore[arg-type]
 
 
 def _logs(*volts):
