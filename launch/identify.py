@@ -108,8 +108,8 @@ def _print_content(content: dict[str, Any], out: Path) -> None:
     error = content["error"][name]
     if error:
       worse = " (worse: do not use it)" if evaluation.is_worse(error) else ""
-      print(f"{name}: {error['before']:.5f} -> {error['after']:.5f} rad (or m) RMSE{worse}")
-  print(f"floor: {content['error']['floor']:.5f}; report: {out / 'report.html'}")
+      print(f"{name}: {error['before']:.3g} -> {error['after']:.3g} rad (or m) RMSE{worse}")
+  print(f"floor: {content['error']['floor']:.3g}; report: {out / 'report.html'}")
 
 
 def _place(effect: dict[str, Any]) -> str:
@@ -130,7 +130,7 @@ def _print_errors(folder: Path, held: Sequence[Path]) -> None:
   table = Table("log", "declared", "extended", "lower by")
   for row in sysid.evaluate(folder, held):
     ratio = row["before"] / max(row["after"], 1e-12)
-    errors = f"{row['before']:.6f}", f"{row['after']:.6f}"
+    errors = f"{row['before']:.3g}", f"{row['after']:.3g}"
     table.add_row(escape(row["log"]), *errors, f"{ratio:.2f} times")
   rich.print(table)
 

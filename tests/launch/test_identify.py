@@ -140,10 +140,11 @@ def test_words_and_paths_are_told_as_they_are(capsys, tmp_path):
     "seconds": 1.0,
     "effects": [],
     "notes": ["held[a].mcap has a bias of 0.1 [rad]."],
-    "error": {"train": None, "held": None, "floor": 0.001},
+    "error": {"train": {"before": 0.00172, "after": 6.1e-05}, "held": None, "floor": 3.2e-06},
   }
   out = tmp_path / "a folder with a long name" / "another one that is as long [as this]"
   script._print_content(content, out)
   told = capsys.readouterr().out
   assert "note: held[a].mcap has a bias of 0.1 [rad].\n" in told
-  assert f"report: {out / 'report.html'}\n" in told
+  assert "train: 0.00172 -> 6.1e-05 rad" in told  # of a slide, m: micrometres count
+  assert f"floor: 3.2e-06; report: {out / 'report.html'}\n" in told
