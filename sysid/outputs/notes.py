@@ -44,9 +44,10 @@ def beyond(model: mujoco.MjModel, log: Log) -> list[str]:
 
 
 def long_step(joints: Sequence[Changed]) -> list[str]:
-  """Returns a sentence on joints whose damping the model's step holds badly; none without such."""
+  """Returns a sentence on joints that have something and whose damping the model's step holds
+  badly; none without such."""
   shares = {}
-  for item in joints:
+  for item in (j for j in joints if j.verdict != "none"):
     plant = item.likelihood.plant
     inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
     inertia += float(plant.declared[INDEX["armature"]])
@@ -58,7 +59,7 @@ def long_step(joints: Sequence[Changed]) -> list[str]:
   step = 1e3 * joints[0].likelihood.plant.step
   return [
     f"The model's step of {step:.3g} ms is long for the damping at {', '.join(names)}: that acts as"
-    f" up to {100 * max(shares.values()):.0f} % more inertia, which the machine has not, and as"
+    f" inertia which the machine has not, up to {max(shares.values()):.2g} times its own, and as"
     f" {step / 2:.3g} ms of lag. Constants, damping and latencies that are off by as much are the"
     " step's: set a shorter timestep in the model."
   ]

@@ -29,12 +29,15 @@ def test_a_step_that_is_long_for_a_joints_damping_is_said():
     for added in (0.001, 0.015)
   ]
   found = [
-    SimpleNamespace(joint=name, likelihood=SimpleNamespace(plant=plant))
+    SimpleNamespace(joint=name, verdict="effects", likelihood=SimpleNamespace(plant=plant))
     for name, plant in zip(("elbow", "wrist"), plants, strict=True)
   ]
   (said,) = long_step(found)  # type: ignore[arg-type]
-  assert "step of 2 ms is long for the damping at wrist: that acts as up to 15 % more" in said
+  assert "step of 2 ms is long for the damping at wrist: that acts as inertia" in said
+  assert "up to 0.15 times its own, and as 1 ms of lag" in said
   assert not long_step(found[:1])  # type: ignore[arg-type]
+  found[1].verdict = "none"
+  assert not long_step(found)  # type: ignore[arg-type]
 
 
 def _logs(*volts):
