@@ -4,6 +4,9 @@ import dataclasses
 
 import numpy as np
 
+_TRIES = 500  # of fits to three points each
+_KEPT = 2.5  # robust standard deviations within which points count (Rousseeuw and Leroy 1987)
+
 
 @dataclasses.dataclass(frozen=True)
 class Similarity:
@@ -57,3 +60,29 @@ class Similarity:
     variance = ((source - centre_s) ** 2).sum() / len(source)
     scale = float(np.trace(np.diag(values) @ sign) / variance) if with_scale else 1.0
     return cls(scale, rotation, centre_t - scale * rotation @ centre_s)
+
+  @classmethod
+  def fit_most(
+    cls, source: np.ndarray, target: np.ndarray, *, with_scale: bool = True
+  ) -> "Similarity":
+    """Least-squares similarity of the points of source [N, 3] and target [N, 3] that most agree on.
+
+    Those within 2.5 robust standard deviations of the fit to three points that leaves the least
+    median of squares. Source: Rousseeuw and Leroy 1987, Robust regression and outlier detection.
+    """
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+
+    def squares(fit: "Similarity") -> np.ndarray:
+      return ((fit.apply(source) - target) ** 2).sum(axis=-1)
+
+    best = squares(cls.fit(source, target, with_scale=with_scale))
+    random = np.random.default_rng(0)
+    for _ in range(_TRIES):
+      rows = random.choice(len(source), 3, replace=False)
+      found = squares(cls.fit(source[rows], target[rows], with_scale=with_scale))
+      if np.median(found) < np.median(best):  # not so of three on a line, whose scale is no number
+        best = found
+    # the deviation of a normal distribution, with Rousseeuw's correction for few points
+    spread = 1.4826 * (1.0 + 5.0 / max(len(source) - 3, 1)) * np.sqrt(np.median(best))
+    kept = best <= max((_KEPT * spread) ** 2, np.median(best))
+    return cls.fit(source[kept], target[kept], with_scale=with_scale)

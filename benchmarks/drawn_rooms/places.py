@@ -8,7 +8,6 @@ altogether wrong: those are counted. No field is trained.
 
 import dataclasses
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from nerf2real.scenes.poses.localisation import LocalisationError
 from nerf2real.scenes.settings import preset
 
 _WRONG = 0.1  # m from the truth
-_TRIES = 500  # of fits to three places each
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,26 +36,9 @@ class Settings(harness.Options):
 
 
 def position_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-  """Distances [N] [m] by the similarity that most places agree with (least median of squares).
-
-  Args:
-    found: Positions [N, 3] in any frame.
-    true: The true ones [N, 3].
-  """
-  random, best = np.random.default_rng(0), np.full(len(found), np.inf)
-  for _ in range(_TRIES):
-    rows = random.choice(len(found), 3, replace=False)
-    try:
-      errors = _errors(found, true, rows)
-    except ValueError:  # three on a line
-      continue
-    if np.median(errors) < np.median(best):
-      best = errors
-  return _errors(found, true, np.argsort(best)[: len(best) // 2 + 1])
-
-
-def _errors(found: np.ndarray, true: np.ndarray, rows: Sequence[int] | np.ndarray) -> np.ndarray:
-  return np.linalg.norm(Similarity.fit(found[rows], true[rows]).apply(found) - true, axis=1)
+  """Distances [N] [m] of positions [N, 3] in any frame from the true ones [N, 3], by the similarity
+  that most agree on."""
+  return np.linalg.norm(Similarity.fit_most(found, true).apply(found) - true, axis=1)
 
 
 def localise(folder: Path, seed: int, kind: captures.Kind) -> dict[str, harness.Value]:

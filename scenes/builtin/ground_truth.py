@@ -121,8 +121,10 @@ def compare(
   pictures = np.load(ROBOT_VIEWS) if pictures is None else pictures
   world = result.alignment.world_from_unit.apply_pose(result.localisation.world_from_camera)
   found, true = world[:, :3, 3], true_poses[:, :3, 3]
-  free = Similarity.fit(found, true)  # poses may differ by any similarity
-  rigid = Similarity.fit(found, true, with_scale=False)  # everything else is metric
+  # Poses may differ by any similarity, everything else is metric. Most poses tell where: a few that
+  # are before the wrong one of two things alike would turn all that is right.
+  free = Similarity.fit_most(found, true)
+  rigid = Similarity.fit_most(found, true, with_scale=False)
   turned = free.rotation @ world[:, :3, :3]
   # rotation angle from the trace: 1 + 2 cos(angle)
   cosine = (np.einsum("nij,nij->n", turned, true_poses[:, :3, :3]) - 1) / 2

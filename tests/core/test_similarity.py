@@ -21,6 +21,26 @@ def test_fit_recovers_a_known_transform(transform):
   np.testing.assert_allclose(found.translation, transform.translation, atol=1e-12)
 
 
+def test_points_that_are_far_off_do_not_move_the_fit_of_most(transform):
+  random = np.random.default_rng(1)
+  points = random.normal(size=(40, 3))
+  moved = transform.apply(points)
+  moved[:8] += [2.0, 0.0, 1.0]
+  exact = Similarity.fit_most(points, moved)
+  assert exact.scale == pytest.approx(2.5)
+  np.testing.assert_allclose(exact.rotation, transform.rotation, atol=1e-9)
+  moved += random.normal(size=moved.shape) * 0.01
+  found = Similarity.fit_most(points, moved)
+  right = Similarity.fit(points[8:], moved[8:])
+  assert found.scale == pytest.approx(right.scale, rel=1e-3)
+  np.testing.assert_allclose(found.apply(points), right.apply(points), atol=0.01)
+  plain = Similarity.fit(points, moved).apply(points)
+  assert np.median(np.linalg.norm(plain - moved, axis=1)) > 0.1
+  rigid = Similarity.fit_most(points, moved / 2.5, with_scale=False)
+  assert rigid.scale == 1.0
+  np.testing.assert_allclose(rigid.rotation, transform.rotation, atol=0.01)
+
+
 def test_fit_never_mirrors():
   points = np.random.default_rng(2).normal(size=(10, 3))
   found = Similarity.fit(points, points * [1, 1, -1])
