@@ -7,7 +7,7 @@ a hand leap: a picture of a plain wall may agree with its neighbours and yet sta
 its way. N pictures in the film's order.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,24 +27,30 @@ Votes = Mapping[tuple[int, int], tuple[int, int]]
 """Of pairs of pictures, the earlier first: matches that agree on a point, and that see one."""
 
 
-def out_of_line(count: int, votes: Votes) -> np.ndarray:
+def out_of_line(count: int, votes: Votes, leaping: Collection[tuple[int, int]] = ()) -> np.ndarray:
   """Tells which pictures contradict those before and after them, bool [N].
 
-  Of all parts of the film, half of it at most, the one goes first of whose matches with its
-  neighbours fewest agree, the shortest of several; what it stood between are neighbours then.
+  Of all parts of the film, half of it at most, of whose matches with their neighbours too few agree
+  the one goes first that has most leaps to them: a part in the wrong place has one on either side,
+  what comes after it one. Of several that of whose matches fewest agree, and the shortest; what it
+  stood between are neighbours then.
 
   Args:
     count: Pictures N.
     votes: Of pairs of them.
+    leaping: Pairs, the earlier first, between which a hand would have had to leap.
   """
   left = list(range(count))
   while True:
-    best, part = _AGREED, None
-    for length, agreed, asked in _parts(left, votes):
+    best, part = (0, _AGREED), None
+    for length, agreed, asked, leapt in _parts(left, votes, leaping):
       share = np.where(asked >= _ASKED, agreed / np.maximum(asked, 1), 1.0)
-      first = int(np.argmin(share))
-      if share[first] < best:
-        best, part = float(share[first]), (first, length)
+      few = np.flatnonzero(share < _AGREED)
+      if len(few):
+        first = min(few, key=lambda k: (-leapt[k], share[k]))
+        rank = (-int(leapt[first]), float(share[first]))
+        if rank < best:
+          best, part = rank, (first, length)
     if part is None:
       found = np.ones(count, bool)
       found[left] = False
@@ -52,29 +58,33 @@ def out_of_line(count: int, votes: Votes) -> np.ndarray:
     del left[part[0] : part[0] + part[1]]
 
 
-def _parts(left: list[int], votes: Votes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def _parts(
+  left: list[int], votes: Votes, leaping: Collection[tuple[int, int]]
+) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
   """Yields the votes between all parts of a length and their neighbours.
 
   Yields:
-    The length, and for each first picture [K] how many agree and how many are asked.
+    The length, and for each first picture [K] how many agree, how many are asked, and how many
+    leaps there are.
   """
   count = len(left)
-  pair = np.zeros((2, count, _NEIGHBOURS + 1))  # of a picture and the one so many later
+  pair = np.zeros((3, count, _NEIGHBOURS + 1))  # of a picture and the one so many later
   for k in range(count):
     for later in range(1, min(_NEIGHBOURS, count - 1 - k) + 1):
-      pair[:, k, later] = votes.get((left[k], left[k + later]), (0, 0))
-  border = np.zeros((2, count + 1))  # of pairs that a place lies between
+      both = left[k], left[k + later]
+      pair[:, k, later] = *votes.get(both, (0, 0)), both in leaping
+  border = np.zeros((3, count + 1))  # of pairs that a place lies between
   for k in range(count):
     for later in range(1, _NEIGHBOURS + 1):
       border[:, k + 1 : k + later + 1] += pair[:, k, later, None]
   for length in range(1, count // 2 + 1):
-    both = border[:, : count - length + 1] + border[:, length:]
+    sums = border[:, : count - length + 1] + border[:, length:]
     for later in range(length + 1, _NEIGHBOURS + 1):  # pairs with the part between them
       for before in range(1, later - length + 1):
-        over = np.zeros_like(both)
-        over[:, before:] = pair[:, : both.shape[1] - before, later]
-        both = both - 2 * over
-    yield length, both[0], both[1]
+        over = np.zeros_like(sums)
+        over[:, before:] = pair[:, : sums.shape[1] - before, later]
+        sums = sums - 2 * over
+    yield length, *sums
 
 
 def leaps(centers: np.ndarray, times: np.ndarray) -> list[tuple[int, int]]:
@@ -115,9 +125,10 @@ def drop_out_of_line(
     pair = (min(first, second), max(first, second))
     votes[pair] = int(agreed.sum()), int(sees.sum())
   centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-  for pair in leaps(centers, np.array([times[image.name] for image in images])):
+  leaping = leaps(centers, np.array([times[image.name] for image in images]))
+  for pair in leaping:
     votes[pair] = 0, max(votes.get(pair, (0, 0))[1], _ASKED)
-  wrong = out_of_line(len(images), votes)
+  wrong = out_of_line(len(images), votes, set(leaping))
   for image, is_wrong in zip(images, wrong, strict=True):
     if is_wrong:
       model.deregister_frame(image.frame_id)

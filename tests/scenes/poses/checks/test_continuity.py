@@ -32,11 +32,25 @@ def test_short_parts_at_the_wrong_place_are_out_of_line(wrong):
 def test_parts_have_the_votes_of_all_pairs_across_their_ends():
   random = np.random.default_rng(0)
   votes = {pair: tuple(random.integers(0, 9, 2)) for pair in votes_of([0] * 9)}
-  for length, *found in continuity._parts(list(range(9)), votes):
+  leaping = {pair for pair in votes if random.random() < 0.3}
+  counted = {pair: (*v, pair in leaping) for pair, v in votes.items()}
+  for length, *found in continuity._parts(list(range(9)), votes, leaping):
     for first in range(9 - length + 1):
       inside = set(range(first, first + length))
-      across = [v for (i, j), v in votes.items() if (i in inside) != (j in inside)]
+      across = [v for (i, j), v in counted.items() if (i in inside) != (j in inside)]
       assert [f[first] for f in found] == np.sum(across, axis=0).tolist()
+
+
+def test_a_part_with_a_leap_on_either_side_goes_before_what_follows_it():
+  """Matches of things alike agree before it, none after it: by them alone the film's end goes."""
+  place = [1 if 9 <= k < 14 else 0 for k in range(20)]
+  votes = votes_of(place)
+  for i in range(6, 9):  # see the thing that is taken for another
+    votes |= {(i, j): (12, 40) for j in range(9, i + 4)}
+  found = continuity.out_of_line(20, votes)
+  assert np.flatnonzero(found).tolist() == list(range(14, 20))
+  found = continuity.out_of_line(20, votes, {(8, 9), (13, 14)})
+  assert np.flatnonzero(found).tolist() == list(range(9, 14))
 
 
 def test_parts_without_common_matches_contradict_nothing():
