@@ -72,9 +72,14 @@ class Checkpoints:
       CheckpointError: if it cannot be written, such as on a full disk; older ones stay.
     """
     seconds = int(info.get("seconds", 0))
-    path = self._folder / f"{kind}-{int(state.steps):010d}-{info['steps']:012d}-{seconds:08d}"
-    if path in self.list(kind):
-      return path
+    steps = f"{kind}-{int(state.steps):010d}-{info['steps']:012d}"
+    for newest in self.list(kind)[-1:]:
+      last = int(newest.name.removeprefix(steps)[1:] or 0) if newest.name.startswith(steps) else -1
+      if seconds <= last:
+        if _same(_read_record(newest), info):
+          return newest
+        seconds = last + 1  # what has changed within a second, as which result is the best
+    path = self._folder / f"{steps}-{seconds:08d}"
     try:
       self._checkpointer.save(
         path,
@@ -158,6 +163,14 @@ def _read_record(checkpoint: Path) -> dict[str, Any] | None:
     raise CheckpointError(
       f"{path} is damaged ({error}): remove {checkpoint} to go on from an older one."
     ) from error
+
+
+def _same(record: dict[str, Any] | None, info: Mapping[str, Any]) -> bool:
+  """Tells whether a checkpoint was made with settings and counters, but for the time."""
+  if record is None:
+    return False
+  now = json.loads(json.dumps(dict(info)))
+  return {**record["info"], "seconds": None} == {**now, "seconds": None}
 
 
 def _shapes(state: TrainingState) -> list[Any]:

@@ -121,3 +121,15 @@ def test_the_time_of_a_run_without_a_step_is_kept(state, tmp_path):
   for seconds in (0.0, 90.5):
     saved.save(_at(state, 1), {"steps": 4, "seconds": seconds})
   assert checkpoints.read_info(tmp_path)["seconds"] == 90.5
+
+
+def test_what_changes_within_a_second_is_kept(state, tmp_path):
+  saved = Checkpoints(tmp_path / "checkpoints")
+  for best in (1.0, 2.0, 2.0, 3.0, 0.5):
+    saved.save(_at(state, 1), {"steps": 4, "seconds": 7.3, "best_return": best})
+    assert checkpoints.read_info(tmp_path)["best_return"] == best
+  names = [p.name for p in saved.list()]
+  assert (
+    saved.save(_at(state, 1), {"steps": 4, "seconds": 7.9, "best_return": 0.5}).name == names[-1]
+  )
+  assert [p.name for p in saved.list()] == names
