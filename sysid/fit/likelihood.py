@@ -23,7 +23,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel, Simulated
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured, block_starts
-from nerf2real.sysid.model.servo_law import Asked, command_jump, duty_for
+from nerf2real.sysid.model.servo.duty import Asked, command_jump, duty_for
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
 

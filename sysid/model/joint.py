@@ -18,7 +18,7 @@ from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.plant import JointPlant, turned_back, turning
 from nerf2real.sysid.model.reduction import Reduction, Surroundings
-from nerf2real.sysid.model.servo_law import ServoLaw, servo_law
+from nerf2real.sysid.model.servo.law import ServoLaw, servo_law
 
 Array = np.ndarray
 I = kernel.INDEX  # noqa: E741

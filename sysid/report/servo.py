@@ -6,7 +6,7 @@ from typing import Any
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.hypotheses.terms import SERVO_GAIN
-from nerf2real.sysid.model.servo_law import ServoLaw
+from nerf2real.sysid.model.servo.law import ServoLaw
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.joints.changes import Changed
 

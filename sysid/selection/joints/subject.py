@@ -20,7 +20,7 @@ from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
-from nerf2real.sysid.model.servo_law import ServoLaw
+from nerf2real.sysid.model.servo.law import ServoLaw
 from nerf2real.sysid.selection.joints.baseline import (
   changed_constants,
   freed_constants,

@@ -9,7 +9,7 @@ from nerf2real.sysid.drift.values import compare
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.report import servo
 from nerf2real.sysid.settings import SETTINGS
-from tests.sysid.model.test_servo_law import plant_of
+from tests.sysid.model.servo.test_law import plant_of
 
 
 def found_of(*, reference: bool, **law):

@@ -1,0 +1,1 @@
+"""The law of a servo that logs its duty, from position error to duty."""
