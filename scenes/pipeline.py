@@ -85,6 +85,7 @@ def _run_stages(
   if watcher is not None:
     watcher.poses(poses.value)
   capture = localising.sensed(cache, capture, poses)
+  capture, poses = localising.aligned(cache, capture, poses)
   if given.override.floor_points is None:
     room_check.require_room(poses.value.world_from_camera, poses.value.points)
   outlook = world_frame.outlook(

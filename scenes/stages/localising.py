@@ -18,7 +18,9 @@ from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.poses import localisation, sensor, structure_from_motion
+from nerf2real.scenes.poses import localisation, structure_from_motion
+from nerf2real.scenes.poses.depth import alignment, sensor
+from nerf2real.scenes.poses.depth.matched import keep_matches
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages.cache import Made, Stages
@@ -37,6 +39,10 @@ _PICTURES_VERSION = 4  # of all others
 # 10: the readout is a frame's period at most; points of a COLMAP model are seen by pictures; of few
 # pictures some may have no place; 11: photographs without pairs whose rotations contradict
 _POSES_VERSION = 11
+_DEPTH_VERSION = 12  # of poses that came with depth: matches are kept
+_ALIGNED_VERSION = 1
+_MATCHES = "matches.db"  # what pictures with depth show alike
+_ALIGNED_RECORD = "aligned.json"  # the factor on the depth's unit
 _SENSOR_VERSION = 2  # 2: depth at the pictures' times
 _SENSOR_RECORD = "sensor.json"  # what was done to the depth
 
@@ -79,10 +85,14 @@ def poses(cache: Stages, capture: Made[Capture], settings: LocaliseSettings) -> 
         raise
       lost = taken.called(np.isin(names, sorted(error.missing)), most=4)
       raise LocalisationError(f"{error} Without a place: {lost}.") from error
+    if has_depth and (database := folder / "work" / "database.db").is_file():
+      keep_matches(database, folder / _MATCHES)
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large
 
+  has_depth = capture.value.known is not None and bool(capture.value.known.depth_files)
+  version = _DEPTH_VERSION if has_depth else _POSES_VERSION
   inputs = {"keyframes": capture.stamp}
-  stage = cache.run("poses", write, settings=settings, inputs=inputs, version=_POSES_VERSION)
+  stage = cache.run("poses", write, settings=settings, inputs=inputs, version=version)
   return Made(localisation.load(stage.folder / "sfm"), stage)
 
 
@@ -137,3 +147,36 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
     )
   still = dataclasses.replace(known, depth_files=tuple(files), depth_poses=known.world_from_camera)
   return Made(dataclasses.replace(capture.value, known=still.lifted(), warnings=warnings), stage)
+
+
+def aligned(
+  cache: Stages, capture: Made[Capture], poses: Made[Localisation]
+) -> tuple[Made[Capture], Made[Localisation]]:
+  """Returns capture and poses with the pictures laid onto the surfaces that a sensor measured.
+
+  As they are where none did, or where depth and pictures then agree no better.
+  """
+  known, found = capture.value.known, poses.value
+  database = poses.stage.folder / _MATCHES
+  if known is None or not known.depth_files or not database.is_file():
+    return capture, poses
+  of_name = {path.name: row for row, path in enumerate(capture.value.images)}
+  rows = [of_name[name] for name in found.names]
+
+  def write(folder: Path, progress: Progress) -> None:
+    images = [capture.value.images[row] for row in rows]
+    laid = alignment.aligned(
+      found, known.selected(rows, known.camera), images, database, progress=progress
+    )
+    if laid is not None:
+      localisation.save(laid[0], laid[1], folder / "sfm")
+    write_json(folder / _ALIGNED_RECORD, {"depth_unit": None if laid is None else laid[2]})
+
+  inputs = {"capture": capture.stamp, "poses": poses.stamp}
+  stage = cache.run("aligned", write, settings=None, inputs=inputs, version=_ALIGNED_VERSION)
+  factor = json.loads((stage.folder / _ALIGNED_RECORD).read_text())["depth_unit"]
+  if factor is None:
+    return capture, poses
+  scaled = dataclasses.replace(known, depth_unit=known.depth_unit * factor)
+  moved = dataclasses.replace(capture.value, known=scaled)
+  return Made(moved, stage), Made(localisation.load(stage.folder / "sfm"), stage)

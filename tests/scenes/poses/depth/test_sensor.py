@@ -12,7 +12,7 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
-from nerf2real.scenes.poses import sensor
+from nerf2real.scenes.poses.depth import sensor
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.stages import localising
 from nerf2real.scenes.stages.cache import Made, StageResult, Stages

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
-from nerf2real.scenes.poses import mapping, refinement
+from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.depth import refinement
 
 COUNT = 9
 NAMES = [f"picture_{k}.jpg" for k in range(COUNT)]

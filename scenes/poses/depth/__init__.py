@@ -1,0 +1,1 @@
+"""Pictures that came with depth and poses: poses, lens and sensor adjusted to what they show."""
