@@ -128,7 +128,7 @@ def make_scene(folder: Path, settings: Settings) -> dict[str, harness.Value]:
   files = read_tum(folder).files
 
   def measure(result: Reconstruction) -> TruthFigures:
-    rows = [int(name.removesuffix(".jpg").split("_")[-1]) for name in result.localisation.names]
+    rows = [int(Path(name).stem.split("_")[-1]) for name in result.localisation.names]
     when = np.array([float(files[row].stem) for row in rows]) - _CLOCK
     return ground_truth.compare(result, _walk(settings.seed).pose(when))
 

@@ -143,7 +143,7 @@ def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str,
   """Makes a scene of the recording and measures it against the truth."""
 
   def measure(result: Reconstruction) -> TruthFigures:
-    rows = [int(name.removesuffix(".jpg").split("_")[-1]) for name in result.localisation.names]
+    rows = [int(Path(name).stem.split("_")[-1]) for name in result.localisation.names]
     return ground_truth.compare(result, poses[rows])
 
   used = preset(settings.preset)

@@ -246,9 +246,7 @@ def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str,
   numbers = [_number(path) for path in stills.of_one_camera(stills.list_images(folder)).files]
 
   def measure(result: Reconstruction) -> TruthFigures:
-    rows = [
-      numbers[int(name.removesuffix(".jpg").split("_")[-1])] for name in result.localisation.names
-    ]
+    rows = [numbers[int(Path(name).stem.split("_")[-1])] for name in result.localisation.names]
     if settings.mixed and _STRANGER in rows:
       print("the picture of another room was placed")
     return ground_truth.compare(result, poses[rows])

@@ -221,6 +221,12 @@ def camera_fault(camera: Camera) -> str | None:
   return None
 
 
+def moved_fault(before: Camera, after: Camera) -> str | None:
+  """Returns what is wrong about how an estimate of a camera moved it, None if nothing is."""
+  change = after.fx / before.fx - 1
+  return f"it moves the focal length by {change:+.1%}" if abs(change) > _MAX_FOCAL_CHANGE else None
+
+
 class FreeLens(NamedTuple):
   """Parameters of the lens that pictures determine, beside the focal lengths."""
 
@@ -260,10 +266,7 @@ def refine(
   report(0.5, "adjusting poses and lens, principal point free")
   full = pycolmap.Reconstruction(base)
   _adjust(full, principal=True, distortion=True, anchors=anchors)
-  fault = camera_fault(_camera(full))
-  change = _camera(full).fx / _camera(base).fx - 1
-  if fault is None and abs(change) > _MAX_FOCAL_CHANGE:
-    fault = f"it moves the focal length by {change:+.1%}"
+  fault = camera_fault(_camera(full)) or moved_fault(_camera(base), _camera(full))
   if fault is not None:
     words = f"all OPENCV parameters but the principal point, because {fault}"
     return base, FreeLens(distortion=True, principal=False, words=words)

@@ -22,6 +22,7 @@ from nerf2real.scenes.poses.depth.adjustment import adjust
 from nerf2real.scenes.poses.localisation import Localisation
 
 _ADJUSTED = 0.7  # of the progress: when poses are adjusted; the points follow
+_CLEARLY = 6.0  # deviations of a scale; chosen: three, as errors near each other are alike
 _KEPT = ("registered_fraction", "unit_from_source", "shutter", "warnings", "seconds")
 
 
@@ -35,8 +36,8 @@ def aligned(
 ) -> tuple[pycolmap.Reconstruction, Localisation, float] | None:
   """Adjusts poses and lens to the depth; None where depth and pictures then agree no better.
 
-  The poses stay metric as those that came are. Where the sensor's metre is another, its unit is
-  what changes.
+  Where the metre of the poses that came is clearly not the sensor's, theirs holds, and the unit of
+  the depth changes.
 
   Args:
     found: The localised pictures.
@@ -61,7 +62,9 @@ def aligned(
     came=came,
     report=part(progress, 0.0, _ADJUSTED),
   )
-  back = Similarity.fit(poses[:, :3, 3], came[:, :3, 3])
+  if mapping.camera_fault(camera) or mapping.moved_fault(found.camera, camera):
+    return None
+  back = _moved_back(poses[:, :3, 3], came[:, :3, 3])
   after = dataclasses.replace(known, depth_unit=known.depth_unit * back.scale)
   after = after.lifted().with_views(camera, back.apply_pose(poses))
   off = agreement.distances([before, after], images)
@@ -86,3 +89,13 @@ def aligned(
   values = {name: getattr(found, name) for name in _KEPT}
   values |= {"strategy": words, "reprojection_error_px": localisation.reprojection_error(model)}
   return model, localisation.from_model(model, values), back.scale
+
+
+def _moved_back(places: np.ndarray, came: np.ndarray) -> Similarity:
+  """Returns what moves places [N, 3] onto those that came, with a scale where that is clear."""
+  scaled = Similarity.fit(places, came)
+  left = np.sqrt(np.mean((scaled.apply(places) - came) ** 2))
+  deviation = left / max(np.linalg.norm(came - came.mean(axis=0)), 1e-12)
+  if abs(np.log(scaled.scale)) > _CLEARLY * deviation:
+    return scaled
+  return Similarity.fit(places, came, with_scale=False)

@@ -1,0 +1,140 @@
+"""Pictures with depth are laid onto each other's surfaces where that agrees with what they show."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerf2real.core.cameras import Camera
+from nerf2real.core.similarity import Similarity
+from nerf2real.scenes.capture.capture import Capture
+from nerf2real.scenes.capture.posed.known_poses import KnownPoses
+from nerf2real.scenes.poses.settings import LocaliseSettings
+from nerf2real.scenes.stages import localising
+from nerf2real.scenes.stages.cache import Made, StageResult, Stages
+from tests.scenes import furnished_room
+
+_CAMERA = Camera(width=320, height=240, fx=262.0, fy=262.0, cx=161.0, cy=119.0)
+_UNIT = 1e-3  # m
+_COUNT = 16
+_PLAIN_FROM = 2.4  # m along x: a wall without texture
+
+
+def _poses():
+  """A walk that ends before the plain wall."""
+  poses = []
+  for angle in np.linspace(-1.6, 0.4, _COUNT):
+    place = [0.5 * np.cos(angle) - 0.6, 0.5 * np.sin(angle), 1.2 + 0.1 * np.sin(4 * angle)]
+    aim = [2.2 * np.cos(angle), 2.2 * np.sin(angle), 0.7]
+    poses.append(furnished_room.look_at(place, aim))
+  return np.array(poses)
+
+
+def _texture(points):
+  """Grey [...] of points [..., 3]: waves of a hand's width and less."""
+  rng = np.random.default_rng(5)
+  waves = rng.standard_normal((60, 3))
+  waves *= (rng.uniform(10.0, 60.0, 60) / np.linalg.norm(waves, axis=1))[:, None]
+  grey = np.cos(points @ waves.T + rng.uniform(0, 6, 60)).sum(axis=-1)
+  return np.where(points[..., 0] > _PLAIN_FROM, 128.0, np.clip(128 + 20 * grey, 0, 255))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+  """A recording whose poses err by 15 mm and 0.5 degrees, and its true poses."""
+  folder, measured = (tmp_path_factory.mktemp(name) for name in ("pictures", "depth"))
+  rng, true = np.random.default_rng(1), _poses()
+  views = furnished_room.depth_views(true, _CAMERA, noise=0.002, rng=rng)
+  exact = furnished_room.depth_views(true, _CAMERA)
+  images, files = [], []
+  for row, pose in enumerate(true):
+    points = _CAMERA.rays() * exact.depth[row][..., None]
+    grey = _texture(points @ pose[:3, :3].T + pose[:3, 3])
+    images.append(folder / f"frame_{row:06d}.png")
+    files.append(measured / f"{row}.png")
+    cv2.imwrite(str(images[-1]), np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
+    cv2.imwrite(str(files[-1]), np.rint(views.depth[row] / _UNIT).astype(np.uint16))
+  came = true.copy()
+  came[:, :3, 3] += 0.015 / np.sqrt(3) * rng.standard_normal((_COUNT, 3))
+  turns = Rotation.from_rotvec(np.radians(0.5) / np.sqrt(3) * rng.standard_normal((_COUNT, 3)))
+  came[:, :3, :3] = turns.as_matrix() @ came[:, :3, :3]
+  known = KnownPoses(
+    kind="rgbd",
+    camera=_CAMERA,
+    files=tuple(images),
+    world_from_camera=came,
+    points=np.zeros((0, 3)),
+    point_colors=np.zeros((0, 3), np.uint8),
+    point_errors=np.zeros(0),
+    depth_files=tuple(files),
+    depth_unit=_UNIT,
+  ).lifted()
+  ones = np.ones(_COUNT)
+  return Capture("rgbd", folder, images, 320, 240, ones, ones, None, [], known), true
+
+
+@pytest.fixture(scope="module")
+def refined(capture, tmp_path_factory):
+  """The stages' cache, and the poses by features."""
+  cache = Stages(tmp_path_factory.mktemp("stages"), show_progress=False)
+  return cache, localising.poses(cache, _made(capture[0]), LocaliseSettings())
+
+
+def _made(capture, made="keyframes"):
+  return Made(capture, StageResult(capture.folder, "key", made, 0.0, cached=False))
+
+
+def _errors(found, true):
+  """Distances [N] [m] from the true places, in the frame that fits best."""
+  places = found.world_from_camera[:, :3, 3] / found.unit_from_source.scale
+  back = Similarity.fit(places, true[:, :3, 3], with_scale=False)
+  return np.linalg.norm(back.apply(places) - true[:, :3, 3], axis=1)
+
+
+def test_places_are_better_known_by_surfaces(capture, refined):
+  cache, before = refined
+  taken, after = localising.aligned(cache, _made(capture[0]), before)
+  assert after.value.names == before.value.names
+  assert "laid onto each other's surfaces" in after.value.strategy
+  errors = [_errors(made.value, capture[1]) for made in (before, after)]
+  assert np.sqrt(np.mean(errors[1] ** 2)) < 0.6 * np.sqrt(np.mean(errors[0] ** 2))
+  assert np.median(errors[1]) < 0.003
+  assert len(after.value.tracks.view) > 500
+  assert taken.value.known.depth_unit == _UNIT
+  off = furnished_room.distance(after.value.unit_from_source.inverse().apply(after.value.points))
+  assert np.median(off) < 0.015  # whose frame is that of the poses that came
+  again = localising.aligned(cache, _made(capture[0]), before)
+  assert again[1].stage.cached and again[1].stamp == after.stamp
+
+
+def test_a_sensors_other_metre_goes_into_its_unit(capture, refined):
+  """Poses stay metric as they came; depth that is 8 % short agrees with them afterwards."""
+  cache, before = refined
+  short = dataclasses.replace(capture[0].known, depth_unit=0.92 * _UNIT).lifted()
+  taken, after = localising.aligned(
+    cache, _made(dataclasses.replace(capture[0], known=short), "short"), before
+  )
+  assert taken.value.known.depth_unit == pytest.approx(_UNIT, rel=0.02)
+  places = after.value.world_from_camera[:, :3, 3] / after.value.unit_from_source.scale
+  assert np.ptp(places, axis=0).max() == pytest.approx(
+    np.ptp(capture[1][:, :3, 3], axis=0).max(), rel=0.04
+  )
+
+
+def test_depth_of_other_pictures_moves_nothing(capture, refined):
+  cache, before = refined
+  known = capture[0].known
+  mixed = dataclasses.replace(known, depth_files=known.depth_files[::-1])
+  given = _made(dataclasses.replace(capture[0], known=mixed), "mixed")
+  taken, after = localising.aligned(cache, given, before)
+  assert after is before and taken is given
+  record = json.loads((cache.folder / "aligned" / "aligned.json").read_text())
+  assert record["depth_unit"] is None
+
+
+def test_pictures_without_depth_stay_as_they_are(capture, refined):
+  bare = _made(dataclasses.replace(capture[0], known=None))
+  assert localising.aligned(refined[0], bare, refined[1]) == (bare, refined[1])
