@@ -15,10 +15,11 @@ import numpy as np
 from benchmarks import harness
 from benchmarks.drawn_rooms import captures
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.poses import structure_from_motion
 from nerf2real.scenes.poses.localisation import LocalisationError
 from nerf2real.scenes.settings import preset
+from nerf2real.scenes.source import open_source
+from nerf2real.scenes.stages import localising
+from nerf2real.scenes.stages.cache import Stages
 
 _WRONG = 0.1  # m from the truth
 
@@ -45,26 +46,21 @@ def localise(folder: Path, seed: int, kind: captures.Kind) -> dict[str, harness.
   """Captures and localises one room; returns its figures."""
   source, true = captures.captured(folder, captures.draw(seed).room, seed, kind)
   settings = preset("fast")
-  taken = read_capture(source, folder / f"{kind}_images", settings=settings.capture)
-  names = [path.name for path in taken.images]
-  times = taken.times if taken.times is None else dict(zip(names, taken.times, strict=True))
+  cache = Stages(folder / f"{kind}_places", show_progress=False)
+  capture = localising.keyframes(cache, open_source(source, cache.folder), settings.capture)
   began = time.monotonic()
   try:
-    result = structure_from_motion.localise(
-      taken.folder,
-      folder / f"{kind}_places",
-      settings=settings.localise,
-      known=taken.known,
-      times=times,
-    )
+    poses = localising.poses(cache, capture, settings.localise)
   except LocalisationError as error:
     return {"refused": str(error)}
+  _, poses = localising.aligned(cache, localising.sensed(cache, capture, poses), poses)
+  result = poses.value
   rows = [int(Path(name).stem.split("_")[-1]) for name in result.names]
   errors = position_errors(result.world_from_camera[:, :3, 3], true[rows][:, :3, 3])
   for row in np.flatnonzero(errors > _WRONG):
     print(f"wrong: {result.names[row]} {errors[row]:.2f} m")
   return {
-    "placed": len(errors) / len(names),
+    "placed": result.registered_fraction,
     "wrong": int((errors > _WRONG).sum()),
     "rmse_m": float(np.sqrt(np.mean(errors**2))),
     "median_m": float(np.median(errors)),
