@@ -1,13 +1,11 @@
 """Tests of reading captures: videos, pictures, posed data sets."""
 
 import dataclasses
-import json
 from fractions import Fraction
 
 import av
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 
 from nerf2real.scenes.capture import reading
@@ -15,9 +13,6 @@ from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.media.spacing import ImageMotion, spread
 from nerf2real.scenes.capture.media.video import inspect_video, sharpest_frames, sharpness
-from nerf2real.scenes.capture.posed.colmap_model import read_colmap, to_colmap, to_opencv
-from nerf2real.scenes.capture.posed.known_poses import KnownPoses
-from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.capture.reading import read_capture
 from tests.scenes import synthetic_capture as synthetic
 
@@ -263,162 +258,3 @@ def test_an_error_leaves_the_last_good_keyframes(frames, tmp_path, monkeypatch):
     read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
   assert all(path.is_file() for path in first.images)
   assert not list(tmp_path.glob("*partial*")) + list(tmp_path.glob(".*"))
-
-
-def write_transforms(folder, poses, camera, **extra):
-  """Writes pictures and a transforms.json with OpenGL axes, as nerfstudio does."""
-  names = synthetic.write_images(folder / "images", poses)
-  flip = np.diag([1.0, -1, -1, 1])
-  values = {
-    "w": camera.width,
-    "h": camera.height,
-    "fl_x": camera.fx,
-    "fl_y": camera.fy,
-    "cx": camera.cx,
-    "cy": camera.cy,
-    "k1": camera.k1,
-    "k2": camera.k2,
-    "p1": camera.p1,
-    "p2": camera.p2,
-    "camera_model": "OPENCV",
-    "frames": [
-      {"file_path": f"images/{name}", "transform_matrix": (pose @ flip).tolist()}
-      for name, pose in zip(names, poses, strict=True)
-    ],
-    **extra,
-  }
-  (folder / "transforms.json").write_text(json.dumps(values))
-  return names
-
-
-def test_transforms_json(tmp_path):
-  poses = synthetic.walk(9)
-  source = tmp_path / "source"
-  write_transforms(source, poses, synthetic.CAMERA, k1=0.01, k2=-0.02, p1=0.001, p2=-0.002)
-  result = read_capture(source, tmp_path / "keyframes", settings=CaptureSettings(num_keyframes=9))
-  assert result.kind == "transforms"
-  np.testing.assert_allclose(result.known.world_from_camera, poses, atol=1e-12)
-  np.testing.assert_allclose(result.known.camera.distortion, [0.01, -0.02, 0.001, -0.002])
-  half = CaptureSettings(num_keyframes=9, max_size=160)
-  result = read_capture(source / "transforms.json", tmp_path / "keyframes", settings=half)
-  assert result.known.camera.width == 160
-  assert result.known.camera.fx == pytest.approx(synthetic.CAMERA.fx / 2)
-
-
-def test_instant_ngp_angles_and_missing_suffix(tmp_path):
-  poses = synthetic.walk(8)
-  write_transforms(tmp_path, poses, synthetic.CAMERA)
-  values = json.loads((tmp_path / "transforms.json").read_text())
-  for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model"):
-    del values[name]
-  values["camera_angle_x"] = 2 * np.arctan(0.5 * 320 / 280)
-  for frame in values["frames"]:
-    frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
-  (tmp_path / "transforms.json").write_text(json.dumps(values))
-  known = read_transforms(tmp_path)
-  assert known.camera.fx == pytest.approx(280)
-  assert known.camera.fy == pytest.approx(280)
-  assert (known.camera.cx, known.camera.cy) == (160, 120)
-  np.testing.assert_allclose(known.world_from_camera, poses, atol=1e-12)
-
-
-def test_transforms_errors(tmp_path):
-  poses = synthetic.walk(8)
-  write_transforms(tmp_path, poses, synthetic.CAMERA, camera_model="OPENCV_FISHEYE")
-  with pytest.raises(CaptureError, match="OPENCV_FISHEYE found, expected OPENCV"):
-    read_transforms(tmp_path)
-  sheared = poses.copy()
-  sheared[2, 0, 1] += 0.5
-  write_transforms(tmp_path, sheared, synthetic.CAMERA)
-  with pytest.raises(CaptureError, match=r"view_002.png is no rigid pose"):
-    read_transforms(tmp_path)
-  for extra, words in (
-    ({"is_fisheye": True}, "OPENCV_FISHEYE found, expected OPENCV: undistort the pictures"),
-    ({"k3": 0.01}, "k3 = 0.01 found, expected a lens of k1, k2, p1, p2"),
-    ({"k4": -0.01}, "k4 = -0.01 found"),
-  ):
-    write_transforms(tmp_path, poses, synthetic.CAMERA, **extra)
-    with pytest.raises(CaptureError, match=words):
-      read_transforms(tmp_path)
-  write_transforms(tmp_path, poses, synthetic.CAMERA, k3=0.0, k4=0.0)
-  assert len(read_transforms(tmp_path).files) == 8
-  (tmp_path / "images" / "view_003.png").unlink()
-  with pytest.raises(CaptureError, match=r"holds 7 pictures \(1 of 8 pictures or their depth are"):
-    read_capture(tmp_path, tmp_path / "keyframes", settings=SETTINGS)
-  for number in range(4, 8):
-    (tmp_path / "images" / f"view_{number:03d}.png").unlink()
-  with pytest.raises(CaptureError, match=r"5 of 8 pictures are missing, as view_003.png"):
-    read_transforms(tmp_path)
-  (tmp_path / "transforms.json").write_text('{"frames": 3}')
-  with pytest.raises(CaptureError, match="no transforms file"):
-    read_transforms(tmp_path)
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_colmap_model(tmp_path, text):
-  poses = synthetic.walk(9)
-  names = synthetic.write_images(tmp_path / "images", poses)
-  points = np.random.default_rng(0).uniform(0, 3, (50, 3))
-  model = pycolmap.Reconstruction()
-  model.add_camera_with_trivial_rig(to_colmap(synthetic.CAMERA))
-  for number, (name, pose) in enumerate(zip(names, poses, strict=True), start=1):
-    image = pycolmap.Image(name=name, camera_id=1, image_id=number)
-    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
-  for point in points:
-    model.add_point3D(point, pycolmap.Track(), np.array([10, 20, 30], np.uint8))
-  folder = tmp_path / "sparse" / "0"
-  folder.mkdir(parents=True)
-  (model.write_text if text else model.write_binary)(str(folder))
-  result = read_capture(tmp_path, tmp_path / "keyframes", settings=CaptureSettings(num_keyframes=9))
-  assert result.kind == "colmap"
-  assert result.known.camera == synthetic.CAMERA
-  np.testing.assert_allclose(result.known.world_from_camera, poses, atol=1e-9)
-  np.testing.assert_allclose(np.sort(result.known.points, axis=0), np.sort(points, axis=0))
-  (tmp_path / "images" / names[4]).unlink()
-  with pytest.raises(CaptureError, match="1 pictures of the COLMAP model are missing"):
-    read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize(
-  ("model", "params", "expected"),
-  [
-    ("SIMPLE_PINHOLE", [200, 160, 120], (200, 200, 0, 0)),
-    ("PINHOLE", [200, 210, 160, 120], (200, 210, 0, 0)),
-    ("SIMPLE_RADIAL", [200, 160, 120, 0.1], (200, 200, 0.1, 0)),
-    ("RADIAL", [200, 160, 120, 0.1, -0.2], (200, 200, 0.1, -0.2)),
-    ("OPENCV", [200, 210, 160, 120, 0.1, -0.2, 0.01, 0.02], (200, 210, 0.1, -0.2)),
-  ],
-)
-def test_colmap_cameras_project_alike(model, params, expected):
-  theirs = pycolmap.Camera(camera_id=1, model=model, width=320, height=240, params=params)
-  ours = to_opencv(theirs)
-  assert (ours.fx, ours.fy, ours.k1, ours.k2) == expected
-  point = np.array([0.2, -0.1, 1.5])
-  np.testing.assert_allclose(ours.project(point), theirs.img_from_cam(point), atol=1e-9)
-
-
-def test_fisheye_is_refused():
-  camera = pycolmap.Camera(
-    camera_id=1,
-    model="OPENCV_FISHEYE",
-    width=320,
-    height=240,
-    params=[200, 200, 160, 120, 0, 0, 0, 0],
-  )
-  with pytest.raises(CaptureError, match="OPENCV_FISHEYE"):
-    to_opencv(camera)
-
-
-def test_known_poses_selection_keeps_order():
-  known = KnownPoses(
-    kind="colmap",
-    camera=synthetic.CAMERA,
-    files=tuple("abcd"),
-    world_from_camera=np.arange(4)[:, None, None] * np.ones((4, 4)),
-    points=np.zeros((0, 3)),
-    point_colors=np.zeros((0, 3), np.uint8),
-    point_errors=np.zeros(0),
-  )
-  chosen = known.selected([1, 3], synthetic.CAMERA)
-  assert chosen.files == ("b", "d")
-  np.testing.assert_array_equal(chosen.world_from_camera[:, 0, 0], [1, 3])
