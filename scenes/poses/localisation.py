@@ -61,6 +61,9 @@ class Localisation:
   """Motion while a picture was read, unit frame; None where all lines count as read at once."""
   warnings: tuple[str, ...] = ()
   """What may ruin the reconstruction."""
+  left_out: tuple[str, ...] = ()
+  """Keyframes of a film without a place, as theirs contradicted what was filmed moments before and
+  after."""
   seconds: dict[str, float] = dataclasses.field(default_factory=dict)
   """Wall time of each step."""
 
@@ -137,6 +140,7 @@ def save(model: pycolmap.Reconstruction, localisation: Localisation, folder: Pat
     "unit_from_source": localisation.unit_from_source,
     "shutter": localisation.shutter,
     "warnings": localisation.warnings,
+    "left_out": localisation.left_out,
     "seconds": localisation.seconds,
   }
   with files.atomic_folder(folder) as partial:
@@ -159,5 +163,6 @@ def load(folder: Path) -> Localisation:
   values["unit_from_source"] = from_plain(values["unit_from_source"], Similarity)
   if values.get("shutter") is not None:
     values["shutter"] = from_plain(values["shutter"], Shutter)
-  values["warnings"] = tuple(values["warnings"])
+  for name in ("warnings", "left_out"):
+    values[name] = tuple(values.get(name, ()))
   return from_model(model, values)

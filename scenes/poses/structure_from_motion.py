@@ -8,6 +8,7 @@ keyframes, P points.
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,7 @@ from nerf2real.scenes.poses.work import KNOWN_SHARES, Mapped, Steps, prepare_wor
 
 _MODEL_FOLDER, _WORK_FOLDER = "sfm", "work"
 _NAMED = 6  # pictures in a warning
+_CHECKS = 3  # at most: what is out of line once more agrees with yet another wrong place
 
 
 def localise(
@@ -149,7 +151,9 @@ def _map(
   if known is not None:
     fixed = mapping.triangulate(database, images_folder, known, names)
     return Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
-  model, mapper, apart = _best_model(database, images_folder, len(names), settings, steps, times)
+  model, mapper, apart, out = _best_model(
+    database, images_folder, len(names), settings, steps, times
+  )
   if model is None or model.num_reg_images() < settings.repair_below * len(names):
     placed = {i.name for i in mapping.registered(model)} if model else set()
     missing = [row for row, name in enumerate(names) if name not in placed]
@@ -164,9 +168,9 @@ def _map(
     )
     if added:
       steps.begin("mapping")
-      again, how, unsure = _best_model(database, images_folder, len(names), settings, steps, times)
-      if again is not None and (model is None or again.num_reg_images() > model.num_reg_images()):
-        model, mapper, apart = again, how, unsure
+      again = _best_model(database, images_folder, len(names), settings, steps, times)
+      if _sees_more(again.model, model):
+        model, mapper, apart, out = again
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
   check_registered(model, names, settings, share, film=film)
   assert model is not None  # for the type checker: check_registered has raised
@@ -175,7 +179,7 @@ def _map(
     steps.begin("mapping")
 
     def map_again(database: Path) -> tuple[pycolmap.Reconstruction | None, str, float]:
-      return _best_model(database, images_folder, len(names), settings, steps, times)
+      return _best_model(database, images_folder, len(names), settings, steps, times)[:3]
 
     found = things_alike.Found(model, mapper, apart)
     model, mapper, apart = things_alike.undeceived(found, database, map_again, seed=settings.seed)
@@ -208,9 +212,14 @@ def _map(
       )
   if dropped:
     check_registered(model, names, settings, share, film=film)
+  placed = {image.name for image in mapping.registered(model)}
+  out -= placed
+  if times is not None and out:
+    warnings.append(continuity.gaps(out, placed, times))
   if not lens.principal:
     warnings.append(f"Lens: estimated {lens.words}.")
-  return Mapped(model, f"{words}, {mapper}; lens: {lens.words}", tuple(warnings), lens)
+  strategy = f"{words}, {mapper}; lens: {lens.words}"
+  return Mapped(model, strategy, tuple(warnings), lens, left_out=tuple(sorted(out)))
 
 
 def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -> Mapped:
@@ -246,6 +255,15 @@ def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -
   return dataclasses.replace(mapped, model=model, strategy=words, shutter=found)
 
 
+class _Best(NamedTuple):
+  """What the mappers found."""
+
+  model: pycolmap.Reconstruction | None
+  how: str
+  apart: float  # how far attempts are apart, see `attempts`
+  out: frozenset[str]  # pictures that were out of a film's line
+
+
 def _best_model(
   database: Path,
   images_folder: Path,
@@ -253,17 +271,13 @@ def _best_model(
   settings: LocaliseSettings,
   steps: Steps,
   times: Mapping[str, float] | None,
-) -> tuple[pycolmap.Reconstruction | None, str, float]:
-  """Runs the mapper of the settings, and the other one if that leaves too many keyframes out.
-
-  Returns:
-    The model, how it came about, and how far attempts are apart, see `attempts`.
-  """
+) -> _Best:
+  """Runs the mapper of the settings, and the other one if that leaves too many keyframes out."""
   mappers = {"incremental": mapping.map_incrementally, "global": mapping.map_globally}
   if settings.mapper not in ("auto", *mappers):
     raise ValueError(f"mapper is {settings.mapper!r}, expected 'auto', 'global' or 'incremental'.")
   order = list(mappers) if settings.mapper == "auto" else [settings.mapper]
-  best, chosen, apart = None, f"{order[0]} mapper", 0.0
+  best = _Best(None, f"{order[0]} mapper", 0.0, frozenset())
   attempts = settings.attempts if count <= settings.attempted else 1
   for name in order:
 
@@ -282,12 +296,21 @@ def _best_model(
 
     found, unsure = best_of(attempt, attempts=attempts, same=settings.max_apart)
     if found is not None:
-      model, what = _checked(found, database, images_folder, settings, steps, times)
-      if best is None or model.num_reg_images() > best.num_reg_images():
-        best, chosen, apart = model, f"{name} mapper{what}", unsure
-    if best is not None and best.num_reg_images() >= settings.repair_below * count:
+      model, what, out = _checked(found, database, images_folder, settings, steps, times)
+      if _sees_more(model, best.model):
+        best = _Best(model, f"{name} mapper{what}", unsure, out)
+    if best.model is not None and best.model.num_reg_images() >= settings.repair_below * count:
       break
-  return best, chosen, apart
+  return best
+
+
+def _sees_more(
+  model: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction | None
+) -> bool:
+  """Whether a model's pictures see more of what they ought to, see `overlap`; None is the least."""
+  if model is None or other is None:
+    return model is not None
+  return overlap(model).balance > overlap(other).balance
 
 
 def _checked(
@@ -297,24 +320,29 @@ def _checked(
   settings: LocaliseSettings,
   steps: Steps,
   times: Mapping[str, float] | None,
-) -> tuple[pycolmap.Reconstruction, str]:
-  """Returns a model without the wrong places that its matches show, and what was done, in words.
+) -> tuple[pycolmap.Reconstruction, str, frozenset[str]]:
+  """Returns a model without the wrong places that its matches show, what was done, in words, and
+  which pictures were out of a film's line.
 
   Pictures keep their places where those that are found anew see less of what they ought to. What is
-  out of a film's line is placed once more, by what all others see.
+  out of a film's line is placed once more, by others than those that agreed with the lost place.
   """
-  placed, dropped = 0, 0
-  for _ in range(2):
+  placed, out, misled = 0, frozenset[str](), frozenset[tuple[int, int]]()
+  for _ in range(_CHECKS):
     again, moved = agreement.place_again(
-      model, database, images_folder, seed=settings.seed, report=steps.report
+      model, database, images_folder, seed=settings.seed, misled=misled, report=steps.report
     )
     if moved and overlap(again).balance >= overlap(model).balance:
       model, placed = again, placed + moved
-    dropped = 0 if times is None else continuity.drop_out_of_line(model, database, times)
-    if not dropped:
+    if times is None:
       break
+    lost = continuity.drop_out_of_line(model, database, times)
+    out, misled = out | lost.names, misled | lost.misled
+    if not lost.names:
+      break
+  out -= {image.name for image in mapping.registered(model)}
   words = f", {placed} pictures placed by what the others see" if placed else ""
-  return model, words + (f", {dropped} left out of the film's line" if dropped else "")
+  return model, words + (f", {len(out)} left out of the film's line" if out else ""), out
 
 
 def _describe(
@@ -347,6 +375,7 @@ def _describe(
     "unit_from_source": unit,
     "shutter": None if result.shutter is None else result.shutter.scaled(unit.scale),
     "warnings": result.warnings,
+    "left_out": result.left_out,
     "seconds": dict(steps.seconds),
   }
   return from_model(model, values)

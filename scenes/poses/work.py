@@ -39,6 +39,8 @@ class Mapped:
   warnings: tuple[str, ...]
   lens: mapping.FreeLens | None = None
   """What was estimated of the lens; None where it was known."""
+  left_out: tuple[str, ...] = ()
+  """Pictures that were out of a film's line, see `checks/continuity.py`."""
   shutter: Shutter | None = None
 
 

@@ -15,6 +15,7 @@ from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
+from nerf2real.scenes.poses.checks import continuity
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.quality.coverage import Coverage, coverage
@@ -121,7 +122,8 @@ def _shared_points(tracks: Tracks, count: int) -> int | None:
 
 
 def judge_poses(capture: Capture, poses: Localisation) -> list[Finding]:
-  """Judges how many keyframes have a pose and whether a film comes back to where it began."""
+  """Judges how many keyframes have a pose, and whether a film is whole and comes back to where it
+  began."""
   placed = np.isin([path.name for path in capture.images], poses.names)
   good = float(placed.mean()) >= _REGISTERED
   text = f"{placed.sum()} of {len(placed)} pictures have a place"
@@ -130,6 +132,9 @@ def judge_poses(capture: Capture, poses: Localisation) -> list[Finding]:
       f"; none {_where(capture, ~placed)}: film that stretch again, slower, without plain walls"
     )
   found = [Finding("poses", good, text + ".")]
+  if capture.times is not None and poses.left_out:
+    times = {path.name: when for path, when in zip(capture.images, capture.times, strict=True)}
+    found.append(Finding("line", False, continuity.gaps(poses.left_out, poses.names, times)))
   shared = _shared_points(poses.tracks, len(poses.names))
   if capture.kind == "video" and shared is not None:
     closed = shared >= _LOOP_POINTS

@@ -37,9 +37,10 @@ _PICTURES_VERSION = 4  # of all others
 # 7: areas of matches are compared, photographs matched with guidance, uncertain ones left out;
 # 8: guidance of our own, attempts; 9: the readout with all that it moves;
 # 10: the readout is a frame's period at most; points of a COLMAP model are seen by pictures; of few
-# pictures some may have no place; 11: photographs without pairs whose rotations contradict
-_POSES_VERSION = 11
-_DEPTH_VERSION = 12  # of poses that came with depth: matches are kept
+# pictures some may have no place; 11: photographs without pairs whose rotations contradict;
+# 12: by what pictures lack; a film's line is the one that least contradicts; matches are kept of
+# what came with depth
+_POSES_VERSION = 12
 _ALIGNED_VERSION = 1
 _MATCHES = "matches.db"  # what pictures with depth show alike
 _ALIGNED_RECORD = "aligned.json"  # the factor on the depth's unit
@@ -90,9 +91,8 @@ def poses(cache: Stages, capture: Made[Capture], settings: LocaliseSettings) -> 
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large
 
   has_depth = capture.value.known is not None and bool(capture.value.known.depth_files)
-  version = _DEPTH_VERSION if has_depth else _POSES_VERSION
   inputs = {"keyframes": capture.stamp}
-  stage = cache.run("poses", write, settings=settings, inputs=inputs, version=version)
+  stage = cache.run("poses", write, settings=settings, inputs=inputs, version=_POSES_VERSION)
   return Made(localisation.load(stage.folder / "sfm"), stage)
 
 

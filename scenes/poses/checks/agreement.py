@@ -130,6 +130,7 @@ def place_again(
   images_folder: Path,
   *,
   seed: int,
+  misled: Collection[tuple[int, int]] = (),
   report: Progress = no_progress,
 ) -> tuple[pycolmap.Reconstruction, int]:
   """Places pictures without a place, and those whose matches disagree with theirs.
@@ -142,6 +143,7 @@ def place_again(
     database: Its features and verified matches.
     images_folder: Where the pictures lie.
     seed: Of the random choices.
+    misled: Pairs that agreed with a wrong place, of which the first has none any more.
     report: Called with the fraction done and a text.
 
   Returns:
@@ -151,7 +153,7 @@ def place_again(
   total = len(image_ids(database))
   moved: set[int] = set()
   staying: set[int] = set()
-  misled: set[tuple[int, int]] = set()
+  misled = set(misled)
   for _ in range(_ROUNDS):
     judged = evidence(model, database)
     weak = {key for key, said in judged.items() if said.share < MAJORITY} - staying

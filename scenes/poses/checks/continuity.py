@@ -3,112 +3,149 @@
 Things that look alike (two beds, rows of chairs) hold matches that agree with a place at the wrong
 one of them: nothing in a single picture tells. What follows each other in a film sees the same
 things, and where neighbours are both placed rightly their matches lead to the same points. Nor does
-a hand leap: a picture of a plain wall may agree with its neighbours and yet stand anywhere along
-its way. N pictures in the film's order.
+a hand leap (`leaps`). What was filmed seconds apart may have nothing in common but things alike,
+and contradict at right places: how many pairs so far apart do is counted in the film, and what a
+pair says is worth the less the more do.
+
+The film is a line then, of which parts stand elsewhere: the smaller of two groups that clearly lack
+each other (`film_groups`), and those without which least is left that contradicts. Evidence is log
+odds, which add. Shapes: N pictures in the film's order.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.checks import agreement
+from nerf2real.scenes.poses.checks.film_groups import smaller_group
+from nerf2real.scenes.poses.checks.leaps import leaps
+from nerf2real.scenes.poses.checks.overlap import overlap
 from nerf2real.scenes.poses.mapping import registered
 
 _NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen
 _ASKED = 15  # matches that a verdict needs, as many as a place does
-_AGREED = 0.25  # share of them below which a place is wrong: of wrong ones a tenth at most, chosen
+_ALIKE = 200  # pairs about as far apart in time of which those that contradict are counted, chosen
+_ROUNDS = 3  # of counting without the pictures that stand elsewhere
+# Against a part that stands elsewhere, and against each more of its pictures. Chosen: a part begins
+# at one picture of twenty at most, and has about ten.
+_BEGINS = float(np.log(0.95 / 0.05))
+_GOES_ON = 0.1
 
-_USUAL = 0.9  # share of the steps from picture to picture that are the film's usual speed, chosen
-_LEAP = 3.0  # times that speed, chosen; held by hand, the fastest step has 1.1 to 1.8 times
 
-Votes = Mapping[tuple[int, int], tuple[int, int]]
-"""Of pairs of pictures, the earlier first: matches that agree on a point, and that see one."""
+class Votes(NamedTuple):
+  """What matches of pairs of pictures say, the earlier first."""
+
+  agreed: np.ndarray  # matches that lead both to one point [N, N]
+  asked: np.ndarray  # matches of which a picture sees a point [N, N]
 
 
-def out_of_line(count: int, votes: Votes, leaping: Collection[tuple[int, int]] = ()) -> np.ndarray:
-  """Tells which pictures contradict those before and after them, bool [N].
+class OutOfLine(NamedTuple):
+  """Pictures that lost their place."""
 
-  Of all parts of the film, half of it at most, of whose matches with their neighbours too few agree
-  the one goes first that has most leaps to them: a part in the wrong place has one on either side,
-  what comes after it one. Of several that of whose matches fewest agree, and the shortest; what it
-  stood between are neighbours then.
+  names: frozenset[str]
+  misled: frozenset[tuple[int, int]]
+  """Their ids, each with that of a picture most of whose matches had agreed with the lost place."""
+
+
+def out_of_line(times: np.ndarray, votes: Votes, leaping: np.ndarray) -> np.ndarray:
+  """Tells which pictures stand elsewhere than those before and after them, bool [N].
 
   Args:
-    count: Pictures N.
+    times: When each picture was taken [s] [N].
     votes: Of pairs of them.
-    leaping: Pairs, the earlier first, between which a hand would have had to leap.
+    leaping: Between which a hand would have had to leap, bool [N, N].
   """
-  left = list(range(count))
-  while True:
-    best, part = (0, _AGREED), None
-    for length, agreed, asked, leapt in _parts(left, votes, leaping):
-      share = np.where(asked >= _ASKED, agreed / np.maximum(asked, 1), 1.0)
-      few = np.flatnonzero(share < _AGREED)
-      if len(few):
-        first = min(few, key=lambda k: (-leapt[k], share[k]))
-        rank = (-int(leapt[first]), float(share[first]))
-        if rank < best:
-          best, part = rank, (first, length)
-    if part is None:
-      found = np.ones(count, bool)
-      found[left] = False
-      return found
-    del left[part[0] : part[0] + part[1]]
+  kept = np.ones(len(times), bool)
+  for _ in range(_ROUNDS):
+    before, kept = kept, _line(_evidence(times, votes, leaping, kept))
+    if (before == kept).all():
+      break
+  return ~kept
 
 
-def _parts(
-  left: list[int], votes: Votes, leaping: Collection[tuple[int, int]]
-) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
-  """Yields the votes between all parts of a length and their neighbours.
+def _parts(times: np.ndarray, votes: Votes, leaping: np.ndarray) -> np.ndarray:
+  """Counts the parts of a film, each of which contradicts the one before, [N]."""
+  evidence = _evidence(times, votes, leaping, np.ones(len(times), bool))
+  return np.cumsum(np.append(False, np.diagonal(evidence, 1) > 0))[: len(times)]
 
-  Yields:
-    The length, and for each first picture [K] how many agree, how many are asked, and how many
-    leaps there are.
+
+def _evidence(times: np.ndarray, votes: Votes, leaping: np.ndarray, kept: np.ndarray) -> np.ndarray:
+  """What says that two pictures are not of one line if they follow each other, log odds [N, N].
+
+  It is the mean over the matches of them and their neighbours of what their pairs are worth, for
+  one that agrees the negative, and what a leap is worth.
   """
-  count = len(left)
-  pair = np.zeros((3, count, _NEIGHBOURS + 1))  # of a picture and the one so many later
-  for k in range(count):
-    for later in range(1, min(_NEIGHBOURS, count - 1 - k) + 1):
-      both = left[k], left[k + later]
-      pair[:, k, later] = *votes.get(both, (0, 0)), both in leaping
-  border = np.zeros((3, count + 1))  # of pairs that a place lies between
-  for k in range(count):
-    for later in range(1, _NEIGHBOURS + 1):
-      border[:, k + 1 : k + later + 1] += pair[:, k, later, None]
-  for length in range(1, count // 2 + 1):
-    sums = border[:, : count - length + 1] + border[:, length:]
-    for later in range(length + 1, _NEIGHBOURS + 1):  # pairs with the part between them
-      for before in range(1, later - length + 1):
-        over = np.zeros_like(sums)
-        over[:, before:] = pair[:, : sums.shape[1] - before, later]
-        sums = sums - 2 * over
-    yield length, *sums
+  count = len(times)
+  worth = _worth(times, votes, kept)
+  against = np.pad(worth * (votes.asked - 2.0 * votes.agreed), _NEIGHBOURS)
+  asked = np.pad(votes.asked, _NEIGHBOURS)
+  sums = np.zeros((2, count, count))
+  for before in range(_NEIGHBOURS):
+    rows = slice(_NEIGHBOURS - before, _NEIGHBOURS - before + count)
+    for after in range(_NEIGHBOURS - before):
+      columns = slice(_NEIGHBOURS + after, _NEIGHBOURS + after + count)
+      sums += against[rows, columns], asked[rows, columns]
+  mean = np.where(sums[1] >= _ASKED, sums[0] / np.maximum(sums[1], 1), 0.0)
+  found: np.ndarray = mean + leaping * _log_odds(0, count)
+  return found
 
 
-def leaps(centers: np.ndarray, times: np.ndarray) -> list[tuple[int, int]]:
-  """Returns the pairs of pictures between which a hand would have had to leap.
+def _worth(times: np.ndarray, votes: Votes, kept: np.ndarray) -> np.ndarray:
+  """Log odds [N, N] that two right pictures as far apart in time do not contradict, 0 at least."""
+  gaps = times - times[:, None]
+  known = (votes.asked >= _ASKED) & kept & kept[:, None]
+  order = np.argsort(gaps[known], kind="stable")
+  apart = gaps[known][order]
+  contradict = (votes.agreed < votes.asked / 2)[known][order]
+  middle = (np.searchsorted(apart, gaps) + np.searchsorted(apart, gaps, side="right")) // 2
+  begin = np.clip(middle - _ALIKE // 2, 0, max(len(apart) - _ALIKE, 0))
+  end = np.minimum(begin + _ALIKE, len(apart))
+  total = np.concatenate([[0], np.cumsum(contradict)])
+  return np.maximum(_log_odds(total[end] - total[begin], end - begin), 0.0)
 
-  A tenth of the steps at most may be leaps, and nine tenths stand still.
 
-  Args:
-    centers: Positions [N, 3].
-    times: When [s] [N]; where they do not grow, nothing is said.
+def _log_odds(seen: np.ndarray | int, count: np.ndarray | int) -> np.ndarray:
+  """Against what was seen in some of a count (Jeffreys' prior)."""
+  share = (np.asarray(seen) + 0.5) / (np.asarray(count) + 1.0)
+  return np.log((1 - share) / share)
+
+
+def _line(evidence: np.ndarray) -> np.ndarray:
+  """Which pictures a film's line goes through, bool [N], by the least sum of what contradicts it.
+
+  That is what it costs to say that parts, each half of the film at most, stand elsewhere, and the
+  evidence against what is said: that pictures are of one line, which follow each other in it or in
+  a part, or that they are not, at a part's ends. In a part another may begin, without a cost beyond
+  a part's.
   """
-  passed = np.diff(times)
-  if len(times) < 2 or passed.min() <= 0:
-    return []
-  usual = np.quantile(np.linalg.norm(np.diff(centers, axis=0), axis=1) / passed, _USUAL)
-  apart = np.linalg.norm(centers[:, None] - centers, axis=2)
-  first, second = np.nonzero(apart > _LEAP * usual * (times - times[:, None]))
-  return [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
+  count = len(evidence)
+  evidence = np.pad(evidence, 1)  # an end before and after the film
+  steps = np.diagonal(evidence, 1)
+  within = np.concatenate([[0.0], np.cumsum(np.clip(steps, 0.0, _BEGINS))])
+  agree = np.maximum(-steps, 0.0)
+  best, before = np.zeros(count + 2), np.zeros(count + 2, int)
+  for last in range(1, count + 2):
+    first = np.arange(max(last - 1 - count // 2, 0), last - 1)  # before a part
+    parts = _BEGINS + _GOES_ON * (last - 1 - first) + within[last - 1] - within[first + 1]
+    parts += agree[first] + agree[last - 1] + np.maximum(evidence[first, last], 0.0)
+    costs = np.append(best[first] + parts, best[last - 1] + max(steps[last - 1], 0.0))
+    least = len(first) if costs[-1] <= costs.min() + 1e-9 else int(np.argmin(costs))
+    best[last], before[last] = costs[least], np.append(first, last - 1)[least]
+  kept = np.zeros(count + 2, bool)
+  at = count + 1
+  while at:
+    at = before[at]
+    kept[at] = True
+  return kept[1:-1]
 
 
 def drop_out_of_line(
   model: pycolmap.Reconstruction, database: Path, times: Mapping[str, float]
-) -> int:
-  """Takes the pose from pictures of a film that are out of its line; returns their number.
+) -> OutOfLine:
+  """Takes the pose from pictures of a film that are out of its line.
 
   Args:
     model: Poses and points; its pictures' names are in the film's order.
@@ -117,19 +154,52 @@ def drop_out_of_line(
   """
   images = registered(model)
   row = {image.image_id: k for k, image in enumerate(images)}
-  votes: dict[tuple[int, int], tuple[int, int]] = {}
+  votes = Votes(*np.zeros((2, len(images), len(images)), int))
   for ids, _, points in agreement.matched_points(model, database):
-    first, second = row[ids[0]], row[ids[1]]
+    first, second = sorted(row[key] for key in ids)
     sees = (points != 0).any(axis=1)
-    agreed = sees & (points[:, 0] == points[:, 1])
-    pair = (min(first, second), max(first, second))
-    votes[pair] = int(agreed.sum()), int(sees.sum())
+    votes.asked[first, second] = sees.sum()
+    votes.agreed[first, second] = (sees & (points[:, 0] == points[:, 1])).sum()
   centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-  leaping = leaps(centers, np.array([times[image.name] for image in images]))
-  for pair in leaping:
-    votes[pair] = 0, max(votes.get(pair, (0, 0))[1], _ASKED)
-  wrong = out_of_line(len(images), votes, set(leaping))
+  taken = np.array([times[image.name] for image in images])
+  wrong = smaller_group(_parts(taken, votes, leaps(centers, taken)), overlap(model))
+  rest = np.flatnonzero(~wrong)
+  agreed, asked = (said[np.ix_(rest, rest)] for said in votes)
+  leaping = leaps(centers[rest], taken[rest])
+  wrong[rest] = out_of_line(taken[rest], Votes(agreed, asked), leaping)
   for image, is_wrong in zip(images, wrong, strict=True):
     if is_wrong:
       model.deregister_frame(image.frame_id)
-  return int(wrong.sum())
+  misled = set()
+  agreeing = (votes.asked > 0) & (votes.agreed >= agreement.MAJORITY * votes.asked)
+  for first, second in np.argwhere(agreeing):
+    for own, other in ((first, second), (second, first)):
+      if wrong[own] and not wrong[other]:
+        misled.add((images[own].image_id, images[other].image_id))
+  return OutOfLine(frozenset(images[k].name for k in np.flatnonzero(wrong)), frozenset(misled))
+
+
+def gaps(out: Collection[str], placed: Collection[str], times: Mapping[str, float]) -> str:
+  """Says which parts of a film were left out of its line.
+
+  Args:
+    out: Pictures that were.
+    placed: Pictures with a place, which part them.
+    times: When each picture was taken [s], by names that are in the film's order.
+  """
+  parts, begins = list[list[float]](), True
+  for name in sorted(times):
+    if name in out:
+      if begins:
+        parts.append([])
+      parts[-1].append(times[name])
+    begins = name in placed or (begins and name not in out)
+  words = [
+    f"from {part[0]:.1f} s to {part[-1]:.1f} s" if len(part) > 1 else f"at {part[0]:.1f} s"
+    for part in parts
+  ]
+  these = "that part" if len(parts) == 1 else "those parts"
+  return (
+    f"Pictures {', '.join(words)} stand apart from the rest of the film and were left out: film "
+    f"{these} again, slowly."
+  )

@@ -1,111 +1,135 @@
 """Tests of a film's line."""
 
+import itertools
+
 import numpy as np
 import pycolmap
 import pytest
 
 from nerf2real.scenes.poses.checks import agreement, continuity
+from nerf2real.scenes.poses.checks.overlap import Overlap
+
+COUNT = 80
+TIMES = 0.4 * np.arange(COUNT)
+NONE = np.zeros((COUNT, COUNT), bool)
 
 
-def votes_of(place, reach=3, matches=40):
-  """Votes of pictures that agree where their places are of one world: `place` names the world."""
-  return {
-    (i, j): (matches if place[i] == place[j] else 0, matches)
-    for i in range(len(place))
-    for j in range(i + 1, min(len(place), i + reach + 1))
-  }
+def votes_of(elsewhere, reach=4, matches=40):
+  """Votes of pictures that agree where their places are of one world; all others are of one."""
+  place = np.zeros(COUNT, int)
+  place[elsewhere] = 1
+  near = np.triu(np.ones((COUNT, COUNT), bool), 1) & ~np.triu(np.ones((COUNT, COUNT), bool), reach)
+  asked = np.where(near, matches, 0)
+  return continuity.Votes(asked * (place == place[:, None]), asked)
+
+
+def out(votes, leaping=NONE):
+  return np.flatnonzero(continuity.out_of_line(TIMES, votes, leaping)).tolist()
 
 
 def test_a_film_in_one_world_is_whole():
-  assert not continuity.out_of_line(20, votes_of([0] * 20)).any()
-  assert not continuity.out_of_line(1, {}).any()
-  assert not continuity.out_of_line(0, {}).any()
+  assert out(votes_of([])) == []
+  for count in (0, 1, 2):
+    nothing = np.zeros((count, count), int)
+    votes = continuity.Votes(nothing, nothing)
+    assert not continuity.out_of_line(TIMES[:count], votes, nothing > 0).any()
 
 
-@pytest.mark.parametrize("wrong", [[7], [0, 1], [18, 19], [5, 6, 7, 8], [3, 12, 13]])
+@pytest.mark.parametrize("wrong", [[0, 1, 2], [77, 78, 79], [5, 6, 7, 8], [13, 14, 15, 42, 43, 44]])
 def test_short_parts_at_the_wrong_place_are_out_of_line(wrong):
-  place = [1 if k in wrong else 0 for k in range(20)]
-  found = continuity.out_of_line(20, votes_of(place))
-  assert np.flatnonzero(found).tolist() == wrong
-
-
-def test_parts_have_the_votes_of_all_pairs_across_their_ends():
-  random = np.random.default_rng(0)
-  votes = {pair: tuple(random.integers(0, 9, 2)) for pair in votes_of([0] * 9)}
-  leaping = {pair for pair in votes if random.random() < 0.3}
-  counted = {pair: (*v, pair in leaping) for pair, v in votes.items()}
-  for length, *found in continuity._parts(list(range(9)), votes, leaping):
-    for first in range(9 - length + 1):
-      inside = set(range(first, first + length))
-      across = [v for (i, j), v in counted.items() if (i in inside) != (j in inside)]
-      assert [f[first] for f in found] == np.sum(across, axis=0).tolist()
-
-
-def test_a_part_with_a_leap_on_either_side_goes_before_what_follows_it():
-  """Matches of things alike agree before it, none after it: by them alone the film's end goes."""
-  place = [1 if 9 <= k < 14 else 0 for k in range(20)]
-  votes = votes_of(place)
-  for i in range(6, 9):  # see the thing that is taken for another
-    votes |= {(i, j): (12, 40) for j in range(9, i + 4)}
-  found = continuity.out_of_line(20, votes)
-  assert np.flatnonzero(found).tolist() == list(range(14, 20))
-  found = continuity.out_of_line(20, votes, {(8, 9), (13, 14)})
-  assert np.flatnonzero(found).tolist() == list(range(9, 14))
+  assert out(votes_of(wrong)) == wrong
 
 
 def test_parts_without_common_matches_contradict_nothing():
-  votes = {(i, j): v for (i, j), v in votes_of([0] * 20).items() if not i < 10 <= j}
-  assert not continuity.out_of_line(20, votes).any()
+  votes = votes_of(range(70, 80))
+  votes.asked[:70, 70:] = 0
+  assert out(votes) == []
 
 
 def test_a_few_matches_decide_nothing():
-  place = [0] * 10 + [1] * 4
-  assert not continuity.out_of_line(14, votes_of(place, matches=1)).any()
+  assert out(votes_of(range(70, 80), matches=1)) == []
 
 
-def test_the_order_is_the_films(monkeypatch):
-  taken, other_world = [], [4]
-  images = [
-    pycolmap.Image(name=f"frame_{k:06d}.jpg", image_id=40 - k, frame_id=k) for k in range(25)
-  ]
+def test_a_part_that_contradicts_on_both_sides_goes_before_what_follows_it():
+  """Matches of things alike agree before it, none after it."""
+  wrong = list(range(60, 65))
+  votes = votes_of(wrong)
+  votes.agreed[57:60, 60:63] = votes.asked[57:60, 60:63] * 0.3
+  assert out(votes) == wrong
+
+
+def test_parts_that_stand_elsewhere_go_and_not_what_is_between_them():
+  """They contradict it in few matches, and what is around the three of them in many."""
+  wrong = [*range(20, 30), *range(50, 55)]
+  votes = votes_of(wrong)
+  for inner, outer in ((29, 30), (49, 50)):
+    votes.asked[inner - 3 : inner + 1, outer : outer + 4] = 0
+    votes.asked[inner, outer] = 16
+  assert out(votes) == wrong
+
+
+def test_pictures_that_stand_each_elsewhere_are_one_part():
+  votes = votes_of(range(30, 36))
+  votes.agreed[30:36, 30:36] = 0
+  assert out(votes) == list(range(30, 36))
+
+
+def test_a_leap_tells_where_matches_say_nothing():
+  votes, leaping = votes_of([]), NONE.copy()
+  for first, second in itertools.combinations(range(COUNT), 2):
+    if (first in range(30, 37)) != (second in range(30, 37)):
+      votes.asked[first, second] = 0
+      leaping[first, second] = second < first + 9
+  assert out(votes) == []
+  assert out(votes, leaping) == list(range(30, 37))
+
+
+def test_pictures_far_apart_in_time_may_contradict():
+  """As many as agree do in this film: what a gap parts stays, whatever is alike beyond it."""
+  votes = votes_of(range(40, 45))
+  for first in range(COUNT):
+    for second in range(first + 5, min(first + 9, COUNT)):
+      votes.asked[first, second] = 40
+      votes.agreed[first, second] = 40 * ((first + second) % 2)
+  assert out(votes) == list(range(40, 45))
+  for first in range(35, 40):
+    for second in range(45, 49):
+      votes.asked[first, second], votes.agreed[first, second] = 40, 0
+  assert out(votes) == list(range(40, 45))
+
+
+def test_the_order_is_the_films_and_deceiving_pairs_are_named(monkeypatch):
+  taken, other_world = [], [4, 5, 6]
+  images = [pycolmap.Image(name=f"{k:03d}", image_id=100 - k, frame_id=k) for k in range(COUNT)]
   monkeypatch.setattr(continuity, "registered", lambda model: images)
   monkeypatch.setattr(pycolmap.Image, "projection_center", lambda image: np.zeros(3))
 
   def pairs(model, database):
-    for i in range(25):
-      for j in range(i + 1, min(25, i + 4)):
-        same = (i in other_world) == (j in other_world)
+    for i, j in itertools.combinations(range(COUNT), 2):
+      if j < i + 4 or (i, j) == (5, 60):
+        same = (i in other_world) == (j in other_world) or j == 60
         points = np.ones((30, 2), np.uint64)
         points[:, 1] += 0 if same else 1
         yield (images[j].image_id, images[i].image_id), np.zeros((30, 2), int), points
 
   monkeypatch.setattr(agreement, "matched_points", pairs)
+  nothing = Overlap([*range(COUNT)], np.zeros((COUNT, COUNT)), np.zeros((COUNT, COUNT)), 0.0)
+  monkeypatch.setattr(continuity, "overlap", lambda model: nothing)
 
   class Model:
     def deregister_frame(self, key):
       taken.append(key)
 
-  times = {f"frame_{k:06d}.jpg": 0.5 * k for k in range(25)}
-  assert continuity.drop_out_of_line(Model(), None, times) == 1
-  assert taken == [4]
-  taken.clear()
-  other_world.clear()
-  places = np.arange(25.0)
-  places[6] = 40.0  # all matches agree with it, and no hand gets there and back
-  monkeypatch.setattr(pycolmap.Image, "projection_center", lambda i: [places[i.frame_id], 0, 0])
-  assert continuity.drop_out_of_line(Model(), None, times) == 1
-  assert taken == [6]
+  times = {image.name: float(when) for image, when in zip(images, TIMES, strict=True)}
+  found = continuity.drop_out_of_line(Model(), None, times)
+  assert found.names == {"004", "005", "006"} and taken == [4, 5, 6]
+  assert found.misled == {(95, 40)}
 
 
-def test_a_leap_is_a_way_that_the_films_usual_speed_does_not_allow():
-  times = np.arange(30) * 0.5
-  centers = np.zeros((30, 3))
-  centers[:, 0] = np.cumsum(np.random.default_rng(0).uniform(0.0, 0.2, 30))
-  assert continuity.leaps(centers, times) == []
-  waits = np.maximum(centers[:, 0] - centers[22, 0], 0.0)  # three quarters of it stand still
-  assert continuity.leaps(np.stack([waits, 0 * waits, 0 * waits], 1), times) == []
-  centers[9, 1] = 0.8
-  found = continuity.leaps(centers, times)
-  assert {(8, 9), (9, 10)} <= set(found) and all(9 in pair for pair in found)
-  assert continuity.leaps(centers, times[::-1]) == []
-  assert continuity.leaps(centers[:1], times[:1]) == []
+def test_what_is_left_out_is_told_by_its_times():
+  times = {f"{k}": 0.5 * k for k in range(10)}
+  placed = set("0127")
+  assert "from 1.5 s to 3.0 s stand apart" in continuity.gaps({"3", "4", "6"}, placed, times)
+  text = continuity.gaps({"3", "8", "9"}, placed, times)
+  assert text.startswith("Pictures at 1.5 s, from 4.0 s to 4.5 s stand apart")
+  assert "those parts" in text
