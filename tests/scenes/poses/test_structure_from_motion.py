@@ -18,6 +18,7 @@ from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses import mapping, readout, shutter, structure_from_motion
+from nerf2real.scenes.poses.checks import continuity
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
 from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.poses.matching.features import FeatureSettings
@@ -55,6 +56,26 @@ def test_poses_against_truth(corner):
   assert result.camera.fx == pytest.approx(280, rel=0.02)
   assert result.reprojection_error_px < 1
   assert result.strategy.startswith("exhaustive")
+
+
+def test_what_is_out_of_a_films_line_is_left_out_and_told(corner, tmp_path, monkeypatch):
+  folder = corner[0]
+  names = [path.name for path in sorted((folder / "images").iterdir())]
+  times = {name: 2.0 + 0.5 * k for k, name in enumerate(names)}
+
+  def drop(model, database, times):
+    for image in mapping.registered(model):
+      if image.name in names[4:6]:
+        model.deregister_frame(image.frame_id)
+    return continuity.OutOfLine(frozenset(names[4:6]), frozenset())
+
+  monkeypatch.setattr(continuity, "drop_out_of_line", drop)
+  shutil.copytree(folder / "out" / "work", tmp_path / "work")
+  localise(folder / "images", tmp_path, settings=FEW, times=times)
+  result = load(tmp_path / "sfm")
+  assert result.left_out == tuple(names[4:6])
+  assert set(result.names) == set(names) - set(names[4:6])
+  assert any("from 4.0 s to 4.5 s stand apart" in line for line in result.warnings)
 
 
 def test_points_lie_on_the_planes_with_their_colours(corner):

@@ -1,5 +1,7 @@
 """Verdicts on captures: blur, exposure, gaps, the loop, and which side of a room was not filmed."""
 
+import types
+
 import numpy as np
 import pytest
 
@@ -92,6 +94,17 @@ def test_a_loop_is_closed_where_the_end_sees_what_the_beginning_saw(last, closed
   views = np.repeat([0, last], 40)
   shared = advice._shared_points(Tracks(views, np.tile(np.arange(40), 2), np.zeros((80, 2))), 20)
   assert (shared >= advice._LOOP_POINTS) == closed
+
+
+def test_a_film_of_which_parts_were_left_out_is_told_when(tmp_path):
+  capture = _capture(tmp_path)
+  names = [path.name for path in capture.images]
+  poses = types.SimpleNamespace(names=names, left_out=(), tracks=Tracks.none())
+  assert all(finding.name != "line" for finding in advice.judge_poses(capture, poses))
+  poses.names, poses.left_out = [*names[:7], *names[9:]], tuple(names[7:9])
+  found = {finding.name: finding for finding in advice.judge_poses(capture, poses)}
+  assert not found["line"].good and found["poses"].good
+  assert "from 21.0 s to 24.0 s" in found["line"].text and "film that part" in found["line"].text
 
 
 def test_without_poses_the_verdict_is_the_reason(tmp_path):

@@ -24,9 +24,9 @@ def model(folder):
   return pycolmap.Reconstruction(str(folder / "out" / "sfm"))
 
 
-def _again(model, folder):
+def _again(model, folder, misled=()):
   database = folder / "out" / "work" / "database.db"
-  return agreement.place_again(model, database, folder / "images", seed=0)
+  return agreement.place_again(model, database, folder / "images", seed=0, misled=misled)
 
 
 def _shares(model, folder):
@@ -84,6 +84,14 @@ def test_a_picture_without_a_place_gets_one(model, folder):
   assert placed == 1
   assert found.num_reg_images() == 8
   assert _off(found, truth).max() < 0.004
+
+
+def test_pairs_that_agreed_with_a_wrong_place_give_no_place(model, folder):
+  lost, *others = registered(model)[3:] + registered(model)[:3]
+  model.deregister_frame(lost.frame_id)
+  found, placed = _again(model, folder, {(lost.image_id, other.image_id) for other in others})
+  assert placed == 0
+  assert found.num_reg_images() == 7
 
 
 def test_a_picture_of_something_else_stays_without_a_place(model, folder, tmp_path):
