@@ -162,7 +162,9 @@ def drop_out_of_line(
     votes.agreed[first, second] = (sees & (points[:, 0] == points[:, 1])).sum()
   centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
   taken = np.array([times[image.name] for image in images])
-  wrong = smaller_group(_parts(taken, votes, leaps(centers, taken)), overlap(model))
+  wrong, parts = np.zeros(len(images), bool), _parts(taken, votes, leaps(centers, taken))
+  if parts.any():
+    wrong = smaller_group(parts, overlap(model))
   rest = np.flatnonzero(~wrong)
   agreed, asked = (said[np.ix_(rest, rest)] for said in votes)
   leaping = leaps(centers[rest], taken[rest])

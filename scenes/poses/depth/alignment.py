@@ -25,7 +25,7 @@ _ADJUSTED = 0.7  # of the progress: when poses are adjusted; the points follow
 _CLEARLY = 6.0  # deviations of a scale; chosen: three, as errors near each other are alike
 _NEARER = 0.9  # of what depth was off that it may be afterwards, chosen: where features place all
 # pictures to a millimetre surfaces do no better, and what a sensor's place is off moves them
-_KEPT = ("registered_fraction", "unit_from_source", "shutter", "warnings", "seconds")
+_KEPT = ("registered_fraction", "unit_from_source", "shutter", "warnings", "seconds", "left_out")
 
 
 def aligned(
