@@ -140,7 +140,7 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
     return capture
   files = [aligned.get(Path(name).stem, file) for name, file in of_name.items()]
   warnings = list(capture.value.warnings)
-  if json.loads((stage.folder / _SENSOR_RECORD).read_text())["beside"]:
+  if _is_beside(Made(capture.value, stage)):
     warnings.append(
       "The depth was measured by a camera beside the pictures' own, of another focal length: both "
       "were aligned by localised points."
@@ -149,16 +149,23 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
   return Made(dataclasses.replace(capture.value, known=still.lifted(), warnings=warnings), stage)
 
 
+def _is_beside(capture: Made[Capture]) -> bool:
+  """Tells whether a capture's depth was measured by a camera beside the pictures' own."""
+  record = capture.stage.folder / _SENSOR_RECORD
+  return record.is_file() and bool(json.loads(record.read_text())["beside"])
+
+
 def aligned(
   cache: Stages, capture: Made[Capture], poses: Made[Localisation]
 ) -> tuple[Made[Capture], Made[Localisation]]:
   """Returns capture and poses with the pictures laid onto the surfaces that a sensor measured.
 
-  As they are where none did, or where depth and pictures then agree no better.
+  As they are where none did, or one in a place of its own, or where depth and pictures then agree
+  no better.
   """
   known, found = capture.value.known, poses.value
   database = poses.stage.folder / _MATCHES
-  if known is None or not known.depth_files or not database.is_file():
+  if known is None or not known.depth_files or not database.is_file() or _is_beside(capture):
     return capture, poses
   of_name = {path.name: row for row, path in enumerate(capture.value.images)}
   rows = [of_name[name] for name in found.names]

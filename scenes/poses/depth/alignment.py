@@ -2,7 +2,8 @@
 
 `refinement.py` adjusts poses to features, and its points tell whether and when a sensor of its own
 measured the depth (`sensor.py`). Depth that is aligned with the pictures then tells more: pictures
-of plain walls see few points, and all see surfaces.
+of plain walls see few points, and all see surfaces. Not so depth of a sensor of its own, which sits
+a few millimetres beside where points show it: poses would move by as much.
 """
 
 import dataclasses
@@ -23,8 +24,6 @@ from nerf2real.scenes.poses.localisation import Localisation
 
 _ADJUSTED = 0.7  # of the progress: when poses are adjusted; the points follow
 _CLEARLY = 6.0  # deviations of a scale; chosen: three, as errors near each other are alike
-_NEARER = 0.9  # of what depth was off that it may be afterwards, chosen: where features place all
-# pictures to a millimetre surfaces do no better, and what a sensor's place is off moves them
 _KEPT = ("registered_fraction", "unit_from_source", "shutter", "warnings", "seconds", "left_out")
 
 
@@ -36,7 +35,7 @@ def aligned(
   *,
   progress: Progress = no_progress,
 ) -> tuple[pycolmap.Reconstruction, Localisation, float] | None:
-  """Adjusts poses and lens to the depth; None where it then agrees not clearly better.
+  """Adjusts poses and lens to the depth; None where depth and pictures then agree no better.
 
   Where the metre of the poses that came is clearly not the sensor's, theirs holds, and the unit of
   the depth changes.
@@ -70,7 +69,7 @@ def aligned(
   after = dataclasses.replace(known, depth_unit=known.depth_unit * back.scale)
   after = after.lifted().with_views(camera, back.apply_pose(poses))
   off = agreement.distances([before, after], images)
-  if not off[1] < _NEARER * off[0]:
+  if not off[1] < off[0]:
     return None
   progress(_ADJUSTED, f"points of {len(names)} pictures")
   bare = dataclasses.replace(

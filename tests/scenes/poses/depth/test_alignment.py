@@ -138,3 +138,10 @@ def test_depth_of_other_pictures_moves_nothing(capture, refined):
 def test_pictures_without_depth_stay_as_they_are(capture, refined):
   bare = _made(dataclasses.replace(capture[0], known=None))
   assert localising.aligned(refined[0], bare, refined[1]) == (bare, refined[1])
+
+
+def test_depth_of_a_sensor_of_its_own_moves_nothing(capture, refined, tmp_path):
+  """Its place is known to a few millimetres."""
+  (tmp_path / "sensor.json").write_text('{"moved": false, "beside": true}')
+  given = Made(capture[0], StageResult(tmp_path, "key", "beside", 0.0, cached=False))
+  assert localising.aligned(refined[0], given, refined[1]) == (given, refined[1])
