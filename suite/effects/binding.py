@@ -21,6 +21,7 @@ _LISTED = 30  # names in an error message
 # Every array of the model that some effect writes, apart from the mass properties.
 _FIELDS = (
   *inertia.MASS_FIELDS,
+  "body_gravcomp",
   "dof_damping",
   "dof_dampingpoly",
   "dof_frictionloss",
@@ -79,11 +80,15 @@ class Binding:
     self.snapshot = inertia.Snapshot(model, _FIELDS)
     self.gravity = model.opt.gravity.copy()
     self.masses_changed = False
+    self.loaded = np.zeros(model.nbody, bool)
+    """Which bodies carry what is not declared."""
     self._find_actuators()
 
     num_joints, num_actuators = len(self.joints), model.nu
     self.position = np.zeros(num_joints)
     self.velocity = np.zeros(num_joints)
+    self.encoder_offset = np.zeros(num_joints)
+    """What the encoder always reads beyond the joint's position, rad."""
     self.force = np.zeros(num_joints)
     """Generalised force that the effects add, N m."""
     self.friction = np.zeros(num_joints)

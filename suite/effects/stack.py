@@ -8,6 +8,7 @@ import numpy as np
 
 from nerf2real.suite.effects import files
 from nerf2real.suite.effects.binding import Binding
+from nerf2real.suite.effects.compensation import unknown_to_firmware
 from nerf2real.suite.effects.effect import Array, Effect, Operator
 from nerf2real.suite.effects.registry import KINDS
 from nerf2real.suite.randomisation import inertia
@@ -59,6 +60,7 @@ class EffectStack:
       binding.restore()
       raise
     binding.note_constants()
+    self._lift = unknown_to_firmware(binding)
     self.binding, self.operators = binding, operators
     self._commands = [op for op in operators if op.overrides("command")]
     self._steps = [op for op in operators if op.overrides("step")]
@@ -83,7 +85,7 @@ class EffectStack:
   @property
   def is_constant(self) -> bool:
     """True if the bound model alone holds all that acts on the motion: plain stepping will do."""
-    return not self._commands and not self._steps
+    return not self._commands and not self._steps and self._lift is None
 
   def operator(self, kind: str) -> Operator | None:
     """Returns the operator of a kind, None if the stack has none."""
@@ -122,6 +124,8 @@ class EffectStack:
     for operator in self._commands:
       operator.command(data.time, applied)
     data.ctrl[:] = applied
+    if self._lift is not None:
+      data.qfrc_applied[:] = self._lift.torques(data)
     if not self._steps:
       return
     binding.data = data
@@ -132,7 +136,8 @@ class EffectStack:
     for operator in self._steps:
       operator.step(binding)
     if self._adds_force:
-      data.qfrc_applied[binding.dofs] = binding.force
+      lifted = 0.0 if self._lift is None else data.qfrc_applied[binding.dofs]
+      data.qfrc_applied[binding.dofs] = lifted + binding.force
     self._write(binding)
 
   def _write(self, binding: Binding) -> None:

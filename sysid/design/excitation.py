@@ -130,10 +130,13 @@ def _quantities(position: Array, velocity: Array, torque: Array, duration: float
 def readings(plant: JointModel, terms: Sequence[Term], x: Array, command: Array) -> Simulated:
   """Returns readings [S] under a design at TIMES, surroundings at the joint's mean."""
   p, loads, table = compose(plant, terms, x)
-  around = plant.forces(loads, 0)
+  inertia, zero, quarter, _ = plant.forces(loads, 0)
+  lift = plant.lift(0, float(p[kernel.INDEX["encoder_offset"]]))
+  if lift is not None:
+    zero, quarter = zero - lift[0], quarter - lift[1]
   weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
   count = int(_DURATION / plant.step) + 100
-  fields = [np.full(count, mean) for mean in (*np.mean(around[:3], axis=1), 0.0)]
+  fields = [np.full(count, mean) for mean in (inertia.mean(), zero.mean(), quarter.mean(), 0.0)]
   out = np.zeros((3, len(TIMES)))
   kernel.simulate(  # type: ignore[call-arg]
     kernel.record(p),

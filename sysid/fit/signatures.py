@@ -35,8 +35,9 @@ class TorqueResidual(NamedTuple):
 def torque_residual(plant: JointModel, hypothesis: Composed, index: int) -> TorqueResidual:
   """Returns the residual torque of a log under a hypothesis [N - 2 edges]."""
   log = plant.logs[index]
-  inertia, here, across, at, bias = plant.at_samples(hypothesis.loads, index)
   value = dict(zip(INDEX, hypothesis.p, strict=True))
+  offset = value["encoder_offset"]
+  inertia, here, across, at, bias = plant.at_samples(hypothesis.loads, index, offset=offset)
   delay = value["command_delay"] + value["measurement_delay"]
   last = np.searchsorted(log.command_time, log.time - delay, side="right") - 1
   command = log.command[np.clip(last, 0, len(log.command) - 1)]
@@ -47,7 +48,7 @@ def torque_residual(plant: JointModel, hypothesis: Composed, index: int) -> Torq
     + value["velocity"] * log.velocity
   )
   torque = np.clip(torque, value["lowest"], value["highest"])
-  q = log.position - value["encoder_offset"]
+  q = log.position - offset
   gravity = here * np.cos(q - at) + across * np.sin(q - at) if plant.hinge else here
   demand = (inertia + value["armature"]) * log.acceleration
   demand = demand + value["damping"] * log.velocity + gravity + bias

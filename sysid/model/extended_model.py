@@ -54,6 +54,9 @@ def write(
   order = [*EXPRESSED, *native_effects.KINDS]
   left, written = [], []
   for effect in sorted(effects, key=lambda e: order.index(e.kind) if e.kind in order else 0):
+    if effect.kind == "gravity_tilt" and any(body.gravcomp for body in spec.bodies):
+      left.append(effect)  # firmware lifts against the declared gravity, MuJoCo against the turned
+      continue
     if effect.kind in EXPRESSED:
       _put(spec, effect)
     elif native_effects.holds(spec, effect):
@@ -170,6 +173,7 @@ def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float
         actuator.forcerange = np.array(actuator.forcerange) * value.get("limit", 1.0)
       if value.get("mass", 1.0) != 1.0:
         joint.parent.mass *= value["mass"]
+        joint.parent.gravcomp /= value["mass"]  # firmware lifts the declared weight
         joint.parent.inertia = np.array(joint.parent.inertia) * value["mass"]
         joint.parent.fullinertia = np.array(joint.parent.fullinertia) * value["mass"]  # NaN: none
         for geom in joint.parent.geoms:

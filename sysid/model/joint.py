@@ -131,7 +131,8 @@ class JointModel(JointPlant):
 
   def forces(self, loads: Sequence[Load], index: int) -> tuple[Array, ...]:
     """Returns what a log's joint feels as the kernel takes it, each [T]: inertia, gravity's torque
-    at position 0 and a quarter turn further, and bias. Those of the last loads are kept."""
+    at position 0 and a quarter turn further, not lifted by firmware, and bias. Those of the last
+    loads are kept."""
     key = tuple((load.key, load.factors.tobytes()) for load in loads)
     kept = self._loaded.setdefault(index, {})
     if key not in kept:
@@ -141,10 +142,13 @@ class JointModel(JointPlant):
       kept[key] = tuple(sum(changes, self._unloaded[index]))
     return kept[key]
 
-  def at_samples(self, loads: Sequence[Load], index: int) -> Array:
+  def at_samples(self, loads: Sequence[Load], index: int, *, offset: float = 0.0) -> Array:
     """Returns inertia, gravity's torque here and a quarter turn further, the position where that
-    is, and bias, at the samples [5, N]."""
+    is, and bias, at the samples [5, N]; see `forces` and `lift`."""
     inertia, zero, quarter, bias = self.forces(loads, index)
+    lift = self.lift(index, offset)
+    if lift is not None:
+      zero, quarter = zero - lift[0], quarter - lift[1]
     at = self._nominal[index][3]
     here, across = turned_back(zero, quarter, at) if self.hinge else (zero, quarter)
     grid, time = self._grids[index], self.logs[index].time

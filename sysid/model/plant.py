@@ -136,6 +136,12 @@ class JointPlant:
     ]
     self._readings = [np.where(log.valid, log.position, np.nan) for log in self.logs]
     self._nominal = [(s.inertia, s.here, s.across, s.at, s.bias) for s in self.surroundings]
+    lifts = [reduction.compensation(joint) for reduction in self.reductions]
+    self._lifts = [
+      None if s is None else turning((s.inertia, s.here, s.across, s.at, s.bias), self.hinge)[1:3]
+      for s in lifts
+    ]
+    self._lifted_by_motor = bool(model.jnt_actgravcomp[index])
 
   @property
   def numerical_inertia(self) -> float:
@@ -176,6 +182,16 @@ class JointPlant:
     damping = self.declared[kernel.INDEX["damping"]] if of_current else 0.0
     return np.abs(np.concatenate([o.torque - damping * o.velocity for o in outputs]))
 
+  def lift(self, index: int, offset: float) -> tuple[Array, Array] | None:
+    """Returns what firmware lifts in a log where a joint is at 0 and a quarter turn further [T].
+
+    Args:
+      index: of the log.
+      offset: what its encoder reads beyond the joint, which firmware does not know, rad (or m).
+    """
+    lift = self._lifts[index]
+    return lift if lift is None or not self.hinge else turned_back(*lift, np.array(offset))
+
   def _run(
     self,
     p: Array,
@@ -185,6 +201,10 @@ class JointPlant:
     readings: Array | None = None,
   ) -> Output:
     log, windows = self.logs[index], self.windows[index]
+    lift = self.lift(index, p[kernel.INDEX["encoder_offset"]])
+    if lift is not None:
+      inertia, zero, quarter, bias = grid
+      grid = inertia, zero - lift[0], quarter - lift[1], bias
     out = np.zeros((3, len(log.time)))
     weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
     kernel.simulate(  # type: ignore
@@ -206,6 +226,10 @@ class JointPlant:
       out[1],
       out[2],
     )
+    if lift is not None and self._lifted_by_motor:
+      zero, quarter = (np.interp(log.time, self._grids[index], part) for part in lift)
+      at = out[0] - p[kernel.INDEX["encoder_offset"]]
+      out[2] += turned_back(zero, quarter, at)[0] if self.hinge else zero
     return Output(out[0], out[1], out[2])
 
 

@@ -74,6 +74,15 @@ def carrying(model: mujoco.MjModel, body: int) -> list[int]:
   return result
 
 
+def carried(model: mujoco.MjModel, body: int) -> Array:
+  """Returns a body and all that it carries."""
+  below = np.zeros(model.nbody, bool)
+  below[body] = True
+  for k in range(body + 1, model.nbody):
+    below[k] |= below[model.body_parentid[k]]
+  return np.flatnonzero(below)
+
+
 def added(
   poses: Poses,
   carrying: Sequence[int],

@@ -127,11 +127,22 @@ class Reduction:
     return Reduction(model, dataclasses.replace(log, states=states)), course
 
   def of_joint(self, joint: str) -> Surroundings:
-    """Returns what a joint feels of the model."""
+    """Returns what a joint feels of the model, not lifted by firmware: see `compensation`."""
     dof = int(self.model.jnt_dofadr[self.model.joint(joint).id])
     inertia, bias, _ = self._evaluated
     here, across = self._weights(joint) @ self.model.opt.gravity
     return self._on_grid(joint, inertia[:, dof], here, across, bias[:, dof])
+
+  def compensation(self, joint: str) -> Surroundings | None:
+    """Returns what firmware lifts of a joint's gravity (`gravcomp`), None where it lifts nothing.
+
+    It knows the declared weights where the encoders read them to be, and no others.
+    """
+    if not self._lifted.any():
+      return None
+    none = np.zeros(len(self._knots))
+    here, across = self._weights(joint, self._lifted) @ self.model.opt.gravity
+    return self._on_grid(joint, none, here, across, none)
 
   def gravity(self, joint: str) -> list[Surroundings]:
     """Returns what gravity adds to a joint's surroundings per m/s^2 along the world's x, y, z."""
@@ -166,8 +177,8 @@ class Reduction:
   def _evaluated(self) -> tuple[Array, Array, Array]:
     """The model at the knots.
 
-    Inertia without armature and what the others' motion demands [M, nv]; of every body's subtree,
-    its centre of mass, then axes and anchors of the joints [M, bodies + 2 joints, 3].
+    Inertia without armature and what the others' motion demands [M, nv]; the centres of
+    mass of the bodies, then axes and anchors of the joints [M, bodies + 2 joints, 3].
     """
     model, data, motion = self.model, mujoco.MjData(self.model), self.detailed
     inertia, bias = np.zeros((2, len(self._knots), model.nv))
@@ -183,7 +194,7 @@ class Reduction:
       mujoco.mj_fullM(model, data, full)
       own = full.diagonal()
       inertia[n] = own - model.dof_armature
-      places.append(np.vstack([data.subtree_com, data.xaxis, data.xanchor]))
+      places.append(np.vstack([data.xipos, data.xaxis, data.xanchor]))
       if self._alone:
         continue
       mujoco.mj_comVel(model, data)
@@ -196,18 +207,29 @@ class Reduction:
       bias[n] += full @ acceleration - own * acceleration - still
     return inertia, bias, np.array(places)
 
-  def _weights(self, joint: str) -> Array:
-    """Returns gravity's torque, and a quarter turn further, at the knots per m/s^2 [2, M, 3]."""
+  @property
+  def _lifted(self) -> Array:
+    """Mass of every body that firmware lifts [bodies], kg."""
+    return self.model.body_mass * self.model.body_gravcomp
+
+  def _weights(self, joint: str, masses: Array | None = None) -> Array:
+    """Returns gravity's torque, and a quarter turn further, at the knots per m/s^2 [2, M, 3].
+
+    Args:
+      joint: that carries them.
+      masses: of the bodies, the model's if left out; the joint feels those that it carries.
+    """
     model, places = self.model, self._evaluated[2]
     index = model.joint(joint).id
     body = int(model.jnt_bodyid[index])
-    centre, axis = places[:, body], places[:, model.nbody + index]
-    anchor = places[:, model.nbody + model.njnt + index]
-    mass = model.body_subtreemass[body]
+    axis, anchor = places[:, model.nbody + index], places[:, model.nbody + model.njnt + index]
+    carried = point_mass.carried(model, body)
+    masses = (model.body_mass if masses is None else masses)[carried]
     if not self._hinge(joint):
-      return -mass * np.array([axis, np.zeros_like(axis)])
-    moved = np.cross(axis, centre - anchor)
-    return -mass * np.array([moved, np.cross(axis, moved)])
+      return -masses.sum() * np.array([axis, np.zeros_like(axis)])
+    moment = np.einsum("b,mbc->mc", masses, places[:, carried] - anchor[:, None])
+    moved = np.cross(axis, moment)
+    return -np.array([moved, np.cross(axis, moved)])
 
   def _hinge(self, joint: str) -> bool:
     kind = int(self.model.jnt_type[self.model.joint(joint).id])

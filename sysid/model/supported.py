@@ -11,6 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from nerf2real.sysid.model import point_mass
 from nerf2real.sysid.model.drive import actuator_of
 
 _CHAIN = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -48,23 +49,15 @@ def _beyond(model: mujoco.MjModel, joint: str) -> str | None:
     return "an actuator with a time constant or another state"
   if int(model.actuator_gaintype[u]) != fixed or int(model.actuator_biastype[u]) > affine:
     return "an actuator that is neither a motor nor an affine servo"
-  if np.any(model.body_gravcomp[_carried(model, int(model.jnt_bodyid[index]))] != 0.0):
-    return "gravity compensation"
+  lifted = np.any(model.body_gravcomp[point_mass.carried(model, int(model.jnt_bodyid[index]))])
+  if lifted and model.jnt_actgravcomp[index] and model.jnt_actfrclimited[index]:
+    return "gravity compensation within a range of force (actuatorgravcomp with actuatorfrcrange)"
   wraps = (model.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)) & (model.wrap_objid == index)
   if np.any(wraps):
     return "a tendon"
   if any(_ties(model, int(e), index) for e in np.flatnonzero(model.eq_active0)):
     return "an equality constraint"
   return None
-
-
-def _carried(model: mujoco.MjModel, body: int) -> np.ndarray:
-  """Returns a body and all that it carries."""
-  carried = np.zeros(model.nbody, bool)
-  carried[body] = True
-  for k in range(body + 1, model.nbody):
-    carried[k] |= carried[model.body_parentid[k]]
-  return np.flatnonzero(carried)
 
 
 def _ties(model: mujoco.MjModel, equality: int, joint: int) -> bool:
@@ -74,7 +67,7 @@ def _ties(model: mujoco.MjModel, equality: int, joint: int) -> bool:
     return joint in ends
   bodies = int(model.eq_objtype[equality]) == int(mujoco.mjtObj.mjOBJ_BODY)
   held = ends if bodies else model.site_bodyid[list(ends)]
-  carried = _carried(model, int(model.jnt_bodyid[joint]))
+  carried = point_mass.carried(model, int(model.jnt_bodyid[joint]))
   return kind in _CHAIN and sum(int(end) in carried for end in held) == 1
 
 

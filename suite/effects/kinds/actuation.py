@@ -104,6 +104,7 @@ class EncoderOffset(Operator):
 
   def bind(self, binding: Binding) -> None:
     self._offset = self.per_joint(binding)["offset"]
+    binding.encoder_offset[:] = self._offset
     model, joint = binding.model, np.maximum(binding.actuator_joint, 0)
     if model.nu:
       stiffness = model.actuator_biasprm[:, 1] * binding.gear

@@ -33,6 +33,7 @@ class ParameterError(Operator):
         body = model.jnt_bodyid[joint]
         model.body_mass[body] *= factor
         model.body_inertia[body] *= factor
+        model.body_gravcomp[body] /= factor  # firmware lifts the declared weight
         binding.masses_changed = True
     if not np.all(factors["armature"] == 1):
       binding.masses_changed = True
@@ -57,6 +58,7 @@ class Payload(Operator):
       mass = self.value(effect, "mass")
       inertia.attach_mass(binding.model, body, added=mass, position=position)
       binding.masses_changed |= mass != 0
+      binding.loaded[body] |= mass != 0
 
 
 class Spring(Operator):

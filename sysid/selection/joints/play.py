@@ -13,6 +13,7 @@ from nerf2real.sysid.fit.expectation import NOISE
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.constants import own_size
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.selection.search.evidence import Scored
 
 Array = np.ndarray
@@ -46,7 +47,9 @@ def beside(joint: JointLikelihood, item: Scored) -> Array:
 def _loose(joint: JointLikelihood, item: Scored, index: int, gap: float) -> Array:
   """Tells where in a log [N] no torque keeps the teeth together."""
   c, log = compose(joint.plant, item.terms, item.fit.x), joint.plant.logs[index]
-  inertia, here, across, at, bias = joint.plant.at_samples(c.loads, index)
+  inertia, here, across, at, bias = joint.plant.at_samples(
+    c.loads, index, offset=c.p[INDEX["encoder_offset"]]
+  )
   turned = np.nan_to_num(log.position - at)
   weight = here * np.cos(turned) + across * np.sin(turned)
   passed = (weight + bias) / inertia + log.acceleration  # torque over the link's inertia

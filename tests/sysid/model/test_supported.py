@@ -20,7 +20,11 @@ END = "</mujoco>"
   ("old", "new", "found"),
   [
     (SERVO, f'{SERVO} timeconst="0.02"', "time constant"),
-    ("<body ", '<body gravcomp="1" ', "gravity compensation"),
+    (
+      '<body name="arm">\n    <joint',
+      '<body name="arm" gravcomp="1"><joint actuatorgravcomp="true" actuatorfrcrange="-3 3"',
+      "gravity compensation within",
+    ),
     (END, f'<equality><joint joint1="joint"/></equality>{END}', "an equality"),
     (
       END,
