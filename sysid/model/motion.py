@@ -25,6 +25,7 @@ Array = np.ndarray
 _START = 0.011  # s within which the first readings tell a velocity: two readings at 100 Hz; chosen
 _SMOOTHING = 0.035  # s, half width of the local polynomial that differentiates positions; chosen
 _LATEST = 0.25  # s that a machine's motion is looked for behind its commands, as late commands are
+_APART = 1e-3  # s between what it is tried to be late by, of steps that are shorter; chosen
 _CLEARLY = 0.9  # of what the best lateness explains: the earliest peak is taken that does; chosen
 _LARGEST = 2.0  # times what the model says smoothing takes away; chosen
 
@@ -123,10 +124,11 @@ def detailed_motion(model: mujoco.MjModel, log: Log, grid: Array) -> Motion:
   late = np.zeros(measured.shape[1], int)
   told = _declared(model, log, along, late)
   for j, column in enumerate(taken.T):
-    gains = [_gain(smoother, told, j, n, column) for n in range(latest + 1)]
+    tried = np.arange(0, latest + 1, max(1, round(_APART / step)))
+    gains = [_gain(smoother, told, j, int(n), column) for n in tried]
     explained = np.array([gain * share for gain, share in gains])
     peaks = explained >= np.maximum(np.append(explained[1:], 0.0), np.append(0.0, explained[:-1]))
-    late[j] = np.argmax(peaks & (explained >= _CLEARLY * explained.max()))
+    late[j] = tried[np.argmax(peaks & (explained >= _CLEARLY * explained.max()))]
   told = _declared(model, log, along, late)
   fields = [along.position.copy(), along.velocity.copy(), along.acceleration.copy()]
   smoothed = smoother.motion(told.at(smoother.time).position).at(grid)
