@@ -5,6 +5,7 @@ a sign of a wrong kind. Starts are several where the error has several valleys.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -279,7 +280,8 @@ def _payload(plant: JointPlant) -> Term:
   name = plant.model.body(int(body)).name or plant.joint
   mass = max(float(plant.model.body_mass[body]), 0.05)
   place = np.array(plant.model.body_ipos[body])
-  size = max(float(np.linalg.norm(place)), 0.05)
+  held = _held(plant, int(body))
+  size = max(float(np.linalg.norm(place)), 0.05, held.size)
   if not plant.hinge:
     return Term(
       "payload",
@@ -290,7 +292,7 @@ def _payload(plant: JointPlant) -> Term:
       (0.1 * mass, 1.0, 1.0, 1.0),
       ((0.1 * mass, 0.0, 0.0, 0.0),),
     )
-  reach = max(2.5 * size, 1.5 * _extent(plant.model, int(body)))
+  reach = max(2.5 * size, 1.5 * held.extent)
   return Term(
     "payload",
     name,
@@ -303,11 +305,28 @@ def _payload(plant: JointPlant) -> Term:
   )
 
 
-def _extent(model: mujoco.MjModel, body: int) -> float:
-  """Returns how far a body's geoms reach from the origin of its frame, m; 0 without any."""
-  geoms = np.flatnonzero(model.geom_bodyid == body)
-  away = np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
-  return float(away.max(initial=0.0))
+class _Held(NamedTuple):
+  """What a body has in its hand: itself and all that no other commanded joint moves against it."""
+
+  size: float
+  """m from its origin to the farthest centre of mass of what it holds; 0 where it holds nothing."""
+  extent: float
+  """m from its origin to where geoms reach; 0 without any."""
+
+
+def _held(plant: JointPlant, body: int) -> _Held:
+  """Returns what a body holds, at the model's reference pose."""
+  model, data = plant.model, mujoco.MjData(plant.model)
+  mujoco.mj_kinematics(model, data)
+  commanded = {model.joint(name).bodyid[0] for name in plant.reductions[0].log.commands.joints}
+  held = [body]
+  for other in range(body + 1, model.nbody):
+    if model.body_parentid[other] in held and other not in commanded:
+      held.append(other)
+  origin, geoms = data.xpos[body], np.flatnonzero(np.isin(model.geom_bodyid, held))
+  away = np.linalg.norm(data.geom_xpos[geoms] - origin, axis=1) + model.geom_rbound[geoms]
+  apart = np.linalg.norm(data.xipos[held[1:]] - origin, axis=1)
+  return _Held(float(apart.max(initial=0.0)), float(away.max(initial=0.0)))
 
 
 def _one(

@@ -16,6 +16,8 @@ _CYCLIC = ("phase",)
 _SERVO = 2.5
 """N m; stall torque of the OP3's MX-28 (Robotis), of whose kind the registry's ranges are."""
 
+_SIZE = 0.25
+"""Power of torque with which a machine's lengths grow: weight goes with their cube."""
 _PER_TORQUE = {"1/(N m)": 1, "K/(s N^2 m^2)": 2}
 """Units by the power of torque that they are per."""
 
@@ -29,9 +31,10 @@ def ends(parameter: Parameter) -> tuple[float, float]:
 def plausible(term: Term, plant: JointPlant) -> Term:
   """Returns a term of a hinge whose bounds lie within the registry's ranges.
 
-  A machine with more torque than such a servo rubs, springs and carries more: ranges of torques, of
-  masses and of what is torque per something grow with it; one with less may be limited to less, and
-  has more of what is something per torque. Of heat only heating times derating shows.
+  A machine with more torque than such a servo rubs, springs and carries more, and farther away:
+  ranges of torques, of masses, of places and of what is torque per something grow with it; one with
+  less may be limited to less, and has more of what is something per torque. Of heat only heating
+  times derating shows.
   """
   limit = plant.declared[INDEX["highest"]]
   torque = max(strongest(plant), limit if np.isfinite(limit) else 0.0)
@@ -44,6 +47,8 @@ def plausible(term: Term, plant: JointPlant) -> Term:
     lowest, highest = ends(parameter)
     if parameter.unit.startswith(("N m", "kg")):
       lowest, highest = lowest * smaller, highest * larger
+    elif parameter.unit == "m":
+      lowest, highest = lowest * larger**_SIZE, highest * larger**_SIZE
     highest /= smaller ** _PER_TORQUE.get(parameter.unit, 0)
     if name == "heating":
       highest *= kind_of(term.kind).parameter("derating").high / dict(term.fixed)["derating"]
