@@ -2,7 +2,8 @@
 
 One row a reading. Columns are `time` [s] and, with a joint's name after the colon, any of
 `command_position:J`, `command_velocity:J`, `command_effort:J`, `position:J`, `velocity:J`,
-`effort:J`, `duty:J` and `temperature:J` (SI, degrees Celsius), and `voltage`. An empty field is a
+`effort:J`, `duty:J` and `temperature:J` (SI, degrees Celsius), and `voltage`; another unit follows
+the name in brackets, as in `position:elbow [deg]` or `time [ms]`. An empty field is a
 value that was not read at that time, so commands and states may have rows of their own; a column
 without values is as none. Joints may be commanded by different quantities, as wheels by velocity
 beside an arm by position. `velocity:J` is not looked at: velocities are those of the positions.
@@ -26,6 +27,12 @@ OF_JOINTS = (
   *("position", "velocity", "effort", "duty", "temperature"),
 )
 ALONE = ("time", "voltage")
+UNITS = {
+  **dict.fromkeys(("s", "rad", "rad/s", "m", "m/s", "N", "N m", "Nm", "V", "1", "degC"), 1.0),
+  **{"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "mm": 1e-3, "mm/s": 1e-3, "mN m": 1e-3, "mV": 1e-3},
+  **{"deg": math.pi / 180, "deg/s": math.pi / 180, "%": 0.01},
+}
+"""What a number in a unit is in SI."""
 
 
 def read_csv(path: Path) -> Log:
@@ -79,7 +86,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     raise LogError(f"{path.name} is no CSV text: {error}.") from error
   if len(rows) < 2:
     raise LogError(f"{path.name} has {len(rows)} lines, expected a header and readings.")
-  names = [name.strip() for name in rows[0]]
+  names, factors = zip(*(_named(path, name.strip()) for name in rows[0]), strict=True)
   for name in names:
     quantity, _, joint = name.partition(":")
     if name not in ALONE and not (quantity in OF_JOINTS and joint):
@@ -89,7 +96,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
       )
   if "time" not in names or len(set(names)) < len(names):
     raise LogError(
-      f"{path.name} has the columns {names}, expected each once and `time` among them."
+      f"{path.name} has the columns {list(names)}, expected each once and `time` among them."
     )
   table = np.full((len(rows) - 1, len(names)), math.nan)
   for index, row in enumerate(rows[1:]):
@@ -109,7 +116,20 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
           f"{path.name} line {index + 2} has {field!r} as {names[place]}, expected a number, or "
           "nothing where none was read."
         )
-  return dict(zip(names, table.T, strict=True))
+  return dict(zip(names, (table * factors).T, strict=True))
+
+
+def _named(path: Path, column: str) -> tuple[str, float]:
+  """Returns a column's name without its unit, and what a number in that unit is in SI."""
+  name, bracket, unit = column.removesuffix("]").partition("[")
+  if not bracket:
+    return column, 1.0
+  if unit.strip() not in UNITS:
+    raise LogError(
+      f"{path.name} has the column {column!r} in the unit {unit.strip()!r}, expected one of "
+      f"{', '.join(UNITS)}: convert its numbers, or leave the brackets out where they are SI."
+    )
+  return name.strip(), UNITS[unit.strip()]
 
 
 def _series(

@@ -76,6 +76,17 @@ def test_a_csv_log(tmp_path):
   assert read_logs([tmp_path / "log.csv"], model)[0].duration == pytest.approx(log.duration)
 
 
+def test_units_stand_in_brackets(tmp_path):
+  lines = ["time [ms],command_position:joint[deg],position:joint [deg],voltage [mV]"]
+  for time, place in zip(TIME, np.degrees(PATH), strict=True):
+    lines.append(f"{1e3 * time:.3f},{0.5 * place:.6f},{place:.6f},12100")
+  log = read_log(csv_of(tmp_path, lines))
+  np.testing.assert_allclose(log.states.stamp, TIME, atol=1e-9)
+  np.testing.assert_allclose(log.commands.position[:, 0], 0.5 * PATH, atol=1e-6)
+  np.testing.assert_allclose(log.states.position[:, 0], PATH, atol=1e-6)
+  np.testing.assert_allclose(log.battery.value, 12.1)
+
+
 @pytest.mark.parametrize("effort", [0.0, 0.25])
 def test_what_a_driver_fills_in_is_not_measured(effort, tmp_path):
   lines = [line.replace(",12.1,", ",0,") for line in rows()]
@@ -173,6 +184,7 @@ def test_joints_of_one_machine_are_commanded_by_what_each_takes(tmp_path):
     (lambda t: t[:1], "has 1 lines, expected a header and readings"),
     (lambda t: [t[0].replace("voltage", "volts"), *t[1:]], "has the column 'volts', expected"),
     (lambda t: [t[0].replace("time", "voltage", 1), *t[1:]], "expected each once and `time`"),
+    (lambda t: [t[0].replace("time", "time [min]"), *t[1:]], r"'time \[min\]' in the unit 'min'"),
     (lambda t: [t[0].replace("command_position", "duty"), *t[1:]], "no column command_position"),
     (lambda t: [*t[:9], t[9] + ",4", *t[10:]], "line 10 has 7 fields, the header 6"),
     (lambda t: [*t[:9], t[9].replace(",,,,", ",,x,,"), *t[10:]], "line 10 has 'x' as effort:joint"),
