@@ -6,7 +6,14 @@ import numpy as np
 from nerf2real.core.robot_logs.messages import COMMANDS, STATES
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.robot_logs.streaming import LogError
-from nerf2real.sysid.model.drive import actuator_of, actuators_of, command_of, holds_position, takes
+from nerf2real.sysid.model.drive import (
+  actuator_of,
+  actuators_of,
+  command_of,
+  holds_position,
+  pulling,
+  takes,
+)
 
 _PLURAL = {"position": "positions", "velocity": "velocities", "effort": "efforts"}
 _NEAR = 0.005  # of a joint's range from its end that counts as there; chosen
@@ -32,6 +39,13 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
     if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
       raise LogError(f"{log.name} commands {name!r}, in the model neither a hinge nor a slide.")
     actuators = actuators_of(model, name)
+    pulled = [] if actuators else pulling(model, name)
+    if pulled:
+      raise LogError(
+        f"{log.name} commands {name!r}, which the model drives by a tendon alone ({pulled}), "
+        "expected an actuator on the joint: leave its commands out, it is then measured and not "
+        "judged."
+      )
     if not actuators:
       driven = sorted(joint for joint in filter(None, names) if actuators_of(model, joint))
       raise LogError(

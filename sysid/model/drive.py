@@ -35,6 +35,17 @@ def actuator_of(model: mujoco.MjModel, joint: str) -> int:
   return next(iter(actuators_of(model, joint)), -1)
 
 
+def pulling(model: mujoco.MjModel, joint: str) -> list[str]:
+  """Returns the names of the actuators on tendons that a joint is tied to."""
+  tied = (model.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)) & (
+    model.wrap_objid == model.joint(joint).id
+  )
+  tendons = np.searchsorted(model.tendon_adr, np.flatnonzero(tied), side="right") - 1
+  on_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+  found = np.flatnonzero(on_tendon & np.isin(model.actuator_trnid[:, 0], tendons))
+  return [model.actuator(int(u)).name or f"number {u}" for u in found]
+
+
 def takes(model: mujoco.MjModel, actuator: int) -> str:
   """Returns what an actuator is told, as a field of commands: position, velocity or effort."""
   if holds_position(model, actuator):

@@ -76,6 +76,14 @@ def test_a_csv_log(tmp_path):
   assert read_logs([tmp_path / "log.csv"], model)[0].duration == pytest.approx(log.duration)
 
 
+def test_a_joint_that_a_tendon_alone_drives_is_not_commanded():
+  start = ARM.index('<position name="elbow"')
+  tied = ARM[:start] + '<position name="fingers" tendon="split" kp="9"/></actuator>'
+  tied += '<tendon><fixed name="split"><joint joint="elbow" coef="1"/></fixed></tendon></mujoco>'
+  with pytest.raises(LogError, match=r"by a tendon alone \(\['fingers'\]\).*leave its commands"):
+    check_against_model(log_of(ARM, "slow", duration=2.0), mujoco.MjModel.from_xml_string(tied))
+
+
 def test_units_stand_in_brackets(tmp_path):
   lines = ["time [ms],command_position:joint[deg],position:joint [deg],voltage [mV]"]
   for time, place in zip(TIME, np.degrees(PATH), strict=True):
