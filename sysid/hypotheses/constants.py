@@ -61,6 +61,9 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
   if healthy:
     tolerance |= {name: settings.servo for name in ("gain", "limit", "damping")}
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
+  # A servo's own damping is known no better, and the joint's is off by what that is.
+  own = max(0.0, -float(p[INDEX["velocity"]])) / max(float(p[INDEX["damping"]]), 1e-12)
+  tolerance["damping"] *= float(np.hypot(1.0, own))
   # A machine lacks the inertia that the model's step adds to its rotor: no fault of the rotor's.
   rotor = max(float(p[INDEX["armature"]]), 1e-12)
   tolerance["armature"] = float(np.hypot(tolerance["armature"], plant.numerical_inertia / rotor))
@@ -88,7 +91,10 @@ def constants(plant: JointModel, settings: Settings = SETTINGS, *, healthy: bool
   rough = {"friction": _ROUGH} if healthy else {}
   high = tuple(rough.get(n, b) for n, b in zip(names, limit, strict=True))
   zeros = (0.0,) * len(names)
-  scale = tuple(0.005 if n in ("skew", "latency") else t for n, t in zip(names, sigma, strict=True))
+  scale = tuple(
+    0.005 if n in ("skew", "latency") else min(s, b / _USUAL)
+    for n, s, b in zip(names, sigma, limit, strict=True)
+  )
   fixed: tuple[tuple[str, float], ...] = ()
   if plant.law is not None:
     # The duty shows the servo's own law: what is left open is the torque at a duty.

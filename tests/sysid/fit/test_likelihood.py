@@ -15,6 +15,7 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of
 
 
@@ -89,6 +90,15 @@ def test_correlation_time_of_an_autoregression():
   starts = np.arange(0, len(row), 100)
   assert _correlation_time(row, starts) == pytest.approx((1 + rho) / (1 - rho), rel=0.25)
   assert _correlation_time(random.normal(size=40_000), starts) < 1.2
+
+
+def test_a_joint_s_damping_is_known_no_better_than_its_servo_s():
+  xml = PENDULUM.replace('kp="21"', 'kp="2100" kv="50"')
+  plant = JointModel(mujoco.MjModel.from_xml_string(xml), "joint", [log_of(xml, "sweep")])
+  own = constants(plant)
+  at, tolerance = own.names.index("damping"), dict(SETTINGS.tolerances)["damping"]
+  assert own.prior[at] == pytest.approx(50 * tolerance, rel=1e-3)
+  assert own.low[at] > -1.0 and own.scale[at] < own.high[at]
 
 
 def test_only_a_reference_may_be_late_beyond_twice_the_tolerance_and_of_another_strength(viscous):
