@@ -1,6 +1,7 @@
 """Tiny synthetic captures for tests: textured planes seen by a known camera, and videos."""
 
 import functools
+import json
 from pathlib import Path
 
 import av
@@ -102,6 +103,26 @@ def write_images(folder: Path, poses: np.ndarray, surfaces=CORNER) -> list[str]:
   for name, pose in zip(names, poses, strict=True):
     cv2.imwrite(str(folder / name), render(pose, surfaces=surfaces))
   return names
+
+
+def write_transforms(folder: Path, poses: np.ndarray, camera: Camera, **extra) -> list[str]:
+  """Writes pictures and a transforms.json, as nerfstudio does; returns the pictures' names."""
+  names = write_images(folder / "images", poses)
+  write_frames(folder, [f"images/{name}" for name in names], poses, camera, **extra)
+  return names
+
+
+def write_frames(folder: Path, files, poses: np.ndarray, camera: Camera, **extra) -> None:
+  """Writes the transforms.json of pictures that are there, of poses [N, 4, 4] in OpenCV's axes."""
+  lens = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
+  lens |= {name: getattr(camera, name) for name in ("cx", "cy", "k1", "k2", "p1", "p2")}
+  flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+  frames = [
+    {"file_path": file, "transform_matrix": (pose @ flip).tolist()}
+    for file, pose in zip(files, poses, strict=True)
+  ]
+  about = {**lens, "camera_model": "OPENCV", "frames": frames, **extra}
+  (folder / "transforms.json").write_text(json.dumps(about))
 
 
 def write_video(

@@ -21,6 +21,7 @@ from nerf2real.scenes.geometry import collision as contact
 from nerf2real.scenes.geometry import decomposition
 from nerf2real.scenes.geometry.mesh import MeshSettings
 from nerf2real.scenes.settings import preset
+from tests.scenes import synthetic_capture as synthetic
 
 _FRAMES = 40
 _SIZE = (160, 120)  # width, height
@@ -33,30 +34,16 @@ def source(tmp_path_factory):
   (folder / "images").mkdir()
   truth = filming.read_truth(ground_truth.TRUTH)
   wanted = np.linspace(0, len(truth["world_from_camera"]) - 1, _FRAMES).astype(int)
-  frames = []
+  files = []
   with av.open(str(ground_truth.VIDEO)) as container:
     for index, frame in enumerate(container.decode(video=0)):
       if index in wanted:
         picture = cv2.resize(frame.to_ndarray(format="bgr24"), _SIZE, interpolation=cv2.INTER_AREA)
         name = f"images/{index:05d}.png"
         cv2.imwrite(str(folder / name), picture)
-        pose = truth["world_from_camera"][index] @ np.diag([1, -1, -1, 1])  # OpenGL's axes
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-  camera = truth["camera"].resized(*_SIZE)
-  about = {
-    "fl_x": camera.fx,
-    "fl_y": camera.fy,
-    "cx": camera.cx,
-    "cy": camera.cy,
-    "k1": camera.k1,
-    "k2": camera.k2,
-    "p1": camera.p1,
-    "p2": camera.p2,
-    "w": camera.width,
-    "h": camera.height,
-    "frames": frames,
-  }
-  (folder / "transforms.json").write_text(json.dumps(about))
+        files.append(name)
+  poses = truth["world_from_camera"][wanted]
+  synthetic.write_frames(folder, files, poses, truth["camera"].resized(*_SIZE))
   return folder / "transforms.json"
 
 

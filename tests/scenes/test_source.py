@@ -7,12 +7,11 @@ import pytest
 
 from nerf2real.scenes.source import open_source
 from tests.scenes import synthetic_capture as synthetic
-from tests.scenes.capture.test_capture import write_transforms
 
 
 def test_changed_pictures_of_a_transforms_file_change_its_hash(tmp_path):
   source, out = tmp_path / "source", tmp_path / "out"
-  write_transforms(source, synthetic.walk(2), synthetic.CAMERA)
+  synthetic.write_transforms(source, synthetic.walk(2), synthetic.CAMERA)
   listed = source / "transforms.json"
   before = open_source(listed, out).sha256
   assert open_source(listed, source / "out").sha256 == before
@@ -22,7 +21,7 @@ def test_changed_pictures_of_a_transforms_file_change_its_hash(tmp_path):
 
 
 def test_a_scene_in_its_capture_is_refused(tmp_path):
-  write_transforms(tmp_path / "source", synthetic.walk(2), synthetic.CAMERA)
+  synthetic.write_transforms(tmp_path / "source", synthetic.walk(2), synthetic.CAMERA)
   for out in (tmp_path / "source", tmp_path / "source" / "out" / "room"):
     with pytest.raises(ValueError, match="lies in the capture .* name a folder beside it"):
       open_source(tmp_path / "source", out)

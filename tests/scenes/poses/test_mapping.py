@@ -1,10 +1,14 @@
 """Tests of adjustments, on made-up places and points."""
 
+import dataclasses
+
 import numpy as np
 import pycolmap
+import pytest
 
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.poses import mapping
+from tests.scenes import synthetic_capture as synthetic
 
 WEAK = 3  # the picture that sees little
 
@@ -65,3 +69,20 @@ def test_points_in_a_camera_are_dropped_and_no_others():
   before = set(model.points3D)
   mapping.drop_points_in_cameras(model)
   assert before - set(model.points3D) == {first, second}
+
+
+@pytest.mark.parametrize(
+  ("change", "fault"),
+  [
+    ({}, None),
+    ({"k1": 0.06, "k2": -0.09}, None),
+    ({"k1": -0.9}, "folds"),
+    ({"k2": -2.0}, "folds"),
+    ({"cx": 200.0}, "principal point"),
+    ({"fy": 330.0}, "differ"),
+  ],
+)
+def test_absurd_lenses_are_recognised(change, fault):
+  camera = dataclasses.replace(synthetic.CAMERA, **change)
+  found = mapping.camera_fault(camera)
+  assert found is None if fault is None else fault in found

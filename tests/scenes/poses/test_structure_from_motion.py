@@ -19,16 +19,14 @@ from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses import mapping, readout, shutter, structure_from_motion
 from nerf2real.scenes.poses.checks import continuity
-from nerf2real.scenes.poses.localisation import Localisation, LocalisationError, load
+from nerf2real.scenes.poses.localisation import LocalisationError, load
 from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
-from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.poses.unit_frame import mean_up
 from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
 from tests.scenes import synthetic_capture as synthetic
-from tests.scenes.capture.test_capture import write_transforms
 
 FOUNTAIN = Path(__file__).parents[4] / "shared" / "data" / "captures" / "fountain-P11"
 FEW = LocaliseSettings(features=FeatureSettings(few_num_features=800), attempts=1)
@@ -233,7 +231,7 @@ def test_other_pictures_start_a_new_database(corner, tmp_path):
 
 def test_transforms_keep_their_poses_and_get_points(tmp_path, capfd):
   poses = synthetic.walk(8)
-  write_transforms(tmp_path / "source", poses, synthetic.CAMERA)
+  synthetic.write_transforms(tmp_path / "source", poses, synthetic.CAMERA)
   capture = read_capture(
     tmp_path / "source", tmp_path / "keyframes", settings=CaptureSettings(num_keyframes=8)
   )
@@ -324,23 +322,6 @@ def test_unrelated_pictures_are_told_so(tmp_path):
   assert not (tmp_path / "out" / "sfm").exists()
 
 
-@pytest.mark.parametrize(
-  ("change", "fault"),
-  [
-    ({}, None),
-    ({"k1": 0.06, "k2": -0.09}, None),
-    ({"k1": -0.9}, "folds"),
-    ({"k2": -2.0}, "folds"),
-    ({"cx": 200.0}, "principal point"),
-    ({"fy": 330.0}, "differ"),
-  ],
-)
-def test_absurd_lenses_are_recognised(change, fault):
-  camera = dataclasses.replace(synthetic.CAMERA, **change)
-  found = mapping.camera_fault(camera)
-  assert found is None if fault is None else fault in found
-
-
 def test_refinement_falls_back_when_distortion_folds(corner, monkeypatch):
   folder, _, _, _ = corner
   model = mapping.pycolmap.Reconstruction(str(folder / "out" / "sfm"))
@@ -398,24 +379,3 @@ def test_fountain():
   )
   assert errors.position_rmse < 1e-9
   assert errors.rotation_rmse < 1e-6
-
-
-def test_overlooking_is_the_keyframe_with_the_most_points_before_its_lens():
-  points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], (300, 3))
-  away, aside = np.eye(4), np.eye(4)
-  away[:3, :3] = np.diag([-1, 1, -1])
-  aside[0, 3] = 1.5  # sees about half of them
-  found = Localisation(
-    camera=Camera.from_vertical_fov(np.radians(40), 64, 48),
-    names=("away", "aside", "ahead"),
-    world_from_camera=np.stack([away, aside, np.eye(4)]),
-    points=points,
-    point_colors=np.zeros((300, 3), np.uint8),
-    point_errors=np.zeros(300),
-    reprojection_error_px=0.0,
-    registered_fraction=1.0,
-    strategy="given",
-    unit_from_source=Similarity(),
-    tracks=Tracks.none(),
-  )
-  assert found.overlooking() == 2

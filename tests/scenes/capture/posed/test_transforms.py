@@ -14,36 +14,12 @@ from tests.scenes import synthetic_capture as synthetic
 SETTINGS = CaptureSettings(num_keyframes=8)
 
 
-def write_transforms(folder, poses, camera, **extra):
-  """Writes pictures and a transforms.json with OpenGL axes, as nerfstudio does."""
-  names = synthetic.write_images(folder / "images", poses)
-  flip = np.diag([1.0, -1, -1, 1])
-  values = {
-    "w": camera.width,
-    "h": camera.height,
-    "fl_x": camera.fx,
-    "fl_y": camera.fy,
-    "cx": camera.cx,
-    "cy": camera.cy,
-    "k1": camera.k1,
-    "k2": camera.k2,
-    "p1": camera.p1,
-    "p2": camera.p2,
-    "camera_model": "OPENCV",
-    "frames": [
-      {"file_path": f"images/{name}", "transform_matrix": (pose @ flip).tolist()}
-      for name, pose in zip(names, poses, strict=True)
-    ],
-    **extra,
-  }
-  (folder / "transforms.json").write_text(json.dumps(values))
-  return names
-
-
 def test_transforms_json(tmp_path):
   poses = synthetic.walk(9)
   source = tmp_path / "source"
-  write_transforms(source, poses, synthetic.CAMERA, k1=0.01, k2=-0.02, p1=0.001, p2=-0.002)
+  synthetic.write_transforms(
+    source, poses, synthetic.CAMERA, k1=0.01, k2=-0.02, p1=0.001, p2=-0.002
+  )
   result = read_capture(source, tmp_path / "keyframes", settings=CaptureSettings(num_keyframes=9))
   assert result.kind == "transforms"
   np.testing.assert_allclose(result.known.world_from_camera, poses, atol=1e-12)
@@ -56,7 +32,7 @@ def test_transforms_json(tmp_path):
 
 def test_instant_ngp_angles_and_missing_suffix(tmp_path):
   poses = synthetic.walk(8)
-  write_transforms(tmp_path, poses, synthetic.CAMERA)
+  synthetic.write_transforms(tmp_path, poses, synthetic.CAMERA)
   values = json.loads((tmp_path / "transforms.json").read_text())
   for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model"):
     del values[name]
@@ -73,12 +49,12 @@ def test_instant_ngp_angles_and_missing_suffix(tmp_path):
 
 def test_transforms_errors(tmp_path):
   poses = synthetic.walk(8)
-  write_transforms(tmp_path, poses, synthetic.CAMERA, camera_model="OPENCV_FISHEYE")
+  synthetic.write_transforms(tmp_path, poses, synthetic.CAMERA, camera_model="OPENCV_FISHEYE")
   with pytest.raises(CaptureError, match="OPENCV_FISHEYE found, expected OPENCV"):
     read_transforms(tmp_path)
   sheared = poses.copy()
   sheared[2, 0, 1] += 0.5
-  write_transforms(tmp_path, sheared, synthetic.CAMERA)
+  synthetic.write_transforms(tmp_path, sheared, synthetic.CAMERA)
   with pytest.raises(CaptureError, match=r"view_002.png is no rigid pose"):
     read_transforms(tmp_path)
   for extra, words in (
@@ -86,10 +62,10 @@ def test_transforms_errors(tmp_path):
     ({"k3": 0.01}, "k3 = 0.01 found, expected a lens of k1, k2, p1, p2"),
     ({"k4": -0.01}, "k4 = -0.01 found"),
   ):
-    write_transforms(tmp_path, poses, synthetic.CAMERA, **extra)
+    synthetic.write_transforms(tmp_path, poses, synthetic.CAMERA, **extra)
     with pytest.raises(CaptureError, match=words):
       read_transforms(tmp_path)
-  write_transforms(tmp_path, poses, synthetic.CAMERA, k3=0.0, k4=0.0)
+  synthetic.write_transforms(tmp_path, poses, synthetic.CAMERA, k3=0.0, k4=0.0)
   assert len(read_transforms(tmp_path).files) == 8
   (tmp_path / "images" / "view_003.png").unlink()
   with pytest.raises(CaptureError, match=r"holds 7 pictures \(1 of 8 pictures or their depth are"):

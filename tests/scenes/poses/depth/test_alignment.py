@@ -3,22 +3,19 @@
 import dataclasses
 import json
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture.capture import Capture
-from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages import localising
 from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from tests.scenes import furnished_room
+from tests.scenes.poses.depth.recordings import UNIT, counts, recorded
 
 _CAMERA = Camera(width=320, height=240, fx=262.0, fy=262.0, cx=161.0, cy=119.0)
-_UNIT = 1e-3  # m
 _COUNT = 16
 _PLAIN_FROM = 2.4  # m along x: a wall without texture
 
@@ -45,35 +42,17 @@ def _texture(points):
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
   """A recording whose poses err by 15 mm and 0.5 degrees, and its true poses."""
-  folder, measured = (tmp_path_factory.mktemp(name) for name in ("pictures", "depth"))
   rng, true = np.random.default_rng(1), _poses()
   views = furnished_room.depth_views(true, _CAMERA, noise=0.002, rng=rng)
-  exact = furnished_room.depth_views(true, _CAMERA)
-  images, files = [], []
-  for row, pose in enumerate(true):
-    points = _CAMERA.rays() * exact.depth[row][..., None]
-    grey = _texture(points @ pose[:3, :3].T + pose[:3, 3])
-    images.append(folder / f"frame_{row:06d}.png")
-    files.append(measured / f"{row}.png")
-    cv2.imwrite(str(images[-1]), np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
-    cv2.imwrite(str(files[-1]), np.rint(views.depth[row] / _UNIT).astype(np.uint16))
+  points = _CAMERA.rays() * furnished_room.depth_views(true, _CAMERA).depth[..., None]
+  points = np.einsum("nij,nhwj->nhwi", true[:, :3, :3], points) + true[:, None, None, :3, 3]
+  grey = [np.repeat(_texture(view)[..., None], 3, axis=-1).astype(np.uint8) for view in points]
   came = true.copy()
   came[:, :3, 3] += 0.015 / np.sqrt(3) * rng.standard_normal((_COUNT, 3))
   turns = Rotation.from_rotvec(np.radians(0.5) / np.sqrt(3) * rng.standard_normal((_COUNT, 3)))
   came[:, :3, :3] = turns.as_matrix() @ came[:, :3, :3]
-  known = KnownPoses(
-    kind="rgbd",
-    camera=_CAMERA,
-    files=tuple(images),
-    world_from_camera=came,
-    points=np.zeros((0, 3)),
-    point_colors=np.zeros((0, 3), np.uint8),
-    point_errors=np.zeros(0),
-    depth_files=tuple(files),
-    depth_unit=_UNIT,
-  ).lifted()
-  ones = np.ones(_COUNT)
-  return Capture("rgbd", folder, images, 320, 240, ones, ones, None, [], known), true
+  folder = tmp_path_factory.mktemp("recording")
+  return recorded(folder, grey, counts(views.depth), _CAMERA, came), true
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +82,7 @@ def test_places_are_better_known_by_surfaces(capture, refined):
   assert np.sqrt(np.mean(errors[1] ** 2)) < 0.6 * np.sqrt(np.mean(errors[0] ** 2))
   assert np.median(errors[1]) < 0.003
   assert len(after.value.tracks.view) > 500
-  assert taken.value.known.depth_unit == _UNIT
+  assert taken.value.known.depth_unit == UNIT
   off = furnished_room.distance(after.value.unit_from_source.inverse().apply(after.value.points))
   assert np.median(off) < 0.015  # whose frame is that of the poses that came
   again = localising.aligned(cache, _made(capture[0]), before)
@@ -113,11 +92,11 @@ def test_places_are_better_known_by_surfaces(capture, refined):
 def test_a_sensors_other_metre_goes_into_its_unit(capture, refined):
   """Poses stay metric as they came; depth that is 8 % short agrees with them afterwards."""
   cache, before = refined
-  short = dataclasses.replace(capture[0].known, depth_unit=0.92 * _UNIT).lifted()
+  short = dataclasses.replace(capture[0].known, depth_unit=0.92 * UNIT).lifted()
   taken, after = localising.aligned(
     cache, _made(dataclasses.replace(capture[0], known=short), "short"), before
   )
-  assert taken.value.known.depth_unit == pytest.approx(_UNIT, rel=0.02)
+  assert taken.value.known.depth_unit == pytest.approx(UNIT, rel=0.02)
   places = after.value.world_from_camera[:, :3, 3] / after.value.unit_from_source.scale
   assert np.ptp(places, axis=0).max() == pytest.approx(
     np.ptp(capture[1][:, :3, 3], axis=0).max(), rel=0.04

@@ -2,32 +2,28 @@
 
 import types
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.cameras import Camera
 from nerf2real.core.similarity import Similarity
-from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.capture.posed import depth_pictures
-from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.poses.depth import sensor
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.stages import localising
 from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from tests.scenes import furnished_room
+from tests.scenes.poses.depth.recordings import UNIT, counts, recorded
 
 _PICTURES = Camera(width=160, height=120, fx=131.0, fy=131.0, cx=81.0, cy=59.0, k1=0.05, k2=-0.06)
 _SENSOR = Camera(width=160, height=120, fx=146.0, fy=146.0, cx=80.0, cy=60.0)
 _BESIDE = np.array([0.025, 0.0, 0.0])
-_UNIT = 1e-3  # m
 _POSES = furnished_room.walk(24)
 
 
 def _raw(views):
-  depth = np.where(np.isfinite(views.depth), views.depth, 0)
-  return np.rint(depth / _UNIT).astype(np.uint16)
+  return counts(views.depth)
 
 
 def _sensed(poses, camera):
@@ -72,32 +68,32 @@ def localised():
 
 
 def test_a_sensor_of_its_own_is_found_and_its_depth_aligned(localised, beside):
-  found = sensor.find_sensor(localised, beside, unit=_UNIT)
+  found = sensor.find_sensor(localised, beside, unit=UNIT)
   assert found is not None
   assert found.camera.fx == pytest.approx(_SENSOR.fx, rel=0.01)
   # at 2 m, where half a pixel is 7 mm
   place = found.camera.project(np.array([0.0, 0.0, 2.0]) - [found.right, found.below, 0.0])
   truth = _SENSOR.project(np.array([0.0, 0.0, 2.0]) - _BESIDE)
   np.testing.assert_allclose(place, truth, atol=1.0)
-  true = _raw(furnished_room.depth_views(_POSES, _PICTURES)) * _UNIT
+  true = _raw(furnished_room.depth_views(_POSES, _PICTURES)) * UNIT
   off = []
   for depth, wanted in zip(beside, true, strict=True):
-    aligned = found.aligned(depth * _UNIT, _PICTURES)
+    aligned = found.aligned(depth * UNIT, _PICTURES)
     both = (aligned > 0) & (wanted > 0)
     assert both.mean() > 0.6  # the sensor sees less than the pictures do
-    off.append([np.abs(d / wanted - 1)[both].mean() for d in (depth * _UNIT, aligned)])
+    off.append([np.abs(d / wanted - 1)[both].mean() for d in (depth * UNIT, aligned)])
   before, after = np.mean(off, axis=0)
   assert after < 0.4 * before
 
 
 def test_aligned_depth_is_left_as_it_is(localised):
-  assert sensor.find_sensor(localised, _sensed(_POSES, _PICTURES), unit=_UNIT) is None
+  assert sensor.find_sensor(localised, _sensed(_POSES, _PICTURES), unit=UNIT) is None
 
 
 def test_few_points_say_nothing(localised, beside):
   few = types.SimpleNamespace(**vars(localised))
   few.tracks = Tracks(*(column[:300] for column in localised.tracks))
-  assert sensor.find_sensor(few, beside, unit=_UNIT) is None
+  assert sensor.find_sensor(few, beside, unit=UNIT) is None
 
 
 def _made(folder, value, made):
@@ -106,26 +102,8 @@ def _made(folder, value, made):
 
 def _capture(folder, depth, **known):
   """A capture whose pictures come with depth [N, H, W]."""
-  images, files = [], []
-  for row, raw in enumerate(depth):
-    images.append(folder / f"frame_{row:06d}.png")
-    files.append(folder / f"{row}.depth.png")
-    cv2.imwrite(str(images[-1]), np.zeros((120, 160, 3), np.uint8))
-    cv2.imwrite(str(files[-1]), raw)
-  about = KnownPoses(
-    kind="rgbd",
-    camera=_PICTURES,
-    files=tuple(images),
-    world_from_camera=_POSES,
-    points=np.zeros((0, 3)),
-    point_colors=np.zeros((0, 3), np.uint8),
-    point_errors=np.zeros(0),
-    depth_files=tuple(files),
-    depth_unit=_UNIT,
-    **known,
-  ).lifted()
-  ones = np.ones(len(images))
-  return Capture("rgbd", folder, images, 160, 120, ones, ones, None, [], about)
+  black = np.zeros((len(depth), 120, 160, 3), np.uint8)
+  return recorded(folder, black, depth, _PICTURES, _POSES, **known)
 
 
 def _sensed_stage(localised, capture, folder):
