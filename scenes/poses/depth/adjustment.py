@@ -53,13 +53,13 @@ def adjust(
   for number in range(_ROUNDS):
     report(number / _ROUNDS, f"laying {len(poses)} pictures' surfaces onto each other")
     system = System(len(poses))
-    for kind, worth, median in (
+    for found, worth, median in (
       (list(surface_rows(poses, camera, depth, pairs)), _CELLS_WORTH, _MEDIAN),
       (list(feature_rows(poses, camera, matches)), _FEATURES_WORTH, _MEDIAN_2D),
     ):
-      if kind:
-        spread = float(np.median(np.concatenate([rows.size for rows in kind]))) / median
-        for rows in kind:
+      if found:
+        spread = float(np.median(np.concatenate([rows.size for rows in found]))) / median
+        for rows in found:
           system.add(rows, max(spread, _EXACT), worth)
     system.hold(poses, came, shift, turn)
     system.hold_lens(*lens.off(camera, nominal))
