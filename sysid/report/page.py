@@ -71,12 +71,11 @@ def page(
   """
   items = found.found
   subject = found.least_explained.subject
-  several = min(max(len(item.named) for item in items), len(subject.thresholds))
   content = {**content, **{k: together(content[k]) for k in ("effects", "in_reference")}}
   sections = [
     summary.section(
       content,
-      beyond=subject.thresholds[max(several, 1) - 1],  # of the least clear
+      asked=subject.thresholds,
       unit=residual_plots.unit_of(found.least_explained),
       shown=capability.sentence(shown),
       referred=referred,

@@ -18,20 +18,20 @@ _CALIBRATED = 1.5  # times by which fitted constants lower the error, from which
 
 
 def section(
-  content: dict[str, Any], *, beyond: float, unit: str, shown: str, referred: bool
+  content: dict[str, Any], *, asked: Sequence[float], unit: str, shown: str, referred: bool
 ) -> Section:
   """Returns the first section of the report.
 
   Args:
     content: what report.json holds.
-    beyond: standard errors that count as clear.
+    asked: standard errors that a joint's clearest effect must be clear by, the next, and so on.
     unit: of small positions, mrad or mm.
     shown: what the logs can show, in a sentence.
     referred: whether there were reference logs.
   """
   answers = [
     _missing(content, referred),
-    _sure(content, beyond, shown),
+    _sure(content, asked, shown),
     _remains(content, unit),
     _next(content, _LARGE[unit]),
   ]
@@ -93,7 +93,7 @@ def _meaning(effect: dict[str, Any]) -> str:
   return words + (f"; {', '.join(values)}" if values else "")
 
 
-def _sure(content: dict[str, Any], beyond: float, shown: str) -> Answer:
+def _sure(content: dict[str, Any], asked: Sequence[float], shown: str) -> Answer:
   question = "How sure is that?"
   alike = [a["kind"] for a in content["alternatives"] if a.get("confounded")]
   effects = content["effects"]
@@ -101,21 +101,40 @@ def _sure(content: dict[str, Any], beyond: float, shown: str) -> Answer:
     return Answer(question, "No effect is clearly better than none", [shown], tone="good")
   if not effects:
     return Answer(question, "Not sure: no name is clear of every other", [], tone="warn")
-  clear = [effect.get("evidence", {}).get("clear_by_standard_errors") for effect in effects]
-  least = min((c for c in clear if c is not None), default=None)
   words = [f"These logs do not tell it from {_either(alike, ())}."] if alike else []
   tone = "warn" if alike else "good"
-  if least is None:
+  pairs = _clearness(effects, asked)
+  if not pairs:
     return Answer(question, "See the evidence below", words, tone)
+  least, needed = min(pairs, key=lambda pair: pair[0] - pair[1])
   size = f"{least:.1f}" if least < _CLEAR else f"More than {_CLEAR:.0f}"
   others = f"By so much every {'other ' if alike else ''}explanation without it is worse"
-  each = " at least" if len(effects) > 1 else ""
+  which = ", for the least certain" if len(pairs) > 1 else ""
   return Answer(
     question,
-    f"{size} standard errors{each}; {beyond:.1f} are asked",
+    f"{size} standard errors{which}; {needed:.1f} are asked",
     [f"{others}, on parts of the logs that were left out.", *words],
     tone,
   )
+
+
+def _clearness(
+  effects: Sequence[dict[str, Any]], asked: Sequence[float]
+) -> list[tuple[float, float]]:
+  """Returns by how many standard errors effects are clear, and what is asked of each: of a joint's
+  n-th clearest more than of its clearest. What a servo's law alone shows is one by itself."""
+  of_joint: dict[Any, list[float]] = {}
+  for number, effect in enumerate(effects):
+    evidence = effect.get("evidence", {})
+    clear = evidence.get("clear_by_standard_errors")
+    if clear is not None:
+      key = number if evidence.get("servo_law") else effect["joint"]
+      of_joint.setdefault(key, []).append(clear)
+  return [
+    (clear, asked[min(rank, len(asked) - 1)])
+    for found in of_joint.values()
+    for rank, clear in enumerate(sorted(found, reverse=True))
+  ]
 
 
 def _either(names: Sequence[str], claimed: Sequence[str]) -> str:

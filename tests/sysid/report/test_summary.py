@@ -43,19 +43,36 @@ SHOWN = "Of 19 kinds of effect these logs would not show cogging."
 
 def answers(content, unit="mrad", referred=False):
   """Returns the four answers, each with its details, and their tones."""
-  part = summary.section(content, beyond=3.0, unit=unit, shown=SHOWN, referred=referred)
+  part = summary.section(content, asked=(3.0, 4.0), unit=unit, shown=SHOWN, referred=referred)
   (block,) = part.blocks
   return [" | ".join((a.answer, *a.details)) for a in block.answers]
 
 
 def tones(content):
-  (block,) = summary.section(content, beyond=3.0, unit="mrad", shown=SHOWN, referred=False).blocks
+  (block,) = summary.section(
+    content, asked=(3.0, 4.0), unit="mrad", shown=SHOWN, referred=False
+  ).blocks
   return [answer.tone for answer in block.answers]
 
 
 @pytest.fixture
 def content():
   return copy.deepcopy(NAMED)
+
+
+def test_of_several_the_least_certain_is_told_with_what_is_asked_of_it(content):
+  """A joint's second effect must be clear by more than its first."""
+  first = content["effects"][0]
+
+  def effect(joint, clear, **evidence):
+    return {**first, "joint": joint, "evidence": {"clear_by_standard_errors": clear, **evidence}}
+
+  content["effects"] = [effect("knee", 9.0), effect("knee", 4.3), effect("hip", 3.7)]
+  assert answers(content)[1].startswith("4.3 standard errors, for the least certain; 4.0 are asked")
+  content["effects"] = [effect("knee", 9.0), effect("knee", 8.0), effect("hip", 3.2)]
+  assert answers(content)[1].startswith("3.2 standard errors, for the least certain; 3.0 are asked")
+  content["effects"] = [effect("knee", 9.0), effect("knee", 3.5, servo_law=True)]
+  assert answers(content)[1].startswith("3.5 standard errors, for the least certain; 3.0 are asked")
 
 
 def test_a_named_effect_has_its_value_its_certainty_and_what_remains(content):
@@ -66,7 +83,9 @@ def test_a_named_effect_has_its_value_its_certainty_and_what_remains(content):
   assert remains.startswith("1.5 mrad, 1.5 times the readings' noise | The declared model leaves")
   assert record.startswith("Steps of 1.5 s, 0.9 rad about 0 rad | ")
   assert "of stribeck_friction, would differ by 3.2 times the noise" in record
-  (block,) = summary.section(content, beyond=3.0, unit="mrad", shown="", referred=False).blocks
+  (block,) = summary.section(
+    content, asked=(3.0, 4.0), unit="mrad", shown="", referred=False
+  ).blocks
   assert block.answers[2].bars == {
     "declared, 30 mrad": 0.03,
     "extended, 1.5 mrad": 0.0015,
