@@ -62,8 +62,8 @@ class Localisation:
   warnings: tuple[str, ...] = ()
   """What may ruin the reconstruction."""
   left_out: tuple[str, ...] = ()
-  """Keyframes of a film without a place, as theirs contradicted what was filmed moments before and
-  after."""
+  """Keyframes without a place, as theirs hung on little or, of a film, contradicted what was filmed
+  moments before and after."""
   seconds: dict[str, float] = dataclasses.field(default_factory=dict)
   """Wall time of each step."""
 

@@ -201,16 +201,15 @@ def _map(
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
   dropped = mapping.drop_weak_images(model)
-  if not film:
-    least = needed(len(names), settings)
-    uncertain, kept = certainty.drop_uncertain(model, least=least)
-    dropped += uncertain
-    if kept:
-      warnings.append(
-        f"Uncertain: the places of {', '.join(kept)} hang on little. They are used, as fewer than "
-        f"{least} pictures would be left: take more in between."
-      )
-  if dropped:
+  least = needed(len(names), settings)
+  uncertain, kept = certainty.drop_uncertain(model, least=least)
+  out |= frozenset(uncertain)
+  if kept:
+    warnings.append(
+      f"Uncertain: the places of {', '.join(kept)} hang on little. They are used, as fewer than "
+      f"{least} pictures would be left: take more in between."
+    )
+  if dropped or uncertain:
     check_registered(model, names, settings, share, film=film)
   placed = {image.name for image in mapping.registered(model)}
   out -= placed

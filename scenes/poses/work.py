@@ -40,7 +40,8 @@ class Mapped:
   lens: mapping.FreeLens | None = None
   """What was estimated of the lens; None where it was known."""
   left_out: tuple[str, ...] = ()
-  """Pictures that were out of a film's line, see `checks/continuity.py`."""
+  """Pictures out of a film's line, see `checks/continuity.py`, or whose place hung on little, see
+  `checks/certainty.py`."""
   shutter: Shutter | None = None
 
 

@@ -1,6 +1,6 @@
-"""Finds photographs whose place hangs on too little.
+"""Finds pictures whose place hangs on too little.
 
-A photograph of a plain wall may be held to the others by one small thing, such as a poster: turned
+A picture of a plain wall may be held to the others by one small thing, such as a poster: turned
 about it by degrees all matches still agree, and where two such things are alike it may hang on the
 wrong one without a contradiction. The covariance of the adjustment of all places and points shows
 it, as such a place is known several times less well than the others are.
@@ -40,7 +40,9 @@ def turns(model: pycolmap.Reconstruction) -> dict[int, float]:
   return {k: float(np.sqrt(np.trace(c[:3, :3]))) for k, c in covariances.items() if c is not None}
 
 
-def drop_uncertain(model: pycolmap.Reconstruction, *, least: int = 0) -> tuple[int, list[str]]:
+def drop_uncertain(
+  model: pycolmap.Reconstruction, *, least: int = 0
+) -> tuple[list[str], list[str]]:
   """Takes the pose from pictures whose place hangs on too little, the least certain first.
 
   Args:
@@ -48,7 +50,7 @@ def drop_uncertain(model: pycolmap.Reconstruction, *, least: int = 0) -> tuple[i
     least: So many pictures keep their poses, certain or not.
 
   Returns:
-    How many have lost their pose, and the names of those that kept it though uncertain.
+    Names of those that have lost their pose, and of those that kept it though uncertain.
   """
   deviations = turns(model)
   usual = np.median(list(deviations.values())) if deviations else 0.0
@@ -57,4 +59,5 @@ def drop_uncertain(model: pycolmap.Reconstruction, *, least: int = 0) -> tuple[i
   spare = max(model.num_reg_images() - least, 0)
   for key in uncertain[:spare]:
     model.deregister_frame(model.images[key].frame_id)
-  return len(uncertain[:spare]), [model.images[key].name for key in uncertain[spare:]]
+  names = [model.images[key].name for key in uncertain]
+  return names[:spare], names[spare:]

@@ -182,7 +182,7 @@ def drop_out_of_line(
 
 
 def gaps(out: Collection[str], placed: Collection[str], times: Mapping[str, float]) -> str:
-  """Says which parts of a film were left out of its line.
+  """Says which parts of a film were left out.
 
   Args:
     out: Pictures that were.
@@ -202,6 +202,6 @@ def gaps(out: Collection[str], placed: Collection[str], times: Mapping[str, floa
   ]
   these = "that part" if len(parts) == 1 else "those parts"
   return (
-    f"Pictures {', '.join(words)} stand apart from the rest of the film and were left out: film "
-    f"{these} again, slowly."
+    f"Pictures {', '.join(words)} stand apart from the rest of the film, or hang on it by little, "
+    f"and were left out: film {these} again, slowly."
   )
