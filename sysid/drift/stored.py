@@ -17,6 +17,7 @@ from nerf2real.sysid.data.opening import load_model
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks, Member
 from nerf2real.sysid.model.supported import on_a_stand
@@ -185,9 +186,12 @@ def read(folder: Path) -> Stored:
       f"Found {model} changed since {folder} was written, expected the same model: restore it, or "
       "identify from the first logs again."
     )
+  stand = on_a_stand(model, compiled)
+  if details.get("numerics"):
+    Numerics(**details["numerics"]).apply(stand)
   return Stored(
     content,
-    on_a_stand(model, compiled),
+    stand,
     [_member(item) for item in (details, *details.get("near", []))],
     [from_plain(joint, StoredJoint, source=folder / "details.json") for joint in details["joints"]],
   )

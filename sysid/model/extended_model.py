@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from nerf2real.core.files import write_atomically
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.model import native_effects
+from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.simulation import Clocks
 
 _PROMPT = 1e-4  # s, of latencies that need no word
@@ -36,6 +37,7 @@ def write(
   effects: Sequence[Effect],
   *,
   clocks: Mapping[str, Clocks] | None = None,
+  numerics: Numerics | None = None,
 ) -> list[Effect]:
   """Writes the extended model.
 
@@ -44,11 +46,14 @@ def write(
     target: file to write.
     effects: corrections of constants and effects.
     clocks: latencies by joint, which a comment names.
+    numerics: of the model that is written; the source's if left out.
 
   Returns:
     The effects that MJCF cannot hold.
   """
   spec = mujoco.MjSpec.from_file(str(source))
+  if numerics is not None:
+    numerics.write(spec)
   _settle_servos(spec)
   # Constants first: friction and play take over what a joint has by then.
   order = [*EXPRESSED, *native_effects.KINDS]

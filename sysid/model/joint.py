@@ -6,9 +6,10 @@ hypothesis costs a product, not a pass over the model. Shapes: N samples of a lo
 kernel parameters, K parts of a basis.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,7 +17,8 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
-from nerf2real.sysid.model.plant import JointPlant, turned_back, turning
+from nerf2real.sysid.model.numerics import Numerics
+from nerf2real.sysid.model.plant import JointPlant, declared_parameters, turned_back, turning
 from nerf2real.sysid.model.reduction import Reduction, Surroundings
 from nerf2real.sysid.model.servo.law import ServoLaw, servo_law
 
@@ -119,6 +121,31 @@ class JointModel(JointPlant):
     """Returns what turning gravity by the rotation vector (x, y, 0) adds."""
     before = self.model.opt.gravity
     return Load("gravity", matrix_from_rotvec([x, y, 0.0]) @ before - before)
+
+  def simulated_by(self, numerics: Numerics) -> "JointModel":
+    """Returns the same joint with other numerics, whose step is an equal part of this one's."""
+    result = copy.copy(self)
+    result.model, result.step = copy.copy(self.model), numerics.step
+    numerics.apply(result.model)
+    result.declared = declared_parameters(result.model, self.joint)
+    result.impedance = float(result.model.dof_solimp[self.model.joint(self.joint).dofadr[0], 1])
+    parts = round(self.step / numerics.step)
+    result._grids = [result.step * np.arange(parts * (len(grid) - 1) + 1) for grid in self._grids]
+    grids = list(zip(result._grids, self._grids, strict=True))
+
+    def between(logs: Sequence[Any]) -> list[tuple[Array, ...]]:
+      return [
+        tuple(np.interp(fine, grid, row) for row in rows)
+        for (fine, grid), rows in zip(grids, logs, strict=True)
+      ]
+
+    result._loads = [rows[0] for rows in between([[load] for load in self._loads])]
+    result._nominal = between(self._nominal)  # type: ignore[assignment]
+    if all(lift is not None for lift in self._lifts):
+      result._lifts = between(self._lifts)  # type: ignore[assignment]
+    result._unloaded = [np.array(rows) for rows in between(self._unloaded)]
+    result._bases, result._loaded = {}, {}
+    return result
 
   @property
   def among_others(self) -> bool:

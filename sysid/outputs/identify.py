@@ -25,7 +25,9 @@ from nerf2real.sysid.data.checks import check_length
 from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
+from nerf2real.sysid.fit import resolution
 from nerf2real.sysid.model import extended_model
+from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.supported import check_supported, on_a_stand
 from nerf2real.sysid.outputs.details import claimed_effects, details_of
@@ -33,6 +35,7 @@ from nerf2real.sysid.outputs.errors import errors, floor
 from nerf2real.sysid.outputs.notes import (
   another_session,
   beyond,
+  finer,
   long_step,
   of_one,
   spread,
@@ -128,6 +131,11 @@ def _identify(
   progress(0.0, "one joint of many: what each feels of the others")
   stand = on_a_stand(model, compiled)
   reductions = [Reduction(stand, log) for log in logs]
+  declared, used = Numerics(reductions[0].step), resolution.numerics(reductions)
+  if used != declared:
+    used.apply(stand)
+    used.apply(compiled)
+    reductions = [Reduction(stand, log) for log in logs]
   shown = identifiability.of_machine(
     stand,
     logs,
@@ -173,6 +181,7 @@ def _identify(
       *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
       *still(found.still),
       *beyond(compiled, logs[0]),
+      *finer(declared, used),
       *long_step(found.joints),
       *supply(logs, reference),
       *(note for item in found.found for note in another_session(item)),
@@ -205,8 +214,12 @@ def _identify(
   content["alternatives"] += sensed.alternatives
   drawn = samples.with_samples(found, claimed_effects(found), np.random.default_rng(0))
   write_effects(out / "effects.json", servo.apart(drawn, by_duty))
-  extended_model.write(model, out / "model_extended.xml", whole, clocks=found.clocks)
+  finer_ones = None if used == declared else used
+  extended_model.write(
+    model, out / "model_extended.xml", whole, clocks=found.clocks, numerics=finer_ones
+  )
   details = details_of(found, model, near, sensed)
+  details["numerics"] = to_plain(finer_ones)
   details["identifiability"] = [to_plain(item) for item in shown]
   details["joints"] = stored.to_json(stored.remembered(found, held, settings))
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")

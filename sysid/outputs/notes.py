@@ -9,6 +9,7 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model.drive import actuators_of
 from nerf2real.sysid.model.kernel import INDEX
+from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.supported import left_out
 from nerf2real.sysid.selection.joints.changed import Changed
 from nerf2real.sysid.settings import SETTINGS
@@ -62,6 +63,19 @@ def long_step(joints: Sequence[Changed]) -> list[str]:
     f" inertia which the machine has not, up to {max(shares.values()):.2g} times its own, and as"
     f" {step / 2:.3g} ms of lag. Constants, damping and latencies that are off by as much are the"
     " step's: set a shorter timestep in the model."
+  ]
+
+
+def finer(declared: Numerics, used: Numerics) -> list[str]:
+  """Returns a sentence on numerics of a model that show in its readings; none where they do not."""
+  if used == declared:
+    return []
+  shown = [f"its step of {1e3 * declared.step:.3g} ms"] if used.step < declared.step else []
+  shown += ["its dry friction, which creeps"] if used.prompt else []
+  return [
+    f"Of the model's simulation {' and '.join(shown)} would show in readings like these, and no "
+    f"machine has that: it was simulated with a step of {1e3 * used.step:.3g} ms"
+    f"{' and friction that holds' if used.prompt else ''}, as model_extended.xml is."
   ]
 
 
