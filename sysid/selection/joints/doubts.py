@@ -30,6 +30,8 @@ _AT_END = 1e-3  # of a range: a value as near to its end has been stopped there
 
 _SCATTER = ("friction",)  # constants that no drawing or data sheet holds
 
+_MOST = 0.95  # chosen: a law that explains so much of what a force of any form does is its law
+
 
 def supported(
   explainer: Explainer,
@@ -47,8 +49,9 @@ def supported(
   that were fitted without them beside constants that were fitted to all, which is for the
   hypothesis that lacks the effect. Where constants could stand in for a kind only by being off by
   more than they are, it is left out with all else as it is beside it. One that is a force over one
-  variable stands unless a force of any form over that variable does clearly better; any other
-  where hypotheses with a force of any form over both are clearly worse without it.
+  variable stands unless a force of any form over that variable does clearly better, and explains
+  more by what a law's own deviations do not make; any other where hypotheses with a force of any
+  form over both are clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
@@ -70,7 +73,9 @@ def supported(
       stands = explained > left - anyway
     elif kind in VARIABLE:
       rival = rivals.with_force(explainer, without, VARIABLE[kind])
-      stands = clear(rival, best) <= beyond
+      stands = clear(rival, best) <= beyond or (
+        explained >= _MOST * (explained + left - _left(explainer, rival))
+      )
     else:
       beside, bare = (rivals.with_force(explainer, s) for s in (best, without))
       stands = clear(beside, bare) > beyond

@@ -195,6 +195,17 @@ def test_where_more_remains_a_name_explains_more_than_it_leaves(
   assert found == stands
 
 
+@pytest.mark.parametrize(("free", "stands"), [(0.8, ("cogging",)), (0.2, ())])
+def test_a_law_that_explains_nearly_all_that_a_force_does_stands(monkeypatch, free, stands):
+  monkeypatch.setattr(rivals, "lacking", lambda *_: _leaving(9.0))
+  monkeypatch.setattr(rivals, "with_force", lambda *_: _leaving(free))
+  monkeypatch.setattr(doubts, "clear", lambda *_: 5.0)  # the force does clearly better
+  found = doubts.supported(
+    _explainer(), _leaving(1.0), ("cogging",), 3.0, anyway=0.1, forced=["cogging"]
+  )
+  assert found == stands
+
+
 def test_each_of_several_names_is_tried_beside_a_force(monkeypatch):
   tried = []
   monkeypatch.setattr(rivals, "lacking", lambda *_: _leaving(9.0))
