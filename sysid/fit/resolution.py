@@ -11,11 +11,14 @@ Shapes: N samples of all logs, n constants.
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.optimize import lsq_linear
 
 from nerf2real.sysid.fit.noise import timing
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.constants import constants
+from nerf2real.sysid.hypotheses.free_force import free_force
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.measured import block_starts
 from nerf2real.sysid.model.numerics import Numerics
@@ -28,6 +31,7 @@ SHORTEST = 2.5e-4
 """s, of a step that is looked for; chosen: what it costs grows with the steps."""
 
 _WIDTH = 0.2  # of finite differences, of a constant's scale
+_SAME = 1e-3  # of its length, that a force's course is apart from the others' to be one more
 _TO_NOTHING = 2.0  # times what halving a step changes: what a step of nothing would
 _MACHINE = 0.5  # standard deviation of the share of a resolved simulation that logs show, about 1
 
@@ -71,9 +75,12 @@ class _Seen:
     """Returns positions [N] of the declared joint."""
     return self._run(self.plant.simulated_by(numerics))
 
-  def _run(self, plant: JointModel, x: Array | None = None) -> Array:
-    """Returns positions [N] with constants off by x [n]."""
-    p, loads, _ = compose(plant, [self.own], np.zeros(len(self.own.names)) if x is None else x)
+  def _run(
+    self, plant: JointModel, x: Array | None = None, terms: Sequence[Term] | None = None
+  ) -> Array:
+    """Returns positions [N] with constants, or what else is given, off by x."""
+    x = np.zeros(len(self.own.names)) if x is None else x
+    p, loads, _ = compose(plant, [self.own] if terms is None else terms, x)
     return np.concatenate([plant.run(p, loads, i).position for i in range(len(plant.logs))])
 
   def beyond(self, course: Array) -> Array:
@@ -83,6 +90,19 @@ class _Seen:
     limits = -self._tolerance, self._tolerance
     left: Array = row - lsq_linear(self._slopes, row @ self._frame, limits).x @ self._moved
     return left
+
+  def apart(self, courses: Sequence[Array]) -> list[Array]:
+    """Returns what of differences of courses [N] neither constants nor a force of any form over
+    position and velocity imitate, over the noise."""
+    force = free_force(self.plant)
+    terms, known = [self.own, force], np.zeros(len(self.own.names))
+    moved = [row / np.linalg.norm(row) for row in self._moved]
+    for values in np.diag(_WIDTH * np.array(force.scale)):
+      row = (self._run(self.plant, np.r_[known, values], terms) - self.here) / self.noise
+      moved.append(row / max(np.linalg.norm(row), 1e-12))
+    frame, lengths, _ = qr(np.array(moved).T, mode="economic", pivoting=True)
+    frame = frame[:, np.abs(np.diag(lengths)) > _SAME]
+    return [row - frame @ (frame.T @ row) for row in (course / self.noise for course in courses)]
 
   def differs(self, one: Numerics, other: Numerics, factor: float = 1.0) -> bool:
     """Tells whether two simulations differ by more than the noise, in the median log."""
@@ -95,12 +115,13 @@ def _shown(seen: Sequence[_Seen], finer: Numerics) -> bool:
   """Tells whether logs do not say that they have a declared model's own numerics.
 
   The share of the difference to finer ones that is in what the declared model leaves is 1 of a
-  machine's logs and 0 of its own simulation's; blocks tell how sure it is.
+  machine's logs and 0 of its own simulation's; blocks tell how sure it is. What the machine has
+  that the model lacks is in these logs, too: a force of any form takes out most of it.
   """
   both, square = [], []  # of blocks
   for s in seen:
-    by = s.beyond(s.course(finer) - s.here)
-    left = s.beyond(np.concatenate([log.position for log in s.plant.logs]) - s.here)
+    read = np.concatenate([log.position for log in s.plant.logs])
+    by, left = s.apart([s.course(finer) - s.here, read - s.here])
     both.append(np.add.reduceat(by * left, s.starts))
     square.append(np.add.reduceat(by * by, s.starts))
   b, q = np.concatenate(both), np.concatenate(square)

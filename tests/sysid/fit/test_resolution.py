@@ -28,11 +28,12 @@ AXIS = """
 SMOOTH = AXIS.replace("ARMATURE", "0").replace("FRICTION", "0")
 RUBBING = AXIS.replace("ARMATURE", "0.5").replace("FRICTION", "20")
 LATE = Effect("command_delay", "joint", {"delay": 0.003})
+RUBS = Effect("coulomb_friction", "joint", {"torque": 20.0})
 MACHINE = Numerics(1e-4, prompt=True)
 
 
-def recorded(xml, noise, *, numerics=None):
-  """Returns readings of what a model makes, by its own numerics or by others."""
+def recorded(xml, noise, *, effect=LATE, numerics=None):
+  """Returns readings of what a model makes with an effect, by its own numerics or by others."""
   model = mujoco.MjModel.from_xml_string(xml)
   if numerics is not None:
     spec = mujoco.MjSpec.from_string(xml)
@@ -41,7 +42,7 @@ def recorded(xml, noise, *, numerics=None):
     xml = spec.to_xml()
   logs = []
   for seed, kind in enumerate(("sweep", "slow", "steps")):
-    log = log_of(xml, kind, [LATE], duration=6.0, seed=seed, rounding=0.0)
+    log = log_of(xml, kind, [effect], duration=6.0, seed=seed, rounding=0.0)
     read = np.random.default_rng(seed).normal(log.states.position, noise)
     states = dataclasses.replace(log.states, position=read)
     logs.append(dataclasses.replace(log, states=states))
@@ -73,9 +74,10 @@ def test_readings_that_do_not_show_a_model_s_numerics_leave_it_as_it_is():
   assert resolution.numerics([Reduction(model, log) for log in logs]) == Numerics(4e-3)
 
 
+@pytest.mark.parametrize("effect", [LATE, RUBS])
 @pytest.mark.parametrize("xml", [SMOOTH, RUBBING])
-def test_logs_of_a_simulation_have_its_numerics(xml):
-  model, logs = recorded(xml, 1e-5)
+def test_logs_of_a_simulation_have_its_numerics(xml, effect):
+  model, logs = recorded(xml, 1e-5, effect=effect)
   assert resolution.numerics([Reduction(model, log) for log in logs]) == Numerics(4e-3)
 
 
