@@ -31,6 +31,7 @@ SHORTEST = 2.5e-4
 """s, of a step that is looked for; chosen: what it costs grows with the steps."""
 
 _WIDTH = 0.2  # of finite differences, of a constant's scale
+_NONE = 1e-12  # of the noise, that nothing moves by
 _SAME = 1e-3  # of its length, that a force's course is apart from the others' to be one more
 _TO_NOTHING = 2.0  # times what halving a step changes: what a step of nothing would
 _MACHINE = 0.5  # standard deviation of the share of a resolved simulation that logs show, about 1
@@ -96,11 +97,11 @@ class _Seen:
     position and velocity imitate, over the noise."""
     force = free_force(self.plant)
     terms, known = [self.own, force], np.zeros(len(self.own.names))
-    moved = [row / np.linalg.norm(row) for row in self._moved]
+    moved = list(self._moved)
     for values in np.diag(_WIDTH * np.array(force.scale)):
-      row = (self._run(self.plant, np.r_[known, values], terms) - self.here) / self.noise
-      moved.append(row / max(np.linalg.norm(row), 1e-12))
-    frame, lengths, _ = qr(np.array(moved).T, mode="economic", pivoting=True)
+      moved.append((self._run(self.plant, np.r_[known, values], terms) - self.here) / self.noise)
+    rows = [row / max(float(np.linalg.norm(row)), _NONE) for row in moved]
+    frame, lengths, _ = qr(np.array(rows).T, mode="economic", pivoting=True)
     frame = frame[:, np.abs(np.diag(lengths)) > _SAME]
     return [row - frame @ (frame.T @ row) for row in (course / self.noise for course in courses)]
 

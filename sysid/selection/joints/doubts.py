@@ -49,9 +49,9 @@ def supported(
   that were fitted without them beside constants that were fitted to all, which is for the
   hypothesis that lacks the effect. Where constants could stand in for a kind only by being off by
   more than they are, it is left out with all else as it is beside it. One that is a force over one
-  variable stands unless a force of any form over that variable does clearly better, and explains
-  more by what a law's own deviations do not make; any other where hypotheses with a force of any
-  form over both are clearly worse without it.
+  variable stands unless a force of any form over that variable does clearly better and explains a
+  twentieth more of the squares; any other where hypotheses with a force of any form over both are
+  clearly worse without it.
 
   Args:
     explainer: scores what has not been scored.
