@@ -27,9 +27,7 @@ from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
 
-SHORTEST = 2.5e-4
-"""s, of a step that is looked for; chosen: what it costs grows with the steps."""
-
+_SHORTEST = 2.5e-4  # s, of a step that is looked for; chosen: what it costs grows with the steps
 _WIDTH = 0.2  # of finite differences, of a constant's scale
 _NONE = 1e-12  # of the noise, that nothing moves by
 _SAME = 1e-3  # of its length, that a force's course is apart from the others' to be one more
@@ -51,7 +49,7 @@ def numerics(reductions: Sequence[Reduction]) -> Numerics:
   found = held if any(s.differs(declared, held) for s in seen) else declared
   for s in seen:
     finer = found._replace(step=0.5 * found.step)
-    while finer.step >= SHORTEST and s.differs(found, finer, _TO_NOTHING):
+    while finer.step >= _SHORTEST and s.differs(found, finer, _TO_NOTHING):
       found, finer = finer, finer._replace(step=0.5 * finer.step)
   return found if found == declared or _shown(seen, found) else declared
 

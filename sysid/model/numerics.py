@@ -9,8 +9,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-HARDEST = 0.999
-"""Impedance of a constraint that holds; 1 is not allowed."""
+_HARDEST = 0.999  # impedance of a constraint that holds; 1 is not allowed
 _SHORTEST = 2.0  # steps, of a constraint's time constant (MuJoCo, "Solver parameters")
 
 
@@ -28,11 +27,11 @@ class Numerics(NamedTuple):
     if self.prompt:
       rubs = model.dof_frictionloss > 0.0
       model.dof_solref[rubs] = _SHORTEST * self.step, 1.0
-      model.dof_solimp[rubs, :2] = HARDEST
+      model.dof_solimp[rubs, :2] = _HARDEST
 
   def write(self, spec: mujoco.MjSpec) -> None:
     """Writes this into a model's source."""
     spec.option.timestep = self.step
     for joint in (j for j in spec.joints if self.prompt and np.any(j.frictionloss > 0.0)):
       joint.solref_friction = [_SHORTEST * self.step, 1.0]
-      joint.solimp_friction[:2] = HARDEST
+      joint.solimp_friction[:2] = _HARDEST

@@ -18,7 +18,7 @@ from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses import mapping, readout, shutter, structure_from_motion
-from nerf2real.scenes.poses.checks import continuity
+from nerf2real.scenes.poses.checks import certainty, continuity
 from nerf2real.scenes.poses.localisation import LocalisationError, load
 from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.poses.matching.features import FeatureSettings
@@ -74,6 +74,24 @@ def test_what_is_out_of_a_films_line_is_left_out_and_told(corner, tmp_path, monk
   assert result.left_out == tuple(names[4:6])
   assert set(result.names) == set(names) - set(names[4:6])
   assert any("from 4.0 s to 4.5 s stand apart" in line for line in result.warnings)
+
+
+def test_a_films_pictures_whose_places_hang_on_little_are_left_out(corner, tmp_path, monkeypatch):
+  folder = corner[0]
+  names = [path.name for path in sorted((folder / "images").iterdir())]
+  deviations = certainty.turns
+
+  def turns(model):
+    found = deviations(model)
+    weak = next(image for image in mapping.registered(model) if image.name == names[4])
+    return found | {weak.image_id: 6.0 * np.median(list(found.values()))}
+
+  monkeypatch.setattr(certainty, "turns", turns)
+  shutil.copytree(folder / "out" / "work", tmp_path / "work")
+  times = {name: 2.0 + 0.5 * k for k, name in enumerate(names)}
+  result = localise(folder / "images", tmp_path, settings=FEW, times=times)
+  assert result.left_out == (names[4],) and names[4] not in result.names
+  assert any("at 4.0 s stand apart" in line for line in result.warnings)
 
 
 def test_points_lie_on_the_planes_with_their_colours(corner):
