@@ -3,6 +3,7 @@
 Shapes: X, Y, Z voxels, P points, F faces.
 """
 
+import functools
 from typing import NamedTuple
 
 import numba
@@ -46,10 +47,21 @@ def hull(points: np.ndarray, *, max_vertices: int | None = None) -> Part | None:
   index = np.full(len(solid.points), -1)
   index[solid.vertices] = np.arange(len(solid.vertices))
   faces = index[solid.simplices]
-  a, b, c = (corners[faces[:, i]] for i in range(3))
-  inward = (np.cross(b - a, c - a) * solid.equations[:, :3]).sum(-1) < 0
-  faces[inward] = faces[inward][:, ::-1]
+  _face_outwards(faces, corners, solid.equations)
   return Part(corners, faces, solid.equations, float(solid.volume))
+
+
+@numba.njit(cache=True)
+def _face_outwards(faces, corners, planes):
+  """Turns the faces [F, 3] that are clockwise seen from outside of their planes [F, 4]."""
+  for f in range(len(faces)):
+    a, b, c = corners[faces[f, 0]], corners[faces[f, 1]], corners[faces[f, 2]]
+    along = 0.0
+    for i in range(3):
+      j, k = (i + 1) % 3, (i + 2) % 3
+      along += ((b[j] - a[j]) * (c[k] - a[k]) - (b[k] - a[k]) * (c[j] - a[j])) * planes[f, i]
+    if along < 0:
+      faces[f, 0], faces[f, 2] = faces[f, 2], faces[f, 0]
 
 
 def _farthest(corners: np.ndarray, count: int) -> np.ndarray:
@@ -58,10 +70,15 @@ def _farthest(corners: np.ndarray, count: int) -> np.ndarray:
   They come from as many directions first, which leave no side out, and then from twice as many.
   """
   spread = (corners - corners.mean(0)) / np.maximum(np.ptp(corners, axis=0), 1e-9)
-  first, more = (np.unique((spread @ _directions(n).T).argmax(0)) for n in (count, 2 * count))
-  return np.append(first, np.setdiff1d(more, first)[: count - len(first)])
+  taken = np.zeros(len(corners), bool)
+  taken[(spread @ _directions(count).T).argmax(0)] = True
+  more = taken.copy()
+  more[(spread @ _directions(2 * count).T).argmax(0)] = True
+  first = np.flatnonzero(taken)
+  return np.append(first, np.flatnonzero(more & ~taken)[: count - len(first)])
 
 
+@functools.cache
 def _directions(count: int) -> np.ndarray:
   """Evenly spread unit vectors [count, 3], by the golden angle."""
   i = np.arange(count) + 0.5

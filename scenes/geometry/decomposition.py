@@ -30,9 +30,9 @@ class ConvexSettings:
 
   cell: float = 1.0
   """The solid is cut into cubes of this size before anything else."""
-  tolerance: float = 0.025
-  """a part may reach this far into seen free space. From two rooms: 0.035 takes half the time and
-  blocks a fifth more sight lines."""
+  tolerance: float = 0.01
+  """A part may reach this far into seen free space: a cell of the floor's map. 0.025 takes four
+  tenths of the time, leaves 2 % less floor and reaches 2 mm farther into free space on average."""
   doubt: float = 0.3
   """Unseen space this near to seen free space counts as free too."""
   inside: float = 0.08
@@ -56,59 +56,74 @@ class _Matter(NamedTuple):
 
 
 @numba.njit(cache=True)
-def _upper_hulls(heights, filled):
-  """Marks the corners of every row's upper hull over its filled places, bool [R, C]."""
-  rows, columns = heights.shape
-  kept = np.zeros((rows, columns), np.bool_)
-  stack = np.empty(columns, np.int64)
-  for i in range(rows):
-    size = 0
-    for j in range(columns):
-      if not filled[i, j]:
+def _outer_ends(columns, values, start, side):
+  """Outer ends of columns [A, B, L] at the surface's crossings, in voxels of the values' array.
+
+  Of the columns of a slice only those whose ends are corners of the slice's hull are returned.
+
+  Args:
+    columns: Voxels of a piece, bool [A, B, L].
+    values: Of the whole grid [A', B', L'], negative in matter.
+    start: Index of the first column's first voxel there [3].
+    side: -1 for the columns' first ends, 1 for their last.
+
+  Returns:
+    Places [P, 3] along the three axes.
+  """
+  first, second, length = columns.shape
+  found = np.empty((first * second, 3))
+  count = 0
+  places, heights = np.empty(second, np.int64), np.empty(second)
+  for a in range(first):
+    size = 0  # of the stack of corners
+    for b in range(second):
+      end = -1
+      for n in range(length):
+        at = n if side < 0 else length - 1 - n
+        if columns[a, b, at]:
+          end = at
+          break
+      if end < 0:
         continue
+      i, j, k = start[0] + a, start[1] + b, start[2] + end
+      here, there = values[i, j, k], values[i, j, min(max(k + side, 0), values.shape[2] - 1)]
+      # Towards free space the surface lies between both; at a cut half a voxel closes the gap.
+      share = min(max(here / min(here - there, -1e-6), 0.0), 1.0) if there > 0 else 0.5
+      height = side * k + share
       while size >= 2:
-        a, b = stack[size - 2], stack[size - 1]
-        rise = (heights[i, b] - heights[i, a]) * (j - a)
-        if rise > (heights[i, j] - heights[i, a]) * (b - a):
+        p, q = places[size - 2], places[size - 1]
+        rise = (heights[size - 1] - heights[size - 2]) * (b - p)
+        if rise > (height - heights[size - 2]) * (q - p):
           break
         size -= 1
-      stack[size] = j
+      places[size], heights[size] = b, height
       size += 1
-    for k in range(size):
-      kept[i, stack[k]] = True
-  return kept
+    for n in range(size):
+      found[count, 0] = start[0] + a
+      found[count, 1] = start[1] + places[n]
+      found[count, 2] = side * heights[n]
+      count += 1
+  return found[:count]
+
+
+_TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # axes of the grid, so that each of them is last once
 
 
 def _piece_points(piece: np.ndarray, start: np.ndarray, matter: _Matter) -> np.ndarray:
   """Points [P, 3] whose hull is the piece's: outer ends of its columns at the surface's crossings.
-
-  Of a slice of columns only the ends on the slice's own hull are returned.
 
   Args:
     piece: Solid voxels of the piece bool [x, y, z], a block of the grid.
     start: Index of the block's first voxel [3].
     matter: The whole solid.
   """
-  space, shape = matter.space, matter.values.shape
   found = []
-  for axis in range(3):
-    columns = np.moveaxis(piece, axis, 2)
-    filled = columns.any(2)
-    places = np.argwhere(filled)
+  for turn in _TURNS:
+    columns, values = piece.transpose(turn), matter.values.transpose(turn)
     for side in (-1, 1):
-      ends = columns.argmax(2) if side < 0 else columns.shape[2] - 1 - columns[:, :, ::-1].argmax(2)
-      index = np.insert(places, axis, ends[filled], axis=1) + start
-      neighbour = index.copy()
-      neighbour[:, axis] = np.clip(neighbour[:, axis] + side, 0, shape[axis] - 1)
-      here, there = matter.values[tuple(index.T)], matter.values[tuple(neighbour.T)]
-      # Towards free space the surface lies between both; at a cut half a voxel closes the gap.
-      share = np.where(there > 0, here / np.minimum(here - there, -1e-6), 0.5)
-      points = space.lower + space.voxel * index
-      points[:, axis] += side * space.voxel * np.clip(share, 0.0, 1.0)
-      heights = np.zeros(filled.shape)
-      heights[filled] = side * points[:, axis]
-      found.append(points[_upper_hulls(heights, filled)[filled]])
-  return np.concatenate(found)
+      ends = _outer_ends(columns, values, start[list(turn)], side)
+      found.append(ends[:, np.argsort(turn)])
+  return matter.space.lower + matter.space.voxel * np.concatenate(found)
 
 
 def _cuts(piece: np.ndarray, count: int) -> list[tuple[int, int]]:

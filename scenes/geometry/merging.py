@@ -47,24 +47,28 @@ def merge(
   alive: dict[int, Part] = dict(enumerate(parts))
   boxes = _Boxes(parts)
   fresh = len(parts)
-  heap: list[tuple[float, float, int, int, Part]] = []
+  # How deep a hull reaches, what it adds, which two, the hull, and whether its depth is known yet.
+  heap: list[tuple[float, float, int, int, Part, bool]] = []
 
   def offer(i: int, others: list[int]) -> None:
     for j in others:
       points = np.concatenate([alive[i].vertices, alive[j].vertices])
       joined = hull(points, max_vertices=max_vertices)
-      if joined is None:
-        continue
-      found = intrusion_of(joined, space, tolerance)
-      added = joined.volume - alive[i].volume - alive[j].volume
-      heapq.heappush(heap, (0.0 if found.allowed else found.deep, added, j, i, joined))
+      if joined is not None:
+        added = joined.volume - alive[i].volume - alive[j].volume
+        heapq.heappush(heap, (0.0, added, j, i, joined, False))
 
   for i in alive:
     offer(i, [j for j in boxes.touching(i, 1.5 * space.voxel) if j < i])
   while heap:
-    deep, _, i, j, joined = heapq.heappop(heap)
+    deep, added, i, j, joined, known = heapq.heappop(heap)
     if i not in alive or j not in alive:
       continue
+    if not known:  # most pairs lose one of the two before it is their turn
+      found = intrusion_of(joined, space, tolerance)
+      if not found.allowed:
+        heapq.heappush(heap, (found.deep, added, i, j, joined, True))
+        continue
     if deep > 0 and len(alive) <= max_parts:
       break
     for index in (i, j):

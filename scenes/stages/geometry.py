@@ -28,8 +28,9 @@ from nerf2real.scenes.stages.results import Contact, FreeFloor
 
 _SURFACE_VERSION = 2  # 2: the floor is inside of the grid
 # 2: unseen space is matter behind seen matter alone; no tolerance grows; 3: its errors apart;
-# 4: the tolerance holds between voxels; 5: thin things; 6: no side is cut off round parts
-_CONTACT_VERSION = 6
+# 4: the tolerance holds between voxels; 5: thin things; 6: no side is cut off round parts;
+# 7: ends of columns in their own arithmetic
+_CONTACT_VERSION = 7
 
 
 def floor(

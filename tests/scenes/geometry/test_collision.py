@@ -35,7 +35,7 @@ def parts(grid):
 
 
 def test_parts_are_few_and_convex(parts):
-  assert 10 < len(parts) <= 160
+  assert 10 < len(parts) <= 400
   for part in parts:
     height = part.vertices @ part.planes[:, :3].T + part.planes[:, 3]
     assert height.max() < 1e-6
