@@ -130,6 +130,7 @@ def adjust(
   principal: bool,
   distortion: bool,
   anchors: Anchors | None = None,
+  loss: float = LOSS_SCALE,
 ) -> None:
   """Adjusts poses, points, focal lengths and, where chosen, principal point and distortion.
 
@@ -138,13 +139,14 @@ def adjust(
     principal: Whether the principal point is free.
     distortion: Whether the distortion is.
     anchors: What holds the positions besides the pictures.
+    loss: Error beyond which an observation counts less [pixel].
   """
   options = pycolmap.BundleAdjustmentOptions()
   options.refine_principal_point = principal
   options.refine_extra_params = distortion
   options.print_summary = False
   options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-  options.ceres.loss_function_scale = LOSS_SCALE
+  options.ceres.loss_function_scale = loss
   options.ceres.solver_options.num_threads = os.cpu_count() or 1
   options.ceres.solver_options.max_num_iterations = 50
   options.ceres.solver_options.function_tolerance = 1e-6
@@ -171,11 +173,11 @@ def adjust(
     pycolmap.create_pose_prior_bundle_adjuster(options, how, config, priors, model).solve()
 
 
-def drop_bad_observations(model: pycolmap.Reconstruction) -> None:
-  """Drops observations far from their point, and points seen under a small angle only or that lie
-  in a camera."""
+def drop_bad_observations(model: pycolmap.Reconstruction, *, limit: float = MAX_ERROR) -> None:
+  """Drops observations farther than a limit [pixel] from their point, and points seen under a small
+  angle only or that lie in a camera."""
   with quiet():
-    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+    pycolmap.ObservationManager(model).filter_all_points3D(limit, MIN_ANGLE)
   drop_points_in_cameras(model)
 
 

@@ -17,7 +17,7 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, readout
+from nerf2real.scenes.poses import mapping, readout, sharpening
 from nerf2real.scenes.poses.checks import agreement, certainty, continuity, things_alike
 from nerf2real.scenes.poses.checks.attempts import best_of
 from nerf2real.scenes.poses.checks.overlap import overlap
@@ -94,8 +94,11 @@ def localise(
   else:
     database = prepare_work(images_folder, out_folder / _WORK_FOLDER, names, settings, known)
     result = _map(database, images_folder, names, settings, known, steps, times)
-    if times is not None and known is None:
-      result = _without_shutter(result, times, steps)
+    if known is None:
+      result = _aligned(result, database, images_folder, steps)
+      if times is not None:
+        result = _without_shutter(result, times, steps)
+      result = _settled(result, steps)
     if known is not None and not result.model.num_points3D():
       result = _as_it_came(known, names)
   localisation = _describe(result, len(names), known, images_folder, turned, steps)
@@ -219,6 +222,23 @@ def _map(
     warnings.append(f"Lens: estimated {lens.words}.")
   strategy = f"{words}, {mapper}; lens: {lens.words}"
   return Mapped(model, strategy, tuple(warnings), lens, left_out=tuple(sorted(out)))
+
+
+def _aligned(mapped: Mapped, database: Path, images_folder: Path, steps: Steps) -> Mapped:
+  """Aligns the patches that a model's points show."""
+  steps.begin("aligning")
+  return dataclasses.replace(
+    mapped, model=sharpening.align(mapped.model, database, images_folder, report=steps.report)
+  )
+
+
+def _settled(mapped: Mapped, steps: Steps) -> Mapped:
+  """Adjusts an aligned model by the noise that is left."""
+  assert mapped.lens is not None  # for the type checker: only known poses have none
+  steps.begin("refining")
+  return dataclasses.replace(
+    mapped, model=sharpening.settle(mapped.model, mapped.lens, report=steps.report)
+  )
 
 
 def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -> Mapped:

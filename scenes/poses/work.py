@@ -20,8 +20,9 @@ _DATABASE = "database.db"
 _SHARES = {
   "features": 0.25,
   "matching": 0.4,
-  "mapping": 0.25,
+  "mapping": 0.2,
   "refining": 0.05,
+  "aligning": 0.05,
   "shutter": 0.05,
 }
 # Where poses came with the pictures few pairs are matched, and all are triangulated and adjusted
