@@ -173,11 +173,11 @@ def adjust(
     pycolmap.create_pose_prior_bundle_adjuster(options, how, config, priors, model).solve()
 
 
-def drop_bad_observations(model: pycolmap.Reconstruction, *, limit: float = MAX_ERROR) -> None:
-  """Drops observations farther than a limit [pixel] from their point, and points seen under a small
-  angle only or that lie in a camera."""
+def drop_bad_observations(model: pycolmap.Reconstruction) -> None:
+  """Drops observations far from their point, and points seen under a small angle only or that lie
+  in a camera."""
   with quiet():
-    pycolmap.ObservationManager(model).filter_all_points3D(limit, MIN_ANGLE)
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
   drop_points_in_cameras(model)
 
 

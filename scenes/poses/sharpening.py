@@ -12,6 +12,7 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.matching import patches
+from nerf2real.scenes.poses.matching.patches import Observation
 
 _LOSS = 2.0  # the loss's scale, times the median error, as it is of detected features
 _LEAST_LOSS = 0.05  # [pixel]: no picture is more exact
@@ -40,21 +41,42 @@ def align(
     ValueError: A picture cannot be read.
   """
   model = pycolmap.Reconstruction(model)
-  lost = patches.align(model, database, images_folder, report=report)
-  left = {image.image_id: image.num_points3D for image in mapping.registered(model)}
-  for observation in lost:
-    left[observation.image] -= 1
-  for observation in lost:
-    enough = left[observation.image] >= mapping.MIN_OBSERVATIONS
-    if enough and model.images[observation.image].points2D[observation.row].has_point3D():
-      model.delete_observation(*observation)
+  _drop(model, patches.align(model, database, images_folder, report=report))
   return model
+
+
+def _drop(model: pycolmap.Reconstruction, observations: list[Observation]) -> None:
+  """Drops observations, but those of pictures that would be left with too few."""
+  left = {image.image_id: image.num_points3D for image in mapping.registered(model)}
+  for observation in observations:
+    left[observation.image] -= 1
+  for image, row in observations:
+    enough = left[image] >= mapping.MIN_OBSERVATIONS
+    if enough and model.images[image].points2D[row].has_point3D():  # its point may be gone
+      model.delete_observation(image, row)
+
+
+def _errors(model: pycolmap.Reconstruction) -> tuple[list[Observation], np.ndarray]:
+  """All observations [O] and their distances [O] from where their points are [pixel]."""
+  observations, errors = [], [np.zeros(0)]
+  for image in mapping.registered(model):
+    seen = {row: place for row, place in enumerate(image.points2D) if place.has_point3D()}
+    if seen:
+      points = np.array([model.points3D[place.point3D_id].xyz for place in seen.values()])
+      local = image.cam_from_world() * points
+      shown = np.asarray(model.cameras[image.camera_id].img_from_cam(local))
+      error = np.linalg.norm(shown - [place.xy for place in seen.values()], axis=1)
+      errors.append(np.where(local[:, 2] > 0, error, np.inf))
+      observations += [Observation(image.image_id, row) for row in seen]
+  return observations, np.concatenate(errors)
 
 
 def settle(
   model: pycolmap.Reconstruction, lens: mapping.FreeLens, *, report: Progress = no_progress
 ) -> pycolmap.Reconstruction:
   """Returns a model adjusted by a loss, and without observations beyond a limit, of their noise.
+
+  Pictures that would be left with too few observations keep theirs.
 
   Args:
     model: Adjusted already.
@@ -64,9 +86,11 @@ def settle(
   model = pycolmap.Reconstruction(model)
   for done in range(_ROUNDS):
     report(done / _ROUNDS, "adjusting poses and lens by the noise that is left")
-    model.update_point_3d_errors()
-    errors = [point.error for point in model.points3D.values()]
-    scale = float(np.clip(_LOSS * np.median(errors), _LEAST_LOSS, mapping.LOSS_SCALE))
+    usual = float(np.median(_errors(model)[1]))
+    scale = float(np.clip(_LOSS * usual, _LEAST_LOSS, mapping.LOSS_SCALE))
     mapping.adjust(model, principal=lens.principal, distortion=lens.distortion, loss=scale)
-    mapping.drop_bad_observations(model, limit=mapping.MAX_ERROR * scale / mapping.LOSS_SCALE)
+    limit = mapping.MAX_ERROR * scale / mapping.LOSS_SCALE
+    observations, errors = _errors(model)
+    _drop(model, [observations[k] for k in np.flatnonzero(errors > limit)])
+    mapping.drop_bad_observations(model)
   return model

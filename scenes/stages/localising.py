@@ -39,8 +39,8 @@ _PICTURES_VERSION = 4  # of all others
 # 10: the readout is a frame's period at most; points of a COLMAP model are seen by pictures; of few
 # pictures some may have no place; 11: photographs without pairs whose rotations contradict;
 # 12: by what pictures lack; a film's line is the one that least contradicts; matches are kept of
-# what came with depth; 13: uncertain pictures of films are left out, too
-_POSES_VERSION = 13
+# what came with depth; 13: uncertain pictures of films are left out, too; 14: patches are aligned
+_POSES_VERSION = 14
 _ALIGNED_VERSION = 1
 _MATCHES = "matches.db"  # what pictures with depth show alike
 _ALIGNED_RECORD = "aligned.json"  # the factor on the depth's unit
