@@ -235,7 +235,7 @@ def _aligned(mapped: Mapped, database: Path, images_folder: Path, steps: Steps) 
 def _settled(mapped: Mapped, steps: Steps) -> Mapped:
   """Adjusts an aligned model by the noise that is left."""
   assert mapped.lens is not None  # for the type checker: only known poses have none
-  steps.begin("refining")
+  steps.begin("settling")
   return dataclasses.replace(
     mapped, model=sharpening.settle(mapped.model, mapped.lens, report=steps.report)
   )

@@ -22,8 +22,9 @@ _SHARES = {
   "matching": 0.4,
   "mapping": 0.2,
   "refining": 0.05,
-  "aligning": 0.05,
-  "shutter": 0.05,
+  "aligning": 0.04,
+  "shutter": 0.03,
+  "settling": 0.03,
 }
 # Where poses came with the pictures few pairs are matched, and all are triangulated and adjusted
 # twice.

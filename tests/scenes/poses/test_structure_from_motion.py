@@ -49,10 +49,10 @@ def test_poses_against_truth(corner):
   _, truth, result, _ = corner
   assert result.registered_fraction == 1
   errors = fountain.pose_errors(result.world_from_camera, truth)
-  assert errors.position_rmse < 0.01  # of a walk of 1.3 m
-  assert errors.rotation_rmse < 0.2
+  assert errors.position_rmse < 0.001  # of a walk of 1.3 m
+  assert errors.rotation_rmse < 0.05
   assert result.camera.fx == pytest.approx(280, rel=0.02)
-  assert result.reprojection_error_px < 1
+  assert result.reprojection_error_px < 0.1  # patches are aligned
   assert result.strategy.startswith("exhaustive")
 
 
@@ -280,7 +280,8 @@ def test_colmap_source_keeps_poses_and_scale_and_its_points_are_seen(corner, tmp
   assert len(result.points) > 0.8 * len(first.points)
   assert len(result.tracks.view) > 0.8 * len(first.tracks.view)
   assert result.point_colors.max() > 0
-  assert result.reprojection_error_px < 1.2 * first.reprojection_error_px
+  # its features as detected: they are aligned where poses are found, not where they are kept
+  assert result.reprojection_error_px < 0.3
 
 
 def test_pictures_without_a_match_keep_the_points_that_came(tmp_path):
@@ -384,7 +385,8 @@ def test_figures_are_plain_json(corner):
   folder, _, result, _ = corner
   values = json.loads((folder / "out" / "sfm" / "localisation.json").read_text())
   assert values["registered_fraction"] == 1.0
-  assert set(values["seconds"]) == {"features", "matching", "mapping", "refining"}
+  expected = {"features", "matching", "mapping", "refining", "aligning", "settling"}
+  assert set(values["seconds"]) == expected
   assert isinstance(result.camera, Camera)
 
 
