@@ -46,14 +46,24 @@ def align(
 
 
 def _drop(model: pycolmap.Reconstruction, observations: list[Observation]) -> None:
-  """Drops observations, but those of pictures that would be left with too few."""
+  """Drops observations, but those of pictures that would be left with too few.
+
+  A point that two pictures see is lost to the other one, too.
+  """
   left = {image.image_id: image.num_points3D for image in mapping.registered(model)}
   for observation in observations:
     left[observation.image] -= 1
   for image, row in observations:
-    enough = left[image] >= mapping.MIN_OBSERVATIONS
-    if enough and model.images[image].points2D[row].has_point3D():  # its point may be gone
-      model.delete_observation(image, row)
+    place = model.images[image].points2D[row]
+    if left[image] < mapping.MIN_OBSERVATIONS or not place.has_point3D():  # it may be gone
+      continue
+    seen_by = [element.image_id for element in model.points3D[place.point3D_id].track.elements]
+    if len(seen_by) == 2:
+      other = seen_by[1] if seen_by[0] == image else seen_by[0]
+      if left[other] <= mapping.MIN_OBSERVATIONS:
+        continue
+      left[other] -= 1
+    model.delete_observation(image, row)
 
 
 def _errors(model: pycolmap.Reconstruction) -> tuple[list[Observation], np.ndarray]:

@@ -88,6 +88,22 @@ def test_what_is_not_found_goes_but_from_pictures_that_show_little(observed, mon
   assert model.images[first].num_points3D == before[first]
 
 
+def test_a_picture_does_not_lose_what_another_one_does_not_find(observed, monkeypatch):
+  model, _ = observed
+  weak, many, *others = (image.image_id for image in mapping.registered(model))
+  shared = [p.point3D_id for p in model.images[weak].points2D][: mapping.MIN_OBSERVATIONS + 3]
+  for image in (weak, *others):
+    for row, place in enumerate(model.images[image].points2D):
+      if place.has_point3D() and (image != weak) == (place.point3D_id in shared):
+        model.delete_observation(image, row)  # `weak` sees these points alone, with `many`
+  rows = [row for row, p in enumerate(model.images[many].points2D) if p.point3D_id in shared]
+  assert model.images[weak].num_points3D == mapping.MIN_OBSERVATIONS + 3 == len(rows)
+  lost = [patches.Observation(many, row) for row in rows]
+  monkeypatch.setattr(patches, "align", lambda *_, **__: lost)
+  aligned = sharpening.align(model, None, None)
+  assert aligned.images[weak].num_points3D == mapping.MIN_OBSERVATIONS
+
+
 def test_a_picture_of_few_points_keeps_them_however_far_they_are(observed):
   model, true = observed
   weak = mapping.registered(model)[3]
