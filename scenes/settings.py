@@ -8,6 +8,7 @@ from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.field import settings as training
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.geometry.collision import CollisionSettings
+from nerf2real.scenes.geometry.decomposition import ConvexSettings
 from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.geometry.mesh import MeshSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
@@ -73,6 +74,8 @@ def with_marker(settings: SceneSettings, place: MarkerPlace) -> SceneSettings:
 
 
 NO_STEREO = StereoSettings(most_pictures=0)
+# of a first look, whose surfaces are rough anyway: in half the time
+ROUGH_PARTS = CollisionSettings(parts=ConvexSettings(tolerance=0.025))
 ONE_ATTEMPT = LocaliseSettings(attempts=1)
 PRESETS = ("fast", "quality", "demo", "tiny", "paper")
 
@@ -92,6 +95,7 @@ def preset(name: str) -> SceneSettings:
       localise=ONE_ATTEMPT,
       stereo=NO_STEREO,
       train=dataclasses.replace(training.preset("fast"), max_seconds=150.0),
+      collision=ROUGH_PARTS,
       baseline="colmap",
     )
   if name == "tiny":
@@ -101,6 +105,7 @@ def preset(name: str) -> SceneSettings:
       stereo=NO_STEREO,
       # a rate for few steps, see benchmarks/results/records/rooms/field_ablation.json
       train=dataclasses.replace(training.preset("fast"), max_seconds=60.0, learning_rate=5e-3),
+      collision=ROUGH_PARTS,
     )
   if name == "paper":
     return SceneSettings(
