@@ -28,7 +28,7 @@ _FINE = 0.005  # m, cells in which borders of voxels and of parts are found
 _HEIGHTS = 0.03  # m between heights at which matter is looked for
 _INSIDE = 0.1  # m from the room's walls and doors within which a border counts
 _REACH = 0.12  # m: a border that is farther from true matter is of matter that is not there
-_TOO_DEEP = 0.025  # m: the tolerance of the parts
+_TOO_DEEP = 0.025  # m: more than parts may reach
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

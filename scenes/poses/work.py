@@ -17,7 +17,7 @@ from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.shutter import Shutter
 
 _DATABASE = "database.db"
-_SHARES = {
+SHARES = {
   "features": 0.25,
   "matching": 0.4,
   "mapping": 0.2,
@@ -50,7 +50,7 @@ class Mapped:
 class Steps:
   """Times the steps and turns their progress into one fraction."""
 
-  def __init__(self, progress: Progress, shares: Mapping[str, float] = _SHARES):
+  def __init__(self, progress: Progress, shares: Mapping[str, float] = SHARES):
     self._progress, self._shares = progress, shares
     self._name, self._start = "", time.perf_counter()
     self.seconds: dict[str, float] = {}

@@ -9,22 +9,14 @@ import pytest
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.poses import mapping
 from tests.scenes import synthetic_capture as synthetic
+from tests.scenes import synthetic_model
 
 WEAK = 3  # the picture that sees little
 
 
 def observed():
   """A model with noise of a pixel, one picture of which sees six points, and its true places."""
-  pycolmap.set_random_seed(0)
-  model = pycolmap.synthesize_dataset(
-    pycolmap.SyntheticDatasetOptions(
-      num_rigs=1,
-      num_cameras_per_rig=1,
-      num_frames_per_rig=8,
-      num_points3D=120,
-      num_points2D_without_point3D=0,
-    )
-  )
+  model = synthetic_model.exact(frames=8, points=120)
   random = np.random.default_rng(0)
   for image in model.images.values():
     for point in image.points2D:

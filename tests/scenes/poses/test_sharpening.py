@@ -7,6 +7,7 @@ import pytest
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.poses import mapping, sharpening
 from nerf2real.scenes.poses.matching import patches
+from tests.scenes import synthetic_model
 
 NOISE = 0.1  # of most observations [pixel]
 LENS = mapping.FreeLens(distortion=False, principal=False, words="")
@@ -15,16 +16,7 @@ LENS = mapping.FreeLens(distortion=False, principal=False, words="")
 @pytest.fixture
 def observed():
   """A model with a little noise, every eighth observation 0.5 to 2 pixels off, and true places."""
-  pycolmap.set_random_seed(0)
-  model = pycolmap.synthesize_dataset(
-    pycolmap.SyntheticDatasetOptions(
-      num_rigs=1,
-      num_cameras_per_rig=1,
-      num_frames_per_rig=10,
-      num_points3D=150,
-      num_points2D_without_point3D=0,
-    )
-  )
+  model = synthetic_model.exact(frames=10, points=150)
   random = np.random.default_rng(0)
   for image in model.images.values():
     for number, point in enumerate(image.points2D):

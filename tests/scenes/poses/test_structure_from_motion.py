@@ -25,7 +25,7 @@ from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.poses.structure_from_motion import localise
 from nerf2real.scenes.poses.unit_frame import mean_up
-from nerf2real.scenes.poses.work import Mapped, Steps, prepare_work
+from nerf2real.scenes.poses.work import SHARES, Mapped, Steps, prepare_work
 from tests.scenes import synthetic_capture as synthetic
 
 FOUNTAIN = Path(__file__).parents[4] / "shared" / "data" / "captures" / "fountain-P11"
@@ -280,8 +280,7 @@ def test_colmap_source_keeps_poses_and_scale_and_its_points_are_seen(corner, tmp
   assert len(result.points) > 0.8 * len(first.points)
   assert len(result.tracks.view) > 0.8 * len(first.tracks.view)
   assert result.point_colors.max() > 0
-  # its features as detected: they are aligned where poses are found, not where they are kept
-  assert result.reprojection_error_px < 0.3
+  assert result.reprojection_error_px < 1.2 * 0.196  # as detected: poses are kept
 
 
 def test_pictures_without_a_match_keep_the_points_that_came(tmp_path):
@@ -385,8 +384,7 @@ def test_figures_are_plain_json(corner):
   folder, _, result, _ = corner
   values = json.loads((folder / "out" / "sfm" / "localisation.json").read_text())
   assert values["registered_fraction"] == 1.0
-  expected = {"features", "matching", "mapping", "refining", "aligning", "settling"}
-  assert set(values["seconds"]) == expected
+  assert set(values["seconds"]) == set(SHARES) - {"shutter"}
   assert isinstance(result.camera, Camera)
 
 
