@@ -13,6 +13,7 @@ from nerf2real.core.progress import Progress
 from nerf2real.core.serialization import read_json, write_json
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.field import photometry
+from nerf2real.scenes.field.render import renderer
 from nerf2real.scenes.field.views import held_out_rows
 from nerf2real.scenes.geometry import poisson as poisson_meshes
 from nerf2real.scenes.geometry.fusion import DepthViews
@@ -38,7 +39,8 @@ def figures(
     write_json(folder / "figures.json", found)
 
   inputs = {"field": field.stamp}
-  stage = cache.run("figures", write, settings=pictures.held_out_every, inputs=inputs)
+  every = pictures.held_out_every
+  stage = cache.run("figures", write, settings=every, inputs=inputs, version=renderer.VERSION)
   return Made(json.loads((stage.folder / "figures.json").read_text()), stage)
 
 

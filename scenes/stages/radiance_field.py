@@ -16,6 +16,7 @@ from nerf2real.core.serialization import write_json
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.field import training
+from nerf2real.scenes.field.render import renderer
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.field.views import held_out_rows
 from nerf2real.scenes.geometry import fusion
@@ -135,7 +136,7 @@ def depth(
   inputs = {"field": field.stamp, "poses": poses.stamp}
   if capture.value.known is not None and capture.value.known.depth_files:
     inputs["keyframes"] = capture.stamp
-  stage = cache.run("depth", write, settings=width, inputs=inputs)
+  stage = cache.run("depth", write, settings=width, inputs=inputs, version=renderer.VERSION)
   arrays = np.load(stage.folder / "depth.npz")
   views = fusion.DepthViews(
     camera=found.camera.at_most(width),

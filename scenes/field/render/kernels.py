@@ -54,7 +54,7 @@ class Kernels(NamedTuple):
 
   frame: Any  # poses x rays of a camera -> uint8 colour, z-depth
   rays: Any  # origins, directions -> float colour, distance, opacity
-  density: Any  # points of the grid's cube -> density
+  density: Any  # a lattice in the grid's cube -> densities
 
 
 @functools.cache
@@ -219,33 +219,24 @@ def build(layout: Layout) -> Kernels:
   @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
   def density(
     field: FieldData,
-    cells: wp.array(dtype=wp.int32),
     side: wp.int32,
+    spacing: wp.float32,
+    offset: wp.float32,
     deviations: wp.vec2,
-    densest: wp.array(dtype=wp.float32),
+    found: wp.array(dtype=wp.float32),
   ):
-    """Largest density of a cell's corners and centre, for both sample sizes in turn."""
-    thread = wp.tid()
-    cell = cells[thread]
-    corner = wp.vec3(
-      wp.float32(cell % side), wp.float32((cell // side) % side), wp.float32(cell // (side * side))
+    """Density at points of a lattice in the grid's cube, of both sample sizes in turn."""
+    point = wp.tid()
+    x, y, z = point % side, (point // side) % side, point // (side * side)
+    p = wp.vec3(wp.float32(x) + offset, wp.float32(y) + offset, wp.float32(z) + offset) * spacing
+    squashed = largest(p - wp.vec3(0.5, 0.5, 0.5)) * 4.0
+    norm = wp.where(squashed > 1.0, 1.0 / wp.max(2.0 - squashed, 1e-3), 1.0)
+    deviation = deviations[(x + y + z) % 2] * norm
+    variance = deviation * deviation
+    base = base_network(
+      field.table, field.levels, field.base, p, wp.vec3(variance, variance, variance)
     )
-    found = wp.float32(0.0)
-    for point in range(9):
-      x, y, z = point & 1, (point >> 1) & 1, (point >> 2) & 1
-      offset = wp.vec3(wp.float32(x), wp.float32(y), wp.float32(z))
-      if point == 8:
-        offset = wp.vec3(0.5, 0.5, 0.5)
-      p = (corner + offset) / wp.float32(side)
-      squashed = largest(p - wp.vec3(0.5, 0.5, 0.5)) * 4.0
-      norm = wp.where(squashed > 1.0, 1.0 / wp.max(2.0 - squashed, 1e-3), 1.0)
-      deviation = deviations[(x + y + z) % 2] * norm
-      variance = deviation * deviation
-      base = base_network(
-        field.table, field.levels, field.base, p, wp.vec3(variance, variance, variance)
-      )
-      found = wp.max(found, base[0])
-    densest[thread] = found
+    found[point] = base[0]
 
   return Kernels(frame, rays, density)
 

@@ -16,6 +16,7 @@ from nerf2real.scenes.field.field import Field
 from nerf2real.scenes.field.render import kernels as render_kernels
 from nerf2real.scenes.field.render import weights as render_weights
 
+VERSION = 2  # of what is drawn of a field; 2: thin things that stand by themselves, too
 _MAX_GROWTH_DISTANCE = 2.0  # [unit] steps double at latest from twice here on: behind the unit cube
 
 

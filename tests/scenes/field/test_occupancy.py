@@ -59,10 +59,29 @@ def test_free_space_is_empty(found):
   assert found.distance[near].max() > 10
 
 
+@pytest.mark.parametrize("layer", [64, 65, 66, 69])
+def test_a_plate_that_stands_by_itself_is_found_wherever_it_is(layer):
+  """A table's top is thinner than what coarse looks are apart, and nothing near it is dense."""
+  cells = 126
+  height, half = 4 * layer / cells - 2, np.array([0.3, 0.3, 0.012])
+
+  def plate(points: np.ndarray) -> np.ndarray:
+    beyond = np.abs(points - [0.1, 0.05, height]) - half
+    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+
+  shape = FieldSettings(levels=1, log2_table_size=21, base_resolution=cells)
+  found = occupancy.build(analytic_fields.from_signed_distance(plate, settings=shape))
+  x, y = np.meshgrid(np.linspace(-0.15, 0.35, 40), np.linspace(-0.2, 0.3, 40))
+  inside = np.stack([x, y, np.full_like(x, height)], axis=-1)
+  assert found.is_occupied(np.asarray(grid_coordinates(jnp.asarray(inside)))).all()
+  beside = inside + np.array([0, 0, 0.15])
+  assert not found.is_occupied(np.asarray(grid_coordinates(jnp.asarray(beside)))).any()
+
+
 def test_empty_grids_and_wrong_shapes():
   nothing = occupancy.Occupancy.from_occupied(np.zeros((8, 8, 8), bool))
   assert nothing.distance.min() == 255
   with pytest.raises(ValueError, match="cube of cells"):
     occupancy.Occupancy.from_occupied(np.zeros((8, 8, 4), bool))
-  with pytest.raises(ValueError, match="multiple of 4"):
-    occupancy.OccupancySettings(cells=50)
+  with pytest.raises(ValueError, match="expected at least 4"):
+    occupancy.OccupancySettings(cells=3)
