@@ -2,7 +2,7 @@
 
 A file in a folder of `benchmarks/results/records/` holds the list of records of one benchmark or
 topic. Scripts write there with `--write` (`benchmarks.harness`), each topic where its file is;
-`benchmarks/tables.py` prints the records into the READMEs and `docs/figures.md`.
+`benchmarks/tables.py` prints the records into the READMEs and `docs/figures/`.
 """
 
 import dataclasses
@@ -157,6 +157,12 @@ def read(folder: Path = RECORDS) -> dict[str, Record]:
         )
       records[record.id] = record
   return records
+
+
+def folders(folder: Path = RECORDS) -> dict[str, str]:
+  """Returns the folders of each topic, joined by an underscore."""
+  paths = list(folder.rglob("*.json"))
+  return {path.stem: "_".join(path.relative_to(folder).parts[:-1]) for path in paths}
 
 
 def path_of(topic: str, folder: Path = RECORDS, within: str = "") -> Path:

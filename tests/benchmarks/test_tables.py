@@ -30,6 +30,7 @@ BLOCKS = {
   "root": "The most important ones.\n",
   "speed": "| a | b | c |\n{row x.speed}\n| d | {x.speed/share.count} / {x.speed/share:.0f} |\n",
 }
+FOLDERS = {"x": "speeds"}
 GOOD = """# A
 
 <!-- figures: speed -->
@@ -42,26 +43,31 @@ It takes 2.3 ms. <!-- record: x.speed -->
 @pytest.fixture
 def root(tmp_path):
   (tmp_path / "README.md").write_text(GOOD)
-  for path, text in tables.differences(tmp_path, RECORDS, BLOCKS).items():
-    path.parent.mkdir(exist_ok=True)
+  for path, text in tables.differences(tmp_path, RECORDS, BLOCKS, FOLDERS).items():
+    path.parent.mkdir(exist_ok=True, parents=True)
     path.write_text(text)
   return tmp_path
 
 
 def _check(root, allowed=None):
-  return tables.check(root, RECORDS, BLOCKS, allowed or {"benchmarks/ledger/tables.md": {}})
+  return tables.check(
+    root, RECORDS, BLOCKS, FOLDERS, allowed or {"benchmarks/ledger/tables.md": {}}
+  )
 
 
 def test_this_checkout_s_readmes_agree_with_their_records():
   """If this fails: python benchmarks/tables.py --write, and read what it says."""
-  found = tables.check(ledger.ROOT, ledger.read(), tables.templates(), prose.read_allowed())
+  found = tables.check(
+    ledger.ROOT, ledger.read(), tables.templates(), ledger.folders(), prose.read_allowed()
+  )
   assert not found, "\n".join(found)
 
 
 def test_blocks_and_page_are_generated(root):
   text = (root / "README.md").read_text()
   assert "| speed | 2.3 ms | 3 ms |\n| d | 10 / 91 |\n<!-- /figures -->" in text
-  page = (root / "docs/figures.md").read_text()
+  assert "[speeds](speeds.md): x" in (root / "docs/figures/README.md").read_text()
+  page = (root / "docs/figures/speeds.md").read_text()
   assert "| speed | 2.3 ms [59 to 100 %] | 3 ms |" in page and "(abc1234); *old*" in page
   assert _check(root) == []
 
@@ -110,7 +116,7 @@ def test_what_is_recorded_or_allowed_or_no_figure_passes(root, sentence):
 
 def test_a_figure_typed_into_a_template_is_found(root):
   blocks = BLOCKS | {"speed": BLOCKS["speed"] + "| e | 77 ms |\n"}
-  found = tables.check(root, RECORDS, blocks, {})
+  found = tables.check(root, RECORDS, blocks, FOLDERS, {})
   assert any('benchmarks/ledger/tables.md: "77 ms" has no record' in line for line in found)
 
 
