@@ -1,1 +1,1 @@
-"""The declared model: reduction to one joint, compiled simulation, the extended model."""
+"""The declared model: reduction to one joint, compiled simulation; the extended model by MuJoCo."""

@@ -26,10 +26,10 @@ from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import resolution
-from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.supported import check_supported, on_a_stand
+from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.outputs.details import claimed_effects, details_of
 from nerf2real.sysid.outputs.errors import errors, floor
 from nerf2real.sysid.outputs.notes import (

@@ -8,9 +8,9 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import resolution
-from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.selection.joints.subject import prepare
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import log_of

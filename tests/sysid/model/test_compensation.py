@@ -6,10 +6,10 @@ import pytest
 
 from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import Effect, EffectStack
-from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model.joint import JointModel, Load
 from nerf2real.sysid.model.kernel import INDEX as I
 from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.outputs import extended_model
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 LIFTED = ARM.replace('<body name="upper"', '<body name="upper" gravcomp="0.9"').replace(

@@ -15,9 +15,9 @@ from nerf2real.suite.effects import Effect, EffectStack, read_effects
 from nerf2real.suite.effects.files import from_list
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import signatures
-from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.wider.wide import ancestors

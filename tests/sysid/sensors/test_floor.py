@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from nerf2real.core.robot_logs.reading import ImuSeries, JointSeries, Log
 from nerf2real.suite.effects import Effect, EffectStack
 from nerf2real.suite.effects.files import from_list, to_list
-from nerf2real.sysid.model import extended_model
+from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.sensors import floor, standing
 from nerf2real.sysid.sensors.stops import Stood
 

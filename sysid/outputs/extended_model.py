@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from nerf2real.core.files import write_atomically
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.model import native_effects
 from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.outputs import native_effects
 
 _PROMPT = 1e-4  # s, of latencies that need no word
 _POINT = 1e-4  # m, radius of a payload: no inertia of its own

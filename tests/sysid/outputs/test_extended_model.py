@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect, EffectStack
-from nerf2real.sysid.model import extended_model
 from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.outputs import extended_model
 from tests.sysid.synthetic import ARM, PENDULUM
 
 STEPS = 4000
