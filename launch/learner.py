@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import tyro
 
 from nerf2real.agents.dmpo import config as configs
+from nerf2real.agents.dmpo import presets
 from nerf2real.agents.link import sessions
 from nerf2real.agents.supervision.statuses import NOT_SAVED
 from nerf2real.core.serialization import from_plain
@@ -111,7 +112,7 @@ def agent_settings(arguments: Arguments) -> tuple[str, configs.DmpoConfig]:
   elif arguments.env is None:
     raise ValueError("Say what to learn, such as --env suite:nerf_nav.")
   else:
-    environment, config = arguments.env, configs.preset(arguments.preset or "paper")
+    environment, config = arguments.env, presets.preset(arguments.preset or "paper")
   return environment, configs.override(config, dict(map(_assignment, arguments.set)))
 
 

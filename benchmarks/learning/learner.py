@@ -22,7 +22,7 @@ import optax
 import tyro
 
 from benchmarks import harness
-from nerf2real.agents.dmpo import config, learning, losses, networks
+from nerf2real.agents.dmpo import config, learning, losses, networks, presets
 from nerf2real.agents.dmpo.config import DmpoConfig
 from nerf2real.agents.dmpo.replay.features import stored_fields
 from nerf2real.agents.dmpo.replay.ring import trajectory_fields
@@ -174,7 +174,7 @@ def steps_to_time(settings: Settings) -> dict[str, Callable[[], None]]:
   pairs = (change.partition("=") for change in settings.set)
   changes = {name: json.loads(value) for name, _, value in pairs}
   if settings.pictures:
-    agent = config.override(config.preset("paper"), changes)
+    agent = config.override(presets.preset("paper"), changes)
     steps = {}
     for size in settings.pictures:
       height, width = map(int, size.split("x"))
@@ -185,13 +185,13 @@ def steps_to_time(settings: Settings) -> dict[str, Callable[[], None]]:
       steps[size] = updates(agent, layout)
     return steps
   if settings.preset is not None:
-    agent = config.override(config.preset(settings.preset), changes)
+    agent = config.override(presets.preset(settings.preset), changes)
     environment = make_environment("suite:nerf_nav", seed=0)
     layout = Layout.of(environment)
     environment.close()
     names = ("update", "update_critic")
     return {f"{settings.preset}.{name}": updates(agent, layout, name=name) for name in names}
-  agent = config.override(config.preset("state"), changes)
+  agent = config.override(presets.preset("state"), changes)
   steps = {"ours": updates(agent, STATE_LAYOUT)}
   try:
     steps["reference"] = reference(agent, STATE_LAYOUT)

@@ -44,12 +44,12 @@ def random_policy(size: tuple[int, int], folder: Path) -> ExportedPolicy:
   """Exports a policy of the paper's shape with random parameters, and loads it."""
   import jax
 
-  from nerf2real.agents.dmpo import config, networks
+  from nerf2real.agents.dmpo import networks, presets
   from nerf2real.agents.dmpo.policy.export import export_policy
   from nerf2real.agents.dmpo.specs import Layout
   from nerf2real.agents.dmpo.training_state import flatten_params
 
-  settings = config.preset("paper")
+  settings = presets.preset("paper")
   layout = Layout("camera", (*size, 3), ("s",), (PROPRIOCEPTION,), (), (), ACTIONS)
   shapes = jax.eval_shape(
     lambda: networks.init_policy(jax.random.PRNGKey(0), settings.network, layout)

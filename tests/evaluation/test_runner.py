@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import belief, config, networks, training_state
+from nerf2real.agents.dmpo import belief, config, networks, presets, training_state
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.core.serialization import to_plain
@@ -109,7 +109,7 @@ def test_protocols_have_the_papers_numbers():
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
   """An untrained policy with pictures and a belief, for the suite's observations."""
-  preset = config.override(config.preset("vision_small"), {"network.lstm_size": 8, "history": 1})
+  preset = config.override(presets.preset("vision_small"), {"network.lstm_size": 8, "history": 1})
   names = ("accelerometer", "goal", "gravity", "gyroscope", "joint_positions", "previous_control")
   layout = Layout(
     image_name="camera",

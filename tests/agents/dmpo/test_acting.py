@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from dm_env import specs
 
-from nerf2real.agents.dmpo import config, networks, training_state
+from nerf2real.agents.dmpo import config, networks, presets, training_state
 from nerf2real.agents.dmpo.policy import acting, export, inference
 from nerf2real.agents.dmpo.replay.ring import check_trajectory, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments import loading
 from nerf2real.core.serialization import to_plain
 
-PRESET = config.override(config.preset("vision_small"), {"network.lstm_size": 8})
+PRESET = config.override(presets.preset("vision_small"), {"network.lstm_size": 8})
 
 
 def _exported(folder, environment_name="agents:cue"):

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from nerf2real.agents.dmpo import config
+from nerf2real.agents.dmpo import config, presets
 from nerf2real.core.serialization import from_plain, to_plain
 
 # Byravan et al. 2022, appendix, table of DMPO hyperparameters, in its order.
@@ -37,15 +37,15 @@ TABLE = {
 
 @pytest.mark.parametrize("name", TABLE)
 def test_the_paper_s_table_is_the_default(name):
-  value = config.preset("paper")
+  value = presets.preset("paper")
   for part in name.split("."):
     value = getattr(value, part)
   assert value == TABLE[name]
 
 
-@pytest.mark.parametrize("name", config.PRESETS)
+@pytest.mark.parametrize("name", presets.PRESETS)
 def test_settings_survive_json(name):
-  settings = config.preset(name)
+  settings = presets.preset(name)
   assert from_plain(json.loads(json.dumps(to_plain(settings))), config.DmpoConfig) == settings
 
 
@@ -65,7 +65,7 @@ def test_overrides_reach_inside_and_unknown_names_are_refused():
   with pytest.raises(ValueError, match="Unknown setting"):
     config.override(config.DmpoConfig(), {"network.depth": 7.0})
   with pytest.raises(ValueError, match="Unknown preset"):
-    config.preset("big")
+    presets.preset("big")
   with pytest.raises(ValueError, match="vmin must lie below"):
     config.override(config.DmpoConfig(), {"network.vmax": -200.0})
   with pytest.raises(ValueError, match="frozen_memory keeps the LSTM behind a frozen encoder"):

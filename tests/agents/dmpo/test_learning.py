@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import config, learning, networks, objective
+from nerf2real.agents.dmpo import config, learning, networks, objective, presets
 from nerf2real.agents.dmpo.replay.ring import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
@@ -170,7 +170,7 @@ def test_it_learns_a_one_step_problem():
   """reward = 1 - (a - 0.5)^2 and nothing follows: the mean goes to 0.5, the value to about 1."""
   layout = Layout(None, None, ("s",), (1,), (), (), 1)
   settings = config.override(
-    config.preset("state"),
+    presets.preset("state"),
     {
       "network.policy_layers": (16,),
       "network.critic_layers": (32, 32),

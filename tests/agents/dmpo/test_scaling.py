@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import config, learning, networks, scaling, training_state
+from nerf2real.agents.dmpo import config, learning, networks, presets, scaling, training_state
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.replay.ring import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
@@ -15,7 +15,7 @@ from nerf2real.core.serialization import to_plain
 
 LAYOUT = Layout("camera", (6, 8, 3), ("a", "b"), (3, 2), ("privileged/p",), (4,), 2)
 CONFIG = config.override(
-  config.preset("op3_small"),
+  presets.preset("op3_small"),
   {
     "network.policy_layers": (12, 9),
     "network.critic_layers": (8,),

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from dm_env import specs
 
-from nerf2real.agents.dmpo import config, learning, scaling, training_state
+from nerf2real.agents.dmpo import config, learning, presets, scaling, training_state
 from nerf2real.agents.dmpo.policy import acting, inference
 from nerf2real.agents.dmpo.replay.ring import Replay, trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
 
 STANDING = 0.3  # the action that moves nothing
 SETTINGS = config.override(
-  config.preset("op3_small"),
+  presets.preset("op3_small"),
   {
     "network.policy_layers": (64, 64),
     "network.critic_layers": (64, 64),

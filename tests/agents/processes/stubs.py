@@ -8,7 +8,7 @@ import dm_env
 import numpy as np
 from dm_env import specs
 
-from nerf2real.agents.dmpo import config, learning, networks, training_state
+from nerf2real.agents.dmpo import config, learning, networks, presets, training_state
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.link.client import Grant
 from nerf2real.core.serialization import from_plain, to_plain
@@ -60,7 +60,7 @@ class Reach(dm_env.Environment):
 
 def description(environment, name, **changes):
   """What a learner tells its actors of a run on an environment."""
-  settings = config.override(config.preset("state"), SMALL)
+  settings = config.override(presets.preset("state"), SMALL)
   return {
     "environment": name,
     "evaluation_environment": name,

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import config, learning
+from nerf2real.agents.dmpo import config, learning, presets
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.processes import checkpoints
 from nerf2real.agents.processes.checkpoints import BEST, CheckpointError, Checkpoints
@@ -17,7 +17,7 @@ WIDTHS = {"network.policy_layers": (64, 64), "network.critic_layers": (64, 64)}
 
 @pytest.fixture(scope="module")
 def state():
-  settings = config.override(config.preset("state"), WIDTHS)
+  settings = config.override(presets.preset("state"), WIDTHS)
   return jax.jit(learning.make_learning(settings, LAYOUT).init)(jax.random.PRNGKey(3))
 
 
@@ -61,7 +61,7 @@ def test_none_and_another_shape_are_refused(state, tmp_path):
   with pytest.raises(CheckpointError, match="holds no checkpoint"):
     saved.restore(state)
   saved.save(_at(state, 1), {"steps": 1})
-  wide = config.override(config.preset("state"), WIDTHS | {"network.policy_layers": (32, 32)})
+  wide = config.override(presets.preset("state"), WIDTHS | {"network.policy_layers": (32, 32)})
   other = jax.jit(learning.make_learning(wide, LAYOUT).init)(jax.random.PRNGKey(3))
   with pytest.raises(CheckpointError, match="other shapes"):
     saved.restore(other)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from nerf2real.agents.dmpo import config, learning, networks, scaling, specs
+from nerf2real.agents.dmpo import config, learning, networks, presets, scaling, specs
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.replay.ring import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
@@ -26,7 +26,7 @@ from tests.agents.processes.stubs import documented
 
 ENVIRONMENT = "dm_control:cartpole:swingup"
 CONFIG = config.override(
-  config.preset("state"),
+  presets.preset("state"),
   {
     "network.policy_layers": (16, 16),
     "network.critic_layers": (16, 16),
@@ -304,7 +304,7 @@ def test_another_price_of_updates_holds_from_where_a_run_is_resumed(tmp_path):
 def _update_metrics():
   """Names that an update gives with pictures and a belief."""
   layout = Layout("camera", (6, 8, 3), ("s",), (3,), (specs.POSITION, specs.ROTATION), (3, 9), 2)
-  settings = config.override(config.preset("vision_small"), {"student_kl": 0.1})
+  settings = config.override(presets.preset("vision_small"), {"student_kl": 0.1})
   functions = learning.make_learning(settings, layout)
   fields = trajectory_fields(layout, lstm_size=settings.network.lstm_size)
   batch = {
