@@ -190,6 +190,12 @@ def check(
     f"{path.relative_to(root)}: differs from its records; run python benchmarks/tables.py --write"
     for path in differences(root, records, blocks, folders)
   ]
+  pages = figures_pages(records, blocks, folders)
+  problems += [
+    f"{path.relative_to(root)}: no folder of records has this name; remove the page"
+    for path in sorted((root / PAGES).glob("*.md"))
+    if path.name not in pages
+  ]
   used = {_OVERVIEW}  # on the first page of figures
   for path in readmes(root):
     text, name = path.read_text(), str(path.relative_to(root))

@@ -72,6 +72,13 @@ def test_blocks_and_page_are_generated(root):
   assert _check(root) == []
 
 
+def test_a_page_without_records_is_found(root):
+  (root / "docs/figures/old.md").write_text("# Figures: old\n")
+  assert _check(root) == [
+    "docs/figures/old.md: no folder of records has this name; remove the page"
+  ]
+
+
 def test_a_figure_changed_by_hand_is_found(root):
   text = (root / "README.md").read_text()
   (root / "README.md").write_text(text.replace("| speed | 2.3 ms", "| speed | 1.9 ms"))
