@@ -99,7 +99,7 @@ def _run_stages(
   figures = judging.figures(cache, field, pictures)
   world = world_frame.world(cache, capture, poses, outlook, depth, settings.align, given)
   rendered = depth.value.transformed(world.value.world_from_unit)
-  metric_depth = geometry.floor(cache, world, rendered, pictures, settings.collision)
+  metric_depth, moved = geometry.corrected(cache, world, rendered, pictures, settings.collision)
   surface = geometry.surface(cache, world, metric_depth, settings.mesh)
   contact = geometry.contact(cache, world, metric_depth, settings.collision, settings.free_space)
   errors = judging.contact_errors(
@@ -116,7 +116,7 @@ def _run_stages(
     figures=figures,
     world=world,
     depth=metric_depth.value,
-    moved_to_floor=float((metric_depth.value.depth != rendered.depth).mean()),
+    moved=moved,
     surface=surface,
     contact=contact,
     errors=errors,

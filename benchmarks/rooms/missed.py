@@ -93,7 +93,7 @@ def main(settings: Settings) -> None:
   place = from_plain(bundle.scene["alignment"], Alignment)
   room_from_world = from_plain(bundle.figures["room_from_world"], Similarity)
   found = localisation.load(stages / "poses" / "sfm")
-  depth = np.load(stages / "floor" / "depth.npy")
+  depth = np.load(stages / "corrected" / "depth.npy")
   camera = found.camera.resized(depth.shape[2], depth.shape[1])
   poses = (room_from_world @ place.world_from_unit).apply_pose(found.world_from_camera)
   half = np.array(furniture.ROOM_SIZE[:2]) / 2 + 0.1

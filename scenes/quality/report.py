@@ -94,6 +94,9 @@ FIGURES: Mapping[str, Meaning] = {
     "share of the field's depth that stood before a floor that the pictures show; it was moved",
     "near 0",
   ),
+  "moved_to_planes": Meaning(
+    "", "share of the field's depth in plain regions that was put onto what borders them lies on"
+  ),
   "floor_tilt_deg": Meaning(
     "deg", "angle between the floor found and the true vertical's floor", "near 0"
   ),

@@ -1,4 +1,4 @@
-"""Stages that make geometry of depth: seen floor, surface mesh, contact geometry with free floor.
+"""Stages that make geometry of depth: corrections, surface mesh, contact geometry with free floor.
 
 Each runs, or finds done, one stage of the cache: a function of earlier results and settings.
 """
@@ -20,11 +20,13 @@ from nerf2real.scenes.geometry import (
   fusion,
   map_server,
   mesh,
+  plain_surfaces,
   seen_floor,
+  seen_through,
 )
 from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from nerf2real.scenes.stages.pictures import PosedPictures
-from nerf2real.scenes.stages.results import Contact, FreeFloor
+from nerf2real.scenes.stages.results import Contact, FreeFloor, Moved
 
 _SURFACE_VERSION = 2  # 2: the floor is inside of the grid
 # 2: unseen space is matter behind seen matter alone; no tolerance grows; 3: its errors apart;
@@ -33,36 +35,43 @@ _SURFACE_VERSION = 2  # 2: the floor is inside of the grid
 _CONTACT_VERSION = 7
 
 
-def floor(
+def corrected(
   cache: Stages,
   world: Made[world_frame.Alignment],
   depth: fusion.DepthViews,
   pictures: PosedPictures,
   settings: collision.CollisionSettings,
-) -> Made[fusion.DepthViews]:
-  """Moves the surface of depth in the world frame to the floor where pictures show the floor.
+) -> tuple[Made[fusion.DepthViews], Moved]:
+  """Moves the surface of depth in the world frame where it cannot be right.
 
-  The held-out pictures take no part: they judge the geometry.
+  To the floor where pictures show the floor, and plain regions onto planes. The held-out pictures
+  take no part: they judge the geometry.
   """
   place = world.value
 
   def write(folder: Path, progress: Progress) -> None:
     shown = dataclasses.replace(pictures, width=depth.camera.width).views().evened()
-    corrected = seen_floor.with_seen_floor(
+    floored = seen_floor.with_seen_floor(
       depth,
       np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in shown.images]),
       np.flatnonzero(~held_out_rows(len(shown), pictures.held_out_every)),
       lower=place.extent_lower,
       upper=np.minimum(place.extent_upper, [np.inf, np.inf, settings.top]),
-      progress=progress,
+      progress=part(progress, 0.0, 0.5),
     )
-    np.save(folder / "depth.npy", corrected.depth)
+    flat = plain_surfaces.on_planes(floored, progress=part(progress, 0.5, 0.8))
+    closed = seen_through.closed(
+      flat, flat.depth != floored.depth, progress=part(progress, 0.8, 1.0)
+    )
+    np.save(folder / "depth.npy", closed.depth)
+    shares = [np.mean(b.depth != a.depth) for a, b in ((depth, floored), (floored, closed))]
+    write_json(folder / "moved.json", Moved(*map(float, shares)))
 
   everything = [settings.top, pictures.held_out_every]
   inputs = {"world": world.stamp}
-  stage = cache.run("floor", write, settings=everything, inputs=inputs)
-  corrected = np.load(stage.folder / "depth.npy")
-  return Made(dataclasses.replace(depth, depth=corrected), stage)
+  stage = cache.run("corrected", write, settings=everything, inputs=inputs)
+  result = dataclasses.replace(depth, depth=np.load(stage.folder / "depth.npy"))
+  return Made(result, stage), read_json(stage.folder / "moved.json", Moved)
 
 
 def surface(

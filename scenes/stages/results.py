@@ -98,6 +98,13 @@ class ContactErrors(NamedTuple):
   judgement: Judgement | None  # by sight lines; None where points have no pictures
 
 
+class Moved(NamedTuple):
+  """Shares of the depth's pixels whose surface was moved."""
+
+  to_floor: float
+  to_planes: float
+
+
 class SceneResults(NamedTuple):
   """All that a bundle is assembled from."""
 
@@ -109,7 +116,7 @@ class SceneResults(NamedTuple):
   figures: Made[dict[str, float]]
   world: Made[Alignment]
   depth: DepthViews  # in the world frame
-  moved_to_floor: float  # share of its pixels
+  moved: Moved
   surface: StageResult
   contact: Made[Contact]
   errors: Made[ContactErrors]
