@@ -20,10 +20,8 @@ from nerf2real.scenes.geometry import (
   fusion,
   map_server,
   mesh,
-  plain_surfaces,
-  seen_floor,
-  seen_through,
 )
+from nerf2real.scenes.geometry.corrections import plain_surfaces, seen_floor, seen_through
 from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from nerf2real.scenes.stages.pictures import PosedPictures
 from nerf2real.scenes.stages.results import Contact, FreeFloor, Moved
@@ -60,11 +58,9 @@ def corrected(
       progress=part(progress, 0.0, 0.5),
     )
     flat = plain_surfaces.on_planes(floored, progress=part(progress, 0.5, 0.8))
-    closed = seen_through.closed(
-      flat, flat.depth != floored.depth, progress=part(progress, 0.8, 1.0)
-    )
+    closed = seen_through.closed(flat, _moved(floored, flat), progress=part(progress, 0.8, 1.0))
     np.save(folder / "depth.npy", closed.depth)
-    shares = [np.mean(b.depth != a.depth) for a, b in ((depth, floored), (floored, closed))]
+    shares = _moved(depth, floored).mean(), _moved(floored, closed).mean()
     write_json(folder / "moved.json", Moved(*map(float, shares)))
 
   everything = [settings.top, pictures.held_out_every]
@@ -72,6 +68,11 @@ def corrected(
   stage = cache.run("corrected", write, settings=everything, inputs=inputs)
   result = dataclasses.replace(depth, depth=np.load(stage.folder / "depth.npy"))
   return Made(result, stage), read_json(stage.folder / "moved.json", Moved)
+
+
+def _moved(before: fusion.DepthViews, after: fusion.DepthViews) -> np.ndarray:
+  """Which pixels [N, H, W] lie elsewhere."""
+  return (after.depth != before.depth) & np.isfinite(after.depth)
 
 
 def surface(

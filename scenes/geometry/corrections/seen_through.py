@@ -13,15 +13,15 @@ import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import fusion
-from nerf2real.scenes.geometry.plain_surfaces import is_plain
+from nerf2real.scenes.geometry.corrections.plain_surfaces import (
+  FARTHEST,
+  clearly,
+  colors,
+  is_plain,
+)
 
 _CELL = 0.04  # m, edge of the cells in which views agree on a surface
 _VIEWS = 3  # that have found it flat, chosen
-_NOISE, _SHARE = (
-  0.07,
-  0.015,
-)  # m, and of the depth: behind by more; a cell and three times the noise
-_FARTHEST = 1.0  # m that a pixel is moved at most
 _NEAREST = 0.2  # m from a camera; what is nearer hides nothing here
 
 
@@ -34,8 +34,11 @@ def closed(
     views: Depth pictures with colours in the world frame (metres).
     flat: Pixels that were put onto planes, bool [N, H, W].
     progress: Called with the fraction done and a text.
+
+  Raises:
+    ValueError: Where the views have no colours.
   """
-  assert views.color is not None
+  pictures = colors(views)
   points = _agreed(views, flat)
   widest = np.abs(views.camera.rays()[..., :2]).max((0, 1))
   depth = views.depth.copy()
@@ -47,12 +50,17 @@ def closed(
     local = local[shown]
     pixels = np.floor(views.camera.project(local)).astype(np.int64)
     half = np.ceil(0.6 * _CELL * views.camera.fx / local[:, 2]).astype(np.int64)
-    surface = _drawn(depth.shape[1:], pixels, local[:, 2], half)
-    moved = is_plain(views.color[index]) & (depth[index] < surface + _FARTHEST)
-    moved &= depth[index] > surface + _NOISE + _SHARE * surface
+    surface = _drawn(depth.shape[1:], pixels, local[:, 2], half, 0.5 * _behind(local[:, 2]))
+    moved = is_plain(pictures[index]) & (depth[index] < surface + FARTHEST)
+    moved &= depth[index] > surface + _behind(surface)
     depth[index][moved] = surface[moved]
     progress((index + 1) / len(depth), "plain surfaces that other views have")
   return dataclasses.replace(views, depth=depth)
+
+
+def _behind(depth: np.ndarray) -> np.ndarray:
+  """How far behind a surface of a depth [...] is behind it: a cell more than is clear [m]."""
+  return _CELL + clearly(depth)
 
 
 def _agreed(views: fusion.DepthViews, flat: np.ndarray) -> np.ndarray:
@@ -75,31 +83,28 @@ def _cells(points: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _drawn(shape, pixels, depth, half):
+def _drawn(shape, pixels, depth, half, slack):
   """Depth [H, W] of squares of half widths [P] about pixels [P, 2] (x, y), the nearest ones; inf
   where there is none, along the rim, which squares widen, and where they show a surface from so
-  far aside that its depth changes too much within one."""
+  far aside that its depth changes by more than the slack [P] within one."""
   height, width = shape
   surface = np.full((height, width), np.inf, np.float32)
-  reach = np.zeros((height, width), np.int64)
+  drawn = np.zeros((height, width), np.int64)
   for n in range(len(pixels)):
     x, y, r = pixels[n, 0], pixels[n, 1], half[n]
     for i in range(max(y - r, 0), min(y + r + 1, height)):
       for j in range(max(x - r, 0), min(x + r + 1, width)):
         if depth[n] < surface[i, j]:
-          surface[i, j], reach[i, j] = depth[n], r
+          surface[i, j], drawn[i, j] = depth[n], n
   inner = np.full((height, width), np.inf, np.float32)
   for i in range(height):
     for j in range(width):
-      own, r = surface[i, j], reach[i, j]
-      least, most = own - 0.5 * (_NOISE + _SHARE * own), own + 0.5 * (_NOISE + _SHARE * own)
-      vertical = surface[max(i - r, 0), j], surface[min(i + r, height - 1), j]
-      across = surface[i, max(j - r, 0)], surface[i, min(j + r, width - 1)]
-      if (
-        min(vertical) > least
-        and max(vertical) < most
-        and min(across) > least
-        and max(across) < most
-      ):
+      own = surface[i, j]
+      if own == np.inf:
+        continue
+      r, limit = half[drawn[i, j]], slack[drawn[i, j]]
+      above, below = surface[max(i - r, 0), j], surface[min(i + r, height - 1), j]
+      left, right = surface[i, max(j - r, 0)], surface[i, min(j + r, width - 1)]
+      if max(abs(above - own), abs(below - own), abs(left - own), abs(right - own)) < limit:
         inner[i, j] = own
   return inner

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core import cameras
-from nerf2real.scenes.geometry import seen_floor
+from nerf2real.scenes.geometry.corrections import seen_floor
 from tests.scenes import furnished_room
 
 LOWER, UPPER = np.array([-2.6, -2.1, 0.0]), np.array([2.6, 2.1, 1.5])

@@ -38,7 +38,7 @@ _ON = 0.4  # least share on the planes, of what borders the region and is not ne
 _AROUND = 0.5  # least share of the region's width and of its height that these span
 _FARTHER = 0.1  # most of what borders it that is farther than the planes
 _SECOND = 0.25  # least share of it that a second plane is looked for in
-_FARTHEST = 1.0  # m that a pixel is moved at most
+FARTHEST = 1.0  # m that a pixel is moved at most
 
 
 def on_planes(views: fusion.DepthViews, *, progress: Progress = no_progress) -> fusion.DepthViews:
@@ -51,21 +51,32 @@ def on_planes(views: fusion.DepthViews, *, progress: Progress = no_progress) -> 
   Raises:
     ValueError: Where the views have no colours.
   """
-  if views.color is None:
-    raise ValueError("Depth pictures have no colours: what is plain in them is not known.")
+  pictures = colors(views)
   rays = views.camera.rays()
   depth = views.depth.copy()
   for index, pose in enumerate(views.frame_from_camera):
     own = np.where(np.isfinite(depth[index]), depth[index], 0).astype(np.float32)
     pixels = _Pixels(own, rays @ pose[:3, :3].T, pose[:3, 3])
     on_surface = fusion.pixel_normals(own, rays)[1] > 0
-    for region, border in _regions(views.color[index], on_surface):
+    for region, border in _regions(pictures[index], on_surface):
       target = _planes(pixels, region, border)
       if target is not None:
-        moved = region & (np.abs(target - own) < _FARTHEST)
+        moved = region & (own > 0) & (np.abs(target - own) < FARTHEST)
         depth[index][moved] = target[moved]
     progress((index + 1) / len(depth), "plain surfaces")
   return dataclasses.replace(views, depth=depth)
+
+
+def colors(views: fusion.DepthViews) -> np.ndarray:
+  """Returns the colours uint8 [N, H, W, 3] of depth pictures; raises ValueError without any."""
+  if views.color is None:
+    raise ValueError("Depth pictures have no colours: what is plain in them is not known.")
+  return views.color
+
+
+def clearly(depth: np.ndarray) -> np.ndarray:
+  """By how much [...] two depths [...] differ that are clearly not of one surface [m]."""
+  return _CLEAR * (_NOISE + _SHARE * depth)
 
 
 def is_plain(color: np.ndarray) -> np.ndarray:
@@ -114,8 +125,9 @@ class _Pixels:
 
 def _regions(color: np.ndarray, on_surface: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
   """Yields plain regions of a picture and what borders them and has texture, both bool [H, W]."""
-  plain = cv2.erode(is_plain(color).astype(np.uint8), np.ones((3, 3), np.uint8))
-  textured = (_contrast(color) > _TEXTURED) & on_surface
+  contrast = _contrast(color)
+  plain = cv2.erode((contrast < _PLAIN).astype(np.uint8), np.ones((3, 3), np.uint8))
+  textured = (contrast > _TEXTURED) & on_surface
   around = np.ones((2 * _BORDER + 1,) * 2, np.uint8)
   count, labels, stats, _ = cv2.connectedComponentsWithStats(plain, connectivity=4)
   for label in range(1, count):
@@ -131,8 +143,8 @@ def _planes(view: _Pixels, region: np.ndarray, border: np.ndarray) -> np.ndarray
   found: list[tuple[np.ndarray, np.ndarray]] = []
   while len(found) < 2 and left.sum() >= max(_SECOND * len(left), _FEWEST / 2):
     plane = _fullest_plane(seen.where(left))
-    off = (seen.meeting(*plane)[0] - seen.depth) / seen.noise
-    inside, nearer = left & (np.abs(off) < 1), left & (off > _CLEAR)
+    off = seen.meeting(*plane)[0] - seen.depth
+    inside, nearer = left & (np.abs(off) < seen.noise), left & (off > clearly(seen.depth))
     if inside.sum() < max(_ON * (left & ~nearer).sum(), _FEWEST / 2):
       break
     found.append(plane)
@@ -141,7 +153,7 @@ def _planes(view: _Pixels, region: np.ndarray, border: np.ndarray) -> np.ndarray
   if not found:
     return None
   at = np.min([seen.meeting(*plane)[0] for plane in found], axis=0)
-  farther = seen.depth - at > _CLEAR * seen.noise
+  farther = seen.depth - at > clearly(seen.depth)
   around = all(
     np.ptp(theirs[on]) >= _AROUND * np.ptp(own)
     for theirs, own in zip(np.nonzero(border), np.nonzero(region), strict=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core import cameras
-from nerf2real.scenes.geometry import plain_surfaces
+from nerf2real.scenes.geometry.corrections import plain_surfaces
 from tests.scenes import furnished_room
 
 SAG = 0.3  # m, where a plain region is deepest
@@ -41,6 +41,7 @@ def _on(lower, upper):
 
 
 NORTH = _on([-1.2, 1.95, 0.5], [0.2, 2.1, 2.1])
+NEAR = _on([-0.6, 1.95, 1.0], [-0.1, 2.1, 1.5])
 CORNER = _on([1.6, 1.2, 1.0], [2.6, 2.1, 2.2])
 TOP = _on([0.7, 0.65, 0.74], [1.7, 1.35, 0.76])
 
@@ -64,13 +65,20 @@ def test_plain_surfaces_are_flat(plain, position, target):
   assert np.abs(found.depth - sagging.depth)[0, ~flat].max() == 0
 
 
-def test_what_stands_in_front_says_nothing_of_a_wall():
-  """The box hides the lower border of the wall's plain part, which goes down to the floor."""
+def test_a_wall_is_flat_behind_a_thing_in_front():
+  """The box hides a part of the lower border of the wall's plain part."""
   wall = _on([-1.6, -2.1, -0.1], [0.4, -1.95, 1.2])
   pose = furnished_room.look_at([-0.9, 0.6, 0.9], [-0.8, -2.0, 0.6])
   true, sagging, flat = _filmed(pose, wall)
   found = plain_surfaces.on_planes(sagging)
   assert np.mean(np.abs(found.depth - true.depth)[0, flat] < 0.02) > 0.9
+
+
+def test_a_border_on_one_side_tells_nothing_of_the_other():
+  pose = furnished_room.look_at([-0.3, -1.2, 1.2], [-0.5, 2.0, 1.3])
+  _, sagging, flat = _filmed(pose, lambda points: points[..., 2] > 0.7)
+  assert flat.mean() > 0.5
+  assert np.array_equal(plain_surfaces.on_planes(sagging).depth, sagging.depth)
 
 
 def test_a_plain_thing_before_a_textured_room_stays_where_it_is():
@@ -92,3 +100,16 @@ def test_depth_without_colours_is_refused():
   view, _, _ = _filmed(furnished_room.look_at([0, 0, 1.2], [0, 2, 1.2]), NORTH)
   with pytest.raises(ValueError, match="no colours"):
     plain_surfaces.on_planes(dataclasses.replace(view, color=None))
+
+
+@pytest.mark.parametrize("nothing", [np.inf, np.nan])
+def test_pixels_without_depth_stay_without(nothing):
+  """The wall is nearer than the farthest that a pixel is moved."""
+  true, sagging, flat = _filmed(furnished_room.look_at([-0.3, 1.2, 1.2], [-0.5, 2.0, 1.3]), NEAR)
+  depth = sagging.depth.copy()
+  depth[0, 110:130, 150:170] = nothing
+  found = plain_surfaces.on_planes(dataclasses.replace(sagging, depth=depth))
+  assert flat[110:130, 150:170].all()
+  assert not np.isfinite(found.depth[0, 110:130, 150:170]).any()
+  others = flat & np.isfinite(depth[0])
+  assert np.mean(np.abs(found.depth - true.depth)[0, others] < 0.02) > 0.9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core import cameras
-from nerf2real.scenes.geometry import seen_through
+from nerf2real.scenes.geometry.corrections import seen_through
 from tests.scenes import furnished_room
 
 BEHIND = 0.3  # m
@@ -55,3 +55,25 @@ def test_what_stands_before_a_wall_stays(views):
   near[-1, 40:80, 50:110] -= BEHIND
   before = dataclasses.replace(true, depth=near)
   assert np.array_equal(seen_through.closed(before, _flat(true, 4)).depth, near)
+
+
+def test_without_anything_flat_all_stays(views):
+  _, wrong = views
+  assert np.array_equal(seen_through.closed(wrong, _flat(wrong, 0)).depth, wrong.depth)
+
+
+@pytest.mark.parametrize("nothing", [np.inf, np.nan])
+def test_pixels_without_depth_stay_without(views, nothing):
+  true, wrong = views
+  depth = wrong.depth.copy()
+  depth[:, 10:20, 10:20] = nothing
+  flat = _flat(true, 4) & np.isfinite(depth)
+  found = seen_through.closed(dataclasses.replace(wrong, depth=depth), flat)
+  assert not np.isfinite(found.depth[:, 10:20, 10:20]).any()
+  assert np.abs(found.depth - true.depth)[-1, 40:80, 50:110].max() < 0.05
+
+
+def test_depth_without_colours_is_refused(views):
+  _, wrong = views
+  with pytest.raises(ValueError, match="no colours"):
+    seen_through.closed(dataclasses.replace(wrong, color=None), _flat(wrong, 4))

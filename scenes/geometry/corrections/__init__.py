@@ -1,0 +1,1 @@
+"""Corrections of depth: surfaces moved where pictures show that they must be."""
