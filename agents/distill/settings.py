@@ -237,11 +237,15 @@ def room() -> DistillSettings:
   """Navigation: a student of one room is trained on in another, which looks different."""
   return dataclasses.replace(
     adapt(),
+    teacher="swift",
     mixture=MixtureSettings(first_share=0.7),
-    # It walks already and must learn where it is; the shares of `ball_push`, for the same reasons.
+    # It walks already and must learn where it is; the shares of `ball_push`, for the same reasons,
+    # and the views of `nerf_nav_on`: a start in a corner where no path led is seen there.
     stages=ball_push().stages,
+    views=20_000,
     settling=600,
     first_frames=8_000,
+    teacher_frames=60_000,
     learning_rate=1e-3,
     evaluation_period=1_500.0,
   )
