@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 
 from nerf2real.core import cameras
+from nerf2real.scenes.geometry import fusion
 from nerf2real.scenes.geometry.corrections import plain_surfaces
 from tests.scenes import furnished_room
 
 SAG = 0.3  # m, where a plain region is deepest
+
+
+def _sag(wrong):
+  """How far depth [H, W] is behind the surface where it is wrong: most far from where it is not."""
+  inside = cv2.distanceTransform(wrong.astype(np.uint8), cv2.DIST_L2, 5)
+  return SAG * (1 - np.exp(-((inside / 15) ** 2)))
 
 
 def _filmed(pose, plain, sags=None):
@@ -30,8 +37,7 @@ def _filmed(pose, plain, sags=None):
   colour = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[None, ..., None], 3, -1)
   true = dataclasses.replace(views, color=colour)
   wrong = flat if sags is None else sags(points)
-  inside = cv2.distanceTransform(wrong.astype(np.uint8), cv2.DIST_L2, 5)
-  depth = true.depth + SAG * (1 - np.exp(-((inside / 15) ** 2)))
+  depth = true.depth + _sag(wrong)
   return true, dataclasses.replace(true, depth=depth.astype(np.float32)), flat
 
 
@@ -88,6 +94,40 @@ def test_a_plain_thing_before_a_textured_room_stays_where_it_is():
   _, sagging, flat = _filmed(pose, front)
   assert flat.sum() > 3000
   assert np.array_equal(plain_surfaces.on_planes(sagging).depth, sagging.depth)
+
+
+def _facing(depth, plain):
+  """A view of a textured wall 3 m away, with depth [H, W] and a plain part [H, W] that sags."""
+  camera = cameras.Camera.from_vertical_fov(0.9, 320, 240)
+  pose = furnished_room.look_at([0, -3, 1.2], [0, 0, 1.2])
+  waves = 120 + 25 * np.sin(np.arange(320) * 1.1) + 25 * np.sin(np.arange(240) * 0.9)[:, None]
+  grey = np.where(plain, 150, waves).astype(np.uint8)
+  return fusion.DepthViews(
+    camera=camera,
+    frame_from_camera=pose[None],
+    depth=np.where(plain, 3.0 + _sag(plain), depth).astype(np.float32)[None],
+    color=np.repeat(grey[None, ..., None], 3, -1),
+  )
+
+
+def test_what_is_nearer_says_nothing():
+  """Clutter of no plane stands before most of the plain part's border."""
+  plain = np.zeros((240, 320), bool)
+  plain[60:180, 100:220] = True
+  rows, columns = np.mgrid[:240, :320]
+  clutter = 1.5 + 0.2 * np.sin(rows / 9) + 0.2 * np.sin(columns / 7)
+  wall = (rows < 100) & (columns < 140)
+  found = plain_surfaces.on_planes(_facing(np.where(wall, 3.0, clutter), plain))
+  assert np.abs(found.depth[0, 64:176, 104:216] - 3.0).max() < 0.02
+
+
+def test_depth_between_an_edge_and_what_is_behind_it_says_nothing():
+  """A plate whose rim of two pixels is textured; depth runs from it to a wall two metres behind."""
+  plain = np.zeros((240, 320), bool)
+  plain[60:180, 100:220] = True
+  outside = cv2.distanceTransform((~plain).astype(np.uint8), cv2.DIST_C, 3)
+  found = plain_surfaces.on_planes(_facing(np.interp(outside, [2, 5], [3.0, 5.0]), plain))
+  assert np.abs(found.depth[0, 64:176, 104:216] - 3.0).max() < 0.02
 
 
 def test_textured_surfaces_stay_where_they_are():
