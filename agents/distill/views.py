@@ -19,6 +19,7 @@ from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.specs import BALL, POSITION, ROTATION, Layout
 from nerf2real.agents.environments.loading import make_environment
 from nerf2real.core import files, rotations
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.light import draw_light
 
@@ -34,7 +35,13 @@ _BEHIND = 3.0  # m
 
 
 def make_views(
-  task: Any, layout: Layout, postures: np.ndarray, *, rng: np.random.Generator, count: int
+  task: Any,
+  layout: Layout,
+  postures: np.ndarray,
+  *,
+  rng: np.random.Generator,
+  count: int,
+  report: Progress = no_progress,
 ) -> dict[str, np.ndarray]:
   """Renders pictures at drawn places.
 
@@ -44,6 +51,7 @@ def make_views(
     postures: recorded privileged observations [M, P], of which height, lean and joints are used.
     rng: draws all that is drawn.
     count: of views, N.
+    report: called with the fraction done and a text.
 
   Returns:
     Arrays as in a data set: `image` [N, H, W, 3], `pose` [N, 3] and, where there is a ball, `ball`.
@@ -71,11 +79,19 @@ def make_views(
       task.robot_camera.set_light(draw_light(rng))
     found["image"][view] = task.picture_of(position=position, rotation=turned, joints=joints)
     found["pose"][view] = place[0], place[1], rotations.yaw_of(turned)
+    report((view + 1) / count, "rendering views")
   return found
 
 
 def kept_views(
-  path: Path, names: Sequence[str], layout: Layout, data: Path, *, seed: int, count: int
+  path: Path,
+  names: Sequence[str],
+  layout: Layout,
+  data: Path,
+  *,
+  seed: int,
+  count: int,
+  report: Progress = no_progress,
 ) -> dict[str, np.ndarray]:
   """Returns a run's views: those that its file holds, or new ones, which the file then holds.
 
@@ -87,16 +103,19 @@ def kept_views(
     data: folder of the episodes whose postures are used.
     seed: of what is drawn.
     count: of views in all.
+    report: called with the fraction done and a text.
   """
   if not path.exists():
     postures = np.concatenate([_postures(file) for file in sorted(data.glob("[0-9]*.npz"))])
     rng = np.random.default_rng(seed)
-    shares = [len(share) for share in np.array_split(np.arange(count), len(names))]
+    shares = np.array_split(np.arange(count), len(names))
     parts = []
-    for name, share in zip(names, shares, strict=True):
+    for number, (name, share) in enumerate(zip(names, shares, strict=True)):
+      here = part(report, number / len(names), (number + 1) / len(names))
       with contextlib.closing(make_environment(name, seed=seed)) as environment:
-        parts.append(make_views(task_of(environment), layout, postures, rng=rng, count=share))
-    made = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        task = task_of(environment)
+        parts.append(make_views(task, layout, postures, rng=rng, count=len(share), report=here))
+    made = {name: np.concatenate([views[name] for views in parts]) for name in parts[0]}
     with files.atomic_path(path) as partial:
       np.savez(partial, **made)  # type: ignore[arg-type]
   with np.load(path, allow_pickle=False) as stored:

@@ -67,7 +67,7 @@ class StatusView:
       rows = {
         "steps": f"{s['steps']:,} ({s['steps_per_second']:.0f}/s)",
         "updates": f"{s['updates']:,} ({s['updates_per_second']:.1f}/s)"
-        + ("" if s["filled"] else f", {filling(s)}"),
+        + "".join(f", {text}" for text in _before(s)),
         **_returns(s),
         "success": _number(s["success"]),
         "localisation error": _number(s["localisation_error"]) + " m",
@@ -97,7 +97,7 @@ class StatusView:
       parts = [
         f"steps {s['steps']:,} ({s['steps_per_second']:.0f}/s)",
         f"updates {s['updates']:,} ({s['updates_per_second']:.1f}/s)",
-        *([] if s["filled"] else [filling(s)]),
+        *_before(s),
         *(f"{n} {s[n]:.3g}" for n in ("return", "evaluation", "success") if s.get(n) is not None),
         f"{s['actors']} actors",
         f"dropped {s['dropped']}",
@@ -109,11 +109,13 @@ class StatusView:
     return ", ".join(parts) or "starting"
 
 
-def filling(status: dict[str, Any]) -> str:
-  """Returns how far the replay is filled, before the first update."""
+def _before(status: dict[str, Any]) -> list[str]:
+  """What is done before the first update: what the learner says, or how far the replay is."""
+  if status.get("doing") or status["filled"]:
+    return [status["doing"]] if status.get("doing") else []
   needed = status.get("replay_needed")
   of = "" if needed is None else f" of {needed:,}"
-  return f"filling the replay: {status['replay_steps']:,}{of}"
+  return [f"filling the replay: {status['replay_steps']:,}{of}"]
 
 
 def _returns(status: dict[str, Any]) -> dict[str, str]:

@@ -191,15 +191,21 @@ class Learner:
     _log.info("Training begins with %d frames.", self._data.frames)
 
   def _make_views(self) -> dict[str, np.ndarray]:
-    """Returns the run's pictures at drawn places: on a loaded core some 3 ms each, once a run."""
-    name = self._settings.environment
+    """Returns the run's pictures at drawn places, rendered once a run: minutes on a loaded core."""
+    name, count = self._settings.environment, self._settings.views
+
+    def report(done: float, text: str) -> None:
+      if self._periods.due("status", _WAIT):
+        self._set_status(doing=f"{text}: {round(done * count):,} of {count:,}")
+
     return kept_views(
       self._run / VIEWS,
       [name, *(in_scene(name, scene) for scene in self._settings.view_scenes)],
       self._layout,
       self._run / "data",
       seed=self._seed,
-      count=self._settings.views,
+      count=count,
+      report=report,
     )
 
   # ---- stages ----
@@ -286,13 +292,14 @@ class Learner:
         self._evaluation = values
       self._write(who.partition("-")[0], values)
 
-  def _set_status(self) -> None:
-    """Offers the figures that `agents.processes.status_view` shows."""
+  def _set_status(self, *, doing: str = "") -> None:
+    """Offers the figures that `agents.supervision.status_view` shows, and what is being done."""
     frames, updates = self._data.frames, self._counters.updates
     status = {
       "steps": frames,
       "updates": updates,
       "filled": frames >= self._settings.first_frames,
+      "doing": doing,
       "success": self._evaluation.get("success"),
       "localisation_error": self._evaluation.get("localisation_error"),
       "replay_steps": frames,

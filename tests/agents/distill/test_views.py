@@ -109,7 +109,17 @@ def test_views_are_of_several_reconstructions(world, made, tmp_path):
   _, layout, postures = world
   np.savez(tmp_path / "000000_0000000000000001_1.npz", privileged=postures)
   names = [NAME, in_scene(NAME, _darker_copy(tmp_path / "other"))]
-  found = views.kept_views(tmp_path / "v.npz", names, layout, tmp_path, seed=1, count=COUNT)
+  done: list[float] = []
+  found = views.kept_views(
+    tmp_path / "v.npz",
+    names,
+    layout,
+    tmp_path,
+    seed=1,
+    count=COUNT,
+    report=lambda fraction, _: done.append(fraction),
+  )
+  assert np.allclose(done, np.arange(1, COUNT + 1) / COUNT)
   assert {len(array) for array in found.values()} == {COUNT}
   first, second = found["image"].reshape(2, -1).mean(axis=1)
   assert second < 0.5 * first

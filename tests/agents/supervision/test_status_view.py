@@ -28,3 +28,11 @@ def test_returns_are_shown_where_a_run_has_them():
   table, line = shown(status | {"return": 2.5, "evaluation": None, "best": 4.0})
   assert "2.5 acting, - evaluated, best 4" in table
   assert "return 2.5" in line and "evaluation" not in line
+
+
+def test_what_a_learner_does_before_it_trains_is_shown():
+  status = _RUN | _LINK | _PARAMETERS | _DISTILLATION | {"filled": False, "replay_needed": 8000}
+  for view in shown(status):
+    assert "filling the replay: 1,200 of 8,000" in view
+  for view in shown(status | {"filled": True, "doing": "rendering views: 500 of 20,000"}):
+    assert "rendering views: 500 of 20,000" in view and "filling" not in view
