@@ -18,6 +18,7 @@ import pi_heif
 import PIL.ExifTags
 import PIL.Image
 
+from nerf2real.scenes.capture.media import colors
 from nerf2real.scenes.capture.media.errors import CaptureError
 
 APPLE_SUFFIXES = (".heic", ".heif")  # what iPhones write; OpenCV does not read them
@@ -203,7 +204,8 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
 
 
 def read_still(path: Path, *, least: int | None = None, upright: bool = True) -> np.ndarray:
-  """Reads a picture upright (EXIF) as BGR uint8 [H, W, 3]; transparent parts keep their colour.
+  """Reads a picture upright (EXIF) as BGR uint8 [H, W, 3] of sRGB; transparent parts keep their
+  colour.
 
   A JPEG that is at least twice as large as needed is decoded at a half, a quarter or an eighth of
   its size, each pixel the mean over its area (libjpeg's scaled inverse transform).
@@ -216,19 +218,17 @@ def read_still(path: Path, *, least: int | None = None, upright: bool = True) ->
   Raises:
     CaptureError: It is damaged or no picture.
   """
-  image = None
-  if path.suffix.lower() in APPLE_SUFFIXES:
-    try:
-      with opened(path) as picture:  # libheif has turned it
-        image = np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
-    except (OSError, ValueError, SyntaxError):
-      image = None
-  else:
+  image, profile = None, None
+  with contextlib.suppress(OSError, ValueError, SyntaxError), opened(path) as picture:
+    profile = picture.info.get("icc_profile")
+    if path.suffix.lower() in APPLE_SUFFIXES:  # libheif has turned it
+      image = np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
+  if path.suffix.lower() not in APPLE_SUFFIXES:
     how = _reduction(path, least) | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
     image = cv2.imread(str(path), how)
   if image is None:
     raise CaptureError(f"{path} cannot be read as a picture: remove it or copy it again.")
-  return image
+  return colors.to_srgb(image, profile)
 
 
 def _reduction(path: Path, least: int | None) -> int:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
+from nerf2real.scenes.capture.media import colors
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.media.spacing import ImageMotion
 
@@ -144,11 +145,13 @@ def _decode(path: Path, counts: collections.Counter) -> Iterator[av.VideoFrame]:
 
 
 def _upright(frame: av.VideoFrame, max_size: int) -> np.ndarray:
-  """Converts to BGR, honours the rotation metadata, limits the long side to max_size."""
-  stored = frame.to_ndarray(format="bgr24")
+  """Converts to BGR, honours rotation and colours' metadata, limits the long side to max_size."""
+  to_standard = colors.standard(frame)
+  stored = frame.to_ndarray(format="bgr24" if to_standard is None else "bgr48le")
   # frame.rotation is counter-clockwise in degrees: what has to be done to see it upright.
   turns = round(frame.rotation / 90) % 4
-  return limit_size(np.ascontiguousarray(np.rot90(stored, turns), np.uint8), max_size)
+  picture = limit_size(np.ascontiguousarray(np.rot90(stored, turns)), max_size)
+  return picture if to_standard is None else to_standard(picture)
 
 
 def limit_size(image: np.ndarray, max_size: int) -> np.ndarray:
@@ -188,9 +191,9 @@ def sharpest_frames(
   counts: collections.Counter = collections.Counter()
   best: tuple[float, int, av.VideoFrame, float] | None = None
   motion = ImageMotion()
-  part, last_time = 0, 0.0
+  part, last_time, hdr = 0, 0.0, None
   for index, frame in enumerate(_decode(path, counts)):
-    last_time = float(frame.time or 0.0)
+    last_time, hdr = float(frame.time or 0.0), colors.hdr_name(frame)
     while part + 1 < parts and index >= edges[part + 1]:
       if best is not None:
         yield _chosen(best, max_size)
@@ -212,6 +215,11 @@ def sharpest_frames(
     )
   if lost:
     warnings.append(f"{lost} of {expected} frames of the video are damaged and may show blocks.")
+  if hdr is not None:
+    warnings.append(
+      f"The video is HDR ({hdr}): its colours were brought to the standard range, and what is "
+      "brighter than white is white; better switch HDR video off in the settings of the camera."
+    )
   if best is not None:
     yield _chosen(best, max_size)
 
