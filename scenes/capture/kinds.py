@@ -1,9 +1,10 @@
 """Classifies a capture by its path: video, pictures, or a data set with known poses."""
 
+import collections
 from pathlib import Path
 
 from nerf2real.scenes.capture.media.errors import CaptureError
-from nerf2real.scenes.capture.media.stills import list_images, list_images_below
+from nerf2real.scenes.capture.media.stills import IMAGE_SUFFIXES, list_images, list_images_below
 from nerf2real.scenes.capture.posed.colmap_model import find_colmap_model
 from nerf2real.scenes.capture.posed.rgbd import find_rgbd
 from nerf2real.scenes.capture.posed.transforms import find_transforms
@@ -14,6 +15,8 @@ EXPORT_STREAM = (
   "--export_color_images --export_depth_images --export_poses --export_intrinsics), and give that "
   "folder."
 )
+_NAMED = 4  # kinds of files in a message
+_VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".3gp")
 
 
 def source_kind(source: Path) -> str:
@@ -54,9 +57,16 @@ def _what_instead(source: Path) -> str:
     )
   if below:
     return f"no capture, but folders that do: give one of them, such as {source / below[0]}."
+  files = [path for path in sorted(source.iterdir()) if path.is_file() and path.name[0] != "."]
+  videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
+  if videos:
+    others = f", and {len(videos) - 1} more" if len(videos) > 1 else ""
+    return f"{videos[0].name}, a video{others}, and no pictures: give {videos[0]} itself."
+  kinds = collections.Counter(path.suffix.lower() or "no suffix" for path in files)
+  found = f" but {len(files)} other files ({', '.join(sorted(kinds)[:_NAMED])})" if files else ""
   return (
-    "no pictures, no COLMAP model and no transforms.json: give a video, or a folder with one of "
-    "these."
+    f"no pictures, no COLMAP model and no transforms.json{found}: give a video, or a folder with "
+    f"one of these; pictures are {', '.join(IMAGE_SUFFIXES)}."
   )
 
 

@@ -203,6 +203,10 @@ def test_unusable_inputs_are_one_clear_line(frames, tmp_path):
   assert "has 4 frames" in message(tmp_path / "short.mp4")
   (tmp_path / "void").mkdir()
   assert "holds no pictures" in message(tmp_path / "void")
+  (tmp_path / "void" / "IMG_1.DNG").touch()
+  assert "but 1 other files (.dng)" in message(tmp_path / "void")
+  (tmp_path / "void" / "IMG_2.MOV").touch()
+  assert "IMG_2.MOV, a video, and no pictures: give " in message(tmp_path / "void")
   folder = tmp_path / "three"
   folder.mkdir()
   for number in range(3):
