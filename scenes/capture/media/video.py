@@ -58,14 +58,24 @@ class VideoInfo:
     return self.num_frames / self.frames_per_second if self.frames_per_second > 0 else 0.0
 
 
+def _standard_size(width: int, height: int) -> tuple[int, int]:
+  """Width and height of a picture at the standard size; its own where it is not larger."""
+  factor = min(STANDARD_SIZE / min(width, height), 1.0)
+  return max(1, round(width * factor)), max(1, round(height * factor))
+
+
 def at_standard_size(grey: np.ndarray) -> np.ndarray:
   """A grey picture [H, W], reduced to the standard size where it is larger."""
-  height, width = grey.shape
-  factor = STANDARD_SIZE / min(height, width)
-  if factor >= 1:
-    return grey
-  size = (max(1, round(width * factor)), max(1, round(height * factor)))
-  return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+  size = _standard_size(grey.shape[1], grey.shape[0])
+  same = size == grey.shape[1::-1]
+  return grey if same else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+
+
+def _grey(frame: av.VideoFrame) -> np.ndarray:
+  """The grey picture of a frame at the standard size, reduced while it is converted: a frame of
+  3840x2160 in 10 bits takes 12 ms so, and 53 ms where it is converted first."""
+  width, height = _standard_size(frame.width, frame.height)
+  return frame.reformat(width, height, format="gray", interpolation="AREA").to_ndarray()
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -198,8 +208,7 @@ def sharpest_frames(
       if best is not None:
         yield _chosen(best, max_size)
       best, part = None, part + 1
-    # The luma plane is the grey picture: no colour conversion for frames that are not kept.
-    grey = at_standard_size(frame.reformat(format="gray").to_ndarray())
+    grey = _grey(frame)
     value, travelled = sharpness(grey), motion.add(grey)
     if best is None or value > best[0]:
       best = (value, index, frame, travelled)
