@@ -15,6 +15,7 @@ them along their sight lines, as a share of their distance.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,14 +40,16 @@ _PASSER = 0.16, 0.7  # width and height of what stands there, of the picture's
 _PATCHES = 8  # of colour, along the picture's sides
 _WAITING = 0.18, 0.75  # half widths of who waits, of the median distance of localised points
 Part = Literal[
-  "falloff", "near_gradient", "points", "distortion", "blur", "rate", "padding", "table"
+  "falloff", "near_gradient", "points", "distortion", "blur", "weights", "rate", "padding", "table"
 ]
+_SHARPER = 3  # times that a picture of the sharper half counts by "weights"
 CHANGES: dict[str, dict[str, Any]] = {  # the first turn a part off, but near_gradient, which is off
   "falloff": {},
   "near_gradient": {"near_gradient": 1.0},
   "points": {"anchor_fraction": 0.0, "empty_samples": 0},
   "distortion": {"distortion_weight": 0.0},
   "blur": {"blur_max": 0.0},
+  "weights": {},
   "rate": {"final_learning_rate": 3e-4},
   "padding": {"charbonnier_padding": 1e-3},
   "table": {"field": FieldSettings(log2_table_size=19)},
@@ -94,6 +97,13 @@ def without_falloff(views: Views) -> Views:
   assert views.exposure is not None
   flat = views.exposure._replace(falloff=np.zeros_like(views.exposure.falloff))
   return dataclasses.replace(views, exposure=flat)
+
+
+def by_sharpness(views: Views, blur: Mapping[str, float]) -> Views:
+  """Returns the pictures with those of the less blurred half several times, as weights of them."""
+  of_each = np.array([blur[name] for name in views.names])
+  times = np.where(of_each < np.median(of_each), _SHARPER, 1)
+  return views.select(np.repeat(np.arange(len(views)), times))
 
 
 def with_passers(views: Views, share: float, seed: int) -> Views:
@@ -167,12 +177,17 @@ def small_db(renderer: Renderer, held: Views, height: int, width: int) -> float:
 
 def main(settings: Settings) -> None:
   """Trains and prints the table."""
-  everything = read_posed(settings.scene, width=SceneSettings().train_width).views()
+  posed = read_posed(settings.scene, width=SceneSettings().train_width)
+  everything, capture = posed.views(), posed.capture.value
+  assert capture.blur is not None  # keyframes on disk have it
+  blur = dict(zip((path.name for path in capture.images), capture.blur.tolist(), strict=True))
   figures: dict[str, dict[str, harness.Value]] = {}
   for part in ("", *settings.change):
     views = without_falloff(everything) if part == "falloff" else everything
     training, held = views.split(SceneSettings().held_out_every)
     training = training.evened()
+    if part == "weights":
+      training = by_sharpness(training, blur)
     if settings.passers:
       training = with_passers(training, settings.passers, settings.seed)
     if settings.waiting:

@@ -30,3 +30,14 @@ def test_who_waits_stands_at_one_place_in_pictures_in_a_row():
   drift = np.polyfit(poses[shown, 0, 3], middle, 1)[0]
   # A metre to the right moves what is 2 m away by half the focal length to the left.
   assert -1.2 * camera.fx / 2 < drift < -0.8 * camera.fx / 2
+
+
+def test_the_sharper_half_counts_more():
+  camera = Camera.from_vertical_fov(1.0, 64, 48)
+  images = np.zeros((4, 48, 64, 3), np.uint8)
+  images[:] = np.arange(4)[:, None, None, None]
+  anchors = np.array([(i, 32, 24, 2.0 + i) for i in range(4)], np.float32)
+  views = Views(camera, images, np.tile(np.eye(4), (4, 1, 1)), tuple("abcd"), anchors=anchors)
+  found = field_ablation.by_sharpness(views, {"a": 0.5, "b": 3.0, "c": 2.0, "d": 0.7})
+  assert found.names == tuple("aaabcddd")
+  assert [image.max() for image in found.images[found.anchors[:, 0].astype(int)]] == [0, 1, 2, 3]
