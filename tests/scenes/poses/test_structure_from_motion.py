@@ -371,6 +371,25 @@ def test_a_picture_that_is_weak_without_the_shutter_has_no_place(corner, monkeyp
   assert found.shutter.rotations[:, 0].tolist() == [k for k in range(count) if k != 3]
 
 
+@pytest.mark.parametrize(("frames", "warned"), [(0.9, 0), (1.0, 1), (-1.0, 1)])
+def test_a_readout_as_long_as_a_frame_is_told(corner, monkeypatch, frames, warned):
+  model = pycolmap.Reconstruction(str(corner[0] / "out" / "sfm"))
+  images = mapping.registered(model)
+  times = {image.name: k / 30 for k, image in enumerate(images)}
+  period = readout.frame_period(times)
+  motion = shutter.Shutter(
+    readout=frames * period,
+    rotations=np.zeros((len(images), 3)),
+    translations=np.zeros((len(images), 3)),
+    depths=np.ones(len(images)),
+  )
+  monkeypatch.setattr(readout, "take_out", lambda *args, **options: (model, motion))
+  mapped = Mapped(model, "test", ("before",), mapping.FreeLens(True, True, ""))
+  found = structure_from_motion._without_shutter(mapped, times, Steps(no_progress))
+  assert found.warnings[0] == "before" and len(found.warnings) == 1 + warned
+  assert all("as long as a frame lasts" in text for text in found.warnings[1:])
+
+
 def test_a_film_without_times_keeps_its_shutter(corner):
   model = pycolmap.Reconstruction(str(corner[0] / "out" / "sfm"))
   mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
