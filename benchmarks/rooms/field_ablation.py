@@ -25,6 +25,7 @@ import numpy as np
 from benchmarks import harness
 from nerf2real.scenes.bundle import STAGES
 from nerf2real.scenes.capture import keyframes
+from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.engine.device import num_threads
 from nerf2real.scenes.field.field import FieldSettings
@@ -97,6 +98,13 @@ def without_falloff(views: Views) -> Views:
   assert views.exposure is not None
   flat = views.exposure._replace(falloff=np.zeros_like(views.exposure.falloff))
   return dataclasses.replace(views, exposure=flat)
+
+
+def blur_of(capture: Capture) -> dict[str, float]:
+  """Blur of each keyframe by its name; raises ValueError where a scene has none."""
+  if capture.blur is None:
+    raise ValueError("The scene's keyframes have no blur: make them again.")
+  return dict(zip((path.name for path in capture.images), capture.blur.tolist(), strict=True))
 
 
 def by_sharpness(views: Views, blur: Mapping[str, float]) -> Views:
@@ -178,16 +186,14 @@ def small_db(renderer: Renderer, held: Views, height: int, width: int) -> float:
 def main(settings: Settings) -> None:
   """Trains and prints the table."""
   posed = read_posed(settings.scene, width=SceneSettings().train_width)
-  everything, capture = posed.views(), posed.capture.value
-  assert capture.blur is not None  # keyframes on disk have it
-  blur = dict(zip((path.name for path in capture.images), capture.blur.tolist(), strict=True))
+  everything = posed.views()
   figures: dict[str, dict[str, harness.Value]] = {}
   for part in ("", *settings.change):
     views = without_falloff(everything) if part == "falloff" else everything
     training, held = views.split(SceneSettings().held_out_every)
     training = training.evened()
     if part == "weights":
-      training = by_sharpness(training, blur)
+      training = by_sharpness(training, blur_of(posed.capture.value))
     if settings.passers:
       training = with_passers(training, settings.passers, settings.seed)
     if settings.waiting:

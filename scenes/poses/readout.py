@@ -217,3 +217,17 @@ def take_out(
     if abs(readout - before) < _PRECISION:
       break
   return result, motion(result, times, readout)
+
+
+def doubt(readout: float, longest: float) -> str | None:
+  """Says what a readout [s] means that was ended by the longest that there can be; None for others.
+
+  A model that is bent fits a longer one than the camera's.
+  """
+  if abs(readout) < longest:
+    return None
+  return (
+    f"Rolling shutter: its readout came out as long as a frame lasts, {1e3 * longest:.0f} ms, the "
+    "most that it can be. Most cameras read faster, and then some pictures have a wrong place: "
+    "run it again, or film more slowly."
+  )

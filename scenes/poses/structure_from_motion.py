@@ -41,7 +41,6 @@ from nerf2real.scenes.poses.work import KNOWN_SHARES, Mapped, Steps, prepare_wor
 
 _MODEL_FOLDER, _WORK_FOLDER = "sfm", "work"
 _NAMED = 6  # pictures in a warning
-_WHOLE = 0.999  # of a frame's period: a readout there was ended by it
 _CHECKS = 3  # at most: what is out of line once more agrees with yet another wrong place
 
 
@@ -272,13 +271,8 @@ def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -
     kept = {image.name for image in mapping.registered(model)}
     found = found.of(np.array([name in kept for name in placed]))
   words = f"{mapped.strategy}; rolling shutter of {1e3 * found.readout:.1f} ms taken out"
-  warnings = mapped.warnings
-  if abs(found.readout) >= _WHOLE * period:
-    warnings += (
-      f"Rolling shutter: its readout came out as long as a frame lasts, {1e3 * period:.0f} ms, the "
-      "most that it can be. Most cameras read faster, and then some pictures have a wrong place: "
-      "run it again, or film more slowly.",
-    )
+  doubt = readout.doubt(found.readout, period)
+  warnings = mapped.warnings if doubt is None else (*mapped.warnings, doubt)
   return dataclasses.replace(mapped, model=model, strategy=words, shutter=found, warnings=warnings)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from nerf2real.scenes.capture.media.video import at_standard_size
 
-_LESS, _MORE = 1.0, 2.5  # deviations of the two further blurs [pixel]; chosen: for 0.5 to 7
+# Deviations of the two further blurs [pixel]; chosen: for widths of 0.5 to 7.
+_LESS, _MORE = 1.0, 2.5
 _DIRECTIONS = 4
 _STRONGEST = 0.03  # share of a direction's pixels that are taken for its edges
 _FEWEST = 20  # of them that say something

@@ -10,7 +10,7 @@ from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.readout import _last_unknown, frame_period, motion, take_out
+from nerf2real.scenes.poses.readout import _last_unknown, doubt, frame_period, motion, take_out
 
 CAMERA = Camera(width=640, height=360, fx=500.0, fy=500.0, cx=320.0, cy=180.0)
 PICTURES, PERIOD = 16, 0.2
@@ -78,6 +78,8 @@ def test_the_readout_is_at_most_a_frame_of_the_film():
   for longest, expected in ((0.02, 0.02), (1 / 24, 0.036)):
     found = take_out(model, times, longest=longest, **LENS)[1].readout
     assert found == pytest.approx(expected, abs=2e-3)
+    assert (doubt(found, longest) is None) == (longest > expected)
+    assert (doubt(-found, longest) is None) == (longest > expected)
 
 
 def test_the_period_is_that_of_the_films_frames():
