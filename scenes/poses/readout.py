@@ -20,6 +20,7 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.posed.colmap_model import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.elimination import eliminate
 from nerf2real.scenes.poses.mapping import registered
 from nerf2real.scenes.poses.shutter import Shutter, instants
 
@@ -150,38 +151,16 @@ def _change(
     inner.append(weight * slope[..., 3:6] @ pose.rotation.matrix())
     errors.append((weight[..., 0] * error).ravel())
   _, point = np.unique(np.concatenate(ids), return_inverse=True)
-  return _SMALL * _last_unknown(outer, np.concatenate(inner), point, np.concatenate(errors))
-
-
-def _last_unknown(
-  outer: list[np.ndarray], inner: np.ndarray, point: np.ndarray, errors: np.ndarray
-) -> float:
-  """Returns the last unknown of a least-squares step, all points eliminated (Schur's complement).
-
-  Args:
-    outer: Of each picture's observations [O, 2, 6 + S], by its pose and by S unknowns of all.
-    inner: Of all observations by their points [O, 2, 3].
-    point: Of which point each is [O].
-    errors: The residuals [2 O].
-  """
-  shared, count = outer[0].shape[-1] - 6, 1 + int(point.max())
   poses = sparse.block_diag([part[..., :6].reshape(-1, 6) for part in outer], format="csr")
-  of_all = np.concatenate([part[..., 6:].reshape(-1, shared) for part in outer])
-  by_outer = sparse.hstack([poses, sparse.csr_matrix(of_all)], format="csr")
-  rows = np.arange(len(point) + 1)
-  by_inner = sparse.bsr_matrix((inner, point, rows), shape=(len(errors), 3 * count)).tocsr()
-  blocks = np.zeros((count, 3, 3))
-  np.add.at(blocks, point, np.swapaxes(inner, 1, 2) @ inner)
-  blocks += _DAMPING * np.trace(blocks, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-  inverse = sparse.bsr_matrix(
-    (np.linalg.inv(blocks), np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count)
+  of_all = np.concatenate([part[..., 6:].reshape(-1, part.shape[-1] - 6) for part in outer])
+  reduced = eliminate(
+    sparse.hstack([poses, sparse.csr_matrix(of_all)], format="csr"),
+    np.concatenate(inner),
+    point,
+    np.concatenate(errors),
+    damping=_DAMPING,
   )
-  mixed = by_outer.T @ by_inner
-  eliminated = mixed @ inverse
-  own = (by_outer.T @ by_outer).toarray()
-  curvature = own - (eliminated @ mixed.T).toarray() + _DAMPING * np.diag(own.diagonal())
-  gradient = by_outer.T @ errors - eliminated @ (by_inner.T @ errors)
-  return float(np.linalg.solve(curvature, -gradient)[-1])
+  return _SMALL * float(np.linalg.solve(reduced.curvature, -reduced.gradient)[-1])
 
 
 def take_out(

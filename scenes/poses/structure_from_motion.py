@@ -17,7 +17,7 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, readout, sharpening
+from nerf2real.scenes.poses import mapping, motion_prior, readout, sharpening
 from nerf2real.scenes.poses.checks import agreement, certainty, continuity, things_alike
 from nerf2real.scenes.poses.checks.attempts import best_of
 from nerf2real.scenes.poses.checks.overlap import overlap
@@ -201,6 +201,9 @@ def _map(
       "show that stand as close to it, so that they may be placed before the wrong one of two: "
       "cover one of the two, and take those of both anew."
     )
+  if times is not None:
+    steps.begin("holding")
+    model = motion_prior.hold(model, database, times, report=steps.report)
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
   dropped = mapping.drop_weak_images(model)
@@ -300,6 +303,12 @@ def _best_model(
   order = list(mappers) if settings.mapper == "auto" else [settings.mapper]
   best = _Best(None, f"{order[0]} mapper", 0.0, frozenset())
   attempts = settings.attempts if count <= settings.attempted else 1
+
+  def worth(model: pycolmap.Reconstruction) -> float:
+    if times is None:
+      return overlap(model).balance
+    return -motion_prior.roughness(*motion_prior.path(model, times))[1]
+
   for name in order:
 
     def attempt(number: int, name: str = name) -> pycolmap.Reconstruction | None:
@@ -315,7 +324,7 @@ def _best_model(
       mapping.drop_weak_images(models[0])
       return models[0]
 
-    found, unsure = best_of(attempt, attempts=attempts, same=settings.max_apart)
+    found, unsure = best_of(attempt, worth, attempts=attempts, same=settings.max_apart)
     if found is not None:
       model, what, out = _checked(found, database, images_folder, settings, steps, times)
       if _sees_more(model, best.model):

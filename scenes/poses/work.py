@@ -20,7 +20,8 @@ _DATABASE = "database.db"
 SHARES = {
   "features": 0.25,
   "matching": 0.4,
-  "mapping": 0.2,
+  "mapping": 0.17,
+  "holding": 0.03,
   "refining": 0.05,
   "aligning": 0.04,
   "shutter": 0.03,

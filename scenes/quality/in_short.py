@@ -39,13 +39,21 @@ def _pictures(figures: Mapping[str, Any]) -> Answer | None:
   return Answer("How true are the pictures?", f"{figures['held_out_psnr_db']:.1f} dB", words)
 
 
-def _geometry(figures: Mapping[str, Any]) -> Answer:
-  question = "Is the contact geometry fit to train in?"
+def _misses(figures: Mapping[str, Any]) -> tuple[float, float] | None:
+  """By what the geometry misses sight lines and points [m]; None where that was not judged."""
   names = ("sight_lines_blocked_p95_m", "points_to_parts_p95_m")
   if not all(name in figures for name in names):
+    return None
+  return figures[names[0]], figures[names[1]]
+
+
+def _geometry(figures: Mapping[str, Any]) -> Answer:
+  question = "Is the contact geometry fit to train in?"
+  misses = _misses(figures)
+  if misses is None:
     return Answer(question, "Not judged: too few points were seen well enough", tone="warn")
-  blocked, missed = (figures[name] for name in names)
-  fit = max(blocked, missed) <= FIT
+  blocked, missed = misses
+  fit = max(misses) <= FIT
   words = [
     f"Of the lines of sight to localised points 5 % meet matter {100 * blocked:.2g} cm or more"
     f" before their point, of the points 5 % lie {100 * missed:.2g} cm or more from all matter;"
@@ -64,7 +72,12 @@ def _floor(figures: Mapping[str, Any]) -> Answer | None:
     narrow = "" if lacks is None else f"; the widest way there lacks {100 * lacks:.0f} cm"
     words.append(f"{apart:.1f} m² more are behind passages that are too narrow for it{narrow}.")
   answer = f"{area:.1f} m² of floor in one piece" if area > 0 else "Nowhere"
-  return Answer("Where can the robot walk?", answer, words, "" if area > 0 else "warn")
+  misses = _misses(figures)
+  doubtful = misses is not None and max(misses) > FIT
+  if area > 0 and doubtful:
+    words.append("Not to be trusted: it is what contact geometry leaves free that is not fit.")
+  tone = "" if area > 0 and not doubtful else "warn"
+  return Answer("Where can the robot walk?", answer, words, tone)
 
 
 def _size(figures: Mapping[str, Any]) -> Answer | None:

@@ -69,7 +69,7 @@ class Judgement(NamedTuple):
     return (
       f"The contact geometry is unfit to train in: {' and '.join(found)}, expected at most "
       f"{FIT:g} m. Film slower, or photograph from more places, with more light, moving sideways "
-      "along plain walls and black or shiny things, or train longer (--preset quality)."
+      "along plain walls and black or shiny things."
     )
 
 

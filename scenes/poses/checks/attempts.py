@@ -1,10 +1,11 @@
-"""Which of several models of the same matches is right: the one that lacks least.
+"""Which of several models of the same matches is right: the one that is worth most.
 
 Where two parts of a place hang together by few pictures, the mapper's result hangs on what it
-begins with. Of a phone's film of a living room, some attempts place parts of it at another scale or
-turned, with as many pictures, as small a reprojection error, and no pair that contradicts: what
-they see of each other becomes points of its own. So the wrong ones have less in common, see
-`overlap`.
+begins with: some attempts place parts of it at another scale or turned, with as many pictures, as
+small a reprojection error, and no pair that contradicts. What they see of each other becomes points
+of its own, so that the wrong ones of photographs have less in common (`overlap`); but parts that
+are moved far apart are not expected to see each other. In a film the camera leaps between them
+(`motion_prior.roughness`).
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import numpy as np
 
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses.checks.overlap import CLEAR, overlap
+from nerf2real.scenes.poses.checks.overlap import CLEAR
 from nerf2real.scenes.poses.mapping import registered
 
 
@@ -32,30 +33,35 @@ def apart(one: pycolmap.Reconstruction, two: pycolmap.Reconstruction) -> float:
 
 
 def best_of(
-  attempt: Callable[[int], pycolmap.Reconstruction | None], *, attempts: int, same: float
+  attempt: Callable[[int], pycolmap.Reconstruction | None],
+  worth: Callable[[pycolmap.Reconstruction], float],
+  *,
+  attempts: int,
+  same: float,
 ) -> tuple[pycolmap.Reconstruction | None, float]:
-  """Returns the model that sees most of what it ought to, of several attempts, and how sure it is.
+  """Returns the model of most worth, of several attempts, and how sure it is.
 
   Args:
     attempt: Makes a model from the attempt's number, or None.
+    worth: What a model is worth.
     attempts: How many there are at most; none follows on two that are the same.
     same: How far such two are `apart` at most.
 
   Returns:
-    The model, and how far it is `apart` from the nearest of those that do not see clearly less; 0
-    where there is none.
+    The model, and how far it is `apart` from the nearest of those that are not worth clearly less;
+    0 where there is none.
   """
   found: list[tuple[float, pycolmap.Reconstruction]] = []
   for number in range(attempts):
     model = attempt(number)
     if model is None:
       continue
-    found.append((overlap(model).balance if attempts > 1 else 0.0, model))
+    found.append((worth(model) if attempts > 1 else 0.0, model))
     if any(apart(model, other) <= same for _, other in found[:-1]):
       break
   if not found:
     return None, 0.0
   found.sort(key=lambda pair: -pair[0])
   (most, best), *others = found
-  rivals = [model for balance, model in others if balance >= most - CLEAR * abs(most)]
+  rivals = [model for value, model in others if value >= most - CLEAR * abs(most)]
   return best, min((apart(best, other) for other in rivals), default=0.0)

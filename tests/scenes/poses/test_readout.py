@@ -10,7 +10,7 @@ from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.readout import _last_unknown, doubt, frame_period, motion, take_out
+from nerf2real.scenes.poses.readout import doubt, frame_period, motion, take_out
 
 CAMERA = Camera(width=640, height=360, fx=500.0, fy=500.0, cx=320.0, cy=180.0)
 PICTURES, PERIOD = 16, 0.2
@@ -105,21 +105,3 @@ def test_a_point_in_a_camera_does_not_hide_the_readout_time():
   corrected, found = take_out(model, times, **FIXED)
   assert found.readout == pytest.approx(0.02, abs=2e-3)
   assert seen not in corrected.points3D
-
-
-def test_the_last_unknown_is_that_of_the_whole_least_squares_step():
-  rng = np.random.default_rng(0)
-  pictures, sights, points, shared = 3, 10, 5, 3
-  point = rng.permuted(np.tile(np.arange(points), (pictures, sights // points)), axis=1).ravel()
-  outer = list(rng.normal(size=(pictures, sights, 2, 6 + shared)))
-  inner, errors = rng.normal(size=(len(point), 2, 3)), rng.normal(size=2 * len(point))
-  poses = 6 * pictures
-  whole = np.zeros((len(point), 2, poses + shared + 3 * points))
-  for row, k in enumerate(point):
-    picture, own = row // sights, outer[row // sights][row % sights]
-    whole[row, :, 6 * picture : 6 * picture + 6] = own[:, :6]
-    whole[row, :, poses : poses + shared] = own[:, 6:]
-    whole[row, :, poses + shared + 3 * k :][:, :3] = inner[row]
-  want = np.linalg.lstsq(whole.reshape(len(errors), -1), -errors, rcond=None)[0]
-  got = _last_unknown(outer, inner, point, errors)
-  assert got == pytest.approx(want[poses + shared - 1], rel=1e-5)

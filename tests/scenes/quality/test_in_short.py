@@ -46,6 +46,11 @@ def test_what_is_wrong_stands_out():
   assert (size.answer, size.tone) == ("A guess", "warn") and len(size.details) == 1
 
 
+def test_floor_of_geometry_that_is_not_fit_is_no_good_news():
+  _, _, floor, _ = answers({**GOOD, "sight_lines_blocked_p95_m": 0.4})
+  assert floor.tone == "warn" and "Not to be trusted" in floor.details[-1]
+
+
 def test_what_was_not_measured_is_left_out_or_said():
   (geometry,) = answers({"keyframes": 60})
   assert geometry.answer.startswith("Not judged") and geometry.tone == "warn"

@@ -1,11 +1,11 @@
-"""Of several models of the same matches the one is taken that lacks least."""
+"""Of several models of the same matches the one is taken that is worth most."""
 
 import numpy as np
 import pytest
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.checks import attempts, overlap
+from nerf2real.scenes.poses.checks import attempts
 
 
 @pytest.mark.parametrize(
@@ -24,25 +24,22 @@ from nerf2real.scenes.poses.checks import attempts, overlap
 )
 def test_attempts_end_with_two_that_are_the_same(monkeypatch, balances, places, taken, unsure):
   tried = []
-
-  def seen(model):
-    return overlap.Overlap([], np.zeros((0, 0)), np.zeros((0, 0)), balances[model])
-
-  monkeypatch.setattr(attempts, "overlap", seen)
   monkeypatch.setattr(attempts, "apart", lambda one, two: abs(places[one] - places[two]))
 
   def attempt(number):
     tried.append(number)
     return None if balances[number] is None else number
 
-  best, apart = attempts.best_of(attempt, attempts=3, same=0.05)
+  best, apart = attempts.best_of(attempt, lambda k: balances[k], attempts=3, same=0.05)
   assert best == taken and apart == pytest.approx(unsure)
   assert tried == list(range(len(balances)))
 
 
-def test_one_attempt_is_not_judged(monkeypatch):
-  monkeypatch.setattr(attempts, "overlap", None)
-  assert attempts.best_of(lambda number: "model", attempts=1, same=0.05) == ("model", 0.0)
+def test_one_attempt_is_not_judged():
+  def never(model):
+    raise AssertionError(model)
+
+  assert attempts.best_of(lambda number: "model", never, attempts=1, same=0.05) == ("model", 0.0)
 
 
 def test_places_of_two_attempts_are_compared_whatever_their_frames(folder):
