@@ -31,7 +31,7 @@ _MEDIAN = 1.538  # of the length of three normal numbers of deviation 1 (Maxwell
 # How many times stiffer than it is a hand is taken to be, one round after the other: what a part
 # that has come apart is held by must first give way. Chosen: of eight maps of one film 10 leave two
 # apart.
-_STIFF = (30.0, 10.0, 3.0, 1.0, 1.0)
+_STIFF = (30.0, 30.0, 15.0, 6.0, 3.0, 1.0)
 _STEPS = 8  # of Gauss and Newton in a round, chosen
 _SETTLED = 1e-3  # of the cost: less is no step worth another
 _DAMPING = 1e-9  # of the curvature, at least
@@ -185,10 +185,9 @@ def _alike(centers: np.ndarray) -> np.ndarray:
   return unit
 
 
-def _adjust(model: pycolmap.Reconstruction, times: np.ndarray, stiff: float) -> None:
+def _adjust(model: pycolmap.Reconstruction, times: np.ndarray, deviation: float) -> None:
   """Adjusts poses and points, in place, by the pictures and by a hand's motion."""
-  centers = np.array([image.projection_center() for image in registered(model)])
-  film = _Film(model, times, roughness(centers, times)[0] / stiff)
+  film = _Film(model, times, deviation)
   cost, damping = film.cost(film.state), 0.0
   for _ in range(_STEPS):
     state = film.step(damping)
@@ -220,29 +219,34 @@ def hold(
     times: When each picture was taken [s].
     report: Called with the fraction done and a text.
   """
-  model = pycolmap.Reconstruction(model)
-  taken = np.array([times[image.name] for image in registered(model)])
+  centers, taken = path(model, times)
   if len(taken) < 4 or np.diff(taken).min() <= 0:
     return model
-  with pycolmap.Database.open(str(database)) as opened:
+  model = pycolmap.Reconstruction(model)
+  with quiet(), pycolmap.Database.open(str(database)) as opened:
     options = pycolmap.DatabaseCacheOptions()
     options.min_num_matches = pycolmap.IncrementalPipelineOptions().min_num_matches
+    options.load_all_images = True  # of those of the model, matched or not
     options.image_names = {image.name for image in model.images.values()}
     graph = pycolmap.DatabaseCache.create(opened, options).correspondence_graph
+  usual, _ = roughness(centers, taken)
   for done, stiff in enumerate(_STIFF):
     report(done / len(_STIFF), "holding the places by a hand's motion")
-    _adjust(model, taken, stiff)
-    _see_again(model, graph)
+    _adjust(model, taken, usual / stiff)
+    _see_again(model, graph, mapping.MAX_ERROR * stiff**0.5)
   return model
 
 
-def _see_again(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> None:
-  """Drops what a model's pictures do not see from their places, and finds what they do."""
+def _see_again(
+  model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph, limit: float
+) -> None:
+  """Drops what a model's pictures do not see from their places to a limit [pixel], and finds what
+  they do."""
   options = pycolmap.IncrementalTriangulatorOptions()
   options.ignore_two_view_tracks = False
   with quiet():
     observations = pycolmap.ObservationManager(model, graph)
-    observations.filter_all_points3D(mapping.MAX_ERROR, mapping.MIN_ANGLE)
+    observations.filter_all_points3D(limit, mapping.MIN_ANGLE)
     triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
     triangulator.retriangulate(options)
     triangulator.complete_all_tracks(options)
