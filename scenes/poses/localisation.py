@@ -18,7 +18,7 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.posed.colmap_model import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.shutter import Shutter
+from nerf2real.scenes.poses.film.shutter import Shutter
 from nerf2real.scenes.poses.tracks import Tracks
 
 _FIGURES = "localisation.json"

@@ -17,12 +17,13 @@ from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import mapping, motion_prior, readout, sharpening
-from nerf2real.scenes.poses.checks import agreement, certainty, continuity, things_alike
+from nerf2real.scenes.poses import mapping, sharpening
+from nerf2real.scenes.poses.checks import agreement, certainty, things_alike
 from nerf2real.scenes.poses.checks.attempts import best_of
 from nerf2real.scenes.poses.checks.overlap import overlap
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.depth import refinement
+from nerf2real.scenes.poses.film import continuity, motion_prior, readout
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,

@@ -13,8 +13,8 @@ from nerf2real.core.serialization import to_plain
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
+from nerf2real.scenes.poses.film.shutter import Shutter
 from nerf2real.scenes.poses.settings import LocaliseSettings
-from nerf2real.scenes.poses.shutter import Shutter
 
 _DATABASE = "database.db"
 SHARES = {
@@ -43,7 +43,7 @@ class Mapped:
   lens: mapping.FreeLens | None = None
   """What was estimated of the lens; None where it was known."""
   left_out: tuple[str, ...] = ()
-  """Pictures out of a film's line, see `checks/continuity.py`, or whose place hung on little, see
+  """Pictures out of a film's line, see `film/continuity.py`, or whose place hung on little, see
   `checks/certainty.py`."""
   shutter: Shutter | None = None
 

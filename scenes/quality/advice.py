@@ -15,7 +15,7 @@ from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
-from nerf2real.scenes.poses.checks import continuity
+from nerf2real.scenes.poses.film import continuity
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.quality.coverage import Coverage, coverage

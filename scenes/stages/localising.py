@@ -39,8 +39,9 @@ _PICTURES_VERSION = 5  # of all others; 5: colours of other profiles
 # 10: the readout is a frame's period at most; points of a COLMAP model are seen by pictures; of few
 # pictures some may have no place; 11: photographs without pairs whose rotations contradict;
 # 12: by what pictures lack; a film's line is the one that least contradicts; matches are kept of
-# what came with depth; 13: uncertain pictures of films are left out, too; 14: patches are aligned
-_POSES_VERSION = 14
+# what came with depth; 13: uncertain pictures of films are left out, too; 14: patches are aligned;
+# 15: a film is held by a hand's motion
+_POSES_VERSION = 15
 _ALIGNED_VERSION = 1
 _MATCHES = "matches.db"  # what pictures with depth show alike
 _ALIGNED_RECORD = "aligned.json"  # the factor on the depth's unit

@@ -1,1 +1,1 @@
-"""Where a model of the pictures is wrong: by its own matches and points, and by a film's line."""
+"""Where a model of the pictures is wrong: by its own matches and points."""

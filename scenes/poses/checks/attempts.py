@@ -5,7 +5,7 @@ begins with: some attempts place parts of it at another scale or turned, with as
 small a reprojection error, and no pair that contradicts. What they see of each other becomes points
 of its own, so that the wrong ones of photographs have less in common (`overlap`); but parts that
 are moved far apart are not expected to see each other. In a film the camera leaps between them
-(`motion_prior.roughness`).
+(`film.motion_prior.roughness`).
 """
 
 from collections.abc import Callable

@@ -13,8 +13,8 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.export import nerfstudio
 from nerf2real.scenes.poses import localisation
-from nerf2real.scenes.poses.readout import motion
-from tests.scenes.poses.test_readout import CAMERA, PICTURES, filmed
+from nerf2real.scenes.poses.film.readout import motion
+from tests.scenes.poses.film.test_readout import CAMERA, PICTURES, filmed
 
 
 def _bundle(folder, readout, picture, **scene):

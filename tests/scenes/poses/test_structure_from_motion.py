@@ -17,8 +17,9 @@ from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.reading import read_capture
-from nerf2real.scenes.poses import mapping, readout, shutter, structure_from_motion
-from nerf2real.scenes.poses.checks import certainty, continuity
+from nerf2real.scenes.poses import mapping, structure_from_motion
+from nerf2real.scenes.poses.checks import certainty
+from nerf2real.scenes.poses.film import continuity, readout, shutter
 from nerf2real.scenes.poses.localisation import LocalisationError, load
 from nerf2real.scenes.poses.matching import features
 from nerf2real.scenes.poses.matching.features import FeatureSettings

@@ -5,9 +5,9 @@ import pytest
 
 from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.colmap import pycolmap
-from nerf2real.scenes.poses import motion_prior
+from nerf2real.scenes.poses.film import motion_prior
 from nerf2real.scenes.poses.mapping import registered
-from tests.scenes.poses.test_readout import PERIOD, PICTURES, filmed
+from tests.scenes.poses.film.test_readout import PERIOD, PICTURES, filmed
 
 FIRST = PICTURES // 2  # of the part that comes apart
 

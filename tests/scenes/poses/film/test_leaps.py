@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerf2real.scenes.poses.checks.leaps import leaps
+from nerf2real.scenes.poses.film.leaps import leaps
 
 
 def walk(count: int) -> tuple[np.ndarray, np.ndarray]:

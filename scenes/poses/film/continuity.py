@@ -8,7 +8,7 @@ and contradict at right places: how many pairs so far apart do is counted in the
 pair says is worth the less the more do.
 
 The film is a line then, of which parts stand elsewhere: the smaller of two groups that clearly lack
-each other (`film_groups`), and those without which least is left that contradicts. Evidence is log
+each other (`groups`), and those without which least is left that contradicts. Evidence is log
 odds, which add. Shapes: N pictures in the film's order.
 """
 
@@ -20,9 +20,9 @@ import numpy as np
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.checks import agreement
-from nerf2real.scenes.poses.checks.film_groups import smaller_group
-from nerf2real.scenes.poses.checks.leaps import leaps
 from nerf2real.scenes.poses.checks.overlap import overlap
+from nerf2real.scenes.poses.film.groups import smaller_group
+from nerf2real.scenes.poses.film.leaps import leaps
 from nerf2real.scenes.poses.mapping import registered
 
 _NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen

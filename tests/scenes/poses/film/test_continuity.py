@@ -6,8 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from nerf2real.scenes.poses.checks import agreement, continuity
+from nerf2real.scenes.poses.checks import agreement
 from nerf2real.scenes.poses.checks.overlap import Overlap
+from nerf2real.scenes.poses.film import continuity
 
 COUNT = 80
 TIMES = 0.4 * np.arange(COUNT)

@@ -21,8 +21,8 @@ from nerf2real.scenes.capture.posed.colmap_model import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.elimination import eliminate
+from nerf2real.scenes.poses.film.shutter import Shutter, instants
 from nerf2real.scenes.poses.mapping import registered
-from nerf2real.scenes.poses.shutter import Shutter, instants
 
 _PRECISION = 0.0005  # s of the readout, chosen: a twentieth of a pixel in a fast pan
 _ROUNDS = 6  # of the readout and adjustments at most, chosen: three or four suffice

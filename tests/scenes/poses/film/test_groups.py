@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nerf2real.scenes.poses.checks.film_groups import smaller_group
 from nerf2real.scenes.poses.checks.overlap import Overlap
+from nerf2real.scenes.poses.film.groups import smaller_group
 
 
 def seen_of(world: np.ndarray, reach: int = 12) -> Overlap:

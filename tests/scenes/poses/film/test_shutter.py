@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 
 from nerf2real.core.cameras import Camera
-from nerf2real.scenes.poses import shutter
-from nerf2real.scenes.poses.readout import motion
-from tests.scenes.poses.test_readout import CAMERA, filmed
+from nerf2real.scenes.poses.film import shutter
+from nerf2real.scenes.poses.film.readout import motion
+from tests.scenes.poses.film.test_readout import CAMERA, filmed
 
 
 def seen_while_turning():

@@ -10,7 +10,7 @@ from nerf2real.core.cameras import Camera
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.readout import doubt, frame_period, motion, take_out
+from nerf2real.scenes.poses.film.readout import doubt, frame_period, motion, take_out
 
 CAMERA = Camera(width=640, height=360, fx=500.0, fy=500.0, cx=320.0, cy=180.0)
 PICTURES, PERIOD = 16, 0.2

@@ -1,0 +1,1 @@
+"""What only a film knows: when each picture was taken, so that a hand moves and a shutter rolls."""
