@@ -306,7 +306,7 @@ def _best_model(
   attempts = settings.attempts if count <= settings.attempted else 1
 
   def worth(model: pycolmap.Reconstruction) -> float:
-    if times is None:
+    if times is None or readout.frame_period(times) is None:
       return overlap(model).balance
     return -motion_prior.roughness(*motion_prior.path(model, times))[1]
 

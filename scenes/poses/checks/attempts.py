@@ -17,6 +17,8 @@ from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.checks.overlap import CLEAR
 from nerf2real.scenes.poses.mapping import registered
 
+_AS_MANY = 0.9  # of the most pictures that an attempt places, chosen
+
 
 def apart(one: pycolmap.Reconstruction, two: pycolmap.Reconstruction) -> float:
   """How far a picture's places in two models are from each other at most, of the places' width.
@@ -39,7 +41,8 @@ def best_of(
   attempts: int,
   same: float,
 ) -> tuple[pycolmap.Reconstruction | None, float]:
-  """Returns the model of most worth, of several attempts, and how sure it is.
+  """Returns the model of most worth, of attempts that place about as many pictures, and how sure it
+  is.
 
   Args:
     attempt: Makes a model from the attempt's number, or None.
@@ -61,6 +64,8 @@ def best_of(
       break
   if not found:
     return None, 0.0
+  least = _AS_MANY * max(model.num_reg_images() for _, model in found)
+  found = [pair for pair in found if pair[1].num_reg_images() >= least]
   found.sort(key=lambda pair: -pair[0])
   (most, best), *others = found
   rivals = [model for value, model in others if value >= most - CLEAR * abs(most)]

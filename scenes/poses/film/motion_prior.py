@@ -29,8 +29,8 @@ from nerf2real.scenes.poses.matching.features import quiet
 
 _MEDIAN = 1.538  # of the length of three normal numbers of deviation 1 (Maxwell)
 # How many times stiffer than it is a hand is taken to be, one round after the other: what a part
-# that has come apart is held by must first give way. Chosen: of eight maps of one film 10 leave two
-# apart.
+# that has come apart is held by must first give way. Chosen on maps of one film, of which one leapt
+# again after fewer stiff rounds.
 _STIFF = (30.0, 30.0, 15.0, 6.0, 3.0, 1.0)
 _STEPS = 8  # of Gauss and Newton in a round, chosen
 _SETTLED = 1e-3  # of the cost: less is no step worth another
@@ -60,8 +60,10 @@ def roughness(centers: np.ndarray, times: np.ndarray) -> tuple[float, float]:
 
   Args:
     centers: Positions [N, 3].
-    times: When [s] [N]; they strictly grow.
+    times: When [s] [N]; they strictly grow. Both are 0 for fewer than three.
   """
+  if len(times) < 3:
+    return 0.0, 0.0
   sizes = np.linalg.norm(accelerations(times) @ centers, axis=1)
   usual = float(np.median(sizes)) / _MEDIAN
   return usual, float(sizes.max() / max(usual, 1e-12))

@@ -1,11 +1,23 @@
 """Of several models of the same matches the one is taken that is worth most."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.checks import attempts
+
+
+class Attempt(NamedTuple):
+  """What stands for a model."""
+
+  number: int
+  pictures: int = 10
+
+  def num_reg_images(self):
+    return self.pictures
 
 
 @pytest.mark.parametrize(
@@ -24,14 +36,16 @@ from nerf2real.scenes.poses.checks import attempts
 )
 def test_attempts_end_with_two_that_are_the_same(monkeypatch, balances, places, taken, unsure):
   tried = []
-  monkeypatch.setattr(attempts, "apart", lambda one, two: abs(places[one] - places[two]))
+  monkeypatch.setattr(
+    attempts, "apart", lambda one, two: abs(places[one.number] - places[two.number])
+  )
 
   def attempt(number):
     tried.append(number)
-    return None if balances[number] is None else number
+    return None if balances[number] is None else Attempt(number)
 
-  best, apart = attempts.best_of(attempt, lambda k: balances[k], attempts=3, same=0.05)
-  assert best == taken and apart == pytest.approx(unsure)
+  best, apart = attempts.best_of(attempt, lambda m: balances[m.number], attempts=3, same=0.05)
+  assert (best and best.number) == taken and apart == pytest.approx(unsure)
   assert tried == list(range(len(balances)))
 
 
@@ -39,7 +53,21 @@ def test_one_attempt_is_not_judged():
   def never(model):
     raise AssertionError(model)
 
-  assert attempts.best_of(lambda number: "model", never, attempts=1, same=0.05) == ("model", 0.0)
+  found, apart = attempts.best_of(Attempt, never, attempts=1, same=0.05)
+  assert found.number == 0 and apart == 0.0
+
+
+def test_an_attempt_that_places_few_pictures_is_not_taken(monkeypatch):
+  monkeypatch.setattr(attempts, "apart", lambda one, two: 1.0)
+  pictures = (100, 60, 95)
+  found, _ = attempts.best_of(
+    lambda k: Attempt(k, pictures[k]), lambda m: m.number, attempts=3, same=0.05
+  )
+  assert found.number == 2
+  found, _ = attempts.best_of(
+    lambda k: Attempt(k, pictures[k]), lambda m: -abs(m.number - 1), attempts=3, same=0.05
+  )
+  assert found.number != 1
 
 
 def test_places_of_two_attempts_are_compared_whatever_their_frames(folder):

@@ -91,6 +91,7 @@ def test_roughness_is_by_the_film_s_own_motion():
   places = np.cumsum(velocities * PERIOD, axis=0)
   usual, most = motion_prior.roughness(places, times)
   assert usual == pytest.approx(0.2, rel=0.3) and most < 6
+  assert motion_prior.roughness(places[:2], times[:2]) == (0.0, 0.0)
   places[15:] += 1.0
   assert motion_prior.roughness(places, times)[1] > 50
   assert motion_prior.roughness(2 * places, times)[1] == pytest.approx(
