@@ -102,7 +102,7 @@ class _Film:
     self._ids, self._point = np.unique(ids, return_inverse=True)
     self._pixels = [np.array([p.xy for p in places]).reshape(-1, 2) for places in seen]
     self._ends = np.cumsum([0] + [len(places) for places in seen])
-    self._hand = np.kron(accelerations(times), np.eye(3)) / deviation
+    self._hand = sparse.kron(accelerations(times) / deviation, np.eye(3), format="csr")
     poses = [image.cam_from_world() for image in self._images]
     self.state = _State(
       np.array([pose.rotation.matrix() for pose in poses]),
@@ -151,11 +151,10 @@ class _Film:
       damping=_DAMPING + damping,
     )
     centers = state.centers
-    moved = np.zeros((3 * len(centers), 6 * len(centers)))  # the centers, by the unknowns
-    for picture, rotation in enumerate(state.rotations):
-      moved[3 * picture : 3 * picture + 3, 6 * picture + 3 : 6 * picture + 6] = -rotation.T
-    hand, held = self._hand @ moved, _alike(centers) @ moved
-    curvature = reduced.curvature + hand.T @ hand + _RIGID * held.T @ held
+    by_move = np.concatenate([np.zeros_like(state.rotations), -state.rotations.swapaxes(1, 2)], -1)
+    moved = sparse.block_diag(by_move, format="csr")  # the centers, by the unknowns
+    hand, held = self._hand @ moved, (moved.T @ _alike(centers).T).T
+    curvature = reduced.curvature + (hand.T @ hand).toarray() + _RIGID * held.T @ held
     gradient = reduced.gradient + hand.T @ (self._hand @ centers.ravel())
     found = np.linalg.solve(curvature, -gradient)
     change = found.reshape(-1, 6)
@@ -224,6 +223,9 @@ def hold(
   centers, taken = path(model, times)
   if len(taken) < 4 or np.diff(taken).min() <= 0:
     return model
+  usual, _ = roughness(centers, taken)
+  if usual <= 0:  # half of the film stands still, which says nothing of a hand
+    return model
   model = pycolmap.Reconstruction(model)
   with quiet(), pycolmap.Database.open(str(database)) as opened:
     options = pycolmap.DatabaseCacheOptions()
@@ -231,7 +233,6 @@ def hold(
     options.load_all_images = True  # of those of the model, matched or not
     options.image_names = {image.name for image in model.images.values()}
     graph = pycolmap.DatabaseCache.create(opened, options).correspondence_graph
-  usual, _ = roughness(centers, taken)
   for done, stiff in enumerate(_STIFF):
     report(done / len(_STIFF), "holding the places by a hand's motion")
     _adjust(model, taken, usual / stiff)

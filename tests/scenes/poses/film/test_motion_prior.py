@@ -84,6 +84,14 @@ def test_a_film_without_times_that_grow_is_left_alone(tmp_path):
   assert held is model
 
 
+def test_a_camera_that_stands_still_says_nothing_of_a_hand(tmp_path):
+  model, times = filmed(0.0)
+  for image in registered(model)[:-2]:
+    turn = image.cam_from_world().rotation
+    image.frame.set_cam_from_world(1, pycolmap.Rigid3d(turn, np.zeros(3)))
+  assert motion_prior.hold(model, tmp_path / "none.db", times) is model
+
+
 def test_roughness_is_by_the_film_s_own_motion():
   times = np.arange(30) * PERIOD
   rng = np.random.default_rng(0)
