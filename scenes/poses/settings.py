@@ -16,7 +16,8 @@ class LocaliseSettings:
   """"global", "incremental", or "auto": incremental, and global where that leaves too many
   keyframes out."""
   attempts: int = 3
-  """Of the mapper at most, of which the one that lacks least of what it ought to see is taken."""
+  """Of the mapper at most, of which for photographs the one is taken that lacks least of what it
+  ought to see, for a film the one that leaps least."""
   attempted: int = 300
   """More keyframes are mapped once: a thousand take half an hour."""
   max_apart: float = 0.05

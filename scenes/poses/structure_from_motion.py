@@ -6,6 +6,7 @@ keyframes, P points.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, sharpening
 from nerf2real.scenes.poses.checks import agreement, certainty, things_alike
 from nerf2real.scenes.poses.checks.attempts import best_of
-from nerf2real.scenes.poses.checks.overlap import overlap
+from nerf2real.scenes.poses.checks.overlap import CLEAR, overlap
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.depth import refinement
 from nerf2real.scenes.poses.film import continuity, motion_prior, readout
@@ -305,10 +306,12 @@ def _best_model(
   best = _Best(None, f"{order[0]} mapper", 0.0, frozenset())
   attempts = settings.attempts if count <= settings.attempted else 1
 
+  timed = times if times is not None and readout.frame_period(times) is not None else None
+
   def worth(model: pycolmap.Reconstruction) -> float:
-    if times is None or readout.frame_period(times) is None:
+    if timed is None:
       return overlap(model).balance
-    return -motion_prior.roughness(*motion_prior.path(model, times))[1]
+    return -motion_prior.roughness(*motion_prior.path(model, timed))[1]
 
   for name in order:
 
@@ -325,7 +328,13 @@ def _best_model(
       mapping.drop_weak_images(models[0])
       return models[0]
 
-    found, unsure = best_of(attempt, worth, attempts=attempts, same=settings.max_apart)
+    found, unsure = best_of(
+      attempt,
+      worth,
+      attempts=attempts,
+      same=settings.max_apart,
+      clear=CLEAR if timed is None else math.inf,  # that it leaps less makes a film no surer
+    )
     if found is not None:
       model, what, out = _checked(found, database, images_folder, settings, steps, times)
       if _sees_more(model, best.model):

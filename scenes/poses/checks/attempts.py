@@ -40,6 +40,7 @@ def best_of(
   *,
   attempts: int,
   same: float,
+  clear: float = CLEAR,
 ) -> tuple[pycolmap.Reconstruction | None, float]:
   """Returns the model of most worth, of attempts that place about as many pictures, and how sure it
   is.
@@ -49,6 +50,7 @@ def best_of(
     worth: What a model is worth.
     attempts: How many there are at most; none follows on two that are the same.
     same: How far such two are `apart` at most.
+    clear: Share of the best one's worth by which another is clearly worth less.
 
   Returns:
     The model, and how far it is `apart` from the nearest of those that are not worth clearly less;
@@ -68,5 +70,5 @@ def best_of(
   found = [pair for pair in found if pair[1].num_reg_images() >= least]
   found.sort(key=lambda pair: -pair[0])
   (most, best), *others = found
-  rivals = [model for value, model in others if value >= most - CLEAR * abs(most)]
+  rivals = [model for value, model in others if most - value <= clear * abs(most)]
   return best, min((apart(best, other) for other in rivals), default=0.0)

@@ -57,6 +57,16 @@ def test_one_attempt_is_not_judged():
   assert found.number == 0 and apart == 0.0
 
 
+def test_all_attempts_may_be_rivals(monkeypatch):
+  monkeypatch.setattr(attempts, "apart", lambda one, two: 0.1 * abs(one.number - two.number))
+  worths = (-5.0, -90.0, -200.0)
+  for clear, unsure in ((0.1, 0.0), (np.inf, 0.1)):
+    found, apart = attempts.best_of(
+      Attempt, lambda m: worths[m.number], attempts=3, same=0.05, clear=clear
+    )
+    assert found.number == 0 and apart == pytest.approx(unsure)
+
+
 def test_an_attempt_that_places_few_pictures_is_not_taken(monkeypatch):
   monkeypatch.setattr(attempts, "apart", lambda one, two: 1.0)
   pictures = (100, 60, 95)
