@@ -60,9 +60,9 @@ def check_render(settings: Settings) -> Figures:
   """Compares pictures of the built-in room drawn on the device with the CPU's, and times both."""
   import numpy as np
 
-  from nerf2real.core.cameras import Camera
+  from nerf2real.core.geometry.cameras import Camera
+  from nerf2real.core.geometry.similarity import Similarity
   from nerf2real.core.serialization import from_plain
-  from nerf2real.core.similarity import Similarity
   from nerf2real.scenes.builtin import ground_truth
   from nerf2real.scenes.bundle import Bundle
   from nerf2real.scenes.field.field import Field

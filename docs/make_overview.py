@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from nerf2real.core import palette
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.pages import pictures
 from nerf2real.core.serialization import from_plain
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import ground_truth, room
 from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.bundle import Bundle

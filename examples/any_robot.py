@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.suite.arena import SceneArena
 from nerf2real.suite.loading import load_renderer

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.core import errors
-from nerf2real.core.camera_info import read_camera_info
+from nerf2real.core.geometry.camera_info import read_camera_info
 from nerf2real.real.camera.source import CameraSource, check_shape
 from nerf2real.real.clock import Clock
 from nerf2real.real.loop.environment import RobotEnvironment

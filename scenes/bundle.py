@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain, write_json
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.geometry import map_server
 from nerf2real.scenes.geometry.free_space import FreeSpaceMap

@@ -18,7 +18,8 @@ from nerf2real.agents.distill.dataset import BALL_SIZE, POSE_SIZE
 from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.specs import BALL, POSITION, ROTATION, Layout
 from nerf2real.agents.environments.loading import make_environment
-from nerf2real.core import files, rotations
+from nerf2real.core import files
+from nerf2real.core.geometry import rotations
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.light import draw_light

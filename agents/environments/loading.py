@@ -100,7 +100,7 @@ def _suite(rest: str, options: dict[str, str], seed: int) -> dm_env.Environment:
 
 def _take_camera(options: dict[str, str]) -> Any:
   """Takes the options of the camera; returns its `CameraSettings`."""
-  from nerf2real.core.camera_info import read_camera_info
+  from nerf2real.core.geometry.camera_info import read_camera_info
   from nerf2real.suite.sensors.camera import CameraSettings
 
   camera = _take(options, CameraSettings(), prefix="camera_")

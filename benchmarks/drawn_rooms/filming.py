@@ -9,7 +9,7 @@ import numpy as np
 from skimage import graph
 
 from benchmarks.drawn_rooms import looks
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.builtin import camera_path, filming, room
 from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.room import TrueRoom

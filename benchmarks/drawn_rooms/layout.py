@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.drawn_rooms import looks, pieces
-from nerf2real.core.rotations import yaw_matrix
+from nerf2real.core.geometry.rotations import yaw_matrix
 from nerf2real.scenes.builtin import furniture
 from nerf2real.scenes.builtin.placing import Group, facing
 from nerf2real.scenes.builtin.room import TrueRoom

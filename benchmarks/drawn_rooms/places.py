@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks import harness
 from benchmarks.drawn_rooms import captures
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses.localisation import LocalisationError
 from nerf2real.scenes.settings import preset
 from nerf2real.scenes.source import open_source

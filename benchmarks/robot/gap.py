@@ -25,7 +25,7 @@ import mujoco
 import numpy as np
 
 from nerf2real import real, suite
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.real.virtual.body import Truth
 from nerf2real.real.virtual.camera import LENS, VirtualCamera
 from nerf2real.real.virtual.robot import VirtualRobot

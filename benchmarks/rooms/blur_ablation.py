@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from benchmarks import harness
-from nerf2real.core.cameras import Camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.builtin import filming, ground_truth
 from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.engine.device import num_threads

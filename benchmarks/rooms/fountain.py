@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks import harness
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.structure_from_motion import localise

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import harness
 from benchmarks.rooms import rgbd
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.builtin import camera_path, ground_truth, room
 from nerf2real.scenes.capture.posed.tum import read_tum

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 
 from benchmarks import harness
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.progress import Progress
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import filming, ground_truth
 from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings

@@ -17,9 +17,9 @@ import numpy as np
 from scipy import spatial
 
 from benchmarks import harness
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.builtin import furniture, ground_truth, room
 from nerf2real.scenes.bundle import STAGES, Bundle

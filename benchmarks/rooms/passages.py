@@ -16,8 +16,8 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks import harness
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import furniture, room, solids
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import harness
 from benchmarks.rooms.field_ablation import read_posed
-from nerf2real.core.cameras import PIXEL_CENTRE, Camera
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
 from nerf2real.scenes.bundle import STAGES
 from nerf2real.scenes.field import training as train
 from nerf2real.scenes.field.engine.device import num_threads

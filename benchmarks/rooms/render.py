@@ -23,10 +23,10 @@ harness.one_thread()
 import mujoco
 import numpy as np
 
-from nerf2real.core import rotations
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry import rotations
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain, read_json
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes import bundle
 from nerf2real.scenes.builtin import furniture, room
 from nerf2real.scenes.field.field import Field

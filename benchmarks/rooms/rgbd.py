@@ -22,7 +22,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from benchmarks import harness
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.builtin import filming, ground_truth, room
 from nerf2real.scenes.settings import preset

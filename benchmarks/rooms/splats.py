@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 
 from benchmarks import harness
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.builtin import ground_truth
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export.mjcf import mujoco_quaternion

@@ -31,7 +31,7 @@ import PIL.ExifTags
 import PIL.Image
 
 from benchmarks import harness
-from nerf2real.core.rotations import camera_axes
+from nerf2real.core.geometry.rotations import camera_axes
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.builtin import filming, ground_truth, room
 from nerf2real.scenes.capture.capture import CaptureSettings

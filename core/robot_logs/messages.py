@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 
 COMMANDS, STATES = "/joint_commands", "/joint_states"
 PWM, CURRENTS, VOLTAGES = "/joint_pwm", "/joint_currents", "/joint_voltages"

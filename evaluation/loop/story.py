@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nerf2real.agents.supervision.training import Scripts
-from nerf2real.core.camera_info import read_camera_info
+from nerf2real.core.geometry.camera_info import read_camera_info
 from nerf2real.core.serialization import to_plain, write_json
 from nerf2real.evaluation import side_by_side
 from nerf2real.evaluation.episodes import OUTCOMES, Episode, Store

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from nerf2real.core.rotations import yaw_quaternion
+from nerf2real.core.geometry.rotations import yaw_quaternion
 from nerf2real.suite.op3 import constants
 
 NONE, BLOCKED_CAMERA, MOVED_OBJECT, PERSON = "none", "blocked_camera", "moved_object", "person"

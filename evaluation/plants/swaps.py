@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.real.virtual.body import Body
 from nerf2real.real.virtual.camera import VirtualCamera, move_to
 from nerf2real.scenes.builtin import room

@@ -1,7 +1,8 @@
 """Calibrates a camera from pictures of a checkerboard: an OPENCV model with its uncertainty.
 
-Pixels follow OpenCV and ROS here: the centre of the upper left pixel is (0, 0). `core.cameras`
-has it at (0.5, 0.5); `Calibration.camera` and `core.camera_info` convert. N views.
+Pixels follow OpenCV and ROS here: the centre of the upper left pixel is (0, 0).
+`core.geometry.cameras` has it at (0.5, 0.5); `Calibration.camera` and
+`core.geometry.camera_info` convert. N views.
 """
 
 import dataclasses
@@ -14,7 +15,7 @@ import numpy as np
 import yaml
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 MIN_VIEWS = 8  # chosen: eight numbers of the lens need well more than two views
@@ -61,7 +62,7 @@ class Calibration:
 
   @property
   def camera(self) -> Camera:
-    """The camera in the convention of `core.cameras`."""
+    """The camera in the convention of `core.geometry.cameras`."""
     fx, fy, cx, cy, *distortion = self.values
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return Camera.from_opencv(self.width, self.height, matrix, distortion)

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.robot_logs import messages, streaming
 
 LENGTH = struct.Struct("<I")  # before every pickled message in the pipe

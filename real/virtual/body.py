@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.real.virtual.hidden import Hidden, Load
 from nerf2real.real.virtual.motors import Motors
 from nerf2real.suite.op3 import constants, op3

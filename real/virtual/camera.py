@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import pose_of_mujoco_camera
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import pose_of_mujoco_camera
 from nerf2real.real.clock import Clock
 from nerf2real.real.virtual.body import Body
 from nerf2real.scenes.builtin.mujoco_renderer import Eye

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.alignment.overrides import Overrides

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 
 if TYPE_CHECKING:  # a robot reads places without what finds markers
   from nerf2real.scenes.alignment.markers import MarkerScale

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from scipy import optimize
 
-from nerf2real.core import cameras, least_squares
+from nerf2real.core import least_squares
+from nerf2real.core.geometry import cameras
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.alignment.lines import nearest_point
 

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from nerf2real.core import files
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.alignment import overrides
 
 FLOOR, DISTANCE, ORIGIN, EXTENT = "floor", "distance", "origin", "extent"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.scenes.alignment.planes import across
 
 _CANCELLED = 0.2  # mean length of the cameras' ups below which they are rolled all ways

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from nerf2real.core import rotations, similarity
+from nerf2real.core.geometry import rotations, similarity
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.extent import choose_extent

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerf2real.core.rotations import yaw_matrix
+from nerf2real.core.geometry.rotations import yaw_matrix
 from nerf2real.scenes.alignment.evidence import Choice, Evidence
 from nerf2real.scenes.alignment.marker_place import MarkerPlace, upper_edge
 from nerf2real.scenes.alignment.overrides import Overrides

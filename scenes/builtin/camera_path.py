@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from nerf2real.core.rotations import camera_axes
+from nerf2real.core.geometry.rotations import camera_axes
 
 RATE = 120.0  # samples of a path a second
 _SMOOTHING = 0.5  # standard deviation of the filter that rounds off the rounds' joints [s]

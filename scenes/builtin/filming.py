@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.serialization import from_plain, to_plain, write_json
 from nerf2real.scenes.builtin import camera_path, furniture, room

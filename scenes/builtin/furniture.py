@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.rotations import yaw_matrix as yaw
+from nerf2real.core.geometry.rotations import yaw_matrix as yaw
 from nerf2real.scenes.builtin import art
 from nerf2real.scenes.builtin.placing import ROOM_SIZE, Group, facing
 from nerf2real.scenes.builtin.potted_plant import plant

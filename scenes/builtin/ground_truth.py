@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import camera_axes, yaw_of
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import camera_axes, yaw_of
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import to_plain
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.builtin import filming, furniture, room
 from nerf2real.scenes.builtin.mujoco_renderer import Eye

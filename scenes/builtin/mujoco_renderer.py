@@ -10,8 +10,8 @@ import cv2
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import PIXEL_CENTRE, Camera
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 
 MAX_WIDTH, MAX_HEIGHT = 2560, 2048  # of the pinhole picture [pixel]; the model's offscreen buffer
 _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"

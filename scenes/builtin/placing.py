@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.rotations import yaw_matrix
+from nerf2real.core.geometry.rotations import yaw_matrix
 from nerf2real.scenes.builtin.solids import Solid
 
 ROOM_SIZE = (5.0, 4.0, 2.5)  # x in [-2.5, 2.5], y in [-2, 2], z in [0, 2.5]

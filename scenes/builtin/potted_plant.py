@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.scenes.builtin.placing import ROOM_SIZE, Group
 from nerf2real.scenes.builtin.solids import Solid
 

@@ -12,8 +12,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nerf2real.core import rotations
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry import rotations
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.builtin import furniture, solids, surfaces
 from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.placing import ROOM_SIZE

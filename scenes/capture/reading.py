@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
 from nerf2real.scenes.capture.kinds import source_kind

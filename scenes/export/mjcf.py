@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV, yaw_matrix, yaw_quaternion
 from nerf2real.core.picture_files import write_picture
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV, yaw_matrix, yaw_quaternion
 from nerf2real.scenes.export.texture import TexturedMesh
 from nerf2real.scenes.geometry import collision, convex
 

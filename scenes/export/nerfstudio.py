@@ -7,10 +7,10 @@ import numpy as np
 import trimesh
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.core.picture_files import write_picture
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views
 from nerf2real.scenes.poses import localisation

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.export.mjcf import floor_of
 from nerf2real.scenes.geometry import convex
 

@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.field.field import Field

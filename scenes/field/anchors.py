@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.poses.localisation import Localisation
 
 if TYPE_CHECKING:

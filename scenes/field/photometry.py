@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import scipy.sparse
 
-from nerf2real.core.cameras import PIXEL_CENTRE, Camera
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
 from nerf2real.scenes.poses.localisation import Localisation
 
 _SMOOTHING = (

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field import photometry
 
 BLUR_LEVELS = (0.0, 0.7, 1.4, 2.8, 5.6, 12.0)  # chosen: an octave apart, up to the paper's 12

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerf2real.core import cameras, similarity
+from nerf2real.core.geometry import cameras, similarity
 from nerf2real.core.progress import Progress, no_progress
 
 _MIN_COSINE = 0.15  # steepest incidence that still counts: at 81 degrees depth is mostly noise

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from scipy import spatial
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.geometry.mesh import Mesh
 

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from nerf2real.core import files
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain, write_json
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.posed.colmap_model import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping

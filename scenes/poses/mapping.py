@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses

@@ -5,8 +5,8 @@ Shapes: N cameras, P points.
 
 import numpy as np
 
-from nerf2real.core import rotations
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry import rotations
+from nerf2real.core.geometry.similarity import Similarity
 
 POINT_FRACTION = 0.98  # of the points inside [-1, 1]^3; the rest are outliers and far views
 CAMERA_MARGIN = 1.05  # cameras stay this factor away from the cube's faces

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 
 _CELL = 0.2  # distance of places [m]
 _FINEST = 0.01  # m that a pixel may span at a place: contact geometry is wanted to 5 cm

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from scipy import spatial
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.geometry import collision, convex
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.quality.collision_error import sample_parts

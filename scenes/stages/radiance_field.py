@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress
 from nerf2real.core.serialization import write_json
 from nerf2real.scenes.capture.capture import Capture

@@ -10,7 +10,7 @@ import dataclasses
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import PIXEL_CENTRE, Camera
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.stereo import patchmatch

@@ -10,7 +10,7 @@ import numpy as np
 import viser
 
 from nerf2real.core import palette
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field.render.browser import FieldView, begin_as, serve_field
 from nerf2real.scenes.field.render.renderer import Renderer

@@ -8,7 +8,7 @@ recompiled.
 import mujoco
 import numpy as np
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 
 Array = np.ndarray
 

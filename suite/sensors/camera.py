@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import pose_of_mujoco_camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import pose_of_mujoco_camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.sensors.light import FIXED, Light
 

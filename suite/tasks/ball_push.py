@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from dm_control import composer
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.suite import protocols
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.pose import Pose

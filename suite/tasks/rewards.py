@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from nerf2real.core.rotations import shortest_rotation
+from nerf2real.core.geometry.rotations import shortest_rotation
 
 Array = np.ndarray
 

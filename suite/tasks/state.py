@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from dm_control import composer, mjcf
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.tasks import rewards

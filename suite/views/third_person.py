@@ -11,8 +11,8 @@ import cv2
 import mujoco
 import numpy as np
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import camera_axes
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import camera_axes
 from nerf2real.suite.op3 import op3
 from nerf2real.suite.sensors.camera import GeomCaster, RobotCamera
 from nerf2real.suite.tasks.base import RobotTask

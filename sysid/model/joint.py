@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.plant import JointPlant, declared_parameters, turned_back, turning

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.sensors import optical, pictures, sensed, viewpoint
 from nerf2real.sysid.sensors.sensed import Part, row

@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 
 from nerf2real.core import least_squares
+from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.sysid.model.motion import smooth_motion
 from nerf2real.sysid.sensors import sensed
 from nerf2real.sysid.sensors.sensed import Estimate, Estimates, Part

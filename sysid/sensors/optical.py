@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core import least_squares
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.sensors import pictures, sensed, tracks, viewpoint
 from nerf2real.sysid.sensors.sensed import Estimate, Part, row

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.robot_logs.messages import CAMERA_INFO, IMAGE
 from nerf2real.core.robot_logs.streaming import NANO, Reading, read_messages
 
@@ -25,7 +25,7 @@ _REDUCED = {
   4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
   8: cv2.IMREAD_REDUCED_GRAYSCALE_8,
 }
-_MODELS = ("plumb_bob", "")  # of distortion that core.cameras has: k1, k2, p1, p2
+_MODELS = ("plumb_bob", "")  # of distortion that core.geometry.cameras has: k1, k2, p1, p2
 _ASPECT = 0.01  # relative: pictures that are wider or less wide than the lens says were cropped
 
 

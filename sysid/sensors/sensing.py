@@ -8,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.core.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.sensors import brightness, floor, inertial, optical
 from nerf2real.sysid.sensors.sensed import Part

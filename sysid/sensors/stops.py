@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.core.robot_logs.reading import ImuSeries, Log
 from nerf2real.sysid.model.motion import smooth_motion
 from nerf2real.sysid.sensors import standing

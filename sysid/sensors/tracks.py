@@ -13,7 +13,7 @@ import dataclasses
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import PIXEL_CENTRE
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE
 from nerf2real.sysid.sensors import pictures
 
 Array = np.ndarray

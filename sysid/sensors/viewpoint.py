@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
 from nerf2real.sysid.model.motion import smooth_motion
 
 Array = np.ndarray

@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.rooms import field_ablation
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field.views import Views
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.drawn_rooms import places
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 
 
 def test_a_wrong_place_does_not_move_the_others():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerf2real import suite
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants import swaps
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field.field import FieldSettings
 from nerf2real.scenes.field.settings import TrainSettings
 from nerf2real.scenes.field.views import Views

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.geometry import fusion
 
 # Centre and half size of each box [m]: a room of 5 x 4 x 2.5 m, floor at z = 0.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core.folder_lock import FolderInUseError, lock_folder
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes import checking
 from nerf2real.scenes.bundle import STAGES
 from nerf2real.scenes.capture.media.errors import CaptureError

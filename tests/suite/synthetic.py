@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.geometry.free_space import FreeSpace
 
 # Boxes (lower, upper) [m]: walls of a 6 x 5 m room and furniture.

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.robot_logs import messages
 from nerf2real.core.robot_logs.reading import Log, read_log
 from nerf2real.core.robot_logs.writer import open_log

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses

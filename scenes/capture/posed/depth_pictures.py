@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.media.errors import CaptureError
 
 MILLIMETRE = 1e-3  # m: 7-Scenes', ScanNet's and nerfstudio's depth

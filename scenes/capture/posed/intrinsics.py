@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.camera_info import read_camera_info
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.camera_info import read_camera_info
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.media import stills
 from nerf2real.scenes.capture.media.errors import CaptureError
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.posed.pictures import read_as_posed

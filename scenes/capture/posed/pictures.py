@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.media import stills
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import intrinsics
 

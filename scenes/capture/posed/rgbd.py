@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.rotations import is_rigid
+from nerf2real.core.geometry.rotations import is_rigid
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed.depth_pictures import MILLIMETRE
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses

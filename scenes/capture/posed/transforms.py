@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera, focal_length
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV, is_rigid
+from nerf2real.core.geometry.cameras import Camera, focal_length
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV, is_rigid
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.media.stills import IMAGE_SUFFIXES
 from nerf2real.scenes.capture.posed.depth_pictures import MILLIMETRE

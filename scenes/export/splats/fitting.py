@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import camera_axes
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.core.rotations import camera_axes
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export import views
 from nerf2real.scenes.export.splats import projection, rasteriser, start

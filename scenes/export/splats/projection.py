@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 
 NEAR = 0.05  # nearer splats are not drawn [m]
 FAINTEST = 0.01  # alpha below which a splat does not reach a pixel: MuJoCo Warp's

@@ -7,8 +7,8 @@ import numpy as np
 import viser
 from viser import transforms
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.field.render.renderer import Renderer
 
 _MOVING_WIDTH = 160  # pixels of a picture while the view moves

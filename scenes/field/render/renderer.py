@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field import occupancy as occupancy_lib
 from nerf2real.scenes.field.engine.device import Device
 from nerf2real.scenes.field.field import Field

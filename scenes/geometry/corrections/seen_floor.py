@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from nerf2real.core.cameras import PIXEL_CENTRE
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.geometry import fusion
 

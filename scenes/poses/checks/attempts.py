@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.checks.overlap import CLEAR
 from nerf2real.scenes.poses.mapping import registered

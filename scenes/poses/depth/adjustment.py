@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.poses.depth import lens
 from nerf2real.scenes.poses.depth.matched import Matched

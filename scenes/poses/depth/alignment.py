@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.progress import Progress, no_progress, part
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.posed import agreement, depth_pictures
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _STEPS = (0.5, 0.5, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4)  # of differences

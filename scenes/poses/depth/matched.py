@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.colmap import pycolmap
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.progress import Progress, no_progress, part
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.posed import agreement
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.poses.depth.lens import LENS, Grid, pixels_by_lens, rays_by_lens
 from nerf2real.scenes.poses.depth.matched import Matched
 from nerf2real.scenes.poses.depth.surfaces import normals

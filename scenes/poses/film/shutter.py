@@ -9,7 +9,7 @@ import dataclasses
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import PIXEL_CENTRE, Camera
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
 
 _SETTLE = 3  # fixed-point steps of a pixel's instant; a line moves by a few pixels
 _GRID = 8  # pixels between those whose shift is computed; it is smooth

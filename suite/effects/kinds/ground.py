@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Effect, Kind, Operator, Parameter
 

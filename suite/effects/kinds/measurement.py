@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from nerf2real.core.rotations import matrix_from_rotvec
+from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
 from nerf2real.suite.sensors.delays import History

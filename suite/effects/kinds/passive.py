@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from nerf2real.core.rotations import matrix_from_rotvec
+from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Kind, Operator, Parameter
 from nerf2real.suite.effects.kinds import laws

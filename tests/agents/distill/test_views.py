@@ -15,7 +15,7 @@ from nerf2real.agents.distill import teacher as teachers
 from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.specs import BALL, POSITION, Layout
 from nerf2real.agents.environments.loading import in_scene, make_environment
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from tests.agents.distill.test_turned_heads import world as plain_world  # noqa: F401
 
 COUNT = 24

@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.robot_logs import messages, streaming
 from nerf2real.core.robot_logs import reading as logs
 from nerf2real.core.robot_logs.writer import open_log

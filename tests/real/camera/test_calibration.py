@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from nerf2real.core.camera_info import read_camera_info
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.camera_info import read_camera_info
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.real.camera import calibration
 
 MEASURED = Path("../shared/data/captures/ridgesfm_livingroom/calibrate.mp4")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mcap_ros2.reader import read_ros2_messages
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.robot_logs import messages
 from nerf2real.core.robot_logs import reading as logs
 from nerf2real.core.robot_logs import streaming as recording
@@ -66,7 +66,7 @@ def test_log_is_what_was_told(tmp_path):
   assert found[messages.STAMPS][7].ros_msg.effort == pytest.approx([0, 1e-3, 2e-3], abs=1e-6)
   assert found[messages.CURRENTS][0].ros_msg.effort == pytest.approx([0.1, 0.2, 0.3])
   info = found[messages.CAMERA_INFO][0].ros_msg
-  # The centre of the upper left pixel is (0, 0) in ROS, (0.5, 0.5) in core.cameras.
+  # The centre of the upper left pixel is (0, 0) in ROS, (0.5, 0.5) in core.geometry.
   assert info.k[2] == 31.5 and info.k[5] == 23.5 and info.d[0] == 0.1 and info.d[3] == -0.01
   image = np.frombuffer(found[messages.IMAGE][0].ros_msg.data, np.uint8)
   shown = cv2.imdecode(image, cv2.IMREAD_COLOR)[..., ::-1]

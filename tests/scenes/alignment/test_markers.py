@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.alignment import markers
 from tests.scenes import furnished_room
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 from nerf2real.scenes.alignment import up
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core import cameras, similarity
+from nerf2real.core.geometry import cameras, similarity
 from nerf2real.core.serialization import from_plain, to_plain
 from nerf2real.scenes.alignment import markers, overrides, world_frame, yaw
 from nerf2real.scenes.alignment.evidence import Evidence

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.builtin import ground_truth, room
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks

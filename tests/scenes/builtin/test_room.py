@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import yaw_matrix
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import yaw_matrix
 from nerf2real.scenes.builtin import camera_path, filming, furniture, mujoco_renderer, room, solids
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.export import exporting, gltf, heightfield, mjcf, nerfstudio, texture, usd

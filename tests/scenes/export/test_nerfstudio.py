@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerf2real.core import files
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.capture.posed.transforms import read_transforms
 from nerf2real.scenes.export import nerfstudio
 from nerf2real.scenes.poses import localisation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.export.splats import fitting, projection, rasteriser, start
 from nerf2real.scenes.export.splats.splats import Splats
 from tests.scenes import furnished_room

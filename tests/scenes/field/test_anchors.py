@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pycolmap
 
-from nerf2real.core.rotations import camera_axes
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.rotations import camera_axes
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.field import anchors
 from nerf2real.scenes.poses import localisation
 from tests.scenes import box_views

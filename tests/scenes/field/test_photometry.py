@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field import photometry
 
 CAMERA = Camera(width=16, height=8, fx=10, fy=10, cx=8, cy=4)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field.photometry import Exposure
 from nerf2real.scenes.field.views import BlurPyramid, Views
 from tests.scenes import box_views

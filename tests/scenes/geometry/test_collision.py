@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.geometry import collision, convex, decomposition, floor_plan, fusion
 from nerf2real.scenes.quality import collision_error
 from tests.scenes import furnished_room

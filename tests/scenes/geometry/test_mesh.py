@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy import ndimage
 
-from nerf2real.core import cameras, similarity
+from nerf2real.core.geometry import cameras, similarity
 from nerf2real.scenes import bundle
 from nerf2real.scenes.geometry import fusion, mesh
 from tests.scenes import furnished_room

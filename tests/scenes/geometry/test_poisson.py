@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.geometry import mesh, poisson
 from tests.scenes import furnished_room
 

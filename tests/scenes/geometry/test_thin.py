@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerf2real.core import cameras
-from nerf2real.core.rotations import camera_axes
+from nerf2real.core.geometry import cameras
+from nerf2real.core.geometry.rotations import camera_axes
 from nerf2real.scenes.geometry import collision, fusion, thin
 
 POLE, RADIUS, TOP = np.array([0.1, -0.05]), 0.012, 1.2

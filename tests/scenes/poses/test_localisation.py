@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks
 

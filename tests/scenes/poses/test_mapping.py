@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses import mapping
 from tests.scenes import synthetic_capture as synthetic
 from tests.scenes import synthetic_model

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses import mapping, sharpening
 from nerf2real.scenes.poses.matching import patches
 from tests.scenes import synthetic_model

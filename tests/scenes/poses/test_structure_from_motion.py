@@ -11,9 +11,9 @@ import pycolmap
 import pytest
 
 from benchmarks.rooms import fountain
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.progress import no_progress
-from nerf2real.core.similarity import Similarity
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.capture.reading import read_capture

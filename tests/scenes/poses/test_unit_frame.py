@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses.unit_frame import mean_up, unit_from_source
 from tests.scenes import synthetic_capture as synthetic
 

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.quality import advice

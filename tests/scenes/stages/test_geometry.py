@@ -5,7 +5,7 @@ import types
 
 import numpy as np
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.geometry import collision, floor_plan, mesh
 from nerf2real.scenes.stages import geometry
 from nerf2real.scenes.stages.cache import Made, Stages

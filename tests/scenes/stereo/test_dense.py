@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import PIXEL_CENTRE, Camera
-from nerf2real.core.rotations import camera_axes
+from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
+from nerf2real.core.geometry.rotations import camera_axes
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.stereo.dense import StereoSettings, dense_points
 from nerf2real.scenes.stereo.neighbours import NeighbourSettings, neighbours

@@ -7,7 +7,7 @@ import pytest
 import viser
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.alignment import overrides, picking
 from nerf2real.scenes.viewing.override_panel import OverridePanel, surface_point
 

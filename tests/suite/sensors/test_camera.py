@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.suite.sensors import camera as camera_module
 from nerf2real.suite.sensors.camera import CameraSettings, GeomCaster, RobotCamera
 from tests.suite.synthetic import FlatRenderer

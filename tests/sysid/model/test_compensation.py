@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.core.rotations import matrix_from_rotvec
+from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.suite.effects import Effect, EffectStack
 from nerf2real.sysid.model.joint import JointModel, Load
 from nerf2real.sysid.model.kernel import INDEX as I

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.capture import CaptureSettings
 from tests.scenes import synthetic_capture as synthetic
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.posed import intrinsics
 
 MATRIX = np.array([[525.0, 0, 319.5], [0, 526, 239.5], [0, 0, 1]])

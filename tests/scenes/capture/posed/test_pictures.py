@@ -6,7 +6,7 @@ import PIL.ExifTags
 import PIL.Image
 import pytest
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.posed.pictures import read_as_posed
 from nerf2real.scenes.capture.reading import read_capture
 from tests.scenes.capture.posed.sequences import SETTINGS, write_transforms

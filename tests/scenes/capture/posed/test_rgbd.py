@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.alignment import scale
 from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.floor import Floor

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.rotations import OPENGL_FROM_OPENCV
+from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.scenes.capture.kinds import source_kind
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import trajectory

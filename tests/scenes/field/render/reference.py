@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field import encoding
 from nerf2real.scenes.field.contraction import grid_coordinates
 from nerf2real.scenes.field.field import Field, FieldSettings, Params, query

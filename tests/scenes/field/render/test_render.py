@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.field.field import Field, FieldSettings
 from nerf2real.scenes.field.occupancy import Occupancy
 from nerf2real.scenes.field.render import renderer as render

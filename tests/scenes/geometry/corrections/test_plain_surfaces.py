@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.geometry import fusion
 from nerf2real.scenes.geometry.corrections import plain_surfaces
 from tests.scenes import furnished_room

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nerf2real.core import cameras
+from nerf2real.core.geometry import cameras
 from nerf2real.scenes.geometry.corrections import seen_floor
 from tests.scenes import furnished_room
 

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.capture.media.stills import list_images
 from nerf2real.scenes.poses.checks import agreement
 from nerf2real.scenes.poses.localisation import poses_of

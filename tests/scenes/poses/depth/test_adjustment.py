@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses.depth import adjustment, lens, residuals
 from nerf2real.scenes.poses.depth.matched import Matched
 from tests.scenes import furnished_room

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses.settings import LocaliseSettings
 from nerf2real.scenes.stages import localising
 from nerf2real.scenes.stages.cache import Made, StageResult, Stages

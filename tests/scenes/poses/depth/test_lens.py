@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.poses.depth import lens
 
 _CAMERA = Camera(width=640, height=480, fx=525.0, fy=520.0, cx=318.0, cy=243.0, k1=0.03)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.depth import refinement

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.poses.depth import sensor
 from nerf2real.scenes.poses.tracks import Tracks

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.poses.depth import surfaces
 from nerf2real.scenes.poses.depth.lens import Grid
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf2real.core.similarity import Similarity
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.film import motion_prior
 from nerf2real.scenes.poses.mapping import registered

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping

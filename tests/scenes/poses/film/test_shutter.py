@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.poses.film import shutter
 from nerf2real.scenes.poses.film.readout import motion
 from tests.scenes.poses.film.test_readout import CAMERA, filmed

@@ -7,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from nerf2real.core import rotations
+from nerf2real.core.geometry import rotations
 
 angles = st.floats(-3.1, 3.1)
 

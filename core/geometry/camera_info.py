@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from nerf2real.core.cameras import Camera
+from nerf2real.core.geometry.cameras import Camera
 
 
 def read_camera_info(path: Path) -> Camera:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain, to_plain
-from nerf2real.core.similarity import Similarity
 
 
 @pytest.fixture

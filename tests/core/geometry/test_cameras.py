@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core.cameras import Camera, focal_length
+from nerf2real.core.geometry.cameras import Camera, focal_length
 
 CAMERA = Camera(
   width=64, height=48, fx=50, fy=51, cx=31, cy=25, k1=0.12, k2=-0.05, p1=0.01, p2=-0.005

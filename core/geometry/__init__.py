@@ -1,0 +1,1 @@
+"""Where things are: rotations, similarities, cameras."""
