@@ -6,22 +6,19 @@ keyframes, P points.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.core.progress import Progress, no_progress, part
+from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, sharpening
-from nerf2real.scenes.poses.checks import agreement, certainty, things_alike
-from nerf2real.scenes.poses.checks.attempts import best_of
-from nerf2real.scenes.poses.checks.overlap import CLEAR, overlap
+from nerf2real.scenes.poses.best_model import best_model, sees_more
+from nerf2real.scenes.poses.checks import certainty, things_alike
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.depth import refinement
 from nerf2real.scenes.poses.film import continuity, motion_prior, readout
@@ -34,7 +31,6 @@ from nerf2real.scenes.poses.localisation import (
   save,
 )
 from nerf2real.scenes.poses.matching import features
-from nerf2real.scenes.poses.matching.features import quiet
 from nerf2real.scenes.poses.matching.pairs import repair_pairs
 from nerf2real.scenes.poses.matching.parallax import parallax_share
 from nerf2real.scenes.poses.settings import LocaliseSettings
@@ -43,7 +39,6 @@ from nerf2real.scenes.poses.work import KNOWN_SHARES, Mapped, Steps, prepare_wor
 
 _MODEL_FOLDER, _WORK_FOLDER = "sfm", "work"
 _NAMED = 6  # pictures in a warning
-_CHECKS = 3  # at most: what is out of line once more agrees with yet another wrong place
 
 
 def localise(
@@ -156,7 +151,7 @@ def _map(
   if known is not None:
     fixed = mapping.triangulate(database, images_folder, known, names)
     return Mapped(fixed, f"{words} matching, triangulated with known poses", tuple(warnings))
-  model, mapper, apart, out = _best_model(
+  model, mapper, apart, out = best_model(
     database, images_folder, len(names), settings, steps, times
   )
   if model is None or model.num_reg_images() < settings.repair_below * len(names):
@@ -173,8 +168,8 @@ def _map(
     )
     if added:
       steps.begin("mapping")
-      again = _best_model(database, images_folder, len(names), settings, steps, times)
-      if _sees_more(again.model, model):
+      again = best_model(database, images_folder, len(names), settings, steps, times)
+      if sees_more(again.model, model):
         model, mapper, apart, out = again
         words += f", repaired with {added} pairs of {len(missing)} keyframes that had no place"
   check_registered(model, names, settings, share, film=film)
@@ -184,7 +179,7 @@ def _map(
     steps.begin("mapping")
 
     def map_again(database: Path) -> tuple[pycolmap.Reconstruction | None, str, float]:
-      return _best_model(database, images_folder, len(names), settings, steps, times)[:3]
+      return best_model(database, images_folder, len(names), settings, steps, times)[:3]
 
     found = things_alike.Found(model, mapper, apart)
     model, mapper, apart = things_alike.undeceived(found, database, map_again, seed=settings.seed)
@@ -279,110 +274,6 @@ def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -
   doubt = readout.doubt(found.readout, period)
   warnings = mapped.warnings if doubt is None else (*mapped.warnings, doubt)
   return dataclasses.replace(mapped, model=model, strategy=words, shutter=found, warnings=warnings)
-
-
-class _Best(NamedTuple):
-  """What the mappers found."""
-
-  model: pycolmap.Reconstruction | None
-  how: str
-  apart: float  # how far attempts are apart, see `attempts`
-  out: frozenset[str]  # pictures that were out of a film's line
-
-
-def _best_model(
-  database: Path,
-  images_folder: Path,
-  count: int,
-  settings: LocaliseSettings,
-  steps: Steps,
-  times: Mapping[str, float] | None,
-) -> _Best:
-  """Runs the mapper of the settings, and the other one if that leaves too many keyframes out."""
-  mappers = {"incremental": mapping.map_incrementally, "global": mapping.map_globally}
-  if settings.mapper not in ("auto", *mappers):
-    raise ValueError(f"mapper is {settings.mapper!r}, expected 'auto', 'global' or 'incremental'.")
-  order = list(mappers) if settings.mapper == "auto" else [settings.mapper]
-  best = _Best(None, f"{order[0]} mapper", 0.0, frozenset())
-  attempts = settings.attempts if count <= settings.attempted else 1
-
-  timed = times if times is not None and readout.frame_period(times) is not None else None
-
-  def worth(model: pycolmap.Reconstruction) -> float:
-    if timed is None:
-      return overlap(model).balance
-    return -motion_prior.roughness(*motion_prior.path(model, timed))[1]
-
-  for name in order:
-
-    def attempt(number: int, name: str = name) -> pycolmap.Reconstruction | None:
-      seed, ends = settings.seed + number, (number / attempts, (number + 1) / attempts)
-      report = part(steps.report, *ends)
-      models = mappers[name](database, images_folder, seed=seed, report=report)
-      if not models:
-        return None
-      with quiet():
-        pycolmap.ObservationManager(models[0]).filter_all_points3D(
-          mapping.MAX_ERROR, mapping.MIN_ANGLE
-        )
-      mapping.drop_weak_images(models[0])
-      return models[0]
-
-    found, unsure = best_of(
-      attempt,
-      worth,
-      attempts=attempts,
-      same=settings.max_apart,
-      clear=CLEAR if timed is None else math.inf,  # that it leaps less makes a film no surer
-    )
-    if found is not None:
-      model, what, out = _checked(found, database, images_folder, settings, steps, times)
-      if _sees_more(model, best.model):
-        best = _Best(model, f"{name} mapper{what}", unsure, out)
-    if best.model is not None and best.model.num_reg_images() >= settings.repair_below * count:
-      break
-  return best
-
-
-def _sees_more(
-  model: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction | None
-) -> bool:
-  """Whether a model's pictures see more of what they ought to, see `overlap`; None is the least."""
-  if model is None or other is None:
-    return model is not None
-  return overlap(model).balance > overlap(other).balance
-
-
-def _checked(
-  model: pycolmap.Reconstruction,
-  database: Path,
-  images_folder: Path,
-  settings: LocaliseSettings,
-  steps: Steps,
-  times: Mapping[str, float] | None,
-) -> tuple[pycolmap.Reconstruction, str, frozenset[str]]:
-  """Returns a model without the wrong places that its matches show, what was done, in words, and
-  which pictures were out of a film's line.
-
-  Pictures keep their places where those that are found anew see less of what they ought to. What is
-  out of a film's line is placed once more, by others than those that agreed with the lost place.
-  """
-  placed, out, misled = 0, frozenset[str](), frozenset[tuple[int, int]]()
-  for _ in range(_CHECKS):
-    again, moved = agreement.place_again(
-      model, database, images_folder, seed=settings.seed, misled=misled, report=steps.report
-    )
-    if moved and overlap(again).balance >= overlap(model).balance:
-      model, placed = again, placed + moved
-    if times is None:
-      break
-    lost = continuity.drop_out_of_line(model, database, times)
-    out, misled = out | lost.names, misled | lost.misled
-    if not lost.names:
-      break
-  out -= {image.name for image in mapping.registered(model)}
-  words = f", {placed} pictures placed by what the others see" if placed else ""
-  return model, words + (f", {len(out)} left out of the film's line" if out else ""), out
 
 
 def _describe(
