@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.progress import Progress, no_progress
+from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.scenes.capture.media.stills import list_images, upright_poses
 from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
@@ -21,7 +21,7 @@ from nerf2real.scenes.poses.best_model import best_model, sees_more
 from nerf2real.scenes.poses.checks import certainty, things_alike
 from nerf2real.scenes.poses.checks.registered import check_registered, needed
 from nerf2real.scenes.poses.depth import refinement
-from nerf2real.scenes.poses.film import continuity, motion_prior, readout
+from nerf2real.scenes.poses.film import completion, continuity, motion_prior, readout
 from nerf2real.scenes.poses.localisation import (
   Localisation,
   LocalisationError,
@@ -200,7 +200,11 @@ def _map(
     )
   if times is not None:
     steps.begin("holding")
-    model = motion_prior.hold(model, database, times, report=steps.report)
+    model = motion_prior.hold(model, database, times, report=part(steps.report, 0.0, 0.7))
+    model, lost = completion.complete(
+      model, database, images_folder, times, seed=settings.seed, report=part(steps.report, 0.7, 1.0)
+    )
+    out |= lost
   steps.begin("refining")
   model, lens = mapping.refine(model, report=steps.report)
   dropped = mapping.drop_weak_images(model)

@@ -10,7 +10,7 @@ Source of the prior: Anderson and Barfoot 2015, Full STEAM ahead (white noise on
 Shapes: N pictures in the film's order, O observations, P points.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +31,8 @@ _MEDIAN = 1.538  # of the length of three normal numbers of deviation 1 (Maxwell
 # How many times stiffer than it is a hand is taken to be, one round after the other: what a part
 # that has come apart is held by must first give way. Chosen on maps of one film, of which one leapt
 # again after fewer stiff rounds.
-_STIFF = (30.0, 30.0, 15.0, 6.0, 3.0, 1.0)
+GIVING_WAY = (30.0, 30.0, 15.0, 6.0, 3.0, 1.0)
+AS_IT_IS = (1.0,)  # where nothing has come apart
 _STEPS = 8  # of Gauss and Newton in a round, chosen
 _SETTLED = 1e-3  # of the cost: less is no step worth another
 _DAMPING = 1e-9  # of the curvature, at least
@@ -210,6 +211,7 @@ def hold(
   database: Path,
   times: Mapping[str, float],
   *,
+  rounds: Sequence[float] = GIVING_WAY,
   report: Progress = no_progress,
 ) -> pycolmap.Reconstruction:
   """Returns a film's model whose places are held by what its pictures see and by a hand's motion.
@@ -218,6 +220,7 @@ def hold(
     model: Poses and points; its pictures' names are in the film's order.
     database: Their features and verified matches.
     times: When each picture was taken [s].
+    rounds: How many times stiffer than it is a hand is taken to be in each.
     report: Called with the fraction done and a text.
   """
   centers, taken = path(model, times)
@@ -233,8 +236,8 @@ def hold(
     options.load_all_images = True  # of those of the model, matched or not
     options.image_names = {image.name for image in model.images.values()}
     graph = pycolmap.DatabaseCache.create(opened, options).correspondence_graph
-  for done, stiff in enumerate(_STIFF):
-    report(done / len(_STIFF), "holding the places by a hand's motion")
+  for done, stiff in enumerate(rounds):
+    report(done / len(rounds), "holding the places by a hand's motion")
     _adjust(model, taken, usual / stiff)
     _see_again(model, graph, mapping.MAX_ERROR * stiff**0.5)
   return model
