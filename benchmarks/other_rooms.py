@@ -29,7 +29,7 @@ from nerf2real.scenes.geometry.floor_plan import FreeSpaceSettings
 from nerf2real.scenes.poses.localisation import LocalisationError
 from nerf2real.scenes.quality import image_quality
 from nerf2real.scenes.quality.held_out import ViewScore
-from nerf2real.scenes.settings import preset, with_marker
+from nerf2real.scenes.settings import preset, with_marker, with_steps
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
 _CELL = 0.02  # m of the true map
@@ -106,8 +106,7 @@ def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value
     used = dataclasses.replace(used, marker_side=furniture.MARKER_SIZE)
     used = with_marker(used, MarkerPlace(x, y, float(np.degrees(turn))))
   if settings.train_steps is not None:
-    field = dataclasses.replace(used.train, max_steps=settings.train_steps, max_seconds=None)
-    used = dataclasses.replace(used, train=field)
+    used = with_steps(used, settings.train_steps)
   scene = "scene" if settings.capture == "film" else f"scene_{settings.capture}"
   began = time.process_time()
   try:

@@ -73,6 +73,12 @@ def with_marker(settings: SceneSettings, place: MarkerPlace) -> SceneSettings:
   return dataclasses.replace(settings, align=dataclasses.replace(settings.align, marker_at=place))
 
 
+def with_steps(settings: SceneSettings, steps: int) -> SceneSettings:
+  """Returns settings whose training ends after so many steps, however long they take."""
+  training = dataclasses.replace(settings.train, max_steps=steps, max_seconds=None)
+  return dataclasses.replace(settings, train=training)
+
+
 NO_STEREO = StereoSettings(most_pictures=0)
 # of a first look, whose surfaces are rough anyway: in half the time
 ROUGH_PARTS = CollisionSettings(parts=ConvexSettings(tolerance=0.025))

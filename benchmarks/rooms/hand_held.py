@@ -25,7 +25,7 @@ from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes import pipeline
 from nerf2real.scenes.builtin import camera_path, ground_truth, room
 from nerf2real.scenes.capture.posed.tum import read_tum
-from nerf2real.scenes.settings import preset
+from nerf2real.scenes.settings import preset, with_steps
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
 # TUM's freiburg1 has this focal length and principal point, and a stronger distortion.
@@ -67,6 +67,8 @@ class Settings(harness.Options):
   """Pictures of the recording."""
   preset: str = "fast"
   """Preset of the scene."""
+  train_steps: int | None = None
+  """Of the training; as many as the preset's time allows for None."""
   record: bool = True
   """Make the recording; otherwise it is there."""
   scene: bool = True
@@ -132,10 +134,11 @@ def make_scene(folder: Path, settings: Settings) -> dict[str, harness.Value]:
     when = np.array([float(files[row].stem) for row in rows]) - _CLOCK
     return ground_truth.compare(result, _walk(settings.seed).pose(when))
 
+  used = preset(settings.preset)
+  if settings.train_steps is not None:
+    used = with_steps(used, settings.train_steps)
   spent = time.process_time()
-  made = pipeline.make_scene(
-    folder, settings.work / "scene", settings=preset(settings.preset), measure=measure
-  )
+  made = pipeline.make_scene(folder, settings.work / "scene", settings=used, measure=measure)
   names = ["registered_fraction", "held_out_psnr_db", "robot_psnr_db", "camera_rmse_m"]
   names += ["camera_rotation_deg", "collision_true_within_5cm", "collision_true_p95_m"]
   names += ["surface_true_within_5cm", "free_area_m2", "scale_error", "sight_lines_blocked"]

@@ -38,7 +38,7 @@ from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.media import stills
 from nerf2real.scenes.capture.reading import read_capture
 from nerf2real.scenes.poses.matching import features
-from nerf2real.scenes.settings import preset, with_marker
+from nerf2real.scenes.settings import preset, with_marker, with_steps
 from nerf2real.scenes.stages.results import Reconstruction, TruthFigures
 
 _LENS = filming.LENS.resized(1920, 1440)
@@ -82,6 +82,8 @@ class Settings(harness.Options):
   """Whether the folder is one as people send it."""
   preset: str = "tiny"
   """Preset of the scene."""
+  train_steps: int | None = None
+  """Of the training; as many as the preset's time allows for None."""
   scene: bool = True
   """Make a scene, and measure it against the truth."""
   seed: int = 0
@@ -253,11 +255,14 @@ def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str,
 
   used = dataclasses.replace(preset(settings.preset), marker_side=ground_truth.MARKER_SIDE)
   used = with_marker(used, ground_truth.MARKER_AT)
+  if settings.train_steps is not None:
+    used = with_steps(used, settings.train_steps)
   began = time.perf_counter()
   made = pipeline.make_scene(folder, settings.work / "scene", settings=used, measure=measure)
   seconds = time.perf_counter() - began
   names = ["registered_fraction", "held_out_psnr_db", "robot_psnr_db", "camera_rmse_m"]
   names += ["collision_true_within_5cm", "surface_true_within_5cm", "free_area_m2", "scale_error"]
+  names += ["sight_lines_blocked"]
   figures: dict[str, harness.Value] = {name: float(made.figures[name]) for name in names}
   for warning in made.scene["warnings"]:
     print("warning:", warning)
