@@ -207,7 +207,7 @@ def _keyframes(source: Path, folder: Path) -> tuple[float, float]:
 
 def _features(folder: Path, database: Path) -> tuple[float, float]:
   """Seconds of processor time a picture for features, and peak memory [MB] of this process."""
-  names = sorted(path.name for path in folder.glob("*.jpg"))[:_READ]
+  names = [path.name for path in stills.list_images(folder)][:_READ]
   began = time.process_time()
   settings = features.FeatureSettings()
   features.extract_features(database, folder, names, settings=settings)

@@ -9,6 +9,7 @@ where a picture shows it, bent by an affine map and changed by a gain and an off
 import functools
 import os
 from collections import defaultdict
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +26,8 @@ _REACH = 4.0  # from there to the edge, times a feature's scale: two thirds of i
 _WINDOW = 0.6  # deviation of the samples' weights, times the way to the edge
 _LEVELS = 4  # of a pyramid
 _BLUR = 0.8  # of its first, deviation [pixel]: places between pixels of sharper ones are biased
-_HELD = 64  # pyramids in memory
+_MEMORY = 1 << 30  # bytes of pyramids that are held; chosen
+_LEAST_HELD = 64  # of them, chosen
 _ROUNDS = 12  # of the search
 _SETTLED = 0.02  # step that ends it [sample]
 _FARTHEST = 3.0  # from the detector's place [sample]
@@ -223,6 +225,18 @@ def _features(
   return found
 
 
+def _held(model: pycolmap.Reconstruction) -> int:
+  """How many pyramids of a model's pictures are held in memory."""
+  largest = max(camera.width * camera.height for camera in model.cameras.values())
+  return max(_LEAST_HELD, _MEMORY * 3 // (4 * largest))
+
+
+def _in_blocks(pairs: Collection[tuple[int, int]], size: int) -> list[tuple[int, int]]:
+  """Pairs of pictures in an order in which so many of either side come again and again."""
+  row = {image: k for k, image in enumerate(sorted({image for pair in pairs for image in pair}))}
+  return sorted(pairs, key=lambda pair: (row[pair[0]] // size, row[pair[1]] // size, pair))
+
+
 def align(
   model: pycolmap.Reconstruction,
   database: Path,
@@ -255,7 +269,8 @@ def align(
     for one in seen:
       if one is not largest:
         pairs[largest.image, one.image].append((largest.row, one.row))
-  pyramid = functools.lru_cache(_HELD)(lambda image: _pyramid(images_folder / names[image]))
+  held = _held(model)
+  pyramid = functools.lru_cache(held)(lambda image: _pyramid(images_folder / names[image]))
   along = np.exp(-0.5 * (np.arange(-_HALF, _HALF + 1) / (_WINDOW * _HALF)) ** 2)
 
   def find(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -267,7 +282,7 @@ def align(
 
   lost = []
   with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-    order = sorted(pairs)
+    order = _in_blocks(pairs, held // 2)
     for done, (pair, (places, found)) in enumerate(zip(order, pool.map(find, order), strict=True)):
       shown = model.images[pair[1]].points2D
       for (_, row), place, is_found in zip(pairs[pair], places, found, strict=True):

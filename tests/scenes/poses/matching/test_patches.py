@@ -1,5 +1,7 @@
 """Patches of a warped texture, whose places are known exactly."""
 
+import functools
+
 import cv2
 import numpy as np
 import pycolmap
@@ -86,3 +88,16 @@ def test_a_picture_that_is_gone_is_named(capture):
   (folder / "b.png").unlink()
   with pytest.raises(ValueError, match=r"b\.png cannot be read"):
     patches.align(model, database, folder)
+
+
+def test_pictures_are_read_few_times_though_few_are_held():
+  pairs = [(i, j) for i in range(0, 90, 3) for j in range(0, 90, 3) if i != j]
+  rng = np.random.default_rng(0)
+  rng.shuffle(pairs)
+  order = patches._in_blocks([tuple(pair) for pair in pairs], 5)
+  assert sorted(order) == sorted(map(tuple, pairs))
+  read = functools.lru_cache(10)(lambda image: image)
+  for pair in order:
+    for image in pair:
+      read(image)
+  assert read.cache_info().misses <= 6 * 6 * 10  # of 6 x 6 blocks, each of 5 and 5 pictures
