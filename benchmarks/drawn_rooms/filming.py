@@ -13,6 +13,7 @@ from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.builtin import camera_path, filming, room
 from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.room import TrueRoom
+from nerf2real.scenes.poses.mapping import camera_fault
 
 Random = np.random.Generator
 
@@ -124,16 +125,19 @@ def walk(true_room: TrueRoom, walked: Sequence[Round], *, seconds: float = _SECO
 def lens(random: Random) -> Camera:
   """Returns a phone's camera for films of 640x480."""
   focal = random.uniform(430.0, 620.0)
-  return Camera(
+  drawn = Camera(
     width=640,
     height=480,
     fx=focal,
     fy=focal * random.uniform(0.997, 1.003),
     cx=320 + random.uniform(-6, 6),
     cy=240 + random.uniform(-6, 6),
-    k1=random.uniform(-0.06, 0.1),
-    k2=random.uniform(-0.12, 0.02),
   )
+  while True:
+    k1, k2 = random.uniform(-0.06, 0.1), random.uniform(-0.12, 0.02)
+    camera = dataclasses.replace(drawn, k1=k1, k2=k2)
+    if camera_fault(camera) is None:  # one of a hundred folds its corners
+      return camera
 
 
 def lights(random: Random) -> tuple[list[tuple[tuple[float, ...], tuple[float, ...]]], float]:

@@ -23,6 +23,8 @@ _NEAREST = 0.02  # of a picture's median depth, chosen: nearer points lie in it,
 LOSS_SCALE = 1.0  # of the soft L1 loss in the final adjustment [pixel]
 _MAX_PRINCIPAL_SHIFT = 0.08  # of the principal point from the middle, times the picture's size
 _MAX_FOCAL_CHANGE = 0.05  # of the focal length when the principal point is freed, relative
+_LEAST_SLOPE = 0.2  # of the radial polynomial, up to a picture's corners
+_WIDEST = 3.0  # times its corner: so far off is looked for what a picture shows there
 _MAX_ASPECT = 0.05  # of fx / fy from 1; phones and cameras have square pixels
 NOTHING = (ValueError, RuntimeError)  # what pycolmap raises
 
@@ -205,14 +207,17 @@ def _adjust(
 def camera_fault(camera: Camera) -> str | None:
   """Returns what is impossible about an estimated camera, None if nothing is.
 
-  The radial polynomial r (1 + k1 r^2 + k2 r^4) must grow up to the farthest corner: where parallax
-  is low, distortion trades against depth and folds the picture.
+  The radial polynomial r (1 + k1 r^2 + k2 r^4) must reach the farthest corner while it grows: where
+  parallax is low, distortion trades against depth and folds the picture.
   """
   x = max(camera.cx, camera.width - camera.cx) / camera.fx
   y = max(camera.cy, camera.height - camera.cy) / camera.fy
-  radius = np.linspace(0, np.hypot(x, y), 100)
+  corner = np.hypot(x, y)
+  radius = np.linspace(0, _WIDEST * corner, 300)
   slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
-  if slope.min() < 0.2:
+  grows = np.logical_and.accumulate(slope >= _LEAST_SLOPE)
+  shown = radius * (1 + camera.k1 * radius**2 + camera.k2 * radius**4)
+  if shown[grows].max() < corner:
     return f"distortion k1={camera.k1:.2f}, k2={camera.k2:.2f} folds the picture's corners"
   shift_x = abs(camera.cx / camera.width - 0.5)
   shift_y = abs(camera.cy / camera.height - 0.5)

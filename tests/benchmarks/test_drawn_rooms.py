@@ -28,6 +28,14 @@ def test_a_hand_walks_clear_of_things(seed):
   assert places[:, 2].max() > 1.3
 
 
+@pytest.mark.parametrize("seed", [0, 51, 90])
+def test_a_lens_shows_something_in_its_corners(seed):
+  camera = filming.lens(np.random.default_rng([seed, 4]))
+  corners = np.array([[0.0, 0.0], [camera.width, 0.0], [0.0, camera.height]])
+  rays = camera.rays(corners)
+  np.testing.assert_allclose(camera.project(rays), corners, atol=0.1)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_things_are_whole_and_in_the_room(seed):
   found = drawn(seed)

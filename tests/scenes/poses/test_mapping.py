@@ -69,6 +69,8 @@ def test_points_in_a_camera_are_dropped_and_no_others():
     ({}, None),
     ({"k1": 0.06, "k2": -0.09}, None),
     ({"k1": -0.9}, "folds"),
+    ({"fx": 215.5, "fy": 215.5, "k1": -0.05, "k2": -0.117}, "folds"),  # grows, but not to a corner
+    ({"k1": 1.0, "k2": -1.8}, None),  # folds behind the corners
     ({"k2": -2.0}, "folds"),
     ({"cx": 200.0}, "principal point"),
     ({"fy": 330.0}, "differ"),
