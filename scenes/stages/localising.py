@@ -41,7 +41,7 @@ _PICTURES_VERSION = 5  # of all others; 5: colours of other profiles
 # 12: by what pictures lack; a film's line is the one that least contradicts; matches are kept of
 # what came with depth; 13: uncertain pictures of films are left out, too; 14: patches are aligned;
 # 15: a film is held by a hand's motion
-_POSES_VERSION = 16
+_POSES_VERSION = 17
 _ALIGNED_VERSION = 1
 _MATCHES = "matches.db"  # what pictures with depth show alike
 _ALIGNED_RECORD = "aligned.json"  # the factor on the depth's unit
