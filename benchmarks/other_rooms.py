@@ -105,8 +105,7 @@ def make(folder: Path, seed: int, settings: Settings) -> dict[str, harness.Value
     x, y, turn = drawn.marker
     used = dataclasses.replace(used, marker_side=furniture.MARKER_SIZE)
     used = with_marker(used, MarkerPlace(x, y, float(np.degrees(turn))))
-  if settings.train_steps is not None:
-    used = with_steps(used, settings.train_steps)
+  used = with_steps(used, settings.train_steps)
   scene = "scene" if settings.capture == "film" else f"scene_{settings.capture}"
   began = time.process_time()
   try:

@@ -73,8 +73,11 @@ def with_marker(settings: SceneSettings, place: MarkerPlace) -> SceneSettings:
   return dataclasses.replace(settings, align=dataclasses.replace(settings.align, marker_at=place))
 
 
-def with_steps(settings: SceneSettings, steps: int) -> SceneSettings:
-  """Returns settings whose training ends after so many steps, however long they take."""
+def with_steps(settings: SceneSettings, steps: int | None) -> SceneSettings:
+  """Returns settings whose training ends after so many steps, however long they take; for None
+  those that were given."""
+  if steps is None:
+    return settings
   training = dataclasses.replace(settings.train, max_steps=steps, max_seconds=None)
   return dataclasses.replace(settings, train=training)
 

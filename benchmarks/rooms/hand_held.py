@@ -134,9 +134,7 @@ def make_scene(folder: Path, settings: Settings) -> dict[str, harness.Value]:
     when = np.array([float(files[row].stem) for row in rows]) - _CLOCK
     return ground_truth.compare(result, _walk(settings.seed).pose(when))
 
-  used = preset(settings.preset)
-  if settings.train_steps is not None:
-    used = with_steps(used, settings.train_steps)
+  used = with_steps(preset(settings.preset), settings.train_steps)
   spent = time.process_time()
   made = pipeline.make_scene(folder, settings.work / "scene", settings=used, measure=measure)
   names = ["registered_fraction", "held_out_psnr_db", "robot_psnr_db", "camera_rmse_m"]

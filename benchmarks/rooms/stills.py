@@ -255,8 +255,7 @@ def make_scene(folder: Path, poses: np.ndarray, settings: Settings) -> dict[str,
 
   used = dataclasses.replace(preset(settings.preset), marker_side=ground_truth.MARKER_SIDE)
   used = with_marker(used, ground_truth.MARKER_AT)
-  if settings.train_steps is not None:
-    used = with_steps(used, settings.train_steps)
+  used = with_steps(used, settings.train_steps)
   began = time.perf_counter()
   made = pipeline.make_scene(folder, settings.work / "scene", settings=used, measure=measure)
   seconds = time.perf_counter() - began

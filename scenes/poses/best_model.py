@@ -1,7 +1,8 @@
 """Maps verified matches: attempts by the mappers, of which the best is checked and kept.
 
-What of attempts and mappers is best, photographs say by what they ought to see of each other, and a
-film by how little its camera leaps.
+Of attempts at photographs that one is best whose pictures see most of what they ought to of each
+other, of attempts at a film the one whose camera leaps least. Of two mappers' models, checked, it
+is always the former.
 """
 
 import math

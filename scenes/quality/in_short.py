@@ -47,6 +47,11 @@ def _misses(figures: Mapping[str, Any]) -> tuple[float, float] | None:
   return figures[names[0]], figures[names[1]]
 
 
+def _cm(metres: float) -> str:
+  """Centimetres to two digits, and whole ones from ten on."""
+  return f"{100 * metres:.0f}" if metres >= 0.1 else f"{100 * metres:.2g}"
+
+
 def _geometry(figures: Mapping[str, Any]) -> Answer:
   question = "Is the contact geometry fit to train in?"
   misses = _misses(figures)
@@ -55,8 +60,8 @@ def _geometry(figures: Mapping[str, Any]) -> Answer:
   blocked, missed = misses
   fit = max(misses) <= FIT
   words = [
-    f"Of the lines of sight to localised points 5 % meet matter {100 * blocked:.2g} cm or more"
-    f" before their point, of the points 5 % lie {100 * missed:.2g} cm or more from all matter;"
+    f"Of the lines of sight to localised points 5 % meet matter {_cm(blocked)} cm or more"
+    f" before their point, of the points 5 % lie {_cm(missed)} cm or more from all matter;"
     f" at most {100 * FIT:.0f} cm is asked of both."
   ]
   return Answer(question, "Yes" if fit else "No", words, "good" if fit else "warn")

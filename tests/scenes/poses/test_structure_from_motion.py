@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -29,7 +28,6 @@ from nerf2real.scenes.poses.unit_frame import mean_up
 from nerf2real.scenes.poses.work import SHARES, Mapped, Steps, prepare_work
 from tests.scenes import synthetic_capture as synthetic
 
-FOUNTAIN = Path(__file__).parents[4] / "shared" / "data" / "captures" / "fountain-P11"
 FEW = LocaliseSettings(features=FeatureSettings(few_num_features=800), attempts=1)
 
 
@@ -388,14 +386,3 @@ def test_figures_are_plain_json(corner):
   assert values["registered_fraction"] == 1.0
   assert set(values["seconds"]) == set(SHARES) - {"holding", "shutter"}
   assert isinstance(result.camera, Camera)
-
-
-def test_fountain():
-  if not FOUNTAIN.is_dir():
-    pytest.skip("needs ../shared/data/captures/fountain-P11")
-  _, truth = fountain.read_truth(FOUNTAIN / "gt_dense_cameras")
-  errors = fountain.pose_errors(
-    Similarity(0.2, cv2.Rodrigues(np.ones(3))[0]).apply_pose(truth), truth
-  )
-  assert errors.position_rmse < 1e-9
-  assert errors.rotation_rmse < 1e-6

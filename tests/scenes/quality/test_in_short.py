@@ -30,6 +30,11 @@ def test_a_good_room_is_said_to_be_one():
   assert size.answer == "From a marker of known size" and "0.3 %" in size.details[0]
 
 
+def test_metres_are_told_in_plain_centimetres():
+  _, geometry, _, _ = answers({**GOOD, "sight_lines_blocked_p95_m": 1.72})
+  assert "5 % meet matter 172 cm or more" in geometry.details[0]
+
+
 def test_what_is_wrong_stands_out():
   figures = {
     **GOOD,

@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from nerf2real.core.geometry.similarity import Similarity
-from nerf2real.scenes.poses.film import continuity
+from nerf2real.scenes.poses.film import continuity, motion_prior
 from nerf2real.scenes.poses.film.completion import complete
 from nerf2real.scenes.poses.localisation import poses_of
 from nerf2real.scenes.poses.mapping import registered
@@ -34,6 +34,20 @@ def test_the_middle_of_a_film_gets_its_place(film):
   off = np.linalg.norm(Similarity.fit(places, truth).apply(places) - truth, axis=1)
   assert off.max() < 0.004
   assert model.num_reg_images() == len(names) - 2  # the map that was given is as it was
+
+
+def test_the_line_judges_what_is_held(film, monkeypatch):
+  model, rest, _ = film
+  held, judged = pycolmap.Reconstruction(model), []
+  monkeypatch.setattr(motion_prior, "hold", lambda *args, **options: held)
+
+  def drop(found, database, times):
+    judged.append(found)
+    return continuity.OutOfLine(frozenset(), frozenset())
+
+  monkeypatch.setattr(continuity, "drop_out_of_line", drop)
+  assert complete(model, *rest, seed=0) == (held, frozenset())
+  assert judged == [held]
 
 
 def test_what_is_out_of_line_loses_its_place_again(film, monkeypatch):
