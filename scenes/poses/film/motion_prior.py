@@ -23,7 +23,7 @@ from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.posed.colmap_model import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.elimination import eliminate
+from nerf2real.scenes.poses.elimination import Sights, eliminate
 from nerf2real.scenes.poses.mapping import registered
 from nerf2real.scenes.poses.matching.features import quiet
 
@@ -129,11 +129,10 @@ class _Film:
   def step(self, damping: float) -> _State:
     """The state after a damped Gauss-Newton step."""
     state, still = self.state, np.zeros(3)
-    outer, inner, errors = [], [], []
+    by_pose, by_point, errors = [], [], []
     for picture, pixels in enumerate(self._pixels):
       local = self._local(state, picture)
       if not len(local):
-        outer.append(np.zeros((0, 6)))
         continue
       _, slope = cv2.projectPoints(
         local, still, still, self._camera.opencv_matrix, self._camera.distortion
@@ -141,16 +140,18 @@ class _Film:
       slope = slope.reshape(len(local), 2, -1)
       error = self._camera.project(local) - pixels
       weight = (1.0 + np.square(error).sum(-1)) ** -0.25 * (local[:, 2] > 0)  # soft L1's root
-      outer.append((weight[:, None, None] * slope[..., :6]).reshape(-1, 6))
-      inner.append(weight[:, None, None] * slope[..., 3:6] @ state.rotations[picture])
-      errors.append((weight[:, None] * error).ravel())
-    reduced = eliminate(
-      sparse.block_diag(outer, format="csr"),
-      np.concatenate(inner),
-      self._point,
-      np.concatenate(errors),
-      damping=_DAMPING + damping,
+      by_pose.append(weight[:, None, None] * slope[..., :6])
+      by_point.append(by_pose[-1][..., 3:] @ state.rotations[picture])
+      errors.append(weight[:, None] * error)
+    sights = Sights(
+      picture=np.repeat(np.arange(len(self._pixels)), np.diff(self._ends)),
+      point=self._point,
+      by_pose=np.concatenate(by_pose),
+      by_point=np.concatenate(by_point),
+      shared=np.zeros((len(self._point), 2, 0)),
+      errors=np.concatenate(errors),
     )
+    reduced = eliminate(sights, len(self._pixels), damping=_DAMPING + damping)
     centers = state.centers
     by_move = np.concatenate([np.zeros_like(state.rotations), -state.rotations.swapaxes(1, 2)], -1)
     moved = sparse.block_diag(by_move, format="csr")  # the centers, by the unknowns

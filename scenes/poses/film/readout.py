@@ -13,14 +13,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.posed.colmap_model import to_opencv
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
-from nerf2real.scenes.poses.elimination import eliminate
+from nerf2real.scenes.poses.elimination import Sights, eliminate
 from nerf2real.scenes.poses.film.shutter import Shutter, instants
 from nerf2real.scenes.poses.mapping import registered
 
@@ -133,12 +132,13 @@ def _change(
     lens: Columns of `cv2.projectPoints`'s Jacobian that are free.
   """
   camera, moves = to_opencv(next(iter(model.cameras.values()))), motion(model, times, _SMALL)
-  still, ids = np.zeros(3), []
-  outer, inner, errors = [], [], []  # by poses, lens and readout, by points
+  still, ids, pictures = np.zeros(3), [], []
+  by_pose, by_point, by_all, errors = [], [], [], []  # all: lens and readout
   for index, (image, sight) in enumerate(zip(registered(model), measured, strict=True)):
     if not len(sight.rows):
       continue
     local, pose = _local_points(model, image, sight.rows), image.cam_from_world()
+    pictures.append(len(local))
     ids.append([image.points2D[int(k)].point3D_id for k in sight.rows])
     _, slope = cv2.projectPoints(local, still, still, camera.opencv_matrix, camera.distortion)
     slope, found = slope.reshape(len(local), 2, -1), camera.project(local)
@@ -146,20 +146,20 @@ def _change(
     ahead = moves.project(local, instants(sight.pixels, camera), index, camera) - found
     weight = (1.0 + np.square(error).sum(-1) / mapping.LOSS_SCALE**2) ** -0.25  # soft L1's root
     weight = weight[:, None, None]
-    own = np.concatenate([slope[..., :6], slope[..., lens], ahead[..., None]], -1)
-    outer.append(weight * own)
-    inner.append(weight * slope[..., 3:6] @ pose.rotation.matrix())
-    errors.append((weight[..., 0] * error).ravel())
+    by_pose.append(weight * slope[..., :6])
+    by_point.append(weight * slope[..., 3:6] @ pose.rotation.matrix())
+    by_all.append(weight * np.concatenate([slope[..., lens], ahead[..., None]], -1))
+    errors.append(weight[..., 0] * error)
   _, point = np.unique(np.concatenate(ids), return_inverse=True)
-  poses = sparse.block_diag([part[..., :6].reshape(-1, 6) for part in outer], format="csr")
-  of_all = np.concatenate([part[..., 6:].reshape(-1, part.shape[-1] - 6) for part in outer])
-  reduced = eliminate(
-    sparse.hstack([poses, sparse.csr_matrix(of_all)], format="csr"),
-    np.concatenate(inner),
-    point,
-    np.concatenate(errors),
-    damping=_DAMPING,
+  sights = Sights(
+    picture=np.repeat(np.arange(len(pictures)), pictures),
+    point=point,
+    by_pose=np.concatenate(by_pose),
+    by_point=np.concatenate(by_point),
+    shared=np.concatenate(by_all),
+    errors=np.concatenate(errors),
   )
+  reduced = eliminate(sights, len(pictures), damping=_DAMPING)
   return _SMALL * float(np.linalg.solve(reduced.curvature, -reduced.gradient)[-1])
 
 
