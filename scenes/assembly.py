@@ -120,6 +120,7 @@ def assemble(
     "alignment": alignment,
     "extent": {"lower": alignment.extent_lower, "upper": alignment.extent_upper},
     "goals": goals,
+    "views": views_of(alignment.world_from_unit.apply_pose(poses.world_from_camera)),
     "camera": poses.camera,
     "collision_parts": sorted(file.name for file in (out / "collision").glob("part_*.obj")),
     "figures": figures,
@@ -128,6 +129,14 @@ def assemble(
   }
   bundle.write_scene(out, scene)
   return bundle.Bundle.load(out)
+
+
+def views_of(world_from_camera: np.ndarray) -> dict[str, np.ndarray]:
+  """What scene.json says of where pictures were taken, of their poses [N, 4, 4]."""
+  return {
+    "position": np.round(world_from_camera[:, :3, 3], 3),
+    "axis": np.round(world_from_camera[:, :3, 2], 3),
+  }
 
 
 def _copy_files(results: SceneResults, out: Path) -> None:

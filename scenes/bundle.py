@@ -133,6 +133,15 @@ class Bundle:
     return np.array(self.scene["extent"]["lower"]), np.array(self.scene["extent"]["upper"])
 
   @property
+  def views(self) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where the capture's pictures were taken [N, 3] [m] and their optical axes [N, 3], world.
+
+    None in a bundle of an older version, which lacks them.
+    """
+    found = self.scene.get("views")
+    return None if found is None else (np.array(found["position"]), np.array(found["axis"]))
+
+  @property
   def goals(self) -> np.ndarray:
     """Goal positions (x, y) on the floor [G, 2] [m]."""
     return np.array(self.scene["goals"], np.float64).reshape(-1, 2)

@@ -20,7 +20,7 @@ from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.scene import open_scene
 from nerf2real.suite.views.drivers import SCRIPTED, Driver, MakeDriver, move_on
-from nerf2real.suite.views.third_person import best_azimuth, clear_distance, direction
+from nerf2real.suite.views.third_person import best_angles, clear_distance, direction
 from nerf2real.suite.views.viewer_elements import bars, geom_mesh
 
 _SPRING = 40.0  # N/m between the handle that is dragged and the torso
@@ -107,7 +107,7 @@ class TaskViewer:
     """Puts a camera of the page where nothing stands between it and the robot."""
     environment = self._environment
     position, physics = environment.task.state.position, environment.physics
-    way = direction(best_azimuth(environment.task, physics))
+    way = direction(best_angles(environment.task, physics))
     distance = clear_distance(physics, position, way)
     camera.position = tuple(position + distance * way)
     camera.look_at = tuple(position)

@@ -1,8 +1,9 @@
 """A spectator's view of the robot in its room: the radiance field with the moving geoms in it.
 
 No GL is needed: field and geoms come from the same renderers as the robot's own picture. The view
-stays where nothing of the room stands between it and the robot, and turns around it where the room
-would bring it too near. Shapes: H height, W width.
+stays where nothing of the room stands between it and the robot, about where the capture looked from
+where that is known, and turns around it where the room would bring it too near. Shapes: H height,
+W width.
 """
 
 from typing import Any
@@ -17,11 +18,13 @@ from nerf2real.suite.op3 import op3
 from nerf2real.suite.sensors.camera import GeomCaster, RobotCamera
 from nerf2real.suite.tasks.base import RobotTask
 
-_DISTANCE, _ELEVATION = 1.4, np.deg2rad(22.0)  # m and rad from the robot
+_DISTANCE = 1.4  # m from the robot
+_ELEVATIONS = np.deg2rad([22.0, 35.0, 50.0])  # that are tried; the first is the preferred one
 _FIELD_OF_VIEW = np.deg2rad(42.0)  # vertical
 _PREFERRED = np.deg2rad(130.0)  # rad from the robot's heading: beside and a little behind it
-_DIRECTIONS = 24  # directions that are tried
+_DIRECTIONS = 24  # azimuths that are tried
 _FLOOR_BONUS, _TURN_COST = 0.7, 0.05  # worth of free floor below the view [m], of turning [m/rad]
+_UNSEEN_COST = 1.0  # of a view that the capture lacks, for each metre and radian that it is off
 _CLEARANCE = 0.15  # m kept from what stands behind the view
 _FOLLOW = 0.06  # share of the way by which the view follows the robot in a frame
 _NEAR = 1.0  # m: from nearer the robot, 0.5 m tall, fills two thirds of the picture's height
@@ -32,10 +35,11 @@ _FLOOR_HEIGHT = 0.04  # m: what is lower than this takes a shadow
 _SHADOW_DEPTH, _SHADOW_RADIUS = 0.5, 0.09  # darkening under a body, and its standard deviation [m]
 
 
-def direction(azimuth: float) -> np.ndarray:
-  """Returns the unit vector [3] from the robot to a view at an azimuth [rad]."""
-  level = np.cos(_ELEVATION)
-  return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(_ELEVATION)])
+def direction(angles: np.ndarray) -> np.ndarray:
+  """Returns the unit vector [3] from the robot to a view at azimuth and elevation [2] [rad]."""
+  azimuth, elevation = angles
+  level = np.cos(elevation)
+  return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
 
 
 def clear_distance(physics: Any, start: np.ndarray, way: np.ndarray) -> float:
@@ -49,28 +53,38 @@ def clear_distance(physics: Any, start: np.ndarray, way: np.ndarray) -> float:
   return float(np.clip(free, 0.3, _DISTANCE))
 
 
-def best_azimuth(task: RobotTask, physics: Any, *, preferred: float | None = None) -> float:
-  """Returns the direction [rad] from the robot in which a view sees it best.
+def best_angles(task: RobotTask, physics: Any, *, preferred: float | None = None) -> np.ndarray:
+  """Returns azimuth and elevation [2] [rad] from the robot of a view that sees it best.
 
-  It is clear of the room's parts and, if there is such a one, above floor where the robot could
-  walk: there the field has been filmed from all around. Of several, the one nearest to the
-  preferred direction.
+  It is clear of the room's parts, near a view that the capture has, where the scene knows these,
+  and, if there is such a one, above floor where the robot could walk. Of several, the one nearest
+  to the preferred azimuth and to level.
 
   Args:
     task: The task.
     physics: Its compiled model and state.
-    preferred: The preferred direction [rad]; beside the robot and a little behind it if None.
+    preferred: The preferred azimuth [rad]; beside the robot and a little behind it if None.
   """
   position = task.state.position
   preferred = task.state.yaw + _PREFERRED if preferred is None else preferred
   turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-  turns = np.where(turns > np.pi, turns - 2 * np.pi, turns)  # from the preferred direction
-  ways = np.array([direction(preferred + turn) for turn in turns])
+  turns = np.where(turns > np.pi, turns - 2 * np.pi, turns)  # from the preferred azimuth
+  views = getattr(task.scene, "views", None)
+  elevations = _ELEVATIONS[:1] if views is None else _ELEVATIONS
+  turn, elevation = (grid.ravel() for grid in np.meshgrid(turns, elevations))
+  angles = np.stack([preferred + turn, elevation], axis=1)
+  ways = np.array([direction(each) for each in angles])
   free = np.array([clear_distance(physics, position, way) for way in ways])
-  places = (position + free[:, None] * ways)[:, :2]
-  above_floor = np.asarray(task.scene.free_space.is_reachable(places), np.float64)
-  score = free + _FLOOR_BONUS * above_floor - _TURN_COST * np.abs(turns)
-  return float(preferred + turns[np.argmax(score)])
+  places = position + free[:, None] * ways
+  above_floor = np.asarray(task.scene.free_space.is_reachable(places[:, :2]), np.float64)
+  score = free + _FLOOR_BONUS * above_floor
+  score -= _TURN_COST * (np.abs(turn) + elevation - elevations[0])
+  if views is not None:
+    away = np.linalg.norm(places[:, None] - views[0], axis=-1)
+    turned = np.arccos(np.clip(-ways @ views[1].T, -1.0, 1.0))
+    score -= _UNSEEN_COST * (away + turned).min(axis=1)
+  best: np.ndarray = angles[np.argmax(score)]
+  return best
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -114,8 +128,8 @@ class ThirdPerson:
   def restart(self) -> None:
     """Chooses the view anew, as at the start of an episode."""
     self._target = self._task.state.position.copy()
-    self._azimuth = self._wanted = best_azimuth(self._task, self._physics)
-    self._distance = clear_distance(self._physics, self._target, direction(self._azimuth))
+    self._angles = self._wanted = best_angles(self._task, self._physics)
+    self._distance = clear_distance(self._physics, self._target, direction(self._angles))
 
   def draw(self) -> np.ndarray:
     """Returns the picture now, RGB uint8 [H, W, 3]."""
@@ -137,9 +151,9 @@ class ThirdPerson:
     """
     position = self._task.state.position
     if clear_distance(self._physics, position, direction(self._wanted)) < _NEAR:
-      self._wanted = best_azimuth(self._task, self._physics, preferred=self._wanted)
-    self._azimuth += _FOLLOW * (self._wanted - self._azimuth)
-    way = direction(self._azimuth)
+      self._wanted = best_angles(self._task, self._physics, preferred=self._wanted[0])
+    self._angles = self._angles + _FOLLOW * (self._wanted - self._angles)
+    way = direction(self._angles)
     self._target += _FOLLOW * (position - self._target)
     free = clear_distance(self._physics, self._target, way)
     self._distance = min(free, self._distance + _FOLLOW * (free - self._distance))

@@ -16,6 +16,7 @@ import pytest
 from nerf2real.scenes import bundle, pipeline
 from nerf2real.scenes.builtin import filming, ground_truth
 from nerf2real.scenes.bundle import Bundle, BundleError
+from nerf2real.scenes.export.views import capture_cameras
 from nerf2real.scenes.field.settings import preset as train_preset
 from nerf2real.scenes.geometry import collision as contact
 from nerf2real.scenes.geometry import decomposition
@@ -84,6 +85,11 @@ def test_bundle_is_whole_and_metric(scene):
   assert 3 < (upper - lower)[0] < 12
   assert scene.goals.shape == (3, 2)
   assert scene.free_space.is_reachable(scene.goals).all()
+  positions, axes = scene.views
+  _, poses, _ = capture_cameras(scene)
+  np.testing.assert_allclose(positions, poses[:, :3, 3], atol=1e-3)
+  np.testing.assert_allclose(axes, poses[:, :3, 2], atol=1e-3)
+  assert (positions > lower).all() and (positions < upper).all()
   assert set(scene.scene["seconds"]) >= {"keyframes", "poses", "field", "world", "contact"}
 
 

@@ -33,8 +33,8 @@ def _stand(environment, x, y, yaw=0.0):
 def test_nothing_of_the_room_stands_before_the_robot(environment, place, yaw):
   _stand(environment, *place, yaw)
   physics, position = environment.physics, environment.task.state.position
-  azimuth = third_person.best_azimuth(environment.task, physics)
-  way = third_person.direction(azimuth)
+  angles = third_person.best_angles(environment.task, physics)
+  way = third_person.direction(angles)
   assert np.linalg.norm(way) == pytest.approx(1.0)
   distance = third_person.clear_distance(physics, position, way)
   camera = position + distance * way
@@ -47,10 +47,22 @@ def test_nothing_of_the_room_stands_before_the_robot(environment, place, yaw):
   assert hit < 0 or hit > distance
 
 
+def test_the_view_is_about_where_the_capture_looked_from(environment, monkeypatch):
+  _stand(environment, 0.0, 0.0)
+  task, physics = environment.task, environment.physics
+  assert third_person.best_angles(task, physics)[1] == pytest.approx(np.deg2rad(22.0))
+  wanted = np.array([2.2, np.deg2rad(50.0)])
+  way = third_person.direction(wanted)
+  views = (task.state.position + 1.4 * way)[None], -way[None]
+  monkeypatch.setattr(type(task.scene), "views", views, raising=False)
+  found = third_person.direction(third_person.best_angles(task, physics))
+  assert np.arccos(found @ way) < np.deg2rad(180 / 24) + 1e-6  # as near as is tried
+
+
 def test_the_view_comes_nearer_where_a_wall_is_in_the_way(environment):
   _stand(environment, -2.6, 0.0)
   position = environment.task.state.position
-  way = third_person.direction(np.pi)  # towards the wall at x = -3
+  way = third_person.direction(np.array([np.pi, np.deg2rad(22.0)]))  # towards the wall at x = -3
   distance = third_person.clear_distance(environment.physics, position, way)
   to_wall = (position[0] + 3.0) / np.cos(np.deg2rad(22.0))
   assert distance == pytest.approx(max(0.3, to_wall - 0.15), abs=1e-6)
@@ -60,7 +72,7 @@ def test_the_view_turns_where_a_wall_would_bring_it_near(environment):
   """The robot walks to the wall that the view stood before; it stays whole in the picture."""
   view = _stand(environment, 1.0, 0.0)
   state = environment.task.state
-  view._azimuth = view._wanted = np.pi  # towards the wall at x = -3
+  view._angles = view._wanted = np.array([np.pi, np.deg2rad(22.0)])  # towards the wall at x = -3
   near, edge = [], []
   for x in np.arange(1.0, -2.75, -0.02):  # m a frame: 0.4 m/s
     state.position[:2] = x, 0.0
@@ -69,7 +81,7 @@ def test_the_view_turns_where_a_wall_would_bring_it_near(environment):
     near.append(seen[2])
     edge.append(np.abs(seen[:2]).max() / seen[2])
   assert min(near) > 0.9 and max(edge) < 0.22
-  assert np.cos(view._wanted) > np.cos(np.deg2rad(120))  # along the wall, or away from it
+  assert np.cos(view._wanted[0]) > np.cos(np.deg2rad(120))  # along the wall, or away from it
 
 
 def test_look_at_is_upright_and_centred():
