@@ -6,6 +6,7 @@ the first of every such period) and `metrics.jsonl`. Files are written whole; a 
 from its last state with all its episodes.
 """
 
+import contextlib
 import dataclasses
 import logging
 import threading
@@ -43,6 +44,10 @@ _WAIT = 0.5  # s between looks for the first frames
 _SLACK = 10_000  # frames that collectors may be on the way with when the run has all
 _VALIDATION_PERIOD = 120.0  # s, at least
 _VALIDATION_REST = 10.0  # times as long as a validation took, at least, until the next
+
+
+class _StopAskedError(Exception):
+  """`stop` was called while views were rendered."""
 
 
 class Learner:
@@ -184,17 +189,24 @@ class Learner:
       self._set_status()
       self._stop.wait(_WAIT)
     if self._settings.views and not self._stop.is_set():
-      self._trainer.views = self._make_views()
+      with contextlib.suppress(_StopAskedError):
+        self._trainer.views = self._make_views()
     if self._stop.is_set() or scaling.is_measured(self._trainer.state.scales):
       return
     self._trainer.standardise()
     _log.info("Training begins with %d frames.", self._data.frames)
 
   def _make_views(self) -> dict[str, np.ndarray]:
-    """Returns the run's pictures at drawn places, rendered once a run: minutes on a loaded core."""
+    """Returns the run's pictures at drawn places, rendered once a run: minutes on a loaded core.
+
+    Raises:
+      _StopAskedError: `stop` was called; a run that is resumed renders them.
+    """
     name, count = self._settings.environment, self._settings.views
 
     def report(done: float, text: str) -> None:
+      if self._stop.is_set():
+        raise _StopAskedError
       if self._periods.due("status", _WAIT):
         self._set_status(doing=f"{text}: {round(done * count):,} of {count:,}")
 

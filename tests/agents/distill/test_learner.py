@@ -91,6 +91,27 @@ def test_a_policy_stage_that_ends_before_it_settled_gives_its_student(kind, stop
   assert learner._counters.begun == (12 if given else None)
 
 
+def test_a_stop_is_heeded_while_views_are_rendered(tmp_path, monkeypatch):
+  """Thousands of views take minutes on a loaded core, which Ctrl-C must not wait for."""
+  learner, rendered = object.__new__(Learner), []
+  learner._settings = dataclasses.replace(TINY, first_frames=0, views=1000)
+  learner._stop, learner._seed, learner._run = threading.Event(), 0, tmp_path
+  learner._data, learner._layout = SimpleNamespace(frames=1), None
+  learner._periods, learner._set_status = SimpleNamespace(due=lambda *_: True), lambda **_: None
+  learner._trainer = SimpleNamespace(views=None, state=SimpleNamespace(scales=None))
+
+  def render(*_, count, report, **__):
+    for view in range(count):
+      report((view + 1) / count, "rendering views")
+      rendered.append(view)
+      if view == 2:
+        learner.stop()
+
+  monkeypatch.setattr("nerf2real.agents.distill.learning.learner.kept_views", render)
+  learner._wait_for_first_frames()
+  assert rendered == [0, 1, 2] and learner._trainer.views is None
+
+
 def test_frames_that_were_labelled_anew_leave_the_student_its_beginning():
   """--relabel fills the data set before the run's own student is there: its share begins then."""
   learner = object.__new__(Learner)
