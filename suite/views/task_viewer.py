@@ -179,7 +179,7 @@ class TaskViewer:
       self._picture = gui.add_image(blank, label="robot's camera")
     self._status = gui.add_markdown("")
     self._bars = gui.add_html("")
-    if getattr(self._environment.task, "goals", ()):
+    if len(getattr(self._environment.task, "goals", ())):
       gui.add_markdown("Green ball: the goal. Grey balls: the other goals.")
     with gui.add_folder("push"):
       gui.add_markdown("Drag the arrows over the robot, or:")

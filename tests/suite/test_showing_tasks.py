@@ -7,9 +7,9 @@ import viser
 from PIL import Image
 
 from nerf2real import suite
-from nerf2real.suite.views.drivers import Random, Walking
+from nerf2real.suite.views.drivers import Random, Standing, Walking
 from nerf2real.suite.views.rollout import run_episodes
-from nerf2real.suite.views.task_viewer import TaskViewer
+from nerf2real.suite.views.task_viewer import TaskViewer, view_task
 from nerf2real.suite.views.viewer_elements import bars
 from tests.suite.synthetic import FlatRenderer, make_room
 
@@ -65,6 +65,18 @@ def test_viewer_shows_the_state_and_pushes(room):
     assert (viewer._picture.image[::6, ::6] == (40, 80, 120)).all(-1).mean() > 0.5
   finally:
     server.stop()
+
+
+@pytest.mark.parametrize("task", suite.ALL_TASKS)
+def test_every_task_is_served_with_the_field_and_steps(task, room):
+  viewer = view_task(task, drivers={"stand": Standing}, port=18_735)
+  try:
+    for _ in range(12):
+      viewer.step()
+    goals = getattr(viewer._environment.task, "goals", ())
+    assert len(viewer._goals) == len(goals) and "0.30 s" in viewer._status.content
+  finally:
+    viewer.server.stop()
 
 
 def test_bars_grow_to_their_side():
