@@ -248,12 +248,17 @@ def _settled(mapped: Mapped, steps: Steps) -> Mapped:
 def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -> Mapped:
   """Takes the rolling shutter out of a model.
 
-  The model itself where that spoils the lens, and of a film without times, which tells no speed.
+  The model itself where that spoils the lens, of a film without times, which tells no speed, and of
+  one whose keyframes lie too far apart.
   """
   period = readout.frame_period(times)
   if period is None:
     words = f"{mapped.strategy}; rolling shutter not taken out, because the film has no times"
     return dataclasses.replace(mapped, strategy=words)
+  if not readout.tells_motion(mapped.model, times):
+    warnings = (*mapped.warnings, readout.TOO_FAR_APART)
+    words = f"{mapped.strategy}; rolling shutter not taken out, because keyframes lie too far apart"
+    return dataclasses.replace(mapped, strategy=words, warnings=warnings)
   lens = mapped.lens
   assert lens is not None  # for the type checker: only known poses have none
   steps.begin("shutter")

@@ -29,6 +29,12 @@ _SMALL = 0.001  # s: unit of the readout in its derivatives
 _DAMPING = 1e-9  # of the curvature, chosen: holds the place, the turn and the size of all
 _FARTHEST_NEIGHBOURS = 2.0  # s between two keyframes that say how the one between them moved
 
+TOO_FAR_APART = (
+  "Rolling shutter: most keyframes lie too far apart in time to tell how the phone moved while a "
+  f"frame was read (the two around one by {_FARTHEST_NEIGHBOURS:g} s or more), so that it stays "
+  "in. Give more --keyframes, or film for less long."
+)
+
 _FOCAL, _PRINCIPAL, _DISTORTION = (6, 7), (8, 9), (10, 11, 12, 13)
 """Columns of `cv2.projectPoints`'s Jacobian; a turn and a move of all points come before."""
 
@@ -72,6 +78,26 @@ def frame_period(times: Mapping[str, float]) -> float | None:
   return float((when[-1] - when[0]) / (numbers[-1] - numbers[0]))
 
 
+def tells_motion(model: pycolmap.Reconstruction, times: Mapping[str, float]) -> bool:
+  """Tells whether most keyframes' neighbours are near enough in time to say how these moved.
+
+  In a film of many minutes they are not: of the few that are no readout could be found.
+
+  Args:
+    model: Localised pictures.
+    times: When each was taken [s]; they strictly grow.
+  """
+  lasted = _between_neighbours(np.array([times[image.name] for image in registered(model)]))[2]
+  return bool(np.median(lasted) < _FARTHEST_NEIGHBOURS)
+
+
+def _between_neighbours(when: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Rows of the keyframes before and after each, itself at an end, and the time between [s] [N]."""
+  before = np.maximum(np.arange(len(when)) - 1, 0)
+  after = np.minimum(np.arange(len(when)) + 1, len(when) - 1)
+  return before, after, when[after] - when[before]
+
+
 def motion(model: pycolmap.Reconstruction, times: Mapping[str, float], readout: float) -> Shutter:
   """Derives the motion during the readout from the poses of neighbouring keyframes.
 
@@ -85,9 +111,7 @@ def motion(model: pycolmap.Reconstruction, times: Mapping[str, float], readout: 
   poses = [image.cam_from_world().inverse() for image in images]
   rotations = Rotation.from_matrix([pose.rotation.matrix() for pose in poses])
   centres = np.array([pose.translation for pose in poses])
-  before = np.maximum(np.arange(len(images)) - 1, 0)
-  after = np.minimum(np.arange(len(images)) + 1, len(images) - 1)
-  lasted = when[after] - when[before]
+  before, after, lasted = _between_neighbours(when)
   share = np.where(lasted < _FARTHEST_NEIGHBOURS, readout / lasted, 0.0)[:, None]
   depths = [
     np.median(_local_points(model, image, sight.rows)[:, 2])
@@ -176,7 +200,7 @@ def take_out(
 
   Args:
     model: Adjusted as if all lines were read at once.
-    times: When each picture was taken [s]; they strictly grow.
+    times: When each picture was taken [s]; they strictly grow and tell the motion (`tells_motion`).
     longest: Of the readout, the period of the film's frames [s]: none is read for longer.
     principal: Whether the lens's principal point is free in adjustments.
     distortion: Whether its distortion is.

@@ -357,14 +357,14 @@ def test_a_picture_that_is_weak_without_the_shutter_has_no_place(corner, monkeyp
       model.delete_observation(images[3].image_id, k)
   count = len(images)
   motion = shutter.Shutter(
-    readout=1.0,  # as long as a frame of this film, which is told
+    readout=0.5,  # as long as a frame of this film, which is told
     rotations=np.arange(count)[:, None] * np.ones(3),
     translations=np.zeros((count, 3)),
     depths=np.ones(count),
   )
   monkeypatch.setattr(readout, "take_out", lambda *args, **options: (model, motion))
   mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
-  times = {image.name: float(k) for k, image in enumerate(images)}
+  times = {image.name: 0.5 * k for k, image in enumerate(images)}
   found = structure_from_motion._without_shutter(mapped, times, Steps(no_progress))
   assert found.model.num_reg_images() == count - 1
   assert found.shutter.rotations[:, 0].tolist() == [k for k in range(count) if k != 3]
@@ -378,6 +378,17 @@ def test_a_film_without_times_keeps_its_shutter(corner):
   found = structure_from_motion._without_shutter(mapped, times, Steps(no_progress))
   assert found.model is model and found.shutter is None
   assert found.strategy == "test; rolling shutter not taken out, because the film has no times"
+
+
+def test_a_film_of_which_few_keyframes_are_kept_keeps_its_shutter(corner):
+  """Nothing tells how the phone moved: the readout had no equation, which ended the run."""
+  model = pycolmap.Reconstruction(str(corner[0] / "out" / "sfm"))
+  mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
+  times = {image.name: 1.5 * k for k, image in enumerate(mapping.registered(model))}
+  assert not readout.tells_motion(model, times)
+  found = structure_from_motion._without_shutter(mapped, times, Steps(no_progress))
+  assert found.model is model and found.shutter is None
+  assert "too far apart" in found.strategy and "Give more --keyframes" in found.warnings[0]
 
 
 def test_figures_are_plain_json(corner):
