@@ -121,7 +121,7 @@ def test_the_loop_closes_on_the_virtual_robot(tmp_path):
     check_against_model(log, model)
     assert log.duration == pytest.approx(6.0, abs=0.2)
     assert np.abs(log.states.position[5] - log.states.position[0]).max() < 0.01  # from rest
-  assert content["verdict"] in ("effects", "unexplained")  # the virtual servos are other ones
+  assert content["verdict"] != "none"  # the virtual servos are other ones
   assert "load_friction" in {e["kind"] for e in [*content["effects"], *content["alternatives"]]}
   assert content["error"]["train"]["after"] < content["error"]["train"]["before"]
   assert json.loads((tmp_path / "identified/finding.json").read_text()) == content
