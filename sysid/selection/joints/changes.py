@@ -70,11 +70,13 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   if with_anothers(explainer, found.best, ahead):
     ranked = explainer.ranked()
     found = conclude(now, ranked, subject.thresholds, baseline)
-  lacking = more_at_first or leaves(subject, explainer.null, settings)
-  lacking |= clear(found.best, explainer.null) > subject.beyond
+  clearly = clear(found.best, explainer.null) > subject.beyond
+  lacking = more_at_first or leaves(subject, explainer.null, settings) or clearly
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
   if before is not None and usual is not None:
     something = [k for k in something if is_new(subject, found.best, k)]
+  # What constants could take of an effect leaves its size open, and is not nothing for that.
+  is_there = bool(something) or (clearly and before is None)
   named = () if pressed(found.best) else tuple(k for k in found.named if k in something)
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
@@ -87,7 +89,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     ranked = explainer.ranked()
   more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
-    bool(something) and lacking,
+    is_there and lacking,
     named,
     any(t.wider for t in known),
     bool(typical or few) or leaves(subject, found.best, settings),
@@ -134,9 +136,9 @@ def _verdict(
 
   Args:
     lacking: whether the best hypothesis has a kind whose values are more than a machine's own, and
-      that references do not have as well, and the baseline leaves more than the machine does
-      anyway, or is clearly worse. Names are tried from less on: what is not certain then is
-      nothing.
+      that references do not have as well, or is clearly better than a declared model, and the
+      baseline leaves more than the machine does anyway, or is clearly worse. Names are tried from
+      less on: what is not certain then is nothing.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
     remains: whether more is left than the machine leaves anyway, by a test or by that limit.

@@ -15,7 +15,14 @@ from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis
-from nerf2real.sysid.selection.joints import doubts, leaving, naming, remainder, subject
+from nerf2real.sysid.selection.joints import (
+  changes,
+  doubts,
+  leaving,
+  naming,
+  remainder,
+  subject,
+)
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
@@ -95,6 +102,20 @@ def test_the_report_lists_what_was_there_before(found):
   kinds = {row["kind"] for row in result.in_reference}
   assert kinds <= {"coulomb_friction", "viscous_friction", "payload"}
   assert {e.kind for e in result.objects} >= {"command_delay", *kinds}
+
+
+@pytest.mark.parametrize(("delay", "verdict"), [(0.02, "unexplained"), (0.0, "none")])
+def test_a_size_that_constants_leave_open_is_not_nothing(monkeypatch, delay, verdict):
+  """A late command of 9 ms: latency and skew at their bounds may be most of it, and no name is
+  certain, but the declared model is clearly worse."""
+  monkeypatch.setattr(subject, "own_library", few)
+  monkeypatch.setattr(changes, "is_something", lambda *_: False)
+  late = [Effect("command_delay", "joint", {"delay": delay})] if delay else []
+  logs = [
+    log_of(PENDULUM, kind, late, duration=5.0, seed=i) for i, kind in enumerate(("sweep", "steps"))
+  ]
+  found = analysis.analyse(mujoco.MjModel.from_xml_string(PENDULUM), logs)
+  assert (found.verdict, found.effects) == (verdict, [])
 
 
 def test_a_rotor_of_twice_the_inertia_since_the_reference_is_named(monkeypatch):
