@@ -28,11 +28,12 @@ _ROUNDS = 6  # of the readout and adjustments at most, chosen: three or four suf
 _SMALL = 0.001  # s: unit of the readout in its derivatives
 _DAMPING = 1e-9  # of the curvature, chosen: holds the place, the turn and the size of all
 _FARTHEST_NEIGHBOURS = 2.0  # s between two keyframes that say how the one between them moved
+_FEWEST = 10  # keyframes of which that is known, chosen: few tell a readout by what else is off
 
 TOO_FAR_APART = (
-  "Rolling shutter: most keyframes lie too far apart in time to tell how the phone moved while a "
-  f"frame was read (the two around one by {_FARTHEST_NEIGHBOURS:g} s or more), so that it stays "
-  "in. Give more --keyframes, or film for less long."
+  "Rolling shutter: nearly all keyframes lie too far apart in time to tell how the phone moved "
+  f"while a frame was read (the two around one by {_FARTHEST_NEIGHBOURS:g} s or more), so that it "
+  "stays in. Give more --keyframes, or film for less long."
 )
 
 _FOCAL, _PRINCIPAL, _DISTORTION = (6, 7), (8, 9), (10, 11, 12, 13)
@@ -79,16 +80,16 @@ def frame_period(times: Mapping[str, float]) -> float | None:
 
 
 def tells_motion(model: pycolmap.Reconstruction, times: Mapping[str, float]) -> bool:
-  """Tells whether most keyframes' neighbours are near enough in time to say how these moved.
+  """Tells whether enough keyframes have neighbours near enough in time to say how they moved.
 
-  In a film of many minutes they are not: of the few that are no readout could be found.
+  Where few keyframes of a film are kept they are not.
 
   Args:
     model: Localised pictures.
     times: When each was taken [s]; they strictly grow.
   """
   lasted = _between_neighbours(np.array([times[image.name] for image in registered(model)]))[2]
-  return bool(np.median(lasted) < _FARTHEST_NEIGHBOURS)
+  return int((lasted < _FARTHEST_NEIGHBOURS).sum()) >= _FEWEST
 
 
 def _between_neighbours(when: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
