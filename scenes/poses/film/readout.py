@@ -28,10 +28,9 @@ _ROUNDS = 6  # of the readout and adjustments at most, chosen: three or four suf
 _SMALL = 0.001  # s: unit of the readout in its derivatives
 _DAMPING = 1e-9  # of the curvature, chosen: holds the place, the turn and the size of all
 _FARTHEST_NEIGHBOURS = 2.0  # s between two keyframes that say how the one between them moved
-_FEWEST = 10  # keyframes of which that is known, chosen: few tell a readout by what else is off
 
 TOO_FAR_APART = (
-  "Rolling shutter: nearly all keyframes lie too far apart in time to tell how the phone moved "
+  "Rolling shutter: all keyframes lie too far apart in time to tell how the phone moved "
   f"while a frame was read (the two around one by {_FARTHEST_NEIGHBOURS:g} s or more), so that it "
   "stays in. Give more --keyframes, or film for less long."
 )
@@ -80,16 +79,16 @@ def frame_period(times: Mapping[str, float]) -> float | None:
 
 
 def tells_motion(model: pycolmap.Reconstruction, times: Mapping[str, float]) -> bool:
-  """Tells whether enough keyframes have neighbours near enough in time to say how they moved.
+  """Tells whether any keyframe has neighbours near enough in time to say how it moved.
 
-  Where few keyframes of a film are kept they are not.
+  Where few keyframes of a film are kept none may have.
 
   Args:
     model: Localised pictures.
     times: When each was taken [s]; they strictly grow.
   """
   lasted = _between_neighbours(np.array([times[image.name] for image in registered(model)]))[2]
-  return int((lasted < _FARTHEST_NEIGHBOURS).sum()) >= _FEWEST
+  return bool((lasted < _FARTHEST_NEIGHBOURS).any())
 
 
 def _between_neighbours(when: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -144,17 +143,22 @@ def _change(
   measured: list[_Sight],
   times: Mapping[str, float],
   lens: list[int],
+  readout: float,
+  longest: float,
 ) -> float:
   """Returns by how much the readout changes in a Gauss-Newton step of poses, points, lens and it.
 
   Adjustments end before they have settled, by more than the costs of two readouts differ: what they
-  would do yet is a part of the step. Errors are weighed as in an adjustment.
+  would do yet is a part of the step. Errors are weighed as in an adjustment, by pixels; a readout
+  that few keyframes tell is held at none by a prior as wide as the longest.
 
   Args:
     model: With its observations as they are at the present readout.
     measured: Its observations as read.
     times: When each picture was taken [s].
     lens: Columns of `cv2.projectPoints`'s Jacobian that are free.
+    readout: The present one [s].
+    longest: Of the readout [s].
   """
   camera, moves = to_opencv(next(iter(model.cameras.values()))), motion(model, times, _SMALL)
   still, ids, pictures = np.zeros(3), [], []
@@ -185,6 +189,8 @@ def _change(
     errors=np.concatenate(errors),
   )
   reduced = eliminate(sights, len(pictures), damping=_DAMPING)
+  reduced.curvature[-1, -1] += (_SMALL / longest) ** 2
+  reduced.gradient[-1] += _SMALL * readout / longest**2
   return _SMALL * float(np.linalg.solve(reduced.curvature, -reduced.gradient)[-1])
 
 
@@ -214,7 +220,7 @@ def take_out(
   for done in range(_ROUNDS):
     report(done / _ROUNDS, f"rolling shutter of {1e3 * readout:.1f} ms")
     before = readout
-    readout += _change(result, measured, times, lens)
+    readout += _change(result, measured, times, lens, readout, longest)
     readout = float(np.clip(readout, -longest, longest))
     _move_observations(result, measured, motion(result, times, readout))
     mapping.adjust(result, principal=principal, distortion=distortion)

@@ -384,7 +384,7 @@ def test_a_film_of_which_few_keyframes_are_kept_keeps_its_shutter(corner):
   """Nothing tells how the phone moved: the readout had no equation, which ended the run."""
   model = pycolmap.Reconstruction(str(corner[0] / "out" / "sfm"))
   mapped = Mapped(model, "test", (), mapping.FreeLens(True, True, ""))
-  times = {image.name: 1.5 * k for k, image in enumerate(mapping.registered(model))}
+  times = {image.name: 2.5 * k for k, image in enumerate(mapping.registered(model))}
   assert not readout.tells_motion(model, times)
   found = structure_from_motion._without_shutter(mapped, times, Steps(no_progress))
   assert found.model is model and found.shutter is None

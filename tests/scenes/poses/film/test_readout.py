@@ -105,3 +105,12 @@ def test_a_point_in_a_camera_does_not_hide_the_readout_time():
   corrected, found = take_out(model, times, **FIXED)
   assert found.readout == pytest.approx(0.02, abs=2e-3)
   assert seen not in corrected.points3D
+
+
+def test_a_readout_that_no_picture_tells_is_none():
+  """Its unknown had no equation but its prior now: the matrix was singular."""
+  model, times = filmed(0.02, noise=0.3)
+  ADJUST(model)
+  far = dict(zip(times, 3.0 * np.arange(len(times)), strict=True))
+  found = take_out(model, far, longest=0.034, **LENS)[1]
+  assert found.readout == pytest.approx(0.0, abs=1e-9)
