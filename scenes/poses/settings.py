@@ -19,7 +19,7 @@ class LocaliseSettings:
   """Of the mapper at most, of which for photographs the one is taken that lacks least of what it
   ought to see, for a film the one that leaps least."""
   attempted: int = 300
-  """More keyframes are mapped once: a thousand take half an hour."""
+  """More keyframes are mapped once: of a thousand that takes a quarter of an hour."""
   max_apart: float = 0.05
   """Of the room's width by which a picture's places in two attempts may differ for these to be the
   same; where none is the same as the best a warning is given. Chosen: the nearest two of five
