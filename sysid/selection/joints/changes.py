@@ -18,7 +18,7 @@ from nerf2real.sysid.selection.joints.doubts import (
   pressed,
   supported,
 )
-from nerf2real.sysid.selection.joints.leaving import leaves, may_leave, remaining
+from nerf2real.sysid.selection.joints.leaving import is_unusual, leaves, may_leave, remaining
 from nerf2real.sysid.selection.joints.naming import conclude
 from nerf2real.sysid.selection.joints.subject import Subject, following
 from nerf2real.sysid.selection.search.elaboration import elaborated
@@ -71,12 +71,13 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     ranked = explainer.ranked()
     found = conclude(now, ranked, subject.thresholds, baseline)
   clearly = clear(found.best, explainer.null) > subject.beyond
-  lacking = more_at_first or leaves(subject, explainer.null, settings) or clearly
+  unusual = is_unusual(subject, explainer.null, settings)
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
   if before is not None and usual is not None:
     something = [k for k in something if is_new(subject, found.best, k)]
   # What constants could take of an effect leaves its size open, and is not nothing for that.
-  is_there = bool(something) or (clearly and before is None)
+  is_open = clearly and unusual and before is None
+  lacking = is_open or (bool(something) and (clearly or unusual))
   named = () if pressed(found.best) else tuple(k for k in found.named if k in something)
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
@@ -89,10 +90,10 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
     ranked = explainer.ranked()
   more = bool(typical or (few and any(k != CONSTANTS_OFF for k in named)))
   verdict = _verdict(
-    is_there and lacking,
+    lacking,
     named,
     any(t.wider for t in known),
-    bool(typical or few) or leaves(subject, found.best, settings),
+    is_unusual(subject, found.best, settings),
     more,
   )
   off = constants_off(subject, found.best, settings)
@@ -136,13 +137,13 @@ def _verdict(
 
   Args:
     lacking: whether the best hypothesis has a kind whose values are more than a machine's own, and
-      that references do not have as well, or is clearly better than a declared model, and the
-      baseline leaves more than the machine does anyway, or is clearly worse. Names are tried from
-      less on: what is not certain then is nothing.
+      that references do not have as well, and is clearly better than the baseline, or that leaves
+      more than a healthy machine; without references both are enough where values are open. Names
+      are tried from less on: what is not certain then is nothing.
     named: kinds that are certain.
     shared: whether the joint has effects of wider scope.
-    remains: whether more is left than the machine leaves anyway, by a test or by that limit.
-    more: whether it is by the limit.
+    remains: whether more is left than a healthy machine leaves.
+    more: whether what is left beside names is beyond the limit.
   """
   if not named and not shared:
     return "unexplained" if remains or lacking else "none"

@@ -23,12 +23,12 @@ Array = np.ndarray
 def leaves(subject: Subject, item: Scored, settings: Settings) -> bool:
   """Tells whether a hypothesis leaves more than the machine does anyway.
 
-  Beside a reference with the same commands only noise may remain, and what a machine differs by
-  between two recordings; beside another its blocks are the measure; without one, a multiple of the
-  readings' noise.
+  Beside a reference with the same commands only noise may remain, and what a machine's constants
+  differ by within a recording; beside another its blocks are the measure; without one, a multiple
+  of the readings' noise.
   """
   if subject.paired:
-    moved, beside = _of_two_recordings(subject), play.beside(subject.now, item)
+    moved, beside = _moved(subject), play.beside(subject.now, item)
     return structured(subject.now, item, settings, moved, beside)
   if subject.usual is not None:
     return grown(item, subject.usual, subject.beyond, settings)
@@ -47,7 +47,18 @@ def may_leave(subject: Subject, item: Scored, settings: Settings) -> bool:
   return leaves(subject, item, settings)
 
 
-def _of_two_recordings(subject: Subject) -> Array:
+def is_unusual(subject: Subject, item: Scored, settings: Settings) -> bool:
+  """Tells whether a hypothesis leaves more than a healthy machine does.
+
+  Without references that is noise and what constants move that differ within a recording. A name
+  does not stand for that: where there is one noise alone is the measure.
+  """
+  anyway, left = remaining(subject, item, healthy=True)
+  more = bool(np.any(settings.more**2 * anyway < left))
+  return more or (subject.before is not None and leaves(subject, item, settings))
+
+
+def _moved(subject: Subject) -> Array:
   """Returns the mean squares of blocks [B] by which a machine's constants move its course, as far
   as they differ within a recording: what one value for all of it explains was fitted before, also
   where constants are those of another session."""
@@ -60,17 +71,20 @@ def _of_two_recordings(subject: Subject) -> Array:
   return repeats(now, null, sigma)
 
 
-def remaining(subject: Subject, item: Scored) -> tuple[Array, Array]:
+def remaining(subject: Subject, item: Scored, *, healthy: bool = False) -> tuple[Array, Array]:
   """Returns what a machine leaves anyway, and what a hypothesis does: mean squares [2] of
-  the median block, and of all blocks by `mean_left`."""
+  the median block, and of all blocks by `mean_left`; of a healthy machine also without references
+  with what its constants differ by within a recording."""
   now, before, usual = subject.now, subject.before, subject.usual
 
   def both(joint: JointLikelihood, squares: Array) -> Array:
     return np.array([np.median(squares), mean_left(joint, squares)])
 
   readings = now.noise_squares * (1.0 + NOISE if subject.paired else 1.0)
+  if subject.paired or healthy:
+    readings = readings + _moved(subject)
   if subject.paired:
-    readings = readings + _of_two_recordings(subject) + play.beside(now, item)
+    readings = readings + play.beside(now, item)
   anyway = np.array([np.median(readings), readings.mean()])
   if before is not None and usual is not None and not subject.paired:
     anyway = both(before, usual.fit.held[0][0])

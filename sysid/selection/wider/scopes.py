@@ -76,8 +76,6 @@ def shared_effects(
 ) -> list[Shared]:
   """Finds effects of bodies and of the machine, puts them into their joints' hypotheses.
 
-  Looks for them as long as a joint may leave more than the machine does anyway.
-
   Args:
     model: the declared one.
     subjects: its joints.
@@ -144,17 +142,30 @@ def _next(
   *,
   only: Collection[str] = (),
 ) -> Shared | None:
-  """Returns the best effect of a body or of the machine, if it is clear, where a joint may leave
-  more than the machine does anyway; joints' scales may have changed after. Only some kinds, if
-  given."""
-  leaving = [s for s in subjects if may_leave(s, s.explainer.null, settings)]
+  """Returns the best effect of a body or of the machine, if it is clear; joints' scales may have
+  changed after. Only some kinds, if given.
+
+  What no joint leaves more than the machine does anyway may be clear of all of them together: then
+  by what they leave, not by how likely it is that all constants are off alike.
+  """
+  leaving = {s.joint for s in subjects if may_leave(s, s.explainer.null, settings)}
   tried = [
     wide.screened(term, members)
-    for term, members in (wide.hypotheses(model, subjects) if leaving else ())
+    for term, members in wide.hypotheses(model, subjects)
     if term.kind not in known and (not only or term.kind in only)
-    if any(m in leaving for m in members)
   ]
-  return _best(tried, certain, own_latency=subjects[0].before is None)
+  shown = [w for w in tried if not _hidden(w, leaving) or w.evidence().by_logs > _beyond([w])]
+  return _best(shown, certain, leaving, own_latency=subjects[0].before is None)
+
+
+def _hidden(item: Wide, leaving: Collection[str]) -> bool:
+  """Tells whether no joint that an effect concerns leaves more than the machine does anyway."""
+  return not any(m.joint in leaving for m in item.members)
+
+
+def _beyond(items: Sequence[Wide]) -> float:
+  """Returns the standard errors that count as clear."""
+  return max(m.beyond for item in items for m in item.members)
 
 
 def _settled(found: Sequence[Shared]) -> list[Shared]:
@@ -175,15 +186,21 @@ def _reach(item: Wide) -> tuple[Array, Array]:
   return intervals.reaches(item.fit, spread, (0, len(item.x)))
 
 
-def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool) -> Shared | None:
-  """Returns the best of the screened effects if it is clear of all that lack it."""
+def _best(
+  tried: Sequence[Wide],
+  certain: Collection[str],
+  leaving: Collection[str],
+  *,
+  own_latency: bool,
+) -> Shared | None:
+  """Returns the best of the screened effects if it is clear of all that lack it, or beside them."""
   forms: dict[tuple[str, str | None], Wide] = {}
   for item in sorted(tried, key=lambda w: -w.possible().total):
     forms.setdefault(item.key, item)
   if not forms:
     return None
-  beyond = max(m.beyond for item in forms.values() for m in item.members)
   top, *others = forms.values()
+  beyond = _beyond([top, *others])
   if top.possible().clear < beyond:
     return None
   near = [w for w in others if (top.evidence() - w.possible()).clear < beyond]
@@ -197,8 +214,13 @@ def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool)
   single = [wide.alone(best, at) for at in range(len(best.members))]
   most = max(range(len(single)), key=lambda at: single[at][0].total)
   behind = (mine - single[most][0]).clear
-  others_behind = [(mine - w.evidence()).clear for w in items if w not in alike]
-  clear = min([mine.clear, *others_behind, *([] if best.term.kind in certain else [behind])])
+  rivals_behind = [_behind(w, best, beyond) for w in items if w not in alike]
+  clear = min(
+    mine.clear,
+    mine.by_logs if _hidden(best, leaving) else np.inf,
+    behind if best.term.kind not in certain else np.inf,
+    *rivals_behind,
+  )
   reach = _reach(best)
   nothing = _is_nothing(best, reach, own_latency=own_latency)
   if clear < beyond or behind < 0.0 or nothing or not _is_new(best):
@@ -207,6 +229,13 @@ def _best(tried: Sequence[Wide], certain: Collection[str], *, own_latency: bool)
   or_alone = (behind, single[most][1]) if behind < beyond else None
   twins = tuple((w.term, w.x) for w in alike if w is not best)
   return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total, or_alone, twins)
+
+
+def _behind(rival: Wide, best: Wide, beyond: float) -> float:
+  """Returns the standard errors by which another effect is behind the best one, or behind itself
+  with the best one beside it: where that is clear both are there."""
+  behind = (best.evidence() - rival.evidence()).clear
+  return behind if behind > beyond else max(behind, wide.beside(best, rival))
 
 
 def _is_nothing(item: Wide, reach: tuple[Array, Array], *, own_latency: bool) -> bool:

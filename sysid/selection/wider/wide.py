@@ -124,6 +124,11 @@ class Evidence:
     expected = [row.joint.told_apart(row.one - row.other) for row in rows]
     return clearness([row.nats for row in rows], self.prior, expected)
 
+  @property
+  def by_logs(self) -> float:
+    """The same of the logs alone, whatever the priors cost."""
+    return dataclasses.replace(self, prior=0.0).clear
+
 
 def hypotheses(
   model: mujoco.MjModel, subjects: Sequence[Subject]
@@ -236,6 +241,19 @@ def resumed(term: Term, members: Sequence[Subject], x: Array) -> Wide:
   start = np.concatenate([x, *[m.explainer.null.fit.x for m in members]])
   fit = Fitter([m.now for m in members], layout).linearise(start)
   return fitted(Wide(term, tuple(members), fit))
+
+
+def beside(item: Wide, other: Wide) -> float:
+  """Returns the standard errors by which another effect is better with one beside it than alone."""
+  joints = {m.joint: m for m in (*item.members, *other.members)}.values()
+  before = [m.state for m in joints]
+  held = dataclasses.replace(other.term.held_at(other.x), known=True)
+  for member in other.members:
+    member.take(held)
+  clear = resumed(item.term, item.members, item.x).evidence().clear
+  for member, state in zip(joints, before, strict=True):
+    member.state = state
+  return clear
 
 
 def _late(term: Term) -> list[int]:

@@ -13,6 +13,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection import analysis, findings
 from nerf2real.sysid.selection.joints import subject
+from nerf2real.sysid.selection.joints.leaving import may_leave
 from nerf2real.sysid.selection.search import rivals
 from nerf2real.sysid.selection.wider import scopes, wide
 from nerf2real.sysid.settings import SETTINGS
@@ -20,13 +21,22 @@ from tests.sysid.selection.joints.test_changes import few
 from tests.sysid.synthetic import ARM, log_of
 
 LATE = Effect("command_delay", None, {"delay": 0.021})
+FADING = Effect("supply_sag", None, {"droop": 0.0, "fade": 0.008})
 PAYLOAD = Effect("payload", "lower", {"mass": 0.25, "x": 0.0, "y": 0.02, "z": -0.12})
 
 
-def _logs(effects, seed=0, xml=ARM):
+def _logs(effects, seed=0, xml=ARM, duration=5.0):
   return [
-    log_of(xml, kind, effects, duration=5.0, seed=seed + i)
+    log_of(xml, kind, effects, duration=duration, seed=seed + i)
     for i, kind in enumerate(("sweep", "slow", "steps"))
+  ]
+
+
+def _subjects(model, logs):
+  reductions = [Reduction(model, log) for log in logs]
+  return [
+    subject.prepare(model, joint, logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS)
+    for joint in ("shoulder", "elbow")
   ]
 
 
@@ -52,6 +62,34 @@ def test_a_late_bus_is_one_effect_and_a_payload_is_its_body_s(model):
   }
 
 
+def test_joints_tell_together_what_none_tells_alone(model):
+  logs = _logs([FADING])
+  assert not any(may_leave(s, s.explainer.null, SETTINGS) for s in _subjects(model, logs))
+  found = analysis.analyse(model, logs)
+  assert [(e["kind"], e["joint"]) for e in found.effects] == [("supply_sag", None)]
+  fade = found.effects[0]["parameters"]["fade"]
+  assert fade["low"] <= 0.008 <= fade["high"] and fade["value"] == pytest.approx(0.008, rel=0.1)
+  assert [c.verdict for c in found.joints] == ["none", "none"] and found.verdict == "effects"
+
+
+def test_what_is_likely_by_priors_alone_is_no_effect_that_no_joint_tells(model, monkeypatch):
+  row = _row(np.zeros(20))
+  alike = wide.Evidence({"shoulder": row, "elbow": row}, prior=-20.0)  # constants, off alike
+  assert alike.clear > 5.0 and alike.by_logs == 0.0
+  monkeypatch.setattr(wide.Evidence, "by_logs", 0.0)
+  assert analysis.analyse(model, _logs([FADING])).verdict == "none"
+
+
+def test_effects_of_the_machine_that_hide_each_other_are_both_there(model):
+  low = Effect("supply_sag", None, {"droop": 0.0, "fade": 0.03})
+  tilted = Effect("gravity_tilt", None, {"x": 0.1, "y": 0.1})
+  found = analysis.analyse(model, _logs([low, tilted], duration=8.0))
+  assert {(e["kind"], e["joint"]) for e in found.effects} == {
+    ("supply_sag", None),
+    ("gravity_tilt", None),
+  }
+
+
 def test_one_joint_s_friction_stays_its_own_beside_a_reference(model):
   rough = Effect("coulomb_friction", "shoulder", {"torque": 0.25})
   found = analysis.analyse(model, _logs([LATE, rough]), _logs([LATE], seed=10))
@@ -70,15 +108,9 @@ def test_a_load_is_new_where_a_reference_s_constants_could_undo_it(model, mass):
 
 
 def test_a_load_that_is_screened_has_left_its_start(model):
-  logs = _logs([PAYLOAD])
-  reductions = [Reduction(model, log) for log in logs]
-  joints = [
-    subject.prepare(model, joint, logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS)
-    for joint in ("shoulder", "elbow")
-  ]
   (term, members), *_ = [
     (term, members)
-    for term, members in wide.hypotheses(model, joints)
+    for term, members in wide.hypotheses(model, _subjects(model, _logs([PAYLOAD])))
     if (term.kind, term.target) == ("payload", "lower")
   ]
   screened = wide.screened(term, members)
