@@ -145,14 +145,16 @@ def _next(
   """Returns the best effect of a body or of the machine, if it is clear; joints' scales may have
   changed after. Only some kinds, if given.
 
-  What no joint leaves more than the machine does anyway may be clear of all of them together: then
-  by what they leave, not by how likely it is that all constants are off alike.
+  An effect of the machine may be clear of all joints together though none leaves more than it does
+  anyway: then by what they leave, not by how likely it is that all constants are off alike. One of
+  a body shows at a joint or two.
   """
   leaving = {s.joint for s in subjects if may_leave(s, s.explainer.null, settings)}
   tried = [
     wide.screened(term, members)
     for term, members in wide.hypotheses(model, subjects)
     if term.kind not in known and (not only or term.kind in only)
+    if term.target is None or any(m.joint in leaving for m in members)
   ]
   shown = [w for w in tried if not _hidden(w, leaving) or w.evidence().by_logs > _beyond([w])]
   return _best(shown, certain, leaving, own_latency=subjects[0].before is None)
