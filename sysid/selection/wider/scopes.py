@@ -211,7 +211,7 @@ def _best(
   first = items[0].evidence()
   as_likely = float(norm.isf(top.members[0].now.settings.level))
   alike = [w for w in items if (first - w.evidence()).clear < as_likely and wide.same(items[0], w)]
-  best = min(alike, key=lambda w: USUAL.index(w.key[0]) if w.key[0] in USUAL else len(USUAL))
+  best = min(alike, key=_how_usual)
   mine = best.evidence()
   single = [wide.alone(best, at) for at in range(len(best.members))]
   most = max(range(len(single)), key=lambda at: single[at][0].total)
@@ -231,6 +231,13 @@ def _best(
   or_alone = (behind, single[most][1]) if behind < beyond else None
   twins = tuple((w.term, w.x) for w in alike if w is not best)
   return Shared(best.term, best.x, reach, origin, best.members, clear, mine.total, or_alone, twins)
+
+
+def _how_usual(item: Wide) -> tuple[int, int]:
+  """Returns the order in which effects are named that predict the same: by kind, and of bodies the
+  one that fewer joints carry, as that the others feel nothing of it would be a coincidence."""
+  kind, _ = item.key
+  return USUAL.index(kind) if kind in USUAL else len(USUAL), len(item.members)
 
 
 def _behind(rival: Wide, best: Wide, beyond: float) -> float:

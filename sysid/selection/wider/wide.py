@@ -329,10 +329,12 @@ def with_twin(member: Subject, item: Scored, held: Term, other: Term) -> bool:
 
 
 def same(one: Wide, other: Wide) -> bool:
-  """Tells whether two effects predict the same of all joints, but for a part of what remains."""
-  if [m.joint for m in one.members] != [m.joint for m in other.members]:
-    return False
-  return all(
-    m.now.alike(a - b)
-    for m, a, b in zip(one.members, one.fit.residuals, other.fit.residuals, strict=True)
+  """Tells whether two effects predict the same of all joints, but for a part of what remains; a
+  joint that one does not concern is as without it."""
+  joints = {m.joint: m for m in (*one.members, *other.members)}
+  bare = {name: m.explainer.null.fit.residuals[0] for name, m in joints.items()}
+  first, second = (
+    bare | {m.joint: r for m, r in zip(w.members, w.fit.residuals, strict=True)}
+    for w in (one, other)
   )
+  return all(m.now.alike(first[name] - second[name]) for name, m in joints.items())

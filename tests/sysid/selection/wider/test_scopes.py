@@ -157,6 +157,30 @@ def test_what_joints_each_have_is_one_effect_of_the_machine(model, monkeypatch):
   assert found.verdict == "effects"
 
 
+def _fake(joint, without):
+  now = SimpleNamespace(alike=lambda apart: bool(np.abs(apart).max() < 0.1))
+  null = SimpleNamespace(fit=SimpleNamespace(residuals=[np.full((1, 20), without)]))
+  return SimpleNamespace(joint=joint, now=now, explainer=SimpleNamespace(null=null))
+
+
+@pytest.mark.parametrize(("at_elbow", "same"), [(1.0, True), (0.5, False)])
+def test_a_load_farther_out_is_the_same_where_the_joints_between_feel_nothing(at_elbow, same):
+  shoulder, elbow = _fake("shoulder", 1.0), _fake("elbow", 1.0)
+  near, far = (
+    wide.Wide(
+      Term(kind="payload", target=body, names=(), low=(), high=(), scale=(), starts=()),
+      members,
+      SimpleNamespace(residuals=[np.full((1, 20), left) for left in lefts]),
+    )
+    for body, members, lefts in (
+      ("upper", (shoulder,), (0.0,)),
+      ("lower", (elbow, shoulder), (at_elbow, 0.0)),
+    )
+  )
+  assert wide.same(near, far) == wide.same(far, near) == same
+  assert min([far, near], key=scopes._how_usual) is near
+
+
 @pytest.mark.parametrize(("square", "stands"), [(0.1, True), (1.0, False), (9.0, False)])
 def test_explanations_beside_a_further_effect_must_be_better(square, stands):
   now = SimpleNamespace(
