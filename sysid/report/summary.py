@@ -147,7 +147,7 @@ def _either(names: Sequence[str], claimed: Sequence[str]) -> str:
       words.append(" + ".join(("the same", *more)))
     else:
       words.append(" + ".join(kinds))
-  return " or ".join(dict.fromkeys(words))
+  return " or ".join(dict.fromkeys(words)).replace("_", " ")
 
 
 def _remains(content: dict[str, Any], unit: str) -> Answer:

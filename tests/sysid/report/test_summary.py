@@ -82,7 +82,7 @@ def test_a_named_effect_has_its_value_its_certainty_and_what_remains(content):
   assert sure.startswith("8.1 standard errors; 3.0 are asked | By so much every explanation")
   assert remains.startswith("1.5 mrad, 1.5 times the readings' noise | The declared model leaves")
   assert record.startswith("Steps of 1.5 s, 0.9 rad about 0 rad | ")
-  assert "of stribeck_friction, would differ by 3.2 times the noise" in record
+  assert "of stribeck friction, would differ by 3.2 times the noise" in record
   (block,) = summary.section(
     content, asked=(3.0, 4.0), unit="mrad", shown="", referred=False
   ).blocks
@@ -99,7 +99,7 @@ def test_what_logs_do_not_tell_apart_is_said(content):
   content["alternatives"] = [rival, {**rival, "kind": "backlash", "confounded": False}]
   _, sure, _, _ = answers(content)
   assert "By so much every other explanation" in sure
-  assert sure.endswith("These logs do not tell it from spring + viscous_friction.")
+  assert sure.endswith("These logs do not tell it from spring + viscous friction.")
   assert tones(content)[1] == "warn"
 
 
@@ -168,7 +168,7 @@ def test_a_motion_without_a_reason_is_not_proposed(content):
 
 def test_rivals_that_no_motion_separates_are_said(content):
   content["next_excitation"]["separation_in_noise"] = 0.02
-  words = "No motion that was tried would tell more | Stribeck_friction would differ from what is"
+  words = "No motion that was tried would tell more | Stribeck friction would differ from what is"
   assert answers(content)[3].startswith(words)
   content |= {"effects": [], "verdict": "none"}
   assert answers(content)[3] == "Nothing in particular"
