@@ -248,9 +248,13 @@ def beside(item: Wide, other: Wide) -> float:
   joints = {m.joint: m for m in (*item.members, *other.members)}.values()
   before = [m.state for m in joints]
   held = dataclasses.replace(other.term.held_at(other.x), known=True)
-  for member in other.members:
-    member.take(held)
-  clear = resumed(item.term, item.members, item.x).evidence().clear
+  for member in other.members:  # with what they have of their own
+    explainer, null = member.explainer, member.explainer.null
+    explainer.null = scored_on(member.now, (*null.terms, held), null.fit.x, iterations=4)
+  nulls = [m.explainer.null for m in item.members]
+  fitter = Fitter([m.now for m in item.members], Layout([n.terms for n in nulls], [item.term]))
+  fit = fitter.linearise(np.concatenate([item.x, *[n.fit.x for n in nulls]]))
+  clear = fitted(dataclasses.replace(item, fit=fit)).evidence().clear
   for member, state in zip(joints, before, strict=True):
     member.state = state
   return clear

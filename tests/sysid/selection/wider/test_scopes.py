@@ -90,6 +90,22 @@ def test_effects_of_the_machine_that_hide_each_other_are_both_there(model):
   }
 
 
+def test_effects_are_tried_beside_each_other_with_what_joints_have_of_their_own(model):
+  low = Effect("supply_sag", None, {"droop": 0.0, "fade": 0.03})
+  tilted = Effect("gravity_tilt", None, {"x": 0.1, "y": 0.1})
+  joints = _subjects(model, _logs([low, tilted], duration=8.0))
+  explainer = joints[0].explainer
+  own = explainer.extend(explainer.null, 1, "viscous_friction")[0]
+  explainer.null = own
+  found = {
+    term.kind: wide.screened(term, members)
+    for term, members in wide.hypotheses(model, joints)
+    if term.kind == "gravity_tilt" or term.kind == "supply_sag"
+  }
+  assert np.isfinite(wide.beside(found["gravity_tilt"], found["supply_sag"]))
+  assert explainer.null is own
+
+
 def test_one_joint_s_friction_stays_its_own_beside_a_reference(model):
   rough = Effect("coulomb_friction", "shoulder", {"torque": 0.25})
   found = analysis.analyse(model, _logs([LATE, rough]), _logs([LATE], seed=10))
