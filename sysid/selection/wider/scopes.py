@@ -2,7 +2,8 @@
 
 They come before joints are explained one by one. An effect is of the wider scope where it is
 clearly better than nothing, than the same effect at one joint alone and than every other of wider
-scope, and where the joints' explanations need it in the end.
+scope, unless that is clearly better with it beside, and where the joints' explanations need it in
+the end.
 """
 
 import dataclasses
