@@ -138,22 +138,19 @@ def drawing(edges: Iterable[Edge]) -> str:
 
 
 def folder_table(edges: Iterable[Edge], package: str) -> str:
-  """Returns a table of a package's folders: their content, size, and what they import of it."""
+  """Returns a table of a package's folders: their content, files, and what they import of it."""
   known = modules()
   between = count(edges, folder_of)
   names = sorted({folder_of(module) for module in known if package_of(module) == package})
-  rows = ["| where | what | files, lines | uses |", "| --- | --- | --- | --- |"]
+  rows = ["| where | what | files | uses |", "| --- | --- | --- | --- |"]
   for name in names:
     if name == package:
       continue
-    inside = [path for module, path in known.items() if folder_of(module) == name]
-    lines = sum(len(path.read_text().splitlines()) for path in inside)
+    files = sum(folder_of(module) == name for module in known)
     uses = sorted(b.split(".")[1] for a, b in between if a == name and b.startswith(package + "."))
     is_folder = (ROOT / Path(*name.split("."))).is_dir()
     where = name.split(".")[1] + ("/" if is_folder else ".py")
-    rows.append(
-      f"| `{where}` | {_first_sentence(known[name])} | {len(inside)}, {lines} | {', '.join(uses)} |"
-    )
+    rows.append(f"| `{where}` | {_first_sentence(known[name])} | {files} | {', '.join(uses)} |")
   return "\n".join(rows)
 
 
