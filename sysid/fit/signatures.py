@@ -7,12 +7,14 @@ The residual torque is what the measured motion demands beyond what the model su
 Dry friction is left in, as a step at v = 0. Shapes: N samples.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from nerf2real.sysid.hypotheses.candidates import SHORTEST
 from nerf2real.sysid.hypotheses.composition import Composed, compose
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX, table_force
 
@@ -60,15 +62,23 @@ def torque_residual(plant: JointModel, hypothesis: Composed, index: int) -> Torq
   return TorqueResidual(*(f[inner] for f in fields))
 
 
-def waves(plant: JointModel, *, count: int = 3) -> list[tuple[float, float, float]]:
-  """Returns the strongest periodic parts of the declared model's residual torque over position.
+def waves(
+  plant: JointModel, terms: Sequence[Term] = (), x: Array | None = None, *, count: int = 3
+) -> list[tuple[float, float, float]]:
+  """Returns the strongest periodic parts of a hypothesis' residual torque over position.
+
+  Args:
+    plant: the joint with its logs.
+    terms: of the hypothesis; the declared model for none.
+    x: its values [n].
+    count: of parts.
 
   Returns:
     (amplitude [N m], periods [1/rad], phase) of torque amplitude * sin(periods q + phase) that the
     model lacks, the strongest first.
   """
-  declared = compose(plant, (), np.zeros(0))
-  parts = [torque_residual(plant, declared, i) for i in range(len(plant.logs))]
+  held = compose(plant, terms, np.zeros(0) if x is None else x)
+  parts = [torque_residual(plant, held, i) for i in range(len(plant.logs))]
   q = np.concatenate([p.position for p in parts])
   v = np.concatenate([p.velocity for p in parts])
   r = np.concatenate([p.residual for p in parts])

@@ -12,7 +12,7 @@ import numpy as np
 
 from nerf2real.suite.effects.registry import KINDS
 from nerf2real.sysid.hypotheses import force_law, measured_supply
-from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.hypotheses.terms import COGGING, Term
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.plant import JointPlant
 
@@ -236,7 +236,7 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
   torque = typical_torque(plant)
   longest = min(np.pi * _SEEN / _reach(plant), SHORTEST - 1.0)
   return Term(
-    "cogging",
+    COGGING,
     plant.joint,
     ("amplitude", "periods", "phase"),
     (0.0, longest, -10.0),

@@ -29,6 +29,9 @@ MuJoCo's own lets it creep."""
 WEAK = "motor_gain"
 """The kind that is a joint's strength, or the supply's where all actuators have it."""
 
+COGGING = "cogging"
+"""The kind that is a torque which repeats with position."""
+
 SERVO_GAIN = "servo_gain"
 """Fixed parameter of constants: gain of the servo's law over the declared one, by the duty log."""
 
@@ -288,5 +291,5 @@ _APPLY = {
   "supply_sag": _weakening("sag", ("droop", "fade"), ("back_emf", "pulsed")),
   "thermal_derating": _weakening("heat", ("heating", "time_constant", "derating"), ("back_emf",)),
   "spring": _spring,
-  "cogging": _setter(("amplitude", "amplitude"), ("periods", "periods"), ("phase", "phase")),
+  COGGING: _setter(("amplitude", "amplitude"), ("periods", "periods"), ("phase", "phase")),
 }

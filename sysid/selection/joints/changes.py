@@ -22,7 +22,7 @@ from nerf2real.sysid.selection.joints.leaving import is_unusual, leaves, may_lea
 from nerf2real.sysid.selection.joints.naming import conclude
 from nerf2real.sysid.selection.joints.subject import Subject, following
 from nerf2real.sysid.selection.search.elaboration import elaborated
-from nerf2real.sysid.selection.search.evidence import UNREPEATED, clear
+from nerf2real.sysid.selection.search.evidence import UNREPEATED, Scored, clear
 from nerf2real.sysid.selection.search.growth import grow
 from nerf2real.sysid.selection.search.rivals import with_anothers
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -41,19 +41,21 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
 
   A course through play does not repeat, so that no model of it is near a whole log; what it
   predicts from each reading on is judged where play is in the best hypothesis of whole logs, or in
-  the likeliest, which is seldom clear of the others there.
+  the likeliest, which is seldom clear of the others there. Both are tried there, too: what makes
+  all torques smaller hardly shows from one reading to the next, and whole logs find it beside play.
   """
   whole = _explained(subject, settings)
   done = subject.now.follows or whole.verdict in ("none", "effects")
   likely = max((s for s in whole.ranked if not s.neutral), key=lambda s: s.evidence)
   if done or not (whole.found.best.names | likely.names) & set(UNREPEATED):
     return whole
-  near = _explained(following(subject), settings)
+  also = {id(s): s for s in (whole.found.best, likely) if not s.beside_force}
+  near = _explained(following(subject), settings, also=list(also.values()))
   stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
   return near if stands else whole
 
 
-def _explained(subject: Subject, settings: Settings) -> Changed:
+def _explained(subject: Subject, settings: Settings, also: Sequence[Scored] = ()) -> Changed:
   now, before, usual = subject.now, subject.before, subject.usual
   known, explainer = subject.known, subject.explainer
   own = [t for t in known if t.names]
@@ -61,7 +63,7 @@ def _explained(subject: Subject, settings: Settings) -> Changed:
   anyway, left = remaining(subject, explainer.null)
   more_at_first = bool(np.any(settings.more**2 * anyway < left))
   if may_leave(subject, explainer.null, settings) or more_at_first:
-    ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings))
+    ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings), also=also)
   else:
     ranked = explainer.constants_alone()
   baseline = now.squares(as_it_was)[0]

@@ -51,7 +51,7 @@ def supported(
   more than they are, it is left out with all else as it is beside it. One that is a force over one
   variable stands unless a force of any form over that variable does clearly better and explains a
   twentieth more of the squares; any other where hypotheses with a force of any form over both are
-  clearly worse without it.
+  clearly worse without it, with constants that may be off where they are in the best hypothesis.
 
   Args:
     explainer: scores what has not been scored.
@@ -77,7 +77,10 @@ def supported(
         explained >= _MOST * (explained + left - _left(explainer, rival))
       )
     else:
-      beside, bare = (rivals.with_force(explainer, s) for s in (best, without))
+      both = [best, without]
+      if best.is_strained(explainer.settings.level):  # the constants are off: in either
+        both = [rivals.with_freed(explainer, s) for s in both]
+      beside, bare = (rivals.with_force(explainer, s) for s in both)
       stands = clear(beside, bare) > beyond
     if stands:
       kept.append(kind)

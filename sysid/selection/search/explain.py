@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerf2real.suite.effects import kind_of
-from nerf2real.sysid.fit import rough
+from nerf2real.sysid.fit import rough, signatures
 from nerf2real.sysid.fit.layout import CONSTANTS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
-from nerf2real.sysid.hypotheses.terms import WEAK, Term
+from nerf2real.sysid.hypotheses.terms import COGGING, WEAK, Term
 from nerf2real.sysid.selection.search.evidence import UNREPEATED, Scored, kinds_of
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -85,10 +85,10 @@ def _moved(terms: Sequence[Term], starts: Array) -> Array:
   its phase moved by the zero: either was found over positions as they were read."""
   at = {(t.kind, n): i for i, (t, n) in enumerate((t, n) for t in terms for n in t.names)}
   zero = at.get(("encoder_offset", "offset"))
-  if zero is None or ("cogging", "phase") not in at:
+  if zero is None or (COGGING, "phase") not in at:
     return starts
-  moved, phase = starts.copy(), at["cogging", "phase"]
-  turned = moved[:, phase] + moved[:, at["cogging", "periods"]] * moved[:, zero]
+  moved, phase = starts.copy(), at[COGGING, "phase"]
+  turned = moved[:, phase] + moved[:, at[COGGING, "periods"]] * moved[:, zero]
   moved[:, phase] = np.angle(np.exp(1j * turned))
   return np.vstack([starts, moved])
 
@@ -160,16 +160,20 @@ class Explainer:
     nats = self.joint.loglik(self.joint.squares(item.fit.residuals[0]))
     return item.prior - float(nats.sum())
 
-  def extend(self, parent: Scored, keep: int, only: str | None = None) -> list[Scored]:
+  def extend(
+    self, parent: Scored, keep: int, only: str | None = None, *, forms: bool = False
+  ) -> list[Scored]:
     """Returns the best hypotheses that add one effect to a parent, fitted to the end.
 
     Args:
       parent: the hypothesis.
       keep: of how many kinds.
       only: the one kind that is tried; None for all.
+      forms: whether the parent's effects are tried in their other forms, too.
     """
     tried: list[tuple[Fitter, tuple[Term, ...], Fit]] = []
-    for terms, starts, stale, fresh in self._candidates(parent):
+    parents = (parent, *(self._other_forms(parent) if forms else ()))
+    for terms, starts, stale, fresh in (c for p in parents for c in self._candidates(p)):
       if only is not None and only not in kinds_of(terms):
         continue
       fitter = Fitter([self.joint], Layout([terms]))
@@ -191,6 +195,38 @@ class Explainer:
       self.score(terms, rough.look_about(fitter, fitter.fit(fit, iterations=4), rough.STAIRS))
       for fitter, terms, fit in chosen[:keep]
     ]
+
+  def take_over(self, other: Scored) -> Scored:
+    """Returns the hypothesis of another explainer of the joint, fitted on and scored here."""
+    own = [t for t in other.terms if t in self.library]
+    first = self.freed if other.terms[0].freed and self.freed is not None else self.constants
+    instead = {t.kind for t in own}
+    known = [t for t in self.base[1:] if t.wider or t.kind not in instead]
+    terms = (first, *known, *own)
+    x = []
+    for term in terms:
+      twin = next((t for t in other.terms if t == term or t.kind == term.kind == CONSTANTS), None)
+      values = {} if twin is None else other.fit.values(twin)
+      x += [values.get(name, at) for name, at in zip(term.names, term.starts[0], strict=True)]
+    fitter = Fitter([self.joint], Layout([terms]))
+    return self.score(terms, fitter.fit(np.array(x), iterations=8))
+
+  def _other_forms(self, parent: Scored) -> list[Scored]:
+    """Returns a hypothesis with each of its effects in the other forms that its kind has, where
+    they predict another motion: one that is worse alone may be the better one beside another."""
+    found = []
+    for at, term in enumerate(parent.terms):
+      for form in self.library if term in self.library else ():
+        if form.kind != term.kind or form.names != term.names or form.fixed == term.fixed:
+          continue
+        terms = (*parent.terms[:at], form, *parent.terms[at + 1 :])
+        if terms not in self.scored:
+          fitter = Fitter([self.joint], Layout([terms]))
+          self.score(terms, fitter.fit(parent.fit.x, iterations=4))
+        item = self.scored[terms]
+        if not self.joint.alike(item.fit.residuals[0] - parent.fit.residuals[0]):
+          found.append(item)
+    return found
 
   def _begin(
     self, parent: Scored, fitter: Fitter, starts: Array
@@ -243,11 +279,22 @@ class Explainer:
       if term.kind in old:
         continue
       blank = np.zeros((len(term.names), *known.shape[1:]))
-      own = [np.concatenate([x, s]) for s in term.starts]
+      own = [np.concatenate([x, s]) for s in (*term.starts, *self._waves(parent, term))]
       begin = np.array([*own, *_handed_over(parent, term), *_scaled(parent, term)])
       begin = _moved((*parent.terms, term), begin)
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
+
+  def _waves(self, parent: Scored, term: Term) -> list[tuple[float, ...]]:
+    """Returns where torque repeats with position under a hypothesis, if that is what a term says:
+    what else is missing hides it in what the declared model leaves."""
+    if term.kind != COGGING or not parent.names:
+      return []
+    plant = self.joint.plant
+    return [
+      tuple(np.clip(wave, term.low, term.high))
+      for wave in signatures.waves(plant, parent.terms, parent.fit.x)
+    ]
 
   def constants_alone(self) -> list[Scored]:
     """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
@@ -270,7 +317,9 @@ class Explainer:
         break
     if self.joint.follows and best.names & set(UNREPEATED):
       fitter = Fitter([self.joint], Layout([best.terms]))
-      best = self.score(best.terms, fitter.fit(rough.draw(fitter, best.fit).x, iterations=8))
+      drawn = self.score(best.terms, fitter.fit(rough.draw(fitter, best.fit).x, iterations=8))
+      best = max(drawn, best, key=lambda item: item.evidence)
+      self.scored[best.terms] = best
       self.joint.rescale(best.fit.residuals[0])
     self.rescore()
     return best

@@ -1,6 +1,6 @@
 """Grows sets of effects until one more is not clear, exchanges them, and scores their rivals."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size
 from nerf2real.sysid.selection.search.explain import Explainer
@@ -13,6 +13,7 @@ def grow(
   explainer: Explainer,
   depth: int | None = None,
   leaves: Callable[[Scored], bool] = lambda _: False,
+  also: Sequence[Scored] = (),
 ) -> list[Scored]:
   """Returns all scored hypotheses, the best first.
 
@@ -21,11 +22,12 @@ def grow(
     depth: effects at most; those of the settings for None.
     leaves: whether a hypothesis leaves more than a machine does anyway: then one more is tried as
       long as it predicts what was left out better, too.
+    also: hypotheses of another explainer of the joint, which compete with what was grown.
   """
   s, limit = explainer.settings, depth or explainer.settings.depth
   parents, best = [explainer.null], explainer.null
   for size in range(limit):
-    grown = [g for p in parents for g in explainer.extend(p, s.kept)]
+    grown = [g for p in parents for g in explainer.extend(p, s.kept, forms=leaves(best))]
     if not grown:
       break
     top = max(grown, key=lambda g: g.evidence)
@@ -42,6 +44,10 @@ def grow(
       break
     best = grown[0]
     parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]
+  for item in also:
+    taken = explainer.take_over(item)
+    if taken.evidence > best.evidence:
+      best = explainer.adopt(taken)
   best = _exchanged(explainer, best)
   for size in {len(item.names) for item in explainer.scored.values()}:
     same = of_size(explainer.scored.values(), size)

@@ -29,6 +29,17 @@ def lacking(explainer: Explainer, item: Scored, kind: str) -> Scored:
   return explainer.scored[kept]
 
 
+def with_freed(explainer: Explainer, item: Scored) -> Scored:
+  """Returns a hypothesis whose constants may differ from what they are taken for."""
+  if explainer.freed is None or item.terms[0].freed:
+    return item
+  terms = (explainer.freed, *item.terms[1:])
+  if terms not in explainer.scored:
+    fitter = Fitter([explainer.joint], Layout([terms]))
+    explainer.score(terms, fitter.fit(item.fit.x, iterations=6))
+  return explainer.scored[terms]
+
+
 def with_anothers(explainer: Explainer, best: Scored, rivals: Sequence[Scored]) -> bool:
   """Scores the best hypothesis with each effect that rivals have besides.
 

@@ -97,8 +97,10 @@ def test_what_is_no_play_is_not_judged_by_following(model) -> None:
 def test_play_that_is_likeliest_but_not_clear_is_judged_from_each_reading_on(
   monkeypatch, likeliest, named, stands
 ) -> None:
-  nothing = SimpleNamespace(names=frozenset(), neutral=False, evidence=-9.0)
-  best = SimpleNamespace(names=frozenset(likeliest), neutral=False, evidence=-1.0)
+  nothing = SimpleNamespace(names=frozenset(), neutral=False, evidence=-9.0, beside_force=False)
+  best = SimpleNamespace(
+    names=frozenset(likeliest), neutral=False, evidence=-1.0, beside_force=False
+  )
   whole = SimpleNamespace(
     verdict="unexplained", ranked=[best, nothing], found=SimpleNamespace(best=nothing)
   )
@@ -106,8 +108,15 @@ def test_play_that_is_likeliest_but_not_clear_is_judged_from_each_reading_on(
   subject = SimpleNamespace(now=SimpleNamespace(follows=False))
   again = SimpleNamespace(now=SimpleNamespace(follows=True))
   monkeypatch.setattr(changes, "following", lambda _: again)
-  monkeypatch.setattr(changes, "_explained", lambda of, _: near if of is again else whole)
+  handed = []
+
+  def explained(of, _, also=()):
+    handed.extend(also)
+    return near if of is again else whole
+
+  monkeypatch.setattr(changes, "_explained", explained)
   assert changes.explain(subject) is (near if stands else whole)
+  assert handed == ([nothing, best] if "backlash" in likeliest else [])
 
 
 def test_a_joint_that_is_followed_has_what_others_share_and_what_its_reference_has(model) -> None:

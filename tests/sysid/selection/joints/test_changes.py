@@ -227,6 +227,19 @@ def test_a_law_that_explains_nearly_all_that_a_force_does_stands(monkeypatch, fr
   assert found == stands
 
 
+@pytest.mark.parametrize(("strained", "stands"), [(False, ("payload",)), (True, ())])
+def test_constants_that_are_off_are_so_beside_a_force_too(monkeypatch, strained, stands):
+  """What a name does beside a force where constants are held, constants that are off do as well."""
+  freed = object()
+  monkeypatch.setattr(rivals, "lacking", lambda *_: _leaving(9.0))
+  monkeypatch.setattr(rivals, "with_freed", lambda *_: freed)
+  monkeypatch.setattr(rivals, "with_force", lambda _, item: item)
+  monkeypatch.setattr(doubts, "clear", lambda item, _: 1.0 if item is freed else 5.0)
+  best = _leaving(1.0, strained)
+  found = doubts.supported(_explainer(), best, ("payload",), 3.0, anyway=0.1, forced=["payload"])
+  assert found == stands
+
+
 def test_each_of_several_names_is_tried_beside_a_force(monkeypatch):
   tried = []
   monkeypatch.setattr(rivals, "lacking", lambda *_: _leaving(9.0))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect
+from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
@@ -23,15 +24,22 @@ KINDS = ("command_delay", "coulomb_friction", "motor_gain", "viscous_friction")
 
 @pytest.fixture(scope="module")
 def explainer():
-  model = mujoco.MjModel.from_xml_string(PENDULUM)
   hidden = [
     Effect("coulomb_friction", "joint", {"torque": 0.3}),
     Effect("motor_gain", "joint", {"gain": 1.3, "scales_limit": 1.0}),
   ]
+  return _explainer(hidden, KINDS)
+
+
+def _explainer(hidden, kinds):
+  """Returns one of a pendulum that has effects, and a library of some kinds."""
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
   logs = [log_of(PENDULUM, kind, hidden, duration=5.0) for kind in ("sweep", "slow")]
   plant = JointModel(model, "joint", logs)
-  library = [t for t in candidates.library(plant) if t.kind in KINDS]
-  return Explainer(JointLikelihood(plant, settings=SETTINGS), constants(plant), library)
+  library = candidates.library(plant)
+  library.append(candidates.cogging(plant, signatures.waves(plant)))
+  own = [t for t in library if t.kind in kinds]
+  return Explainer(JointLikelihood(plant, settings=SETTINGS), constants(plant), own)
 
 
 def _of(explainer, *kinds):
@@ -84,6 +92,51 @@ def test_what_a_rival_has_besides_is_tried_beside_the_best_hypothesis(explainer)
   )
   assert rubbing.evidence > max(best.evidence, late.evidence)  # friction is there, a delay is not
   assert not rivals.with_anothers(explainer, best, [rival])  # all are scored
+
+
+def test_a_form_that_is_worse_alone_is_found_beside_another_effect():
+  """Friction of what the link takes, in a weak motor: alone that of all torques looks likelier."""
+  hidden = [
+    Effect("load_friction", "joint", {"coefficient": 0.4, "carried": 2.0}),
+    Effect("motor_gain", "joint", {"gain": 0.69, "scales_limit": 1.0}),
+  ]
+  explainer = _explainer(hidden, ("load_friction", "motor_gain"))
+  (single,) = (s for s in explainer.extend(explainer.null, 2) if s.names == {"load_friction"})
+  assert dict(single.terms[-1].fixed)["carried"] != 2.0
+  alone, among = (
+    explainer.extend(single, 1, only="motor_gain", forms=forms)[0] for forms in (False, True)
+  )
+  assert dict(among.terms[1].fixed)["carried"] == 2.0
+  left = [np.sqrt(np.median(s.fit.held[0][0])) for s in (among, alone)]
+  assert left[0] < 0.5 * left[1]
+  assert among.values("load_friction")["coefficient"] == pytest.approx(0.4, rel=0.1)
+
+
+def test_cogging_is_read_off_what_the_effects_beside_it_leave():
+  hidden = [
+    Effect("torque_limit", "joint", {"limit": 1.2}),
+    Effect("cogging", "joint", {"amplitude": 0.06, "periods": 7.5, "phase": -2.0}),
+  ]
+  explainer = _explainer(hidden, ("torque_limit", "cogging"))
+  limited = _of(explainer, "torque_limit")
+  wave = next(t for t in explainer.library if t.kind == "cogging")
+  assert min(abs(s[1] - 7.5) for s in wave.starts) > 1.0  # the limit hides it
+  assert min(abs(s[1] - 7.5) for s in explainer._waves(limited, wave)) < 0.5
+  assert explainer._waves(explainer.null, wave) == []
+  (found,) = explainer.extend(limited, 1, only="cogging")
+  assert found.values("cogging")["periods"] == pytest.approx(7.5, rel=0.02)
+
+
+def test_a_hypothesis_is_taken_over_with_its_values(explainer):
+  grown = growth._exchanged(explainer, _of(explainer, "coulomb_friction", "viscous_friction"))
+  plant = explainer.joint.plant
+  other = Explainer(
+    JointLikelihood(plant, settings=SETTINGS), explainer.constants, explainer.library
+  )
+  taken = other.take_over(grown)
+  assert taken.terms == grown.terms and taken in other.scored.values()
+  for kind, values in {"motor_gain": {"gain": 1.3}, "coulomb_friction": {"torque": 0.3}}.items():
+    assert taken.values(kind) == pytest.approx(values, rel=0.1)
 
 
 def test_cogging_begins_where_a_shifted_zero_has_moved_it(explainer):
