@@ -6,7 +6,8 @@ Of sets of the first generator whose effects are all at one joint, without refer
 hypotheses are grown as the analyser grows them; then the hidden effects themselves are fitted,
 begun at their hidden values, in every form that they have. Where that is clearly better than what
 was grown the search had failed; where what was grown lacks an effect and is not clearly worse, the
-logs do not tell.
+logs do not tell. Both are of whole courses: what is judged from reading to reading, beside play, is
+not looked at, nor what a name must stand besides.
 """
 
 import dataclasses
@@ -50,6 +51,9 @@ class Settings:
 def main(settings: Settings) -> None:
   """Prints a row for every set."""
   answers = json.loads((settings.sets / "answers.json").read_text())
+  unknown = [name for name in settings.only if name not in answers]
+  if unknown:
+    raise ValueError(f"Found no sets {unknown} in {settings.sets}, expected some of its answers.")
   rows = []
   for name, answer in answers.items():
     joint = one_joint(answer)

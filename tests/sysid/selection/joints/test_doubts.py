@@ -165,14 +165,23 @@ def test_what_constants_are_better_for_otherwise_says_nothing_of_an_effect(
   assert doubts.more_likely(gains, prior, 0.05) == new
 
 
-@pytest.mark.parametrize("low, something", [(0.003, False), (0.019, False), (0.03, True)])
-def test_what_a_healthy_mesh_of_gears_loses_is_no_effect(monkeypatch, low, something):
+@pytest.mark.parametrize(
+  "low, reference, something",
+  [
+    (0.003, False, False),
+    (0.019, False, False),
+    (0.03, False, True),
+    (0.003, True, True),  # the reference has what a healthy one loses
+  ],
+)
+def test_what_a_healthy_mesh_of_gears_loses_is_no_effect(monkeypatch, low, reference, something):
   term = SimpleNamespace(
     name="load_friction", kind="load_friction", names=("coefficient",), freed=False
   )
   bounds = {"coefficient": (low, low + 0.01)}
   monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
   plant = SimpleNamespace(hinge=True, holds=True)
-  joint = SimpleNamespace(before=None, now=SimpleNamespace(plant=plant, settings=SETTINGS))
+  before = object() if reference else None
+  joint = SimpleNamespace(before=before, now=SimpleNamespace(plant=plant, settings=SETTINGS))
   best = SimpleNamespace(terms=[term], fit=None)
   assert doubts.is_something(joint, best, "load_friction") == something
