@@ -25,8 +25,8 @@ from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.fit import resolution
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.supported import on_a_stand
 from nerf2real.sysid.selection.joints.leaving import leaves
 from nerf2real.sysid.selection.joints.subject import Subject, prepare
@@ -79,15 +79,13 @@ def _prepared(folder: Path, joint: str) -> Subject:
   compiled = load_model(path)
   logs = read_logs(sorted(folder.glob("train_*.mcap")), compiled)
   model = on_a_stand(path, compiled)
-  reductions = [Reduction(model, log) for log in logs]
-  numerics = resolution.numerics(reductions)
-  if numerics != Numerics(reductions[0].step):
+  machine = Machine(model, logs)
+  numerics = resolution.numerics(machine)
+  if numerics != Numerics(machine.reductions[0].step):
     numerics.apply(model)
-    reductions = [Reduction(model, log) for log in logs]
+    machine = Machine(model, logs)
   tried = len(logs[0].commands.joints)
-  return prepare(
-    model, joint, logs, (), reductions=(reductions, ()), tried=tried, settings=SETTINGS
-  )
+  return prepare(joint, machine, None, tried=tried, settings=SETTINGS)
 
 
 def row(subject: Subject, effects: Sequence[Mapping[str, Any]]) -> list[str]:

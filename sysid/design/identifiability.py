@@ -9,19 +9,17 @@ Effects of several joints are judged at each of them.
 import dataclasses
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.core.robot_logs.reading import Log, moves
+from nerf2real.core.robot_logs.reading import moves
 from nerf2real.sysid.design import excitation
 from nerf2real.sysid.design.information import Place, beside, information, places
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.drive import actuator_of
-from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection.joints.subject import own_library
 from nerf2real.sysid.settings import Settings
 
@@ -91,25 +89,22 @@ class Identifiability:
 
 
 def of_machine(
-  model: mujoco.MjModel,
-  logs: Sequence[Log],
+  machine: Machine,
   *,
   repeated: bool,
   settings: Settings,
-  reductions: Sequence[Reduction] | None = None,
   progress: Progress = no_progress,
 ) -> list[Identifiability]:
   """Returns what logs can show of every joint that all of them command and that moves, before
   anything is fitted.
 
   Args:
-    model: the declared one.
-    logs: to identify from.
+    machine: the declared model along the logs to identify from.
     repeated: whether reference logs tell the constants, so that they vary by `settings.repeat`.
     settings: tolerances.
-    reductions: of the logs, where they were made before.
     progress: called with the fraction done and a text.
   """
+  model, logs = machine.model, machine.logs
   joints = [
     name
     for name in logs[0].commands.joints
@@ -119,11 +114,10 @@ def of_machine(
   ]
   if repeated:
     settings = dataclasses.replace(settings, tolerances=settings.repeat)
-  reductions = reductions or [Reduction(model, log) for log in logs]
   result = []
   for k, joint in enumerate(joints):
     progress(k / len(joints), f"what the logs can show of {joint}, {k + 1} of {len(joints)} joints")
-    plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)
+    plant = machine.joint(joint)
     library = own_library(plant, alone=len(joints) == 1)
     result.append(identifiability(JointLikelihood(plant, settings=settings), library))
   return result

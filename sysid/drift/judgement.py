@@ -23,8 +23,7 @@ from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, moves
 from nerf2real.sysid.drift.stored import Stored, StoredJoint, squares_by_log
 from nerf2real.sysid.drift.values import Value, compare
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection.search.evidence import variance
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -105,13 +104,9 @@ def judge(stored: Stored, logs: Sequence[Log], *, settings: Settings = SETTINGS)
       "the motions of the stored result."
     )
   stored = _without(stored, still)
-  reductions = [Reduction(stored.model, log) for log in logs]
+  machine = Machine(stored.model, logs, window_s=settings.window_s)
   now = {
-    item.joint: JointLikelihood(
-      JointModel(stored.model, item.joint, logs, reductions=reductions, window_s=settings.window_s),
-      settings=settings,
-      follows=item.follows,
-    )
+    item.joint: JointLikelihood(machine.joint(item.joint), settings=settings, follows=item.follows)
     for item in stored.joints
   }
   level = settings.level / _TESTS

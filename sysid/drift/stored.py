@@ -16,9 +16,8 @@ from nerf2real.suite.effects.files import from_list, to_list
 from nerf2real.sysid.data.opening import load_model
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.simulation import Clocks, Member
 from nerf2real.sysid.model.supported import on_a_stand
 from nerf2real.sysid.selection.findings import Identified
@@ -81,18 +80,12 @@ def remembered(found: Identified, held: Sequence[Log], settings: Settings) -> li
     held: logs that were not fitted.
     settings: length of blocks.
   """
-  reductions = [Reduction(found.model, log) for log in held]
+  other = Machine(found.model, held, window_s=settings.window_s)
   result = []
   for item in found.joints:
-    best, likelihoods = (
-      item.extended,
-      [JointLikelihood(item.likelihood.plant, settings=settings, follows=item.likelihood.follows)],
-    )
-    if held:
-      plant = JointModel(
-        found.model, item.joint, held, reductions=reductions, window_s=settings.window_s
-      )
-      likelihoods.append(JointLikelihood(plant, settings=settings, follows=item.likelihood.follows))
+    plants = [item.likelihood.plant, *([other.joint(item.joint)] if held else [])]
+    follows, best = item.likelihood.follows, item.extended
+    likelihoods = [JointLikelihood(p, settings=settings, follows=follows) for p in plants]
     result.append(joint_of(likelihoods, best.terms, best.fit.x))
   return result
 

@@ -20,9 +20,9 @@ from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.free_force import free_force
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.measured import block_starts
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.settings import SETTINGS
 
 Array = np.ndarray
@@ -35,16 +35,14 @@ _TO_NOTHING = 2.0  # times what halving a step changes: what a step of nothing w
 _MACHINE = 0.5  # standard deviation of the share of a resolved simulation that logs show, about 1
 
 
-def numerics(reductions: Sequence[Reduction]) -> Numerics:
+def numerics(machine: Machine) -> Numerics:
   """Returns the numerics with which a declared model is simulated: its own, or finer ones.
 
   Args:
-    reductions: of the declared model along the logs.
+    machine: the declared model along the logs.
   """
-  model, logs = reductions[0].model, [reduction.log for reduction in reductions]
-  declared = Numerics(reductions[0].step)
-  joints = logs[0].commands.joints
-  seen = [_Seen(JointModel(model, joint, logs, reductions=reductions)) for joint in joints]
+  declared = Numerics(machine.reductions[0].step)
+  seen = [_Seen(machine.joint(joint)) for joint in machine.logs[0].commands.joints]
   held = declared._replace(prompt=True)
   found = held if any(s.differs(declared, held) for s in seen) else declared
   for s in seen:

@@ -69,6 +69,7 @@ class JointModel(JointPlant):
     self._bases: dict[str, list[Array]] = {}
     self._unloaded = [np.array(turning(fields, self.hinge)) for fields in self._nominal]
     self._loaded: dict[int, dict[tuple, tuple[Array, ...]]] = {}
+    self._missed: dict[int, Array] = {}
     periods = np.concatenate([np.diff(log.time) for log in self.logs])
     period = max(float(np.median(periods)), 1e-6)
     share = 1.0 - float(np.exp(-period / FOLLOWED_S))
@@ -105,6 +106,11 @@ class JointModel(JointPlant):
 
     The root of the mean square over `_NEAR` s, of the declared machine's own recording.
     """
+    if index not in self._missed:
+      self._missed[index] = self._missed_in(index)
+    return self._missed[index]
+
+  def _missed_in(self, index: int) -> Array:
     twin = self.reductions[index].twin
     time = self.logs[index].time
     if twin is None:
@@ -144,7 +150,7 @@ class JointModel(JointPlant):
     if all(lift is not None for lift in self._lifts):
       result._lifts = between(self._lifts)  # type: ignore[assignment]
     result._unloaded = [np.array(rows) for rows in between(self._unloaded)]
-    result._bases, result._loaded = {}, {}
+    result._bases, result._loaded, result._missed = {}, {}, {}
     return result
 
   @property

@@ -181,31 +181,37 @@ class Reduction:
     mass of the bodies, then axes and anchors of the joints [M, bodies + 2 joints, 3].
     """
     model, data, motion = self.model, mujoco.MjData(self.model), self.detailed
-    inertia, bias = np.zeros((2, len(self._knots), model.nv))
-    full, still = np.zeros((model.nv, model.nv)), np.zeros(model.nv)
-    places = []
+    count, still = len(self._knots), np.zeros(model.nv)
+    diagonal = model.M_rowadr + model.M_rownnz - 1
+    inertia, bias, demanded = np.zeros((3, count, model.nv))
+    places = np.zeros((count, model.nbody + 2 * model.njnt, 3))
+    ends = model.nbody, model.nbody + model.njnt
+    acceleration = np.zeros((count, model.nv))
+    acceleration[:, self._dofs] = 0.0 if self._alone else motion.acceleration[self._knots]
+    data.qpos[:] = model.qpos0
+    data.qpos[self._qpos] = 0.0
     for n, knot in enumerate(self._knots):
-      data.qpos[:] = model.qpos0
-      data.qpos[self._qpos] = 0.0 if self._alone else motion.position[knot]
-      data.qvel[:] = 0.0
+      if not self._alone:
+        data.qpos[self._qpos] = motion.position[knot]
       mujoco.mj_kinematics(model, data)
       mujoco.mj_comPos(model, data)
       mujoco.mj_makeM(model, data)
-      mujoco.mj_fullM(model, data, full)
-      own = full.diagonal()
-      inertia[n] = own - model.dof_armature
-      places.append(np.vstack([data.xipos, data.xaxis, data.xanchor]))
+      inertia[n] = data.M[diagonal]
+      places[n, : ends[0]] = data.xipos
+      places[n, ends[0] : ends[1]] = data.xaxis
+      places[n, ends[1] :] = data.xanchor
       if self._alone:
         continue
+      data.qvel[:] = 0.0
       mujoco.mj_comVel(model, data)
       mujoco.mj_rne(model, data, 0, still)
       data.qvel[self._dofs] = motion.velocity[knot]
       mujoco.mj_comVel(model, data)
       mujoco.mj_rne(model, data, 0, bias[n])
-      acceleration = np.zeros(model.nv)
-      acceleration[self._dofs] = motion.acceleration[knot]
-      bias[n] += full @ acceleration - own * acceleration - still
-    return inertia, bias, np.array(places)
+      mujoco.mj_mulM(model, data, demanded[n], acceleration[n])
+      bias[n] -= still
+    bias += demanded - inertia * acceleration
+    return inertia - model.dof_armature, bias, places
 
   @property
   def _lifted(self) -> Array:

@@ -26,8 +26,8 @@ from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import resolution
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.model.supported import check_supported, on_a_stand
 from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.outputs.details import claimed_effects, details_of
@@ -130,25 +130,23 @@ def _identify(
   began = time.perf_counter()
   progress(0.0, "one joint of many: what each feels of the others")
   stand = on_a_stand(model, compiled)
-  reductions = [Reduction(stand, log) for log in logs]
-  declared, used = Numerics(reductions[0].step), resolution.numerics(reductions)
+  machine = Machine(stand, logs, window_s=settings.window_s)
+  declared, used = Numerics(machine.reductions[0].step), resolution.numerics(machine)
   if used != declared:
     used.apply(stand)
     used.apply(compiled)
-    reductions = [Reduction(stand, log) for log in logs]
+    machine = Machine(stand, logs, window_s=settings.window_s)
   shown = identifiability.of_machine(
-    stand,
-    logs,
+    machine,
     repeated=bool(reference),
     settings=settings,
-    reductions=reductions,
     progress=part(progress, _REDUCED, _SHOWN),
   )
   found = analyse(
     stand,
     logs,
     reference,
-    reductions=reductions,
+    machine=machine,
     settings=settings,
     progress=part(progress, _SHOWN, _ANALYSIS),
   )

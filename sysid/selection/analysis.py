@@ -15,7 +15,7 @@ from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model.drive import actuator_of
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import claims, whole_machine
 from nerf2real.sysid.selection.findings import Identified, Zero, beside_machine
@@ -38,7 +38,7 @@ def analyse(
   logs: Sequence[Log],
   reference: Sequence[Log] = (),
   *,
-  reductions: Sequence[Reduction] | None = None,
+  machine: Machine | None = None,
   settings: Settings = SETTINGS,
   progress: Progress = no_progress,
 ) -> Identified:
@@ -51,7 +51,7 @@ def analyse(
     model: the declared one.
     logs: to identify from.
     reference: logs of the same machine without what is looked for.
-    reductions: of the logs, where they were made before.
+    machine: the model along the logs, where it was made before.
     settings: tolerances and effort.
     progress: called with the fraction done and a text.
 
@@ -70,14 +70,12 @@ def analyse(
     raise ValueError(
       "Found no joint with an actuator that all logs command and that moves, expected at least one."
     )
-  made = reductions or [Reduction(model, log) for log in logs]
-  both = list(made), [Reduction(model, log) for log in reference]
+  machine = machine or Machine(model, logs, window_s=settings.window_s)
+  before = Machine(model, reference, window_s=settings.window_s) if reference else None
   subjects = []
   for k, joint in enumerate(joints):
     progress(_PREPARED * k / len(joints), f"constants of {joint}, {k + 1} of {len(joints)} joints")
-    subjects.append(
-      prepare(model, joint, logs, reference, reductions=both, tried=len(joints), settings=settings)
-    )
+    subjects.append(prepare(joint, machine, before, tried=len(joints), settings=settings))
   shared, changed = _explained(model, subjects, settings, part(progress, _PREPARED, 1.0))
   origins = [s.origin.joint for s in shared]
   changed.sort(

@@ -8,10 +8,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
@@ -19,7 +17,7 @@ from nerf2real.sysid.hypotheses.constants import constants, sticking, tolerant
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.servo.law import ServoLaw
 from nerf2real.sysid.selection.joints.baseline import (
   changed_constants,
@@ -113,14 +111,7 @@ class Subject:
 
 
 def prepare(
-  model: mujoco.MjModel,
-  joint: str,
-  logs: Sequence[Log],
-  reference: Sequence[Log],
-  *,
-  reductions: tuple[Sequence[Reduction], Sequence[Reduction]],
-  tried: int,
-  settings: Settings,
+  joint: str, machine: Machine, reference: Machine | None, *, tried: int, settings: Settings
 ) -> Subject:
   """Returns a joint with its constants fitted.
 
@@ -129,16 +120,17 @@ def prepare(
   for longer than a block: then with what is predicted from each reading on.
 
   Args:
-    model: the declared one.
     joint: its name.
-    logs: to explain.
-    reference: of the same joint before; none if there are none.
-    reductions: of the logs and of the reference.
+    machine: the declared model along the logs to explain.
+    reference: the same along those of before; None if there are none.
     tried: joints that are looked at, over which the level of significance is shared.
     settings: tolerances and effort.
   """
-  now = _likelihood(model, joint, logs, reductions[0], settings)
-  before = _likelihood(model, joint, reference, reductions[1], settings) if reference else None
+  now, before = (
+    None if m is None else JointLikelihood(m.joint(joint), settings=settings)
+    for m in (machine, reference)
+  )
+  assert now is not None
   library = own_library(now.plant, alone=tried == 1)
   sure = thresholds(len({t.kind for t in library} | set(WHOLE)), tried, settings)
   found = _subject(now, before, library, sure, alone=tried == 1)
@@ -239,17 +231,6 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   subject.paired = subject.now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   subject.freed = freed_constants(subject.known[0])
   subject.explainer = _explainer(subject.now, before, subject.known, subject.library, subject.freed)
-
-
-def _likelihood(
-  model: mujoco.MjModel,
-  joint: str,
-  logs: Sequence[Log],
-  reductions: Sequence[Reduction],
-  settings: Settings,
-) -> JointLikelihood:
-  plant = JointModel(model, joint, logs, reductions=reductions, window_s=settings.window_s)
-  return JointLikelihood(plant, settings=settings)
 
 
 def _explainer(

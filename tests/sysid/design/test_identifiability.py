@@ -13,6 +13,7 @@ from nerf2real.sysid.design.information import Place, beside, information
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import simulation
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.report import capability
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import ARM, COUNT, PENDULUM, log_of
@@ -87,7 +88,7 @@ def triangle(duration=8.0):
 
 
 def shown_by(*logs, repeated=False):
-  (found,) = identifiability.of_machine(MODEL, logs, repeated=repeated, settings=SETTINGS)
+  (found,) = identifiability.of_machine(Machine(MODEL, logs), repeated=repeated, settings=SETTINGS)
   return found, {effect.kind: effect for effect in found.effects}
 
 
@@ -126,7 +127,7 @@ def test_a_joint_that_gravity_does_not_turn_shows_no_payload():
   upright = PENDULUM.replace('axis="0 1 0"', 'axis="0 0 1"').replace("0 0 -0.15", "0 0 0.15")
   model = mujoco.MjModel.from_xml_string(upright)
   logs = [log_of(upright, kind, duration=6.0) for kind in ("sweep", "steps")]
-  (found,) = identifiability.of_machine(model, logs, repeated=False, settings=SETTINGS)
+  (found,) = identifiability.of_machine(Machine(model, logs), repeated=False, settings=SETTINGS)
   assert "gravity_tilt" in found.hidden and "encoder_offset" in found.hidden
   assert (
     "gravity_tilt" not in shown_by(*(log_of(PENDULUM, k) for k in ("sweep", "steps")))[0].hidden
@@ -144,7 +145,7 @@ def test_references_make_smaller_effects_visible():
 def test_joints_are_counted_in_the_sentence_and_written_as_json():
   model = mujoco.MjModel.from_xml_string(ARM)
   logs = [log_of(ARM, "slow", duration=6.0)]
-  found = identifiability.of_machine(model, logs, repeated=False, settings=SETTINGS)
+  found = identifiability.of_machine(Machine(model, logs), repeated=False, settings=SETTINGS)
   assert [item.joint for item in found] == ["shoulder", "elbow"]
   words = capability.sentence(found)
   assert words.startswith("Of ") and words.count("These logs") <= 1

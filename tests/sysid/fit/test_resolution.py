@@ -8,8 +8,8 @@ import pytest
 
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit import resolution
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.selection.joints.subject import prepare
 from nerf2real.sysid.settings import SETTINGS
@@ -51,17 +51,13 @@ def recorded(xml, noise, *, effect=LATE, numerics=None):
 
 def left(model, logs):
   """Returns what constants within their tolerances leave of logs, over the noise."""
-  reductions = [Reduction(model, log) for log in logs]
-  subject = prepare(
-    model, "joint", logs, [], reductions=(reductions, []), tried=1, settings=SETTINGS
-  )
-  return subject.left
+  return prepare("joint", Machine(model, logs), None, tried=1, settings=SETTINGS).left
 
 
 @pytest.mark.parametrize(("xml", "prompt"), [(SMOOTH, False), (RUBBING, True)])
 def test_a_healthy_machine_leaves_noise_where_its_model_is_simulated_finely(xml, prompt):
   model, logs = recorded(xml, 1e-5, numerics=MACHINE)
-  found = resolution.numerics([Reduction(model, log) for log in logs])
+  found = resolution.numerics(Machine(model, logs))
   assert found.step < 4e-3 and found.prompt == prompt
   before = left(model, logs)
   found.apply(model)
@@ -71,14 +67,14 @@ def test_a_healthy_machine_leaves_noise_where_its_model_is_simulated_finely(xml,
 
 def test_readings_that_do_not_show_a_model_s_numerics_leave_it_as_it_is():
   model, logs = recorded(RUBBING, 3e-2, numerics=MACHINE)
-  assert resolution.numerics([Reduction(model, log) for log in logs]) == Numerics(4e-3)
+  assert resolution.numerics(Machine(model, logs)) == Numerics(4e-3)
 
 
 @pytest.mark.parametrize("effect", [LATE, RUBS])
 @pytest.mark.parametrize("xml", [SMOOTH, RUBBING])
 def test_logs_of_a_simulation_have_its_numerics(xml, effect):
   model, logs = recorded(xml, 1e-5, effect=effect)
-  assert resolution.numerics([Reduction(model, log) for log in logs]) == Numerics(4e-3)
+  assert resolution.numerics(Machine(model, logs)) == Numerics(4e-3)
 
 
 def test_numerics_are_written_as_they_are_applied(tmp_path):

@@ -11,7 +11,7 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection.analysis import analyse
 from nerf2real.sysid.selection.joints import changes, subject
 from nerf2real.sysid.settings import SETTINGS
@@ -124,10 +124,8 @@ def test_a_joint_that_is_followed_has_what_others_share_and_what_its_reference_h
   had = [Effect("coulomb_friction", "joint", {"torque": 0.15})]
   has = [*had, Effect("payload", "arm", load)]
   logs = [logs_of(PENDULUM, effects, duration=5.0) for effects in (had, has)]
-  before, now = ([Reduction(model, log) for log in part] for part in logs)
-  whole = subject.prepare(
-    model, "joint", logs[1], logs[0], reductions=(now, before), tried=2, settings=SETTINGS
-  )
+  before, now = (Machine(model, part) for part in logs)
+  whole = subject.prepare("joint", now, before, tried=2, settings=SETTINGS)
   subject.explain_reference(whole, SETTINGS)
   values = tuple(load.items())
   shared = Term("payload", "arm", (), (), (), (), ((),), fixed=values, known=True)

@@ -10,6 +10,7 @@ from nerf2real.core.robot_logs.reading import LogError, check_motion, moves
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.fit.noise import timing
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.measured import fresh
 from nerf2real.sysid.outputs import notes
 from nerf2real.sysid.selection import analysis
@@ -42,7 +43,7 @@ def test_a_log_without_motion_does_not_make_the_readings_exact():
 def test_a_joint_that_does_not_move_is_noted_and_not_judged(where, monkeypatch):
   log, judged = log_of(ARM, "sweep", duration=3.0), []
   parts = {"logs": [log], "reference": [log]} | {where: [_frozen(log, "elbow")]}
-  monkeypatch.setattr(analysis, "prepare", lambda model, joint, *_, **__: judged.append(joint))
+  monkeypatch.setattr(analysis, "prepare", lambda joint, *_, **__: judged.append(joint))
   monkeypatch.setattr(analysis, "_explained", lambda *_: ([], []))
   told: list[tuple[float, str]] = []
   reports = lambda *report: told.append(report)  # noqa: E731
@@ -56,7 +57,7 @@ def test_a_joint_that_does_not_move_is_noted_and_not_judged(where, monkeypatch):
 def test_what_a_joint_that_does_not_move_can_show_is_not_asked(monkeypatch):
   log = _frozen(log_of(ARM, "sweep", duration=3.0), "elbow")
   monkeypatch.setattr(identifiability, "identifiability", lambda joint, _: joint.plant.joint)
-  shown = identifiability.of_machine(MODEL, [log], repeated=False, settings=SETTINGS)
+  shown = identifiability.of_machine(Machine(MODEL, [log]), repeated=False, settings=SETTINGS)
   assert shown == ["shoulder"]
 
 

@@ -13,7 +13,7 @@ from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.selection.joints import (
   changes,
@@ -146,10 +146,8 @@ def test_a_machine_of_another_session_differs_as_its_constants_do(torque, roughe
   before = [dataclasses.replace(log, start_ns=-days * 86_400 * 10**9) for log in logs_of(PENDULUM)]
   friction = f'frictionloss="{0.03 * rougher}"'
   logs = logs_of(PENDULUM.replace('frictionloss="0.03"', friction), [wave] if torque else [])
-  reductions = tuple([Reduction(model, log) for log in some] for some in (logs, before))
-  found = subject.prepare(
-    model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
-  )
+  machines = Machine(model, logs), Machine(model, before)
+  found = subject.prepare("joint", *machines, tried=1, settings=SETTINGS)
   assert found.paired and found.another_session == (days > 0)
   assert leaving.leaves(found, found.explainer.null, SETTINGS) == more
 
@@ -175,10 +173,8 @@ def test_a_command_waits_for_the_firmwares_tick(tick, more):
   logs, before = (
     [_with_ticks(log, longest, random) for log in logs_of(PENDULUM)[:2]] for longest in (tick, 1e-3)
   )
-  reductions = tuple([Reduction(model, log) for log in some] for some in (logs, before))
-  found = subject.prepare(
-    model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
-  )
+  machines = Machine(model, logs), Machine(model, before)
+  found = subject.prepare("joint", *machines, tried=1, settings=SETTINGS)
   assert found.paired and not found.another_session
   assert leaving.leaves(found, found.explainer.null, SETTINGS) == more
 
@@ -265,10 +261,8 @@ def test_a_machine_whose_courses_stray_for_long_is_judged_from_each_reading_on(
     joint.independent[:] = independent  # of blocks of 100 readings
 
   monkeypatch.setattr(JointLikelihood, "rescale", rescale)
-  reductions = [Reduction(model, logs[0])], [Reduction(model, logs[1])]
-  found = subject.prepare(
-    model, "joint", logs[:1], logs[1:], reductions=reductions, tried=1, settings=SETTINGS
-  )
+  machines = Machine(model, logs[:1]), Machine(model, logs[1:])
+  found = subject.prepare("joint", *machines, tried=1, settings=SETTINGS)
   assert found.now.follows == found.before.follows == follows
 
 

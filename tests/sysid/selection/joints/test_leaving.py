@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection.joints import leaving, subject
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.joints.test_changes import few
@@ -21,10 +21,7 @@ STEADY = dataclasses.replace(
 
 def _elbow(settings):
   model, logs = mujoco.MjModel.from_xml_string(ARM), logs_of(ARM, duration=4.0)
-  reductions = [Reduction(model, log) for log in logs]
-  return subject.prepare(
-    model, "elbow", logs, (), reductions=(reductions, ()), tried=2, settings=settings
-  )
+  return subject.prepare("elbow", Machine(model, logs), None, tried=2, settings=settings)
 
 
 def test_friction_that_differs_within_a_recording_is_left_anyway(monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.hypotheses.constants import own_size
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection.joints import leaving, play, subject
 from nerf2real.sysid.selection.joints.subject import Subject
 from nerf2real.sysid.settings import SETTINGS
@@ -33,10 +33,8 @@ def _prepared(xml: str, gap: float, known: float) -> Subject:
   """A joint whose logs lie in one gap and whose reference lay in another."""
   model, random = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(0)
   logs, before = ([_lying_anywhere(log, g, random) for log in logs_of(xml)] for g in (gap, known))
-  reductions = tuple([Reduction(model, log) for log in some] for some in (logs, before))
-  found = subject.prepare(
-    model, "joint", logs, before, reductions=reductions, tried=1, settings=SETTINGS
-  )
+  machines = Machine(model, logs), Machine(model, before)
+  found = subject.prepare("joint", *machines, tried=1, settings=SETTINGS)
   assert found.paired
   return found
 

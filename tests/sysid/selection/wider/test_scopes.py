@@ -10,7 +10,7 @@ import pytest
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.model.reduction import Reduction
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection import analysis, findings
 from nerf2real.sysid.selection.joints import subject
 from nerf2real.sysid.selection.joints.leaving import may_leave
@@ -33,9 +33,9 @@ def _logs(effects, seed=0, xml=ARM, duration=5.0):
 
 
 def _subjects(model, logs):
-  reductions = [Reduction(model, log) for log in logs]
+  machine = Machine(model, logs)
   return [
-    subject.prepare(model, joint, logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS)
+    subject.prepare(joint, machine, None, tried=2, settings=SETTINGS)
     for joint in ("shoulder", "elbow")
   ]
 
@@ -340,13 +340,8 @@ def test_a_weak_joint_is_weak_beside_a_low_supply(weakened):
   """Factors multiply: the joint's own is tried, and written as what counts there in the suite."""
   low = Term("motor_gain", None, ("gain",), (0.05,), (3.0,), (0.1,), ((0.9,),))
   logs = _logs([])
-  reductions = (
-    [Reduction(weakened, log) for log in logs],
-    [Reduction(weakened, log) for log in logs],
-  )
-  joint = subject.prepare(
-    weakened, "elbow", logs, logs, reductions=reductions, tried=2, settings=SETTINGS
-  )
+  now, before = Machine(weakened, logs), Machine(weakened, logs)
+  joint = subject.prepare("elbow", now, before, tried=2, settings=SETTINGS)
   joint.take(dataclasses.replace(low.held_at(np.array([0.9])), known=True))
   tried = [t for terms, *_ in joint.explainer._candidates(joint.explainer.null) for t in terms]
   own = next(t for t in tried if t.kind == "motor_gain" and t.names)

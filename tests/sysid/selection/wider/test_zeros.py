@@ -12,6 +12,7 @@ from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection.joints import changes, subject
 from nerf2real.sysid.selection.wider import scopes, wide, zeros
@@ -48,13 +49,11 @@ def machine():
   """The model, its logs, the shoulder as explained beside the misread elbow, and the elbow."""
   model = mujoco.MjModel.from_xml_string(CHAIN)
   logs = [log_of(CHAIN, kind, [SHIFTED], duration=5.0) for kind in ("sweep", "slow")]
-  reductions = [Reduction(model, log) for log in logs]
+  machine = Machine(model, logs)
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(subject, "own_library", few)
     shoulder = changes.explain(
-      subject.prepare(
-        model, "shoulder", logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS
-      )
+      subject.prepare("shoulder", machine, None, tried=2, settings=SETTINGS)
     )
   return model, logs, shoulder, misread(SHIFT)
 
@@ -123,10 +122,9 @@ def test_a_zero_is_named_by_what_the_joint_before_it_feels():
   model = mujoco.MjModel.from_xml_string(CHAIN)
   far = Effect("encoder_offset", "elbow", {"offset": 0.18})  # less is a payload as well as a zero
   logs = [log_of(CHAIN, kind, [far], duration=8.0) for kind in ("sweep", "steps", "slow")]
-  reductions = [Reduction(model, log) for log in logs]
+  machine = Machine(model, logs)
   subjects = [
-    subject.prepare(model, j, logs, (), reductions=(reductions, ()), tried=2, settings=SETTINGS)
-    for j in ("shoulder", "elbow")
+    subject.prepare(j, machine, None, tried=2, settings=SETTINGS) for j in ("shoulder", "elbow")
   ]
   (found,) = scopes.shared_effects(model, subjects, SETTINGS)
   assert (found.term.kind, found.term.target) == (ZERO, "elbow")
