@@ -78,6 +78,10 @@ class Smoother:
     fit = np.einsum("npk,nkj->npj", self._maps, position[self._index])
     return Motion(self.time, fit[:, 0], fit[:, 1], fit[:, 2])
 
+  def taken(self, position: Array) -> Array:
+    """Returns what smoothing takes away from positions [N, J]."""
+    return position - np.einsum("nk,nkj->nj", self._maps[:, 0], position[self._index])
+
 
 def smooth_motion(log: Log, *, half_width: float = _SMOOTHING) -> Motion:
   """Differentiates measured positions by local cubic fits in time (handles uneven stamps)."""
@@ -125,15 +129,15 @@ def detailed_motion(model: mujoco.MjModel, log: Log, grid: Array) -> Motion:
   told = _declared(model, log, along, late)
   for j, column in enumerate(taken.T):
     tried = np.arange(0, latest + 1, max(1, round(_APART / step)))
-    gains = [_gain(smoother, told, j, int(n), column) for n in tried]
-    explained = np.array([gain * share for gain, share in gains])
+    gains, shares = _gains(smoother, told, j, tried, column)
+    explained = gains * shares
     peaks = explained >= np.maximum(np.append(explained[1:], 0.0), np.append(0.0, explained[:-1]))
     late[j] = tried[np.argmax(peaks & (explained >= _CLEARLY * explained.max()))]
   told = _declared(model, log, along, late)
   fields = [along.position.copy(), along.velocity.copy(), along.acceleration.copy()]
   smoothed = smoother.motion(told.at(smoother.time).position).at(grid)
   for j, column in enumerate(taken.T):
-    gain = _gain(smoother, told, j, 0, column)[0]
+    gain = _gains(smoother, told, j, np.zeros(1), column)[0][0]
     details = (
       told.position - smoothed.position,
       told.velocity - smoothed.velocity,
@@ -144,26 +148,27 @@ def detailed_motion(model: mujoco.MjModel, log: Log, grid: Array) -> Motion:
   return Motion(grid, *fields)
 
 
-def _gain(
-  smoother: Smoother, told: Motion, joint: int, late: int, taken: Array
-) -> tuple[float, float]:
+def _gains(
+  smoother: Smoother, told: Motion, joint: int, late: Array, taken: Array
+) -> tuple[Array, Array]:
   """Returns by how much what smoothing takes from a path told is what it takes from readings.
 
   Args:
     smoother: of the readings.
     told: a path on the grid.
     joint: its column.
-    late: points of the grid by which the readings are later.
+    late: points of the grid by which the readings are later [L].
     taken: what smoothing takes from the joint's readings [N].
 
   Returns:
-    The factor, from 0 to `_LARGEST`, and how much the two go with each other.
+    The factors [L], from 0 to `_LARGEST`, and how much the two go with each other [L].
   """
   step = told.time[1] - told.time[0]
-  sampled = np.interp(smoother.time - late * step, told.time, told.position[:, joint])[:, None]
-  missing = (sampled - smoother.motion(sampled).position)[:, 0]
-  share = float(missing @ taken)
-  return float(np.clip(share / max(missing @ missing, 1e-30), 0.0, _LARGEST)), share
+  times = smoother.time[:, None] - late * step
+  missing = smoother.taken(np.interp(times, told.time, told.position[:, joint]))
+  shares = taken @ missing
+  squares = np.maximum(np.sum(missing**2, axis=0), 1e-30)
+  return np.clip(shares / squares, 0.0, _LARGEST), shares
 
 
 def _declared(model: mujoco.MjModel, log: Log, motion: Motion, late: Array) -> Motion:

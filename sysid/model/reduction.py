@@ -81,13 +81,21 @@ class Surroundings:
 class Reduction:
   """Computes the surroundings of joints of a model along a log."""
 
-  def __init__(self, model: mujoco.MjModel, log: Log, *, motion: Motion | None = None):
+  def __init__(
+    self,
+    model: mujoco.MjModel,
+    log: Log,
+    *,
+    motion: Motion | None = None,
+    knots: Array | None = None,
+  ):
     """Prepares the poses.
 
     Args:
       model: compiled model; not changed for longer than a call.
       log: its joints are prescribed; joints that it lacks stay at the model's reference pose.
       motion: of its joints on the grid, if other than this model tells in detail.
+      knots: of that motion [M], where they are known.
     """
     self.model, self.log = model, log
     own = float(model.opt.timestep)
@@ -99,7 +107,8 @@ class Reduction:
       self.detailed, self._knots = self.motion.at(self.time), np.zeros(1, int)
     else:
       self.detailed = detailed_motion(model, log, self.time) if motion is None else motion
-      self._knots = _knots(self.detailed.acceleration, round(_SPACING / self.step))
+      spacing = round(_SPACING / self.step)
+      self._knots = _knots(self.detailed.acceleration, spacing) if knots is None else knots
     ids = [model.joint(name).id for name in log.joints]
     self._qpos = model.jnt_qposadr[ids]
     self._dofs = model.jnt_dofadr[ids]
@@ -171,7 +180,7 @@ class Reduction:
     position = self.detailed.position.copy()
     position[:, self.log.states.column(joint)] -= offset
     motion = dataclasses.replace(self.detailed, position=position)
-    return Reduction(self.model, self.log, motion=motion)
+    return Reduction(self.model, self.log, motion=motion, knots=self._knots)
 
   @functools.cached_property
   def _evaluated(self) -> tuple[Array, Array, Array]:
