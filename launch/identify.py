@@ -153,7 +153,7 @@ def _check_drift(folder: Path, held: Sequence[Path], out: Path | None) -> int:
 
 def main() -> int:
   """Runs the command line; returns the exit status."""
-  return command.main(Arguments, run)
+  return command.main(Arguments, run, environment=command.ONE_THREAD)
 
 
 if __name__ == "__main__":

@@ -148,15 +148,19 @@ def _next(
 
   An effect of the machine may be clear of all joints together though none leaves more than it does
   anyway: then by what they leave, not by how likely it is that all constants are off alike. One of
-  a body shows at a joint or two.
+  a body shows at a joint or two. It is not tried where the best so far, of more joints, would be
+  clear of it though it left nothing at its own.
   """
   leaving = {s.joint for s in subjects if may_leave(s, s.explainer.null, settings)}
-  tried = [
-    wide.screened(term, members)
-    for term, members in wide.hypotheses(model, subjects)
-    if term.kind not in known and (not only or term.kind in only)
-    if term.target is None or any(m.joint in leaving for m in members)
-  ]
+  tried: list[Wide] = []
+  for term, members in sorted(wide.hypotheses(model, subjects), key=lambda h: -len(h[1])):
+    if term.kind in known or (only and term.kind not in only):
+      continue
+    if term.target is not None and not any(m.joint in leaving for m in members):
+      continue
+    top = max(tried, key=lambda w: w.possible().total, default=None)
+    if top is None or (top.evidence() - wide.perfect(members)).clear < _beyond([top]):
+      tried.append(wide.screened(term, members))
   shown = [w for w in tried if not _hidden(w, leaving) or w.evidence().by_logs > _beyond([w])]
   return _best(shown, certain, leaving, own_latency=subjects[0].before is None)
 

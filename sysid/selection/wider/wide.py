@@ -318,6 +318,19 @@ def _evidence(members: Sequence[Subject], fit: Fit) -> Evidence:
   return Evidence(rows, prior - sum(n.prior for n in nulls))
 
 
+def perfect(members: Sequence[Subject]) -> Evidence:
+  """Returns what an effect of some joints would gain that left nothing there."""
+  nulls = {m.joint: m.explainer.null for m in members}
+  return Evidence(
+    {
+      joint: Row(
+        null.joint, -null.nats, np.zeros_like(null.fit.residuals[0]), null.fit.residuals[0]
+      )
+      for joint, null in nulls.items()
+    }
+  )
+
+
 def without(member: Subject, item: Scored, held: Term) -> Scored:
   """Returns a joint's hypothesis without one of its effects of wider scope, fitted on."""
   terms = tuple(t for t in item.terms if t != held)
