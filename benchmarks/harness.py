@@ -72,6 +72,8 @@ class Options:
 def run(main: Callable[[T], Any], settings: type[T], description: str | None) -> None:
   """Runs a script; with --other, the comparison of two checkouts instead.
 
+  A ValueError or OSError ends it in one line, as in commands of `launch`.
+
   Args:
     main: Takes the settings; what it returns is the exit status.
     settings: Their class.
@@ -82,7 +84,10 @@ def run(main: Callable[[T], Any], settings: type[T], description: str | None) ->
   if other is not None:
     command = compare.own_command(sys.argv, other)
     sys.exit(compare.main(compare.Settings(other=other, command=command, turns=chosen.turns)))  # type: ignore[attr-defined]
-  sys.exit(main(chosen))
+  try:
+    sys.exit(main(chosen))
+  except (ValueError, OSError) as error:
+    sys.exit(f"error: {error}")
 
 
 def one_thread() -> None:

@@ -50,7 +50,10 @@ class Settings:
 
 def main(settings: Settings) -> None:
   """Prints a row for every set."""
-  answers = json.loads((settings.sets / "answers.json").read_text())
+  path = settings.sets / "answers.json"
+  if not path.is_file():
+    raise ValueError(f"Found no {path}, expected sets that benchmarks/make_blind_sets.py drew.")
+  answers = json.loads(path.read_text())
   unknown = [name for name in settings.only if name not in answers]
   if unknown:
     raise ValueError(f"Found no sets {unknown} in {settings.sets}, expected some of its answers.")

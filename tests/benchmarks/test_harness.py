@@ -173,3 +173,13 @@ def test_no_tracked_text_names_a_machine_s_folders():
   if found.returncode > 1:
     pytest.skip("not a git checkout")
   assert found.stdout.split() == []
+
+
+@pytest.mark.parametrize("error", [ValueError("Found no sets."), OSError("Found no sets.")])
+def test_what_the_user_can_mend_ends_in_one_line(error, monkeypatch):
+  def main(_):
+    raise error
+
+  monkeypatch.setattr(sys, "argv", ["benchmark"])
+  with pytest.raises(SystemExit, match="^error: Found no sets.$"):
+    harness.run(main, harness.Options, None)
