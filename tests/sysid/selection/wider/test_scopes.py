@@ -351,3 +351,18 @@ def test_a_weak_joint_is_weak_beside_a_low_supply(weakened):
   assert found.intervals["gain"] == pytest.approx((0.36, 0.54))
   other = Effect("viscous_friction", "elbow", {"coefficient": 0.5})
   assert findings.beside_machine(other, joint.known) is other
+
+
+@pytest.mark.parametrize(("effects", "tried"), [([LATE], 1), ([], 2)])
+def test_what_could_not_come_near_the_best_is_not_tried(model, monkeypatch, effects, tried):
+  """One of the elbow alone cannot, where late commands explain the shoulder, too."""
+  subjects = _subjects(model, _logs(effects))
+  every = wide.hypotheses(model, subjects)
+  late = next(h for h in every if h[0].kind == "command_delay")
+  both = [(every[-1][0], (subjects[1],)), late]
+  screened, seen = wide.screened, []
+  monkeypatch.setattr(wide, "hypotheses", lambda *_: both)
+  monkeypatch.setattr(scopes, "may_leave", lambda *_: True)
+  monkeypatch.setattr(wide, "screened", lambda *h: seen.append(h) or screened(*h))
+  scopes._next(model, subjects, SETTINGS, ())
+  assert len(seen) == tried and seen[0] == late
