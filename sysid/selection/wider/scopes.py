@@ -152,16 +152,20 @@ def _next(
   clear of it though it left nothing at its own.
   """
   leaving = {s.joint for s in subjects if may_leave(s, s.explainer.null, settings)}
-  tried: list[Wide] = []
+  shown: list[Wide] = []
+  top: Wide | None = None
   for term, members in sorted(wide.hypotheses(model, subjects), key=lambda h: -len(h[1])):
     if term.kind in known or (only and term.kind not in only):
       continue
     if term.target is not None and not any(m.joint in leaving for m in members):
       continue
-    top = max(tried, key=lambda w: w.possible().total, default=None)
-    if top is None or (top.evidence() - wide.perfect(members)).clear < _beyond([top]):
-      tried.append(wide.screened(term, members))
-  shown = [w for w in tried if not _hidden(w, leaving) or w.evidence().by_logs > _beyond([w])]
+    if top is not None and (top.evidence() - wide.perfect(members)).clear > _beyond([top]):
+      continue
+    item = wide.screened(term, members)
+    if not _hidden(item, leaving) or item.evidence().by_logs > _beyond([item]):
+      shown.append(item)
+      if top is None or item.possible().total > top.possible().total:
+        top = item
   return _best(shown, certain, leaving, own_latency=subjects[0].before is None)
 
 
