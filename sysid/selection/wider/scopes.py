@@ -148,8 +148,8 @@ def _next(
 
   An effect of the machine may be clear of all joints together though none leaves more than it does
   anyway: then by what they leave, not by how likely it is that all constants are off alike. One of
-  a body shows at a joint or two. It is not tried where the best so far, of more joints, would be
-  clear of it though it left nothing at its own.
+  a body shows at a joint or two. It is not tried where the best so far, of at least as
+  many joints, would be clear of it though it left nothing at its own.
   """
   leaving = {s.joint for s in subjects if may_leave(s, s.explainer.null, settings)}
   shown: list[Wide] = []
