@@ -63,26 +63,6 @@ class Poses:
     return np.cross(self.axis[:, joint], point - self.anchor[:, joint])
 
 
-def carrying(model: mujoco.MjModel, body: int) -> list[int]:
-  """Returns the hinges and slides on the way to a body, the farthest from it first."""
-  moving = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-  result: list[int] = []
-  while body > 0:
-    first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-    result = [k for k in range(first, first + count) if model.jnt_type[k] in moving] + result
-    body = int(model.body_parentid[body])
-  return result
-
-
-def carried(model: mujoco.MjModel, body: int) -> Array:
-  """Returns a body and all that it carries."""
-  below = np.zeros(model.nbody, bool)
-  below[body] = True
-  for k in range(body + 1, model.nbody):
-    below[k] |= below[model.body_parentid[k]]
-  return np.flatnonzero(below)
-
-
 def added(
   poses: Poses,
   carrying: Sequence[int],

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.model import point_mass
+from nerf2real.sysid.model import chains, point_mass
 from nerf2real.sysid.model.drive import actuator_of, holds_position
 from nerf2real.sysid.model.motion import Motion, detailed_motion, smooth_motion
 from nerf2real.sysid.model.simulation import simulate
@@ -62,20 +62,6 @@ class Surroundings:
   """The joint's measured position, rad."""
   bias: Array
   """What the others' motion demands, N m."""
-
-  def plus(self, other: "Surroundings", factor: float) -> "Surroundings":
-    """Returns self + factor * other (the position stays)."""
-    return Surroundings(
-      self.inertia + factor * other.inertia,
-      self.here + factor * other.here,
-      self.across + factor * other.across,
-      self.at,
-      self.bias + factor * other.bias,
-    )
-
-  def times(self, factor: float) -> "Surroundings":
-    """Returns factor * self (the position stays)."""
-    return self.plus(self, factor - 1.0)
 
 
 class Reduction:
@@ -114,7 +100,7 @@ class Reduction:
     self._dofs = model.jnt_dofadr[ids]
     self._poses: point_mass.Poses | None = None
     self._moments: dict[int, dict[str, Array]] = {}
-    self._reread: dict[str, tuple[Reduction, Reduction]] = {}
+    self._reread: dict[str, dict[str, Array]] = {}
 
   @functools.cached_property
   def twin(self) -> tuple["Reduction", Array] | None:
@@ -137,10 +123,7 @@ class Reduction:
 
   def of_joint(self, joint: str) -> Surroundings:
     """Returns what a joint feels of the model, not lifted by firmware: see `compensation`."""
-    dof = int(self.model.jnt_dofadr[self.model.joint(joint).id])
-    inertia, bias, _ = self._evaluated
-    here, across = self._weights(joint) @ self.model.opt.gravity
-    return self._on_grid(joint, inertia[:, dof], here, across, bias[:, dof])
+    return self._on_grid(joint, *self._at_knots(joint))
 
   def compensation(self, joint: str) -> Surroundings | None:
     """Returns what firmware lifts of a joint's gravity (`gravcomp`), None where it lifts nothing.
@@ -166,14 +149,22 @@ class Reduction:
     joint at its own angle is known of each angle, so that its own offset adds none.
     """
     if shifted not in self._reread:
-      self._reread[shifted] = self._shifted(shifted, _SHIFT), self._shifted(shifted, -_SHIFT)
-    here = self.of_joint(joint)
-    ahead, back = (r.of_joint(joint).plus(here, -1.0) for r in self._reread[shifted])
-    if joint == shifted:
-      none = np.zeros(len(self.time))
-      ahead, back = (dataclasses.replace(p, here=none, across=none) for p in (ahead, back))
-    odd, even = ahead.plus(back, -1.0), ahead.plus(back, 1.0)
-    return [odd.times(0.5 / _SHIFT), even.times(0.5 / _SHIFT**2)]
+      self._reread[shifted] = self._zeros(shifted)
+    fields = self._reread[shifted].get(joint, np.zeros((2, 4, len(self._knots))))
+    return [self._on_grid(joint, *part) for part in fields]
+
+  def _zeros(self, shifted: str) -> dict[str, Array]:
+    """Returns `zero` at the knots [2, 4, M] for all joints of a joint's chain."""
+    ahead, back = self._shifted(shifted, _SHIFT), self._shifted(shifted, -_SHIFT)
+    result = {}
+    for joint in set(chains.along(self.model, shifted)).intersection(self.log.joints):
+      here = self._at_knots(joint)
+      more, less = ahead._at_knots(joint) - here, back._at_knots(joint) - here
+      fields = np.array([(more - less) / (2 * _SHIFT), (more + less) / (2 * _SHIFT**2)])
+      if joint == shifted:
+        fields[:, 1:3] = 0.0
+      result[joint] = fields
+    return result
 
   def _shifted(self, joint: str, offset: float) -> "Reduction":
     """Returns the same motion where a joint's readings lack an offset."""
@@ -181,6 +172,14 @@ class Reduction:
     position[:, self.log.states.column(joint)] -= offset
     motion = dataclasses.replace(self.detailed, position=position)
     return Reduction(self.model, self.log, motion=motion, knots=self._knots)
+
+  def _at_knots(self, joint: str) -> Array:
+    """Returns what a joint feels at the knots [4, M]: inertia, gravity's torque, that a quarter
+    turn further, and bias."""
+    dof = int(self.model.jnt_dofadr[self.model.joint(joint).id])
+    inertia, bias, _ = self._evaluated
+    here, across = self._weights(joint) @ self.model.opt.gravity
+    return np.array([inertia[:, dof], here, across, bias[:, dof]])
 
   @functools.cached_property
   def _evaluated(self) -> tuple[Array, Array, Array]:
@@ -238,7 +237,7 @@ class Reduction:
     index = model.joint(joint).id
     body = int(model.jnt_bodyid[index])
     axis, anchor = places[:, model.nbody + index], places[:, model.nbody + model.njnt + index]
-    carried = point_mass.carried(model, body)
+    carried = chains.carried(model, body)
     masses = (model.body_mass if masses is None else masses)[carried]
     if not self._hinge(joint):
       return -masses.sum() * np.array([axis, np.zeros_like(axis)])
@@ -287,7 +286,7 @@ class Reduction:
     positions = motion.position[self._knots] * (not self._alone)
     if self._poses is None:
       self._poses = point_mass.Poses(model, self._qpos, positions)
-    carrying = point_mass.carrying(model, body)
+    carrying = chains.carrying(model, body)
     names = [model.joint(k).name for k in carrying]
     velocity, acceleration = np.zeros((2, len(self._knots), len(carrying)))
     for i, name in enumerate(names):

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from nerf2real.sysid.model import point_mass
+from nerf2real.sysid.model import chains
 from nerf2real.sysid.model.drive import actuator_of
 
 _CHAIN = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -49,7 +49,7 @@ def _beyond(model: mujoco.MjModel, joint: str) -> str | None:
     return "an actuator with a time constant or another state"
   if int(model.actuator_gaintype[u]) != fixed or int(model.actuator_biastype[u]) > affine:
     return "an actuator that is neither a motor nor an affine servo"
-  lifted = np.any(model.body_gravcomp[point_mass.carried(model, int(model.jnt_bodyid[index]))])
+  lifted = np.any(model.body_gravcomp[chains.carried(model, int(model.jnt_bodyid[index]))])
   if lifted and model.jnt_actgravcomp[index] and model.jnt_actfrclimited[index]:
     return "gravity compensation within a range of force (actuatorgravcomp with actuatorfrcrange)"
   wraps = (model.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)) & (model.wrap_objid == index)
@@ -67,7 +67,7 @@ def _ties(model: mujoco.MjModel, equality: int, joint: int) -> bool:
     return joint in ends
   bodies = int(model.eq_objtype[equality]) == int(mujoco.mjtObj.mjOBJ_BODY)
   held = ends if bodies else model.site_bodyid[list(ends)]
-  carried = point_mass.carried(model, int(model.jnt_bodyid[joint]))
+  carried = chains.carried(model, int(model.jnt_bodyid[joint]))
   return kind in _CHAIN and sum(int(end) in carried for end in held) == 1
 
 

@@ -14,6 +14,7 @@ from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING
+from nerf2real.sysid.model import chains
 from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.simulation import Clocks
@@ -207,7 +208,7 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   effect, row = claims.shared(shared.term, shared.x, bounds, evidence, slide=slide)
   if shared.term.kind == "payload":
     body = result.model.body(str(shared.term.target)).id
-    row |= {"joint": wide.ancestors(result.model, body)[0], "body": shared.term.target}
+    row |= {"joint": chains.ancestors(result.model, body)[0], "body": shared.term.target}
   result.objects.append(effect)
   result.effects.append(row)
   if shared.or_alone is not None:

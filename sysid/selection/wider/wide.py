@@ -20,8 +20,8 @@ from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import library
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import WEAK, Term
+from nerf2real.sysid.model.chains import along, ancestors
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.model.point_mass import carrying
 from nerf2real.sysid.selection.joints.subject import WHOLE, Subject
 from nerf2real.sysid.selection.search.evidence import Scored, clearness
 from nerf2real.sysid.selection.search.explain import scored_on
@@ -161,22 +161,6 @@ def hypotheses(
       if len(members) > 1:
         result.append((term, members))
   return [*((term, everyone) for term in machine.values()), *result]
-
-
-def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
-  """Returns the joints that carry a body, the nearest first."""
-  return [model.joint(k).name for k in reversed(carrying(model, body))]
-
-
-def along(model: mujoco.MjModel, joint: str) -> list[str]:
-  """Returns the joints that carry a joint, itself, and those that it carries, from the root on."""
-  index, body = model.joint(joint).id, model.jnt_bodyid
-  near = [
-    k
-    for k in range(model.njnt)
-    if index in carrying(model, body[k]) or k in carrying(model, body[index])
-  ]
-  return [model.joint(k).name for k in near]
 
 
 def _of_machine(term: Term) -> Term:

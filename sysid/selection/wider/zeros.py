@@ -13,11 +13,11 @@ import mujoco
 import numpy as np
 
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.model.point_mass import carrying
+from nerf2real.sysid.model.chains import along, carrying
 from nerf2real.sysid.selection.joints import changes
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.wider.scopes import better
-from nerf2real.sysid.selection.wider.wide import ZERO, along
+from nerf2real.sysid.selection.wider.wide import ZERO
 from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray

@@ -249,12 +249,6 @@ def test_two_healthy_joints_have_nothing(model):
   assert (found.verdict, found.effects) == ("none", [])
 
 
-def test_a_body_is_carried_by_the_joints_on_its_way():
-  model = mujoco.MjModel.from_xml_string(ARM)
-  assert wide.ancestors(model, model.body("lower").id) == ["elbow", "shoulder"]
-  assert np.all([j.startswith("s") for j in wide.ancestors(model, model.body("upper").id)])
-
-
 class _Even:
   """A joint all of whose blocks tell two hypotheses apart equally well."""
 

@@ -15,7 +15,7 @@ from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.reduction import Reduction
 from nerf2real.sysid.selection.joints import changes, subject
-from nerf2real.sysid.selection.wider import scopes, wide, zeros
+from nerf2real.sysid.selection.wider import scopes, zeros
 from nerf2real.sysid.selection.wider.wide import ZERO
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.joints.test_changes import few
@@ -129,16 +129,6 @@ def test_a_zero_is_named_by_what_the_joint_before_it_feels():
   (found,) = scopes.shared_effects(model, subjects, SETTINGS)
   assert (found.term.kind, found.term.target) == (ZERO, "elbow")
   assert found.x[0] == pytest.approx(0.18, abs=0.003)
-
-
-@pytest.mark.parametrize(
-  ("joint", "chain"),
-  [("shoulder", ["shoulder", "elbow"]), ("elbow", ["shoulder", "elbow"]), ("wheel", ["wheel"])],
-)
-def test_a_chain_is_what_carries_a_joint_and_what_it_carries(joint, chain):
-  beside = '<body><joint name="wheel"/><geom size="0.1"/></body></worldbody>'
-  model = mujoco.MjModel.from_xml_string(CHAIN.replace("</worldbody>", beside))
-  assert wide.along(model, joint) == chain
 
 
 @pytest.mark.parametrize(
