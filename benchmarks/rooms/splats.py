@@ -3,7 +3,7 @@
   python launch/export_scene.py --to splat --out out/room.ply
   python benchmarks/rooms/splats.py --splats out/room.ply
 
-Needs `pip install mujoco-warp`. The pictures are the film's own from the robot's 24 places, 60x80.
+The pictures are the film's own from the robot's 24 places, 60x80.
 """
 
 import dataclasses

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.rooms.splats import draw_with_mujoco_warp
 from nerf2real.core.geometry.cameras import Camera
+from nerf2real.scenes.builtin import ground_truth
 from nerf2real.scenes.export.splats import fitting, projection, rasteriser, start
 from nerf2real.scenes.export.splats.splats import Splats
+from nerf2real.scenes.quality import image_quality
 from tests.scenes import furnished_room
 from tests.scenes.export import splat_projection
 
@@ -146,6 +149,20 @@ def test_the_file_opens_with_plyfile(tmp_path):
   np.testing.assert_allclose(0.5 + 0.28209479 * vertex["f_dc_1"], splats.colors[:, 1], rtol=1e-5)
   again = Splats.load_ply(tmp_path / "room.ply")
   np.testing.assert_allclose(again.rotations, splats.rotations, atol=1e-6)
+
+
+def test_another_renderer_draws_the_file_as_ours_does(tmp_path):
+  pytest.importorskip("mujoco_warp")
+  rng = np.random.default_rng(5)
+  fit = fitting.Fit(_parameters(rng, 300))
+  fit.rows[:, :-3] += rng.normal(0, 0.3, (300, fit.rows.shape[1] - 3))
+  fit.splats.save_ply(tmp_path / "room.ply")
+  pose = np.eye(4)
+  pose[:3, 3] = 0.2, -0.1, 0.3
+  ours = (255 * fit.render(ground_truth.robot_camera(60, 80), pose)).round().astype(np.uint8)
+  drawn = draw_with_mujoco_warp(Splats.load_ply(tmp_path / "room.ply"), pose[None], samples=1)
+  # both leave out what is faint, each by its own bound
+  assert image_quality.psnr(drawn[0], ours) > 40
 
 
 def _views(size):
