@@ -68,41 +68,54 @@ def command_of(log: Log, model: mujoco.MjModel, joint: str) -> Array | None:
   return np.clip(column, *model.actuator_ctrlrange[u]) if model.actuator_ctrllimited[u] else column
 
 
-def mean_commands(
-  model: mujoco.MjModel, log: Log, times: Array, step: float, late_by: Array | None = None
-) -> Array:
-  """Returns the mean command [T, U] of every step, each held until the next comes, and late.
+class Told:
+  """A log's commands as the actuators of a model take them: of the model as it is when this is
+  made, as effects that are bound to it write into its actuators while it is simulated.
 
   A joint that is measured and not commanded is held at its first reading where its actuator holds
   a position: it was not told to go to 0.
-
-  A command that comes within a step acts for the rest of it: used from the next step on it would be
-  half a step late in the mean, which a moving joint shows.
-
-  Args:
-    model: compiled model.
-    log: its commands.
-    times: at which the steps begin [T], s.
-    step: s.
-    late_by: of every actuator [U], s; none is if left out.
   """
-  stamp = log.commands.stamp
-  spans = np.diff(stamp, append=stamp[-1])
-  result = np.zeros((len(times), model.nu))
-  for name in set(log.joints) - set(log.commands.joints):
-    for u in actuators_of(model, name):
-      result[:, u] = _holding(model, log, name, u)
-  for name in log.commands.joints:
-    u, command = actuator_of(model, name), command_of(log, model, name)
-    assert command is not None
-    total = np.concatenate([[0.0], np.cumsum(command * spans)[:-1]])
-    begin = times - (0.0 if late_by is None else late_by[u])
-    edges = []
-    for at in (begin, begin + step):
-      index = np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, len(stamp) - 1)
-      edges.append(total[index] + command[index] * (at - stamp[index]))
-    result[:, u] = (edges[1] - edges[0]) / step
-  return result
+
+  def __init__(self, model: mujoco.MjModel, log: Log):
+    """Reads the commands.
+
+    Args:
+      model: compiled model.
+      log: its commands.
+    """
+    self._stamp = log.commands.stamp
+    spans = np.diff(self._stamp, append=self._stamp[-1])
+    self._still = np.zeros(model.nu)
+    for name in set(log.joints) - set(log.commands.joints):
+      for u in actuators_of(model, name):
+        self._still[u] = _holding(model, log, name, u)
+    self._commands: dict[int, tuple[Array, Array]] = {}
+    for name in log.commands.joints:
+      command = command_of(log, model, name)
+      assert command is not None
+      total = np.concatenate([[0.0], np.cumsum(command * spans)[:-1]])
+      self._commands[actuator_of(model, name)] = command, total
+
+  def mean(self, times: Array, step: float, late_by: Array | None = None) -> Array:
+    """Returns the mean command [T, U] of every step, each held until the next comes, and late.
+
+    A command that comes within a step acts for the rest of it: used from the next step on it would
+    be half a step late in the mean, which a moving joint shows.
+
+    Args:
+      times: at which the steps begin [T], s.
+      step: s.
+      late_by: of every actuator [U], s; none is if left out.
+    """
+    result = np.tile(self._still, (len(times), 1))
+    for u, (command, total) in self._commands.items():
+      begin = times - (0.0 if late_by is None else late_by[u])
+      edges = []
+      for at in (begin, begin + step):
+        index = np.clip(np.searchsorted(self._stamp, at, side="right") - 1, 0, len(self._stamp) - 1)
+        edges.append(total[index] + command[index] * (at - self._stamp[index]))
+      result[:, u] = (edges[1] - edges[0]) / step
+    return result
 
 
 def _holding(model: mujoco.MjModel, log: Log, joint: str, actuator: int) -> float:

@@ -18,7 +18,7 @@ from mujoco import rollout
 from scipy.stats import norm
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.model.drive import actuator_of, mean_commands
+from nerf2real.sysid.model.drive import Told, actuator_of
 
 Array = np.ndarray
 
@@ -201,7 +201,7 @@ def _declared(model: mujoco.MjModel, log: Log, motion: Motion, late: Array) -> M
     states = np.repeat(state[None], len(motion.time), axis=0)
     states[:, 1 + qpos] = motion.position
     states[:, 1 + model.nq + dofs] = motion.velocity
-    control = mean_commands(model, log, motion.time, step, late_by)
+    control = Told(model, log).mean(motion.time, step, late_by)
     after, _ = rollout.rollout(model, data, states, control[:, None])
   finally:
     model.opt.timestep, model.opt.disableflags = own, flags

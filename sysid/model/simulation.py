@@ -14,7 +14,7 @@ from mujoco import rollout
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect, EffectStack
-from nerf2real.sysid.model.drive import actuator_of, holds_position, joint_of, mean_commands
+from nerf2real.sysid.model.drive import Told, actuator_of, holds_position, joint_of
 from nerf2real.sysid.model.measured import fresh
 from nerf2real.sysid.model.motion import smooth_motion, start_velocity
 
@@ -99,6 +99,7 @@ def simulate(
   delays = merge_delays(effects, clocks, model)
   late_by = _delays(delays, model)
   moving = [e for e in delays if e.kind != "command_delay" and not e.kind.startswith(_SENSORS)]
+  told = Told(model, log)
   stack = EffectStack(moving).bind(model)
   try:
     rate = _of_joint(effects, "clock_drift", "rate", None)
@@ -116,7 +117,7 @@ def simulate(
       count = int(np.ceil((time[end - 1] / (1 + rate) - first - late.min()) / step)) + 2
       data.time = first
       times = first + step * np.arange(count + 1)
-      ctrl = mean_commands(model, log, times[:-1], step, late_by)
+      ctrl = told.mean(times[:-1], step, late_by)
       history = np.vstack([data.qpos[qpos], _roll(stack, data, ctrl, qpos)])
       for j in range(len(ids)):
         stamps = time[start:end] / (1 + rate) - late[j]

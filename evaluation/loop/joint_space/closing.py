@@ -11,6 +11,7 @@ from nerf2real.evaluation.loop.joint_space import gap
 from nerf2real.evaluation.loop.robot import machines, recording
 from nerf2real.evaluation.loop.settings import LoopSettings, claim
 from nerf2real.real.loading import Connection
+from nerf2real.suite.effects import read_effects
 
 
 class Closed(NamedTuple):
@@ -47,6 +48,13 @@ def close_loop(settings: LoopSettings) -> Closed:
   if settings.robot == recording.VIRTUAL:
     table += gap.hidden_table(settings.seed, named.content, out / "identified" / "details.json")
     table += "".join(f"\nUndeclared: {effect}.\n" for effect in altered)
+    zeros = gap.with_hidden_zeros(settings.seed, read_effects(named.effects_path))
+    known = gap.suite_motion(zeros, standing["actions"])
+    mean = gap.gaps_between(standing["positions"], known).mean()
+    table += (
+      "\nOn the floor, with the hidden zeros of the encoders in place of those found, of which a"
+      f" robot held in the air shows little: mean {mean:.3f} deg.\n"
+    )
   write_atomically(out / "gap.md", table)
   return Closed(named.content, table, out / "identified" / "report.html")
 

@@ -1,6 +1,7 @@
 """The gap between a robot and the suite, joint by joint, and what a virtual robot hides."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from nerf2real import suite
 from nerf2real.core import markdown
+from nerf2real.suite.effects import Effect
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.pose import Pose
 from nerf2real.suite.randomisation.draws import NOMINAL
@@ -16,7 +18,7 @@ from nerf2real.sysid.report.servo import by_law
 _STEP = constants.CONTROL_TIMESTEP
 
 
-def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
+def suite_motion(effects: Path | Sequence[Effect] | None, actions: np.ndarray) -> np.ndarray:
   """Returns the joint positions [T, 20] that the suite gives for the same actions."""
   environment = suite.load(
     "nerf_nav",
@@ -38,15 +40,18 @@ def suite_motion(effects: Path | None, actions: np.ndarray) -> np.ndarray:
   return np.array(rows)
 
 
+def gaps_between(robot: np.ndarray, simulated: np.ndarray) -> np.ndarray:
+  """Returns the RMS of every joint's gap [20] between motions [T, 20], deg, over the shorter."""
+  count = min(len(robot), len(simulated))
+  return np.rad2deg(np.sqrt(np.mean((robot[:count] - simulated[:count]) ** 2, axis=0)))
+
+
 def gap_table(
   robot: np.ndarray, before: np.ndarray, after: np.ndarray, content: dict[str, Any]
 ) -> str:
   """Returns the gap in Markdown: joint positions, standing on the floor and held in the air."""
   count = min(len(robot), len(before), len(after))
-  gaps = [
-    np.rad2deg(np.sqrt(np.mean((robot[:count] - simulated[:count]) ** 2, axis=0)))
-    for simulated in (before, after)
-  ]
+  gaps = [gaps_between(robot, simulated[:count]) for simulated in (before, after)]
   rows = {name: [gap[index] for gap in gaps] for index, name in enumerate(constants.JOINT_NAMES)}
   rows["mean"] = [gap.mean() for gap in gaps]
   held = content["error"]["held"]
@@ -66,6 +71,17 @@ def gap_table(
     + (", ".join(f"{e['kind']} ({e['joint'] or 'all'})" for e in content["effects"]) or "nothing"),
   ]
   return "\n".join(lines) + "\n"
+
+
+def with_hidden_zeros(seed: int, effects: Sequence[Effect]) -> list[Effect]:
+  """Returns effects with the zeros of a virtual robot's encoders in place of those found."""
+  from nerf2real.real.virtual import motors
+  from nerf2real.real.virtual.hidden import Hidden
+
+  zeros = 2 * np.pi / motors.COUNTS * Hidden.draw(seed).motors.encoder_offset
+  others = [e for e in effects if e.kind != "encoder_offset"]
+  own = zip(constants.JOINT_NAMES, zeros, strict=True)
+  return [*others, *(Effect("encoder_offset", name, {"offset": float(z)}) for name, z in own)]
 
 
 def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:

@@ -12,6 +12,8 @@ from nerf2real.evaluation.loop.joint_space import closing, gap
 from nerf2real.evaluation.loop.robot import motions, recording
 from nerf2real.evaluation.loop.settings import LoopSettings
 from nerf2real.launch import close_loop as script
+from nerf2real.real.virtual import motors
+from nerf2real.real.virtual.hidden import Hidden
 from nerf2real.suite.effects import Effect, read_effects, write_effects
 from nerf2real.suite.op3 import constants
 from nerf2real.sysid.data.compatibility import check_against_model
@@ -101,6 +103,18 @@ def test_strength_holds_the_gain_of_the_servos_law_once(tmp_path):
     assert found["l_knee"] == "1.08"
     assert found["r_knee"] == "0.54"
     assert found["head_pan"] == "1.00"
+
+
+def test_hidden_zeros_take_the_place_of_those_found_as_the_robot_reads_them():
+  others = [Effect("command_delay", None, {"delay": 0.01})]
+  found = [*others, Effect("encoder_offset", "l_knee", {"offset": 0.5})]
+  effects = gap.with_hidden_zeros(3, found)
+  assert effects[:1] == others and len(effects) == 21
+  servos = motors.Motors(Hidden.draw(3).motors)
+  servos.measure(np.zeros(20), np.zeros(20))
+  shown = 2 * np.pi / motors.COUNTS * (servos.counts - motors.CENTER)
+  offsets = [e.parameters["offset"] for e in effects[1:]]
+  np.testing.assert_allclose(shown, offsets, atol=np.pi / motors.COUNTS)
 
 
 def test_an_unreachable_robot_is_one_line(monkeypatch, capsys, tmp_path):
