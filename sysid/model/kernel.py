@@ -126,9 +126,10 @@ def _turned(cosine: float, sine: float, angle: float, by: float) -> tuple[float,
   if abs(by) > _LITTLE:
     return math.cos(angle), math.sin(angle)
   square = by * by
-  s = by * (1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0)))
-  c = 1.0 - 0.5 * square * (1.0 - square / 12.0 * (1.0 - square / 30.0))
-  return cosine * c - sine * s, sine * c + cosine * s
+  fourth = square * square
+  s = by + by * square * ((square / 120.0 - 1.0 / 6.0) - fourth / 5040.0)
+  less = square * ((0.5 - square / 24.0) + fourth / 720.0)  # 1 - cosine
+  return cosine - (cosine * less + sine * s), sine - (sine * less - cosine * s)
 
 
 def record(p: Array) -> np.void:
@@ -311,11 +312,12 @@ def simulate(
       demand = gravity_cos[i]
       if hinge:
         demand = demand * cosine + gravity_sin[i] * sine
-      passive = -demand - bias[i] + offset_force - stiffness * (q - reference)
+      passive = offset_force - bias[i] - stiffness * (q - reference)
       if amplitude != 0.0:
         passive += laws.cogging(q, amplitude, periods, phase)
       if learned:
         passive += force_at(q, v, weights, bounds)
+      passive -= demand
       limit = friction
       if breakaway > 0.0:
         limit += laws.stribeck(v, breakaway, stribeck)
@@ -368,7 +370,8 @@ def simulate(
       acceleration = (speed - v) * rate_of_steps
       if half > 0.0:
         link_freely = acceleration - passed * freely
-      after = q + step * speed
+      moved = step * speed
+      after = q + moved
       ahead = time + step
       apart = 0.0  # the last reading within the step, less what is simulated of it
       while s < end and when < ahead:
@@ -380,10 +383,10 @@ def simulate(
         s += 1
         if s < end:
           when = sample_time[s] * true_time - late
-      turned = after + follow * apart - q
-      q += turned
+      moved += follow * apart
+      q += moved
       if hinge:
-        cosine, sine = _turned(cosine, sine, q, turned)
+        cosine, sine = _turned(cosine, sine, q, moved)
       v = speed + follow_speed * apart
       time = ahead
       n += 1

@@ -13,6 +13,7 @@ import numba
 LEAST_STRENGTH = 0.1
 """Of an actuator that is hot or starved; chosen: it has shut down, and the model stays regular."""
 _SLOWEST = 1e-6  # rad/s, against division by zero
+_GONE = 40.0  # exponent from which less than a rounding of 1 is left
 
 law = numba.njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 """Compiles a law."""
@@ -32,7 +33,8 @@ def stribeck(speed: float, breakaway: float, velocity: float) -> float:
   Stribeck exponent 2.
   """
   ratio = speed / max(velocity, _SLOWEST)
-  return breakaway * math.exp(-ratio * ratio)
+  square = ratio * ratio
+  return breakaway * math.exp(-square) if square < _GONE else 0.0
 
 
 @law
