@@ -124,9 +124,8 @@ def _place(effect: dict[str, Any]) -> str:
 def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
   rows, bounds = _parameters(content["effects"])
   notes = [
-    f"As good an explanation of {a['joint'] or 'all joints'}: {a['kind']}."
-    for a in content["alternatives"]
-    if a.get("confounded")
+    f"As good an explanation of {place}: {summary.either(kinds, ())}."
+    for place, kinds in summary.alike_by_place(content["alternatives"]).items()
   ]
   # Of what is unexplained, the nearest hypothesis is among the alternatives, with intervals.
   listed = [a for a in content["alternatives"] if "kinds" not in a]

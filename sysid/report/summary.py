@@ -95,13 +95,13 @@ def _meaning(effect: dict[str, Any]) -> str:
 
 def _sure(content: dict[str, Any], asked: Sequence[float], shown: str) -> Answer:
   question = "How sure is that?"
-  alike = [a["kind"] for a in content["alternatives"] if a.get("confounded")]
+  alike = alike_by_place(content["alternatives"])
   effects = content["effects"]
   if not effects and content["verdict"] == "none":
     return Answer(question, "No effect is clearly better than none", [shown], tone="good")
   if not effects:
     return Answer(question, "Not sure: no name is clear of every other", [], tone="warn")
-  words = [f"These logs do not tell it from {_either(alike, ())}."] if alike else []
+  words = [_alike(alike)] if alike else []
   tone = "warn" if alike else "good"
   pairs = _clearness(effects, asked)
   if not pairs:
@@ -115,6 +115,28 @@ def _sure(content: dict[str, Any], asked: Sequence[float], shown: str) -> Answer
     f"{size} standard errors{which}; {needed:.1f} are asked",
     [f"{others}, on parts of the logs that were left out.", *words],
     tone,
+  )
+
+
+def alike_by_place(alternatives: Sequence[dict[str, Any]]) -> dict[str, list[str]]:
+  """Returns the kinds that the logs do not tell from what was found, by joint; all where none is
+  said."""
+  found: dict[str, list[str]] = {}
+  for other in alternatives:
+    if other.get("confounded"):
+      found.setdefault(other.get("joint") or "all joints", []).append(other["kind"])
+  return found
+
+
+def _alike(kinds: dict[str, list[str]]) -> str:
+  """Returns in a sentence what logs do not tell apart: of several joints, at which."""
+  if len(kinds) == 1:
+    (own,) = kinds.values()
+    return f"These logs do not tell it from {either(own, ())}."
+  places = list(kinds)
+  more = f" and {len(places) - _FEW} more" if len(places) > _FEW else ""
+  return (
+    f"At {', '.join(places[:_FEW])}{more} other explanations are as good: they are listed below."
   )
 
 
@@ -137,7 +159,7 @@ def _clearness(
   ]
 
 
-def _either(names: Sequence[str], claimed: Sequence[str]) -> str:
+def either(names: Sequence[str], claimed: Sequence[str]) -> str:
   """Returns hypotheses such as "a+b" in words; `claimed` are the kinds that the report names."""
   words = []
   for name in names:
@@ -184,7 +206,7 @@ def _next(content: dict[str, Any], unit: str) -> Answer:
   proposal = content["next_excitation"]
   claimed = [e["kind"] for e in content["effects"] if e.get("joint") == proposal.get("joint")]
   sets = ["+".join(names) for names in proposal["separates"] if names]
-  rivals = _either(sets, claimed)
+  rivals = either(sets, claimed)
   apart, would = proposal.get("separation_in_noise"), proposal.get("would")
   motion = _sentence(proposal["design"])
   if "centre_rad" in proposal:

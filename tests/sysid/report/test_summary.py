@@ -103,6 +103,19 @@ def test_what_logs_do_not_tell_apart_is_said(content):
   assert tones(content)[1] == "warn"
 
 
+def test_what_logs_do_not_tell_apart_at_several_joints_is_listed_by_joint(content):
+  rival = {"kinds": [], "confounded": True}
+  content["alternatives"] = [
+    {**rival, "joint": joint, "kind": kind}
+    for joint in ("knee", "hip")
+    for kind in ("spring+viscous_friction", "payload")
+  ]
+  _, sure, _, _ = answers(content)
+  assert sure.endswith("At knee, hip other explanations are as good: they are listed below.")
+  kinds = ["spring+viscous_friction", "payload"]
+  assert summary.alike_by_place(content["alternatives"]) == {"knee": kinds, "hip": kinds}
+
+
 def test_of_many_effects_the_rest_is_counted(content):
   content["effects"] = [FRICTION] * 6
   missing = answers(content)[0]
