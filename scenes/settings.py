@@ -103,7 +103,7 @@ def preset(name: str) -> SceneSettings:
       capture=CaptureSettings(num_keyframes=110),
       localise=ONE_ATTEMPT,
       stereo=NO_STEREO,
-      train=dataclasses.replace(training.preset("fast"), max_seconds=150.0),
+      train=dataclasses.replace(training.preset("fast"), max_seconds=80.0),
       collision=ROUGH_PARTS,
       baseline="colmap",
     )
