@@ -8,7 +8,7 @@ import viser
 from scipy.spatial.transform import Rotation
 from viser import transforms
 
-from nerf2real.core import palette
+from nerf2real.core import browser_view, palette
 from nerf2real.scenes.bundle import Bundle
 from nerf2real.scenes.export.splats.splats import Splats
 from nerf2real.scenes.export.views import capture_cameras, overlooking_view, renderer_of
@@ -165,7 +165,7 @@ def view_bundle(
     port: Port to serve on.
     splats: Shown beside the field, which starts switched off then.
   """
-  server = viser.ViserServer(host=host, port=port, label=f"scene {bundle.name}", verbose=False)
+  server = browser_view.serve(f"scene {bundle.name}", host=host, port=port)
   server.scene.set_up_direction("+z")
   field_view.begin_as(server, *overlooking_view(bundle))
   renderer = renderer_of(bundle)

@@ -7,9 +7,8 @@ import threading
 
 import cv2
 import numpy as np
-import viser
 
-from nerf2real.core import palette
+from nerf2real.core import browser_view, palette
 from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field.render.browser import FieldView, begin_as, serve_field
@@ -43,7 +42,7 @@ class TrainingViewer:
 
   def __init__(self, *, host: str, port: int):
     """Serves the page; see `address`."""
-    self._server = viser.ViserServer(host=host, port=port, label="a scene is made", verbose=False)
+    self._server = browser_view.serve("a scene is made", host=host, port=port)
     self._server.scene.set_up_direction("+z")
     self._text = self._server.gui.add_markdown("Keyframes come first.")
     self._view: FieldView | None = None

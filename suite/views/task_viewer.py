@@ -13,6 +13,7 @@ import viser
 from viser import transforms
 
 from nerf2real import suite
+from nerf2real.core import browser_view
 from nerf2real.scenes.field.render import browser as field_view
 from nerf2real.scenes.geometry.mesh import load_glb
 from nerf2real.suite import loading
@@ -329,6 +330,6 @@ def view_task(
     time_limit=_TIME_LIMIT,
     randomisation=RandomisationSettings(pushes=False),  # by hand only
   )
-  server = viser.ViserServer(host=host, port=port, label=f"task {task}", verbose=False)
+  server = browser_view.serve(f"task {task}", host=host, port=port)
   field = field_view.FieldView(renderer, bundle.world_from_unit)
   return TaskViewer(environment, server, field=field, drivers=drivers)
