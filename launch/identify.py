@@ -83,18 +83,16 @@ def _print_content(content: dict[str, Any], out: Path) -> None:
   from rich.table import Table
 
   from nerf2real.sysid.model import simulation as evaluation
-  from nerf2real.sysid.report.alike import together
+  from nerf2real.sysid.report.alike import place, together
 
   rich.print(f"[bold]{escape(content['verdict'])}[/bold] in {content['seconds']:.0f} s")
   table = Table("effect", "where", "parameter", "value", "95 %", "unit")
   for effect in together(content["effects"]):
     for name, value in effect["parameters"].items():
-      if isinstance(value["value"], list):
-        continue
       interval = "" if value["low"] is None else f"{value['low']:.4g} .. {value['high']:.4g}"
       table.add_row(
         effect["kind"],
-        escape(_place(effect)),
+        escape(place(effect)),
         name,
         _number(value["value"]),
         interval,
@@ -110,10 +108,6 @@ def _print_content(content: dict[str, Any], out: Path) -> None:
       worse = " (worse: do not use it)" if evaluation.is_worse(error) else ""
       print(f"{name}: {error['before']:.3g} -> {error['after']:.3g} rad (or m) RMSE{worse}")
   print(f"floor: {content['error']['floor']:.3g}; report: {out / 'report.html'}")
-
-
-def _place(effect: dict[str, Any]) -> str:
-  return effect["joint"] or effect.get("geom") or effect.get("sensor") or "all"
 
 
 def _number(value: float | None) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 from nerf2real.core.robot_logs.messages import COMMANDS, STATES
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.robot_logs.streaming import LogError
+from nerf2real.sysid.model import chains
 from nerf2real.sysid.model.drive import (
   actuator_of,
   actuators_of,
@@ -36,7 +37,7 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
     )
   for name in log.commands.joints:
     kind = int(model.joint(name).type[0])
-    if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+    if kind not in chains.SINGLE:
       raise LogError(f"{log.name} commands {name!r}, in the model neither a hinge nor a slide.")
     actuators = actuators_of(model, name)
     pulled = [] if actuators else pulling(model, name)

@@ -13,8 +13,9 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model import kernel
-from nerf2real.sysid.model.joint import JointModel, Simulated
+from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.measured import quantum
+from nerf2real.sysid.model.plant import Simulated, Windows, simulated
 from nerf2real.sysid.selection.search.evidence import Scored
 
 Array = np.ndarray
@@ -134,27 +135,10 @@ def readings(plant: JointModel, terms: Sequence[Term], x: Array, command: Array)
   lift = plant.lift(0, float(p[kernel.INDEX["encoder_offset"]]))
   if lift is not None:
     zero, quarter = zero - lift[0], quarter - lift[1]
-  weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
   count = int(_DURATION / plant.step) + 100
-  fields = [np.full(count, mean) for mean in (inertia.mean(), zero.mean(), quarter.mean(), 0.0)]
-  out = np.zeros((3, len(TIMES)))
-  kernel.simulate(  # type: ignore[call-arg]
-    kernel.record(p),
-    plant.step,
-    np.arange(len(command)) / _RATE,
-    command,
-    TIMES,
-    *fields,  # type: ignore
-    np.zeros(count),
-    plant.hinge,
-    np.array([0]),
-    command[:1].copy(),
-    np.zeros(1),
-    np.full(len(TIMES), np.nan),
-    weights,
-    bounds,
-    out[0],
-    out[1],
-    out[2],
-  )
-  return Simulated(out[0], out[2])
+  means = (inertia.mean(), zero.mean(), quarter.mean(), 0.0, 0.0)
+  fields = [np.full(count, mean) for mean in means]
+  begin = Windows(np.array([0]), command[:1].copy(), np.zeros(1))
+  times = (np.arange(len(command)) / _RATE, command, TIMES)
+  none = np.full(len(TIMES), np.nan)
+  return Simulated(*simulated(p, plant.step, times, fields, plant.hinge, begin, none, table))

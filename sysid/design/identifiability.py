@@ -14,7 +14,7 @@ import numpy as np
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.core.robot_logs.reading import moves
 from nerf2real.sysid.design import excitation
-from nerf2real.sysid.design.information import Place, beside, information, places
+from nerf2real.sysid.design.information import Place, beside, information, of_logs, places
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import Term
@@ -131,13 +131,7 @@ def identifiability(joint: JointLikelihood, library: Sequence[Term]) -> Identifi
     library: effects.
   """
   own, chosen = constants(joint.plant, joint.settings), places(library)
-  matrix = information(
-    lambda terms, x: joint.residuals(terms, x[None])[0],
-    own,
-    chosen,
-    noise=joint.floor,
-    count=float(joint.mask.sum()),
-  )
+  matrix = of_logs(joint, own, chosen)
   effects = _judged(chosen, matrix)
   lacking = _open(effects)
   result = Identifiability(joint.plant.joint, tuple(effects), {}, {})

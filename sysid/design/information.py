@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from nerf2real.suite.effects import kind_of
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
 
 Array = np.ndarray
@@ -110,6 +111,12 @@ def information(
   tolerated, u = np.array(columns).T, np.array(secants).reshape(len(chosen), -1).T
   inner = np.linalg.solve(np.eye(len(columns)) + tolerated.T @ tolerated, tolerated.T @ u)
   return u.T @ u - (tolerated.T @ u).T @ inner
+
+
+def of_logs(joint: JointLikelihood, own: Term, chosen: Sequence[Place]) -> Array:
+  """Returns the information matrix [K, K] of effects along a joint's logs; see `information`."""
+  readings = lambda terms, x: joint.residuals(terms, x[None])[0]  # noqa: E731
+  return information(readings, own, chosen, noise=joint.floor, count=float(joint.mask.sum()))
 
 
 def beside(matrix: Array, place: int, rivals: Sequence[int]) -> float:

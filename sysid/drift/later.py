@@ -33,9 +33,8 @@ def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
   window = stored.content["window_s"] or SETTINGS.window_s
   rows = []
   for log in read_logs(held, stored.model):
-    before = simulation.error(stored.model, [log], window_s=window)
     errors = simulation.errors(stored.model, [log], stored.near, window_s=window)
-    rows.append({"log": log.name, "before": before, **errors})
+    rows.append({"log": log.name, **errors})
   return rows
 
 

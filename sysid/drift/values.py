@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import norm
 
 from nerf2real.suite.effects import Effect, kind_of
-from nerf2real.sysid.design.information import Place, information
+from nerf2real.sysid.design.information import Place, of_logs
 from nerf2real.sysid.drift.stored import Stored, StoredJoint
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS, Fit, Layout
@@ -254,14 +254,7 @@ def _held(
 def _shows(joint: JointLikelihood, constants: Term, term: Term, values: Array) -> bool:
   """Tells whether an effect changes the readings by their noise, beyond what constants imitate."""
   place = Place(term, tuple(map(float, values)))
-  matrix = information(
-    lambda terms, x: joint.residuals(terms, x[None])[0],
-    constants,
-    [place],
-    noise=joint.floor,
-    count=float(joint.mask.sum()),
-  )
-  return bool(matrix[0, 0] >= 1.0)
+  return bool(of_logs(joint, constants, [place])[0, 0] >= 1.0)
 
 
 def _fitted(

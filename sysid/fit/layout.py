@@ -20,22 +20,21 @@ class Layout:
   """Which values are whose: shared terms first, then each joint's own."""
 
   def __init__(self, own: Sequence[Sequence[Term]], shared: Sequence[Term] = ()):
-    self.own, self.shared = [tuple(o) for o in own], tuple(shared)
     self.terms: list[Term] = [*shared, *[t for o in own for t in o]]
     at, spans = 0, []
     for term in self.terms:
       spans.append((at, at + len(term.names)))
       at += len(term.names)
     self.spans, self.count = spans, at
-    first = len(self.shared)
+    first = len(shared)
     common = [i for a, b in spans[:first] for i in range(a, b)]
     self.index: list[Array] = []
     self.of_joint: list[tuple[Term, ...]] = []
-    for terms in self.own:
+    for terms in own:
       mine = [i for a, b in spans[first : first + len(terms)] for i in range(a, b)]
       first += len(terms)
       self.index.append(np.array(mine + common, int))
-      self.of_joint.append((*terms, *self.shared))
+      self.of_joint.append((*terms, *shared))
     join = lambda f: np.concatenate([np.zeros(0), *[np.array(f(t), float) for t in self.terms]])  # noqa: E731
     self.low, self.high = join(lambda t: t.low), join(lambda t: t.high)
     self.scale = join(lambda t: t.scale)
@@ -68,8 +67,6 @@ class Fit:
   """Of the finite differences that the Jacobian is of; None where it was carried along by steps."""
   held: list[Array] = dataclasses.field(default_factory=list)
   """Mean squares [C, B] of left-out blocks, a joint."""
-  held_x: list[Array] = dataclasses.field(default_factory=list)
-  """Values without each fold."""
   spread: tuple[bytes, Array] | None = None
   """Covariance [n, n], and the residual's scale under which it holds."""
 

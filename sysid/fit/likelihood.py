@@ -20,9 +20,10 @@ from nerf2real.sysid.fit.expectation import Expectation
 from nerf2real.sysid.fit.noise import effort_noise, timing
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.model.joint import JointModel, Simulated
+from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import Measured, block_starts
+from nerf2real.sysid.model.plant import Simulated
 from nerf2real.sysid.model.servo.duty import Asked, command_jump, duty_for
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
@@ -98,10 +99,15 @@ class JointLikelihood:
     assert self.law is not None and self.effort is not None
     rows = np.zeros((2, self.size))
     rows[1] = left * self.gain[1]
-    squares = self.squares(rows)[1]
-    row = rows[1] / np.sqrt(squares[self.block_of] + 1e-30)
-    scale = float(np.sqrt(np.median(squares) + self.floor[1] ** 2))
-    return scale, _correlation_time(row, self.starts)
+    scale, times = self._scales(rows)
+    return scale[1], times[1]
+
+  def _scales(self, residuals: Array) -> tuple[Array, list[float]]:
+    """Returns scales and correlation times [C] of residuals [C, N]."""
+    squares = self.squares(residuals)
+    alike = residuals / np.sqrt(squares[:, self.block_of] + 1e-30)
+    times = [_correlation_time(row, self.starts) for row in alike]
+    return np.sqrt(np.median(squares, axis=1) + self.floor**2), times
 
   def _cut(self) -> None:
     starts, folds, offset = [], [], 0
@@ -357,12 +363,7 @@ class JointLikelihood:
     Channels show one misfit: where courses go together for long, efforts count no more often. A
     duty is of the servo's law alone, which the readings feed: it counts by what that law leaves.
     """
-    squares = self.squares(residuals)
-    self.scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
-    times = [
-      _correlation_time(row / np.sqrt(squares[c, self.block_of] + 1e-30), self.starts)
-      for c, row in enumerate(residuals)
-    ]
+    self.scale, times = self._scales(residuals)
     self.independent[:] = 1.0 / np.maximum(times, times[0])
     if self._known is not None:
       self.scale[1], self.independent[1] = self._known[0], 1.0 / self._known[1]

@@ -17,7 +17,6 @@ import numpy as np
 
 from nerf2real.sysid.fit.layout import Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.steps import bounded
 
 Array = np.ndarray
 
@@ -215,7 +214,7 @@ class Fitter:
 
   def _step(self, fit: Fit, damping: float, share: float, clocks: bool) -> Array:
     moving = None if clocks else np.flatnonzero(~self.layout.is_clock)
-    return bounded(fit.x, fit.precision, fit.slope, self.layout, damping, share, moving)
+    return _bounded(fit.x, fit.precision, fit.slope, self.layout, damping, share, moving)
 
   def leave_out(self, fit: Fit) -> Fit:
     """Fills in what a fit predicts of each fold when its effects are fitted to the others alone.
@@ -225,13 +224,12 @@ class Fitter:
     layout, x = self.layout, fit.x
     moving = np.flatnonzero(layout.is_effect)
     fit.held = [j.squares(r) for j, r in zip(self.joints, fit.residuals, strict=True)]
-    fit.held_x = [x] * len(self.folds)
     if not len(moving) or len(self.folds) < 2:
       return fit
     tried = []
     for f in range(len(self.folds)):
       g, h = fit.slope - fit.gradient[f], fit.precision - fit.curvature[f]
-      tried += [bounded(x, h, g, layout, 1e-3, share, moving) for share in (1.0, 0.5)]
+      tried += [_bounded(x, h, g, layout, 1e-3, share, moving) for share in (1.0, 0.5)]
     _, rows = self.simulated(np.array(tried))
     squares = [j.squares(r) for j, r in zip(self.joints, rows, strict=True)]
     within = [h.copy() for h in fit.held]
@@ -242,7 +240,39 @@ class Fitter:
         own.append(np.concatenate([found[2 * f : 2 * f + 2], held[None]]))
         costs = costs - joint.loglik(own[-1])[:, joint.fold != fold].sum(axis=1)
       best = int(np.argmin(costs))
-      fit.held_x[f] = values[best]
       for joint, found, out in zip(self.joints, own, fit.held, strict=True):
         out[:, joint.fold == fold] = found[best][:, joint.fold == fold]
     return fit
+
+
+def _bounded(
+  x: Array,
+  h: Array,
+  g: Array,
+  layout: Layout,
+  damping: float,
+  share: float,
+  moving: Array | None = None,
+) -> Array:
+  """Returns a damped Newton step from x, within bounds; values that press on one stay.
+
+  Args:
+    x: values [n].
+    h: curvature [n, n].
+    g: gradient [n].
+    layout: bounds and scales.
+    damping: of Marquardt's kind.
+    share: of the step.
+    moving: indices of the values that may move; all for None.
+  """
+  s = layout.scale
+  free = ~(((x <= layout.low + 1e-9 * s) & (g > 0)) | ((x >= layout.high - 1e-9 * s) & (g < 0)))
+  if moving is not None:
+    free &= np.isin(np.arange(len(x)), moving)
+  result = x.copy()
+  if free.any():
+    block = (h * s[:, None] * s)[np.ix_(free, free)]
+    block = block + (1e-9 * np.trace(block) + 1e-9) * np.eye(len(block))
+    block += damping * np.diag(np.diag(block))
+    result[free] -= share * np.linalg.solve(block, (g * s)[free]) * s[free]
+  return np.clip(result, layout.low, layout.high)

@@ -20,13 +20,13 @@ from nerf2real.sysid.model.kernel import INDEX, table_force
 
 Array = np.ndarray
 
+_WAVES = 3  # parts that repeat with position, at most
 EDGES = 10  # samples at either end whose derivatives are one-sided
 
 
 class TorqueResidual(NamedTuple):
   """Residual torque of one log and the regressors at the same samples."""
 
-  time: Array
   position: Array
   velocity: Array
   torque: Array
@@ -58,12 +58,12 @@ def torque_residual(plant: JointModel, hypothesis: Composed, index: int) -> Torq
   if hypothesis.table is not None:
     demand = demand - table_force(q, log.velocity, *hypothesis.table)
   inner = slice(EDGES, -EDGES)
-  fields = (log.time, log.position, log.velocity, torque, torque - demand)
+  fields = (log.position, log.velocity, torque, torque - demand)
   return TorqueResidual(*(f[inner] for f in fields))
 
 
 def waves(
-  plant: JointModel, terms: Sequence[Term] = (), x: Array | None = None, *, count: int = 3
+  plant: JointModel, terms: Sequence[Term] = (), x: Array | None = None
 ) -> list[tuple[float, float, float]]:
   """Returns the strongest periodic parts of a hypothesis' residual torque over position.
 
@@ -71,7 +71,6 @@ def waves(
     plant: the joint with its logs.
     terms: of the hypothesis; the declared model for none.
     x: its values [n].
-    count: of parts.
 
   Returns:
     (amplitude [N m], periods [1/rad], phase) of torque amplitude * sin(periods q + phase) that the
@@ -98,7 +97,7 @@ def waves(
     complex_part[i] = np.mean(r * np.exp(-1j * k * q))
     power[i] = np.abs(complex_part[i])
   found = []
-  for _ in range(count):
+  for _ in range(_WAVES):
     best = int(np.argmax(power))
     z = complex_part[best]
     # r = -torque lacking? The demand exceeds the supply by what pushes along.

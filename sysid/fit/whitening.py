@@ -15,15 +15,15 @@ _ORDER = 4  # of the autoregression
 _DRAWS = 300  # resamplings
 
 
-def whiten(residual: Array, *, order: int = _ORDER) -> Array:
-  """Returns the innovations of an autoregression fitted to the residual [N - order]."""
-  rows = np.stack([residual[order - 1 - k : len(residual) - 1 - k] for k in range(order)], axis=1)
-  target = residual[order:]
+def whiten(residual: Array) -> Array:
+  """Returns the innovations of an autoregression fitted to the residual [N - _ORDER]."""
+  rows = np.stack([residual[_ORDER - 1 - k : len(residual) - 1 - k] for k in range(_ORDER)], axis=1)
+  target = residual[_ORDER:]
   coefficients = np.linalg.lstsq(rows, target, rcond=None)[0]
   return target - rows @ coefficients
 
 
-def tests(joint: JointLikelihood, residual: Array, *, seed: int = 0) -> dict[str, dict[str, float]]:
+def tests(joint: JointLikelihood, residual: Array) -> dict[str, dict[str, float]]:
   """Returns, for each regressor, its correlation with the whitened residual and its p value.
 
   The p value is the share of block resamplings with random signs whose correlation is as large.
@@ -31,9 +31,8 @@ def tests(joint: JointLikelihood, residual: Array, *, seed: int = 0) -> dict[str
   Args:
     joint: the logs.
     residual: of positions [N], all logs.
-    seed: of the resampling.
   """
-  random = np.random.default_rng(seed)
+  random = np.random.default_rng(0)
   innovations, regressors, blocks, start = [], [], [], 0
   for index, log in enumerate(joint.plant.logs):
     end = start + len(log.time)

@@ -46,27 +46,19 @@ def library(plant: JointPlant) -> list[Term]:
   reach = _reach(plant)
   torque = typical_torque(plant)
   speed = typical_speed(plant)
+  most = strongest(plant)
+  rubs, drags = 0.1 * torque / speed, 0.1 * torque / speed**2
   terms = [
     _one("command_delay", joint, "delay", 0.0, 0.25, 0.01, _DELAYS),
     _drift(plant),
-    _one(
-      "coulomb_friction", joint, "torque", 0.0, strongest(plant), 0.1 * torque, (0.05 * torque,)
-    ),
-    _one(
-      "viscous_friction",
-      joint,
-      "coefficient",
-      0.0,
-      2 * torque / speed,
-      0.1 * torque / speed,
-      (0.1 * torque / speed,),
-    ),
+    _one("coulomb_friction", joint, "torque", 0.0, most, 0.1 * torque, (0.05 * torque,)),
+    _one("viscous_friction", joint, "coefficient", 0.0, 2 * torque / speed, rubs, (rubs,)),
     Term(
       "stribeck_friction",
       joint,
       ("breakaway", "velocity"),
       (0.0, 0.002 * speed),
-      (strongest(plant), 0.5 * speed),  # a larger one would hold the joint throughout
+      (most, 0.5 * speed),  # a larger one would hold the joint throughout
       (0.05 * torque, 0.03 * speed),
       ((0.05 * torque, 0.02 * speed), (0.05 * torque, 0.15 * speed)),
     ),
@@ -82,19 +74,11 @@ def library(plant: JointPlant) -> list[Term]:
       joint,
       ("positive", "negative"),
       (0.0, 0.0),
-      (strongest(plant), strongest(plant)),
+      (most, most),
       (0.1 * torque, 0.1 * torque),
       ((0.06 * torque, 0.01 * torque), (0.01 * torque, 0.06 * torque)),
     ),
-    _one(
-      "quadratic_drag",
-      joint,
-      "coefficient",
-      0.0,
-      2 * torque / speed**2,
-      0.1 * torque / speed**2,
-      (0.1 * torque / speed**2,),
-    ),
+    _one("quadratic_drag", joint, "coefficient", 0.0, 2 * torque / speed**2, drags, (drags,)),
     _play(plant, encoder_on_motor=False),
     _one("motor_gain", joint, "gain", 0.05, 3.0, 0.1, (0.4, 0.75, 1.25)),
     Term(
@@ -123,11 +107,7 @@ def library(plant: JointPlant) -> list[Term]:
       (0.0, -2.0 * reach),
       (3 * torque / reach, 2.0 * reach),
       (0.1 * torque / reach, 0.1 * reach),
-      (
-        (0.1 * torque / reach, 0.0),
-        (0.1 * torque / reach, 0.7 * reach),
-        (0.1 * torque / reach, -0.7 * reach),
-      ),
+      tuple((0.1 * torque / reach, at * reach) for at in (0.0, 0.7, -0.7)),
     ),
   ]
   weaker = {"motor_gain", "supply_sag", "thermal_derating"}
@@ -152,7 +132,6 @@ def library(plant: JointPlant) -> list[Term]:
       (0.3, 0.3),
     )
   )
-  most = strongest(plant)
   limit = most if not np.isfinite(top) else min(top, most)
   terms.append(
     Term(

@@ -3,14 +3,23 @@
 import mujoco
 import numpy as np
 
+SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+"""Joints of one degree of freedom."""
+
+
+def driven(model: mujoco.MjModel) -> set[int]:
+  """Returns the root bodies of what actuators on joints move."""
+  on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+  bodies = model.jnt_bodyid[model.actuator_trnid[on_joint, 0]]
+  return set(map(int, model.body_rootid[bodies]))
+
 
 def carrying(model: mujoco.MjModel, body: int) -> list[int]:
   """Returns the hinges and slides on the way to a body, the farthest from it first."""
-  moving = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
   result: list[int] = []
   while body > 0:
     first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-    result = [k for k in range(first, first + count) if model.jnt_type[k] in moving] + result
+    result = [k for k in range(first, first + count) if model.jnt_type[k] in SINGLE] + result
     body = int(model.body_parentid[body])
   return result
 

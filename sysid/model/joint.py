@@ -18,7 +18,13 @@ from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.plant import JointPlant, declared_parameters, turned_back, turning
+from nerf2real.sysid.model.plant import (
+  JointPlant,
+  Simulated,
+  declared_parameters,
+  turned_back,
+  turning,
+)
 from nerf2real.sysid.model.reduction import Reduction, Surroundings
 from nerf2real.sysid.model.servo.law import ServoLaw, servo_law
 
@@ -44,13 +50,6 @@ class Load(NamedTuple):
 
 Table = tuple[Array, Array]
 """Weights [Q, V] of a force over position and velocity, and its bounds [4]."""
-
-
-class Simulated(NamedTuple):
-  """A log as simulated, at its samples [N]."""
-
-  position: Array
-  torque: Array
 
 
 class JointModel(JointPlant):
@@ -223,10 +222,4 @@ class JointModel(JointPlant):
     if follow:
       p = p.copy()
       p[I["follow"]], p[I["follow_speed"]] = self._follow
-    forces = self.forces(loads, index)
-
-    def simulated() -> Simulated:
-      out = self._run(p, index, forces, table, readings)
-      return Simulated(out.position, out.torque)
-
-    return simulated
+    return functools.partial(self._run, p, index, self.forces(loads, index), table, readings)

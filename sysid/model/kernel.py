@@ -218,7 +218,6 @@ def simulate(
   rate_of_steps, true_time = 1.0 / step, 1.0 / (1.0 + rate)
   stamped = (1.0 + rate) / step
 
-  s = 0
   for w in range(windows):
     end = window_start[w + 1] if w + 1 < windows else samples
     s = window_start[w]
@@ -233,7 +232,6 @@ def simulate(
     time = n * step
     if w > 0 or late == 0.0:
       q += v * (time - first)
-    pointer = 0
     low_index, high_index = 0, command_time.size - 1
     while low_index < high_index:  # the last command not after the window's start
       middle = (low_index + high_index + 1) // 2

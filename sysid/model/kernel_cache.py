@@ -14,7 +14,7 @@ import numba
 _DIGEST = "kernels.sha256"
 
 
-def discard_stale(folder: Path, sources: Sequence[str], used: Sequence[Path] = ()) -> bool:
+def discard_stale(folder: Path, sources: Sequence[str], used: Sequence[Path]) -> bool:
   """Deletes the cached kernels of modules unless they were made from these very sources.
 
   Args:

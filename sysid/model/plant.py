@@ -29,7 +29,7 @@ class Windows:
   velocity: Array
 
 
-class Output(NamedTuple):
+class Simulated(NamedTuple):
   """A simulated log at its samples."""
 
   position: Array
@@ -199,38 +199,62 @@ class JointPlant:
     grid: tuple[Array, ...],
     table: tuple[Array, Array] | None,
     readings: Array | None = None,
-  ) -> Output:
+  ) -> Simulated:
     log, windows = self.logs[index], self.windows[index]
     lift = self.lift(index, p[kernel.INDEX["encoder_offset"]])
     if lift is not None:
       inertia, zero, quarter, bias = grid
       grid = inertia, zero - lift[0], quarter - lift[1], bias
-    out = np.zeros((3, len(log.time)))
-    weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
-    kernel.simulate(  # type: ignore
-      kernel.record(p),
-      self.step,
-      log.command_time,
-      log.command,
-      log.time,
-      *grid,  # type: ignore
-      self._loads[index],
-      self.hinge,
-      windows.start,
-      windows.position,  # type: ignore
-      windows.velocity,
-      self._readings[index] if readings is None else readings,
-      weights,
-      bounds,
-      out[0],
-      out[1],
-      out[2],
+    readings = self._readings[index] if readings is None else readings
+    times = (log.command_time, log.command, log.time)
+    out = simulated(
+      p, self.step, times, (*grid, self._loads[index]), self.hinge, windows, readings, table
     )
     if lift is not None and self._lifted_by_motor:
       zero, quarter = (np.interp(log.time, self._grids[index], part) for part in lift)
       at = out[0] - p[kernel.INDEX["encoder_offset"]]
       out[2] += turned_back(zero, quarter, at)[0] if self.hinge else zero
-    return Output(out[0], out[1], out[2])
+    return Simulated(*out)
+
+
+def simulated(
+  p: Array,
+  step: float,
+  times: tuple[Array, Array, Array],
+  fields: Sequence[Array],
+  hinge: bool,
+  windows: Windows,
+  readings: Array,
+  table: tuple[Array, Array] | None,
+) -> Array:
+  """Returns position, velocity and torque [3, N] of one run of the kernel.
+
+  Args:
+    p: kernel parameters [P].
+    step: s.
+    times: of commands, the commands, times of the samples.
+    fields: inertia, gravity at 0 and a quarter turn further, bias, other actuators' load, each [T].
+    hinge: whether gravity turns with the joint.
+    windows: where the state is set anew.
+    readings: that it follows where it is told to.
+    table: a force over position and velocity; None for none.
+  """
+  out = np.zeros((3, len(times[2])))
+  weights, bounds = table if table is not None else (np.zeros((0, 0)), np.zeros(4))
+  begin = (windows.start, windows.position, windows.velocity)
+  kernel.simulate(  # type: ignore
+    kernel.record(p),
+    step,
+    *times,
+    *fields,  # type: ignore[arg-type]
+    hinge,
+    *begin,
+    readings,
+    weights,
+    bounds,
+    *out,
+  )
+  return out
 
 
 def turning(fields: Sequence[Array], hinge: bool) -> tuple[Array, Array, Array, Array]:

@@ -103,9 +103,10 @@ def simulate(
   stack = EffectStack(moving).bind(model)
   try:
     rate = _of_joint(effects, "clock_drift", "rate", None)
-    offset = np.array([_offset(effects, name) for name in log.joints])
+    offset = np.array([_of_joint(effects, "encoder_offset", "offset", n) for n in log.joints])
     step = float(model.opt.timestep)
-    late = np.array([_late(effects, name) + _skew(clocks, name) for name in log.joints])
+    late = np.array([_of_joint(effects, "measurement_delay", "delay", n) for n in log.joints])
+    late += [clocks.get(name, Clocks()).skew for name in log.joints]
     data = mujoco.MjData(model)
     result = np.zeros_like(measured)
     for index, start in enumerate(starts):
@@ -157,24 +158,12 @@ def _delays(effects: Sequence[Effect], model: mujoco.MjModel) -> Array:
   return result
 
 
-def _skew(clocks: dict[str, Clocks], joint: str) -> float:
-  return clocks.get(joint, Clocks()).skew
-
-
 def _backlash_of(stack: EffectStack):
   """Returns the backlash operator where an encoder sits on the motor, else None."""
   on_motor = any(
     e.kind == "backlash" and e.parameters.get("encoder_on_motor") for e in stack.effects
   )
   return stack.operator("backlash") if on_motor else None
-
-
-def _offset(effects: Sequence[Effect], joint: str) -> float:
-  return _of_joint(effects, "encoder_offset", "offset", joint)
-
-
-def _late(effects: Sequence[Effect], joint: str) -> float:
-  return _of_joint(effects, "measurement_delay", "delay", joint)
 
 
 def _of_joint(effects: Sequence[Effect], kind: str, name: str, joint: str | None) -> float:
@@ -204,8 +193,8 @@ def error(
 def errors(
   model: mujoco.MjModel, logs: Sequence[Log], members: Sequence[Member], *, window_s: float = 0.5
 ) -> dict[str, float]:
-  """Returns the RMSE of the mean of several models' predictions over the joints that the logs
-  command, rad (or m).
+  """Returns the RMSE of the model, and of the mean of several models' predictions, over the joints
+  that the logs command, rad (or m).
 
   Args:
     model: compiled model.
@@ -214,14 +203,15 @@ def errors(
     window_s: length of windows where an actuator does not hold position.
 
   Returns:
-    "after", and where there are several models "single", that of the first, "median", "least" and
-    "most" of them, and "models", how many they are.
+    "before", "after", and where there are several models "single", that of the first, "median",
+    "least" and "most" of them, and "models", how many they are.
   """
   courses = [
     [simulate(model, log, m.effects, clocks=m.clocks, window_s=window_s) for log in logs]
     for m in members
   ]
-  result = {"after": _rmse(logs, [np.mean(c, axis=0) for c in zip(*courses, strict=True)])}
+  result = {"before": error(model, logs, window_s=window_s)}
+  result["after"] = _rmse(logs, [np.mean(c, axis=0) for c in zip(*courses, strict=True)])
   if len(members) > 1:
     each = [_rmse(logs, c) for c in courses]
     result |= {"single": each[0], "median": float(np.median(each)), "least": min(each)}

@@ -78,11 +78,7 @@ def on_a_stand(path: Path, model: mujoco.MjModel) -> mujoco.MjModel:
     path: of the model.
     model: the same, compiled; returned itself where no driven machine is free.
   """
-  driven = {
-    int(model.body_rootid[model.jnt_bodyid[model.actuator_trnid[u, 0]]])
-    for u in range(model.nu)
-    if int(model.actuator_trntype[u]) == int(mujoco.mjtTrn.mjTRN_JOINT)
-  }
+  driven = chains.driven(model)
   free = int(mujoco.mjtJoint.mjJNT_FREE)
   loose = [j for j in np.flatnonzero(model.jnt_type == free) if model.jnt_bodyid[j] in driven]
   if not loose:

@@ -136,7 +136,7 @@ def _put(spec: mujoco.MjSpec, effect: Effect) -> None:
         _turn(spec, geom, turn)
     return
   if effect.kind == "payload":
-    body = spec.body(effect.target) or _joint(spec, effect).parent
+    body = spec.body(effect.target) or native_effects.joints_of(spec, effect)[0].parent
     carrier = body.add_body(name=f"payload_on_{body.name}", pos=[value[a] for a in "xyz"])
     carrier.add_geom(
       type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -146,8 +146,7 @@ def _put(spec: mujoco.MjSpec, effect: Effect) -> None:
       conaffinity=0,
     )
     return
-  joints = [_joint(spec, effect)] if effect.target is not None else list(spec.joints)
-  for joint in joints:
+  for joint in native_effects.joints_of(spec, effect):
     _on_joint(spec, effect, joint, value)
 
 
@@ -157,13 +156,6 @@ def _turn(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, turn: Rotation) -> None:
   before = Rotation.from_quat(model.geom_quat[geom.id], scalar_first=True)
   geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
   geom.quat = (turn * before).as_quat(scalar_first=True)
-
-
-def _joint(spec: mujoco.MjSpec, effect: Effect):
-  joint = spec.joint(effect.target)
-  if joint is None:
-    raise ValueError(f"Found no joint {effect.target!r} in the model for {effect.kind}.")
-  return joint
 
 
 def _on_joint(spec: mujoco.MjSpec, effect: Effect, joint, value: dict[str, float]) -> None:

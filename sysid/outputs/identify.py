@@ -14,24 +14,23 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nerf2real.core.files import write_atomically
+from nerf2real.core.files import hash_path, write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.core.pages import page
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
-from nerf2real.suite.effects import write_effects
+from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.sysid.data.checks import check_length
 from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
-from nerf2real.sysid.fit import resolution
+from nerf2real.sysid.fit import resolution, whitening
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
+from nerf2real.sysid.model.simulation import Member, errors
 from nerf2real.sysid.model.supported import check_supported, on_a_stand
 from nerf2real.sysid.outputs import extended_model
-from nerf2real.sysid.outputs.details import claimed_effects, details_of
-from nerf2real.sysid.outputs.errors import errors, floor
 from nerf2real.sysid.outputs.notes import (
   another_session,
   beyond,
@@ -50,13 +49,8 @@ from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.sensors import sensing
 from nerf2real.sysid.settings import SETTINGS, Settings
 
-_REDUCED, _SHOWN, _ANALYSIS, _SENSORS, _ERRORS = (
-  0.05,
-  0.25,
-  0.9,
-  0.92,
-  0.97,
-)  # shares of the work done after each, about
+# Shares of the work done after each, about.
+_REDUCED, _SHOWN, _ANALYSIS, _SENSORS, _ERRORS = 0.05, 0.25, 0.9, 0.92, 0.97
 
 
 def identify(
@@ -155,9 +149,10 @@ def _identify(
   _add(found, by_duty)
   progress(_ANALYSIS, "sensors and floor")
   sensed = sensing.find(compiled, logs, reference, tilt=_tilt(found))
-  found.objects += sensed.effects
-  found.in_reference += sensed.in_reference
-  _add(found, sensed.rows, moves=False)
+  said = sensed.whole
+  found.objects += said.effects
+  found.in_reference += said.in_reference
+  _add(found, said.rows, moves=False)
   progress(_SENSORS, "errors on the logs")
   whole = [*found.calibration, *found.objects]
   near = found.near
@@ -165,12 +160,16 @@ def _identify(
     "verdict": found.verdict,
     "effects": [] if found.verdict == "none" else _effects_first(found.effects),
     "in_reference": found.in_reference,
-    "alternatives": [*found.scopes, *found.twins, *alternatives(found)],
+    # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
+    "alternatives": [
+      *(*_effects_first(found.nearest), *found.scopes, *found.twins),
+      *(*alternatives(found), *said.alternatives),
+    ],
     "residual_at": residual_at(found),
     "error": {
-      "train": errors(found, logs, near, settings),
-      "held": errors(found, held, near, settings) if held else None,
-      "floor": floor(held or logs, [j.joint for j in found.joints]),
+      "train": errors(stand, logs, near, window_s=settings.window_s),
+      "held": errors(stand, held, near, window_s=settings.window_s) if held else None,
+      "floor": _floor(held or logs, [j.joint for j in found.joints]),
     },
     "window_s": None if _holds(found) else settings.window_s,
     "seconds": 0.0,
@@ -183,40 +182,36 @@ def _identify(
       *long_step(found.joints),
       *supply(logs, reference),
       *(note for item in found.found for note in another_session(item)),
-      *sensed.notes,
+      *dict.fromkeys(said.notes),
     ],
   }
-  # The best named hypothesis of a joint that stays unexplained is listed, not claimed.
-  content["alternatives"] = [*_effects_first(found.nearest), *content["alternatives"]]
   if found.followed:
     joints = ", ".join(item.joint for item in found.followed)
-    content["notes"] = [
-      *content["notes"],
+    content["notes"].append(
       "Found by a simulation that follows the readings, as courses do not repeat (play, where a "
       f"motion stops, or where no actuator holds a position): {joints}. The errors before and "
-      f"after are of {'whole courses' if _holds(found) else 'windows'}, which stray.",
-    ]
+      f"after are of {'whole courses' if _holds(found) else 'windows'}, which stray."
+    )
   if found.in_reference:
     counts = collections.Counter(row["kind"] for row in found.in_reference)
     kinds = ", ".join(f"{k} ({n} times)" if n > 1 else k for k, n in counts.items())
     text = f"In the reference, too, so that nothing has changed: {kinds}. The model lacks it."
-    content["notes"] = [*content["notes"], text]
+    content["notes"].append(text)
   if found.verdict == "partly":
     joints = ", ".join(item.joint for item in found.unexplained)
     text = (
       f"At {joints} more remains than the machine leaves anyway: the names are certain, not all."
     )
-    content["notes"] = [*content["notes"], text]
+    content["notes"].append(text)
   if len(near) > 1:
-    content["notes"] = [*content["notes"], spread(content["error"])]
-  content["alternatives"] += sensed.alternatives
-  drawn = samples.with_samples(found, claimed_effects(found), np.random.default_rng(0))
+    content["notes"].append(spread(content["error"]))
+  drawn = samples.with_samples(found, _claimed(found), np.random.default_rng(0))
   write_effects(out / "effects.json", servo.apart(drawn, by_duty))
   finer_ones = None if used == declared else used
   extended_model.write(
     model, out / "model_extended.xml", whole, clocks=found.clocks, numerics=finer_ones
   )
-  details = details_of(found, model, near, sensed)
+  details = _details(found, model, near, sensed)
   details["numerics"] = to_plain(finer_ones)
   details["identifiability"] = [to_plain(item) for item in shown]
   details["joints"] = stored.to_json(stored.remembered(found, held, settings))
@@ -277,5 +272,62 @@ def _check_joints(logs: Sequence[Log], others: Sequence[Log]) -> None:
       )
 
 
+def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:
+  """Returns what no smooth model can explain, rad (or m) rms over joints.
+
+  Readings scatter about any smooth motion by rounding, noise and stamps that are off while the
+  joint moves: that is what their differences of fourth order keep (70 times its variance). The
+  largest hundredth, stale readings, is left out.
+  """
+  squares = []
+  for log in logs:
+    position = log.states.position
+    assert position is not None
+    columns = [log.states.column(joint) for joint in joints]
+    fourth = np.sort(np.square(np.diff(position[:, columns], n=4, axis=0)), axis=0)
+    squares.append(fourth[: max(1, int(0.99 * len(fourth)))].mean(axis=0) / 70.0)
+  return float(np.sqrt(np.mean(squares)))
+
+
 def _holds(found: Identified) -> bool:
   return all(j.likelihood.plant.holds for j in found.joints)
+
+
+def _details(
+  found: Identified, model: Path, near: Sequence[Member], sensed: sensing.Sensed
+) -> dict[str, Any]:
+  """Returns what the findings rest on, and what the extended model is simulated with."""
+  first = found.least_explained
+  return {
+    "model": str(model.resolve()),
+    "model_hash": hash_path(model),
+    **stored.member_to_json(near[0]),
+    "near": [stored.member_to_json(member) for member in near[1:]],
+    "calibration": {
+      e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
+      for e in found.calibration
+    },
+    "tests": {
+      "joint": first.joint,
+      **{
+        name: whitening.tests(first.likelihood, item.fit.residuals[0][0])
+        for name, item in (("declared", first.declared), ("extended", first.extended))
+      },
+    },
+    "audit": found.audits,
+    "servo": {j.joint: to_plain(j.likelihood.law) for j in found.joints if j.likelihood.law},
+    "sensors": sensed.errors(),
+  }
+
+
+def _claimed(found: Identified) -> list[Effect]:
+  """Returns the effects that go into effects.json.
+
+  The constants of a joint go with its effects, which were fitted beside them.
+  """
+  if found.verdict == "none":
+    return []
+  joints = {e["joint"] for e in (*found.effects, *found.nearest)}
+  all_off = any(e["kind"] == "parameter_error" and e["joint"] is None for e in found.effects)
+  constants = [c for c in found.calibration if all_off or c.target in joints]
+  return [*constants, *found.objects]

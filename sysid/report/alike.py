@@ -10,6 +10,12 @@ from nerf2real.sysid.settings import SETTINGS
 _SEVERAL = 3  # joints from which one entry stands for all, chosen
 
 
+def place(effect: dict[str, Any], everywhere: str = "all") -> str:
+  """Returns where an entry's effect is, in a word."""
+  places = (effect.get(noun) for noun in ("joint", "body", "geom", "sensor"))
+  return next((place for place in places if place), everywhere)
+
+
 def together(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
   """Returns entries with one for all gains of servos' laws that are alike, in place of the first.
 

@@ -16,7 +16,7 @@ from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.fit.likelihood import rms_of
 from nerf2real.sysid.model import simulation as evaluation
 from nerf2real.sysid.report import capability, meanings, residual_plots, summary
-from nerf2real.sysid.report.alike import together
+from nerf2real.sysid.report.alike import place, together
 from nerf2real.sysid.report.residual_plots import AFTER, BEFORE
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.selection.joints.changes import Changed
@@ -109,23 +109,18 @@ def _summary(effects: Sequence[dict[str, Any]]) -> str:
   """Returns kinds with where they are; many joints are counted."""
   where: dict[str, list[str]] = {}
   for effect in effects:
-    where.setdefault(effect["kind"], []).append(_place(effect))
+    where.setdefault(effect["kind"], []).append(place(effect))
   return ", ".join(
     f"{kind} ({', '.join(places) if len(places) <= _SHOWN else f'{len(places)} joints'})"
     for kind, places in where.items()
   )
 
 
-def _place(effect: dict[str, Any]) -> str:
-  places = (effect["joint"], *(effect.get(noun) for noun in ("body", "geom", "sensor")))
-  return next((place for place in places if place), "all")
-
-
 def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
   rows, bounds = _parameters(content["effects"])
   notes = [
-    f"As good an explanation of {place}: {summary.either(kinds, ())}."
-    for place, kinds in summary.alike_by_place(content["alternatives"]).items()
+    f"As good an explanation of {where}: {summary.either(kinds, ())}."
+    for where, kinds in summary.alike_by_place(content["alternatives"]).items()
   ]
   # Of what is unexplained, the nearest hypothesis is among the alternatives, with intervals.
   listed = [a for a in content["alternatives"] if "kinds" not in a]
@@ -156,11 +151,11 @@ def _parameters(effects: Sequence[dict[str, Any]]) -> tuple[list[list[Any]], lis
   rows: list[list[Any]] = []
   bounds = []
   for effect in effects:
-    where = _place(effect)
+    where = place(effect)
     evidence = effect["evidence"]
     gain = evidence.get("held_out_gain_nats", evidence.get("gain_nats", ""))
     for name, value in effect["parameters"].items():
-      if _is_choice(effect, name) or isinstance(value["value"], list):
+      if _is_choice(effect, name):
         continue
       known = None not in (value["value"], value["low"], value["high"])
       interval = f"{value['low']:.4g} to {value['high']:.4g}" if known else ""
@@ -188,7 +183,7 @@ def _choices(effects: Sequence[dict[str, Any]]) -> list[str]:
     for name in (n for n in chosen if _is_choice(effect, n)):
       meaning = kind_of(effect["kind"]).parameter(name).doc  # "1 if it is so, else 0"
       so = meaning.removeprefix("1 if ").rpartition(", ")[0] or meaning
-      said.append(f"{effect['kind']} ({_place(effect)}), {name}: {so}.")
+      said.append(f"{effect['kind']} ({place(effect)}), {name}: {so}.")
   return said
 
 

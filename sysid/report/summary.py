@@ -7,6 +7,7 @@ from nerf2real.core.pages.blocks import Answer, Answers
 from nerf2real.core.pages.page import Section
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model import simulation
+from nerf2real.sysid.report.alike import place
 
 _FEW = 4  # effects that are said with their values; more are counted
 _LARGE = {"mrad": "rad", "mm": "m"}
@@ -71,9 +72,7 @@ def _sentence(words: str) -> str:
 
 def _name(effect: dict[str, Any]) -> str:
   """Returns an effect's kind and place as words."""
-  places = (effect.get("joint"), *(effect.get(noun) for noun in ("body", "geom", "sensor")))
-  where = next((place for place in places if place), "all joints")
-  return f"{effect['kind'].replace('_', ' ')} at {where}"
+  return f"{effect['kind'].replace('_', ' ')} at {place(effect, 'all joints')}"
 
 
 def _effect(effect: dict[str, Any]) -> str:
@@ -84,7 +83,7 @@ def _meaning(effect: dict[str, Any]) -> str:
   """Returns what an effect is, its values and intervals in words."""
   values = []
   for name, value in effect["parameters"].items():
-    if isinstance(value["value"], list) or None in (value["value"], value["low"], value["high"]):
+    if None in (value["value"], value["low"], value["high"]):
       continue
     unit = "" if value["unit"] == "1" else f" {value['unit']}"
     low, high = (f"{value[end]:.3g}" for end in ("low", "high"))

@@ -185,6 +185,4 @@ def _parameters(
 
 
 def _plain(value: Any) -> Any:
-  if isinstance(value, (list, tuple)):
-    return list(value)
   return float(value) if np.isfinite(value) else None

@@ -16,8 +16,6 @@ from nerf2real.sysid.model.simulation import Clocks, Member
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.search.evidence import Scored
 
-_MOST = 8  # fits near the best that are simulated, chosen
-
 
 def effects_of(joint: str, item: Scored, *, offset: float = 0.0) -> tuple[list[Effect], Clocks]:
   """Returns the effects of a joint's hypothesis that are its own, and its latencies; its zero is
@@ -103,7 +101,7 @@ class Identified:
   @property
   def near(self) -> list[Member]:
     """What to simulate with: the extended model, and others whose fits are near its own."""
-    count = min(max((len(j.near) for j in self.joints), default=1), _MOST)
+    count = max((len(j.near) for j in self.joints), default=1)
     own = Member([*self.calibration, *self.objects], self.clocks)
     return [own, *(self._member(own, k) for k in range(1, count))]
 

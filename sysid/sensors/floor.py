@@ -25,6 +25,7 @@ import numpy as np
 
 from nerf2real.core import least_squares
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.sysid.model import chains
 from nerf2real.sysid.sensors import sensed, standing
 from nerf2real.sysid.sensors.sensed import Estimate, Part, row
 from nerf2real.sysid.sensors.stops import Stood, Stops, find_stops, join_stops, known_stops
@@ -38,7 +39,6 @@ _ROUGH = (
 )
 _FEWEST = 3  # headings
 _GRAVITY = 9.81  # m/s^2
-_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def find(
@@ -75,22 +75,14 @@ def find(
 
 def _root(model: mujoco.MjModel) -> int | None:
   """Returns the free body that actuators move; None without one, or with two."""
-  found = set()
-  for u in range(model.nu):
-    if model.actuator_trntype[u] == int(mujoco.mjtTrn.mjTRN_JOINT):
-      body = int(model.jnt_bodyid[model.actuator_trnid[u, 0]])
-      found.add(int(model.body_rootid[body]))
-  free = [b for b in found if model.body_jntnum[b] and _is_free(model, int(model.body_jntadr[b]))]
-  return free[0] if len(free) == 1 else None
-
-
-def _is_free(model: mujoco.MjModel, joint: int) -> bool:
-  return int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+  free = set(model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)])
+  found = chains.driven(model) & free
+  return found.pop() if len(found) == 1 else None
 
 
 def _of(model: mujoco.MjModel, joint: int) -> int | None:
   """Returns the root body of a hinge or slide; None of another joint."""
-  single = int(model.jnt_type[joint]) in _SINGLE
+  single = int(model.jnt_type[joint]) in chains.SINGLE
   return int(model.body_rootid[model.jnt_bodyid[joint]]) if single else None
 
 

@@ -3,14 +3,12 @@
 import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from nerf2real.core.geometry.rotations import matrix_from_rotvec
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.suite.effects import Effect
 from nerf2real.sysid.sensors import brightness, floor, inertial, optical
 from nerf2real.sysid.sensors.sensed import Part
 
@@ -23,29 +21,14 @@ class Sensed:
   """By "imu", "camera", "brightness", "floor"; those that logs and model have."""
 
   @property
-  def rows(self) -> list[dict[str, Any]]:
-    """Entries of the report for what is named."""
-    return [row for part in self.parts.values() for row in part.rows]
-
-  @property
-  def in_reference(self) -> list[dict[str, Any]]:
-    """Entries of the report for what reference logs show, too."""
-    return [row for part in self.parts.values() for row in part.in_reference]
-
-  @property
-  def effects(self) -> list[Effect]:
-    """What the model lacks, as effects that can be simulated."""
-    return [effect for part in self.parts.values() for effect in part.effects]
-
-  @property
-  def alternatives(self) -> list[dict[str, Any]]:
-    """Entries for what cannot be told apart."""
-    return [row for part in self.parts.values() for row in part.alternatives]
-
-  @property
-  def notes(self) -> list[str]:
-    """What was not looked at, and why, a line each."""
-    return list(dict.fromkeys(note for part in self.parts.values() for note in part.notes))
+  def whole(self) -> Part:
+    """What all of them name and say together."""
+    every = self.parts.values()
+    joined = {
+      name: [entry for part in every for entry in getattr(part, name)]
+      for name in ("rows", "alternatives", "notes", "in_reference")
+    }
+    return Part(**joined)  # type: ignore[arg-type]
 
   def errors(self) -> dict[str, dict[str, float]]:
     """Returns each sensor's error without and with its effects, in its own measure.

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from nerf2real.core.geometry.rotations import OPENGL_FROM_OPENCV
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.sysid.model import chains
 from nerf2real.sysid.model.motion import smooth_motion
 
 Array = np.ndarray
@@ -51,13 +52,12 @@ def choose(model: mujoco.MjModel, frame: str) -> int | None:
 
 def unmeasured(model: mujoco.MjModel, camera: int, joints: Sequence[str]) -> list[str]:
   """Returns the joints between the world and a camera that are not among the measured ones."""
-  single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
   missing, body = [], int(model.cam_bodyid[camera])
   while body:
     first = int(model.body_jntadr[body])
     for index in range(first, first + int(model.body_jntnum[body])):
       name = model.joint(index).name
-      if int(model.jnt_type[index]) not in single or name not in joints:
+      if int(model.jnt_type[index]) not in chains.SINGLE or name not in joints:
         missing.append(name or f"the free joint of {model.body(body).name!r}")
     body = int(model.body_parentid[body])
   return missing

@@ -13,15 +13,16 @@ the logs' where that is more. Shapes: N samples of all logs, K columns.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from scipy.linalg import orth
 
 from nerf2real.core import least_squares
+from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import quantum
 from nerf2real.sysid.model.plant import JointPlant
-from nerf2real.sysid.model.servo.clock import best_clock, best_delay
 from nerf2real.sysid.model.servo.duty import duty_of
 from nerf2real.sysid.settings import SETTINGS
 
@@ -29,6 +30,11 @@ Array = np.ndarray
 
 _BANDS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Dead bands that are tried, in steps of the position's reading."""
+_STEP, _COARSE, _NEAR = 0.001, 0.004, 0.016
+"""s between delays that are tried, chosen: firmware and bus work in cycles of a millisecond; in a
+first round, a quarter of a period at 60 Hz, faster than position errors change; and how far about
+its best delay a second round goes, which a held command's plateau must not leave. Where a clock's
+rate is sought, too, they are of the shifts at a log's middle and at its end."""
 _FEWEST = 50  # samples of a line
 
 
@@ -134,8 +140,8 @@ class _Duties:
       return float(asked @ asked - (column @ asked) ** 2 / max(float(column @ column), 1e-300))
 
     longest = max(float(log.time[-1] - log.time[0]) for log in self._plant.logs)
-    delay = best_delay(squares)
-    late, drift = best_clock(squares, longest)
+    delay = _best_delay(squares)
+    late, drift = _best_clock(squares, longest)
     return (late, drift) if self._is_worth(squares(late, drift), squares(delay)) else (delay, 0.0)
 
   def dead_band(self, delay: float, rate: float) -> float:
@@ -228,3 +234,46 @@ def _declared(plant: JointPlant, delay: float, rate: float) -> Array:
 
 def _shrunk(x: Array, band: float) -> Array:
   return np.sign(x) * np.maximum(np.abs(x) - band, 0.0)
+
+
+def _best_delay(squares: Callable[[float], float]) -> float:
+  """Returns the delay [s] of least squares, within what is plausible of late commands.
+
+  Held commands give plateaus of equal squares: the middle of the best.
+  """
+  most = kind_of("command_delay").parameter("delay").high
+  coarse = np.arange(0.0, most + _COARSE / 2, _COARSE)
+  near = coarse[np.argmin([squares(delay) for delay in coarse])]
+  fine = np.arange(max(near - _NEAR, 0.0), near + _NEAR + _STEP / 2, _STEP)
+  found = np.array([squares(delay) for delay in fine])
+  return float(np.median(fine[found <= found.min() * (1.0 + 1e-6)]))
+
+
+def _best_clock(squares: Callable[[float, float], float], longest: float) -> tuple[float, float]:
+  """Returns the delay [s] at the beginning of logs and the clock's rate of least squares, within
+  what is plausible of both.
+
+  Rates are sought by the shifts that they make at the end of the longest log [s], and delays by
+  those at its middle: nearly independent of each other.
+  """
+  most, fastest = (
+    kind_of(kind).parameter(name).high
+    for kind, name in (("command_delay", "delay"), ("clock_drift", "rate"))
+  )
+  ends = np.arange(-fastest * longest, fastest * longest + _NEAR, 2.0 * _NEAR)
+  middles = np.arange(ends[0] / 2.0, most + ends[-1] / 2.0, _NEAR)
+  step = 2.0 * _NEAR
+  while True:
+    found = {}
+    for end in ends:
+      rate = min(max(end / longest, -fastest), fastest)
+      for middle in middles:
+        delay = middle - 0.5 * rate * longest
+        if 0.0 <= delay <= most:
+          found[squares(delay, rate), middle, end] = delay, rate
+    least = min(found)
+    if step <= 2.0 * _STEP:
+      return found[least]
+    step /= 4.0
+    ends = least[2] + step * np.arange(-4, 5)
+    middles = least[1] + step / 2.0 * np.arange(-4, 5)

@@ -56,8 +56,6 @@ class Explanation:
 
   best: Scored
   names: tuple[Name, ...]
-  left: Array
-  """[B] mean squared position residual of left-out blocks."""
   share: float
   """Of the squared residual without effects that the names explain, on left-out blocks."""
   share_low: float
@@ -115,9 +113,8 @@ def conclude(
         others = _names(joint, item, ranked, beyond)
         if _certain(others) >= _certain(names) | {special}:
           best, names = item, others
-  left = best.fit.held[0][0]
-  share = _share(left, bare.fit.held[0][0] if without is None else without)
-  return Explanation(best, names, left, *share)
+  share = _share(best.fit.held[0][0], bare.fit.held[0][0] if without is None else without)
+  return Explanation(best, names, *share)
 
 
 def _names(

@@ -176,12 +176,20 @@ def _subject(
     return Subject(joint, now, (own,), library, freed, explainer, sure, alone)
   now.ahead = None if before.law is None else _ahead(before.law, settings)
   usual = reference_constants(before, settings)
-  now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
-  known = known_terms(usual, settings, another_session=_apart(now, before))
-  paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
-  freed = freed_constants(known[0])
+  known, paired, freed = _shown(now, before, usual)
   explainer = _explainer(now, before, known, library, freed)
   return Subject(joint, now, known, library, freed, explainer, sure, alone, before, usual, paired)
+
+
+def _shown(
+  now: JointLikelihood, before: JointLikelihood, usual: Scored
+) -> tuple[tuple[Term, ...], bool, Term]:
+  """Returns what a reference's hypothesis says of logs: what is known, whether every log has its
+  like, and the constants, of which some may have changed."""
+  now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
+  known = known_terms(usual, now.settings, another_session=_apart(now, before))
+  paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
+  return known, paired, freed_constants(known[0])
 
 
 def _apart(now: JointLikelihood, before: JointLikelihood) -> bool:
@@ -224,12 +232,9 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
   library = own_library(before.plant, alone=subject.alone)
   first = Explainer(before, own, library, settings=settings, known=[sticking(before.plant)])
   usual = conclude(before, grow(first, settings.reference_depth), subject.thresholds).best
-  subject.now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
+  known, subject.paired, subject.freed = _shown(subject.now, before, usual)
   shared = [t for t in subject.known if t.wider]
-  known = known_terms(usual, settings, another_session=subject.another_session)
   subject.usual, subject.known = usual, (*known, *shared)
-  subject.paired = subject.now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
-  subject.freed = freed_constants(subject.known[0])
   subject.explainer = _explainer(subject.now, before, subject.known, subject.library, subject.freed)
 
 

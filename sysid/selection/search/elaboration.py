@@ -13,13 +13,24 @@ from scipy.stats import chi2
 from nerf2real.sysid.fit.layout import CONSTANTS, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
-from nerf2real.sysid.hypotheses.rich_friction import FORMS, REPLACED, rich_friction
+from nerf2real.sysid.hypotheses.candidates import typical_speed, typical_torque
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING, Term
+from nerf2real.sysid.model.plant import JointPlant
 from nerf2real.sysid.selection.search.evidence import Scored, kinds_of
 from nerf2real.sysid.selection.search.explain import Explainer
 
 Array = np.ndarray
 
+_FORMS = (0, 1, 2, 3, 4)
+"""Which torque L loads the gear: `suite.effects.kinds.friction.LoadFriction`."""
+_REPLACED = ("load_friction", "stribeck_friction", "supply_sag")
+"""Kinds that imitate parts of it: strength that falls with torque is like friction that grows."""
+
+_SLOWEST = 0.1
+"""Of the fastest speed, most that the fall from rest to motion may take: the authors' published
+fits of small servos have 0.07 to 0.11 rad/s; chosen, some times that."""
+_EXPECTED = {"coefficient": 0.1, "rest": 0.5}
+"""Spread about zero: what a motion does not show stays away; chosen."""
 _NEAR = 0.95
 """Share of a posterior that lies within so much of the least cost: half a quantile of chi square
 with as many degrees as values."""
@@ -71,8 +82,8 @@ def _begun(
   joint, tried = explainer.joint, []
   for terms, x in bases(explainer, best, named):
     known = Fitter([joint], Layout([terms])).linearise(x).jacobian[0]
-    for carried in FORMS:
-      term = rich_friction(joint.plant, carried)
+    for carried in _FORMS:
+      term = _rich_friction(joint.plant, carried)
       fitter = Fitter([joint], Layout([(*terms, term)]))
       blank = [np.concatenate([known, np.zeros((len(term.names), *known.shape[1:]))])]
       fresh = np.arange(len(x) + len(term.names)) >= len(x)
@@ -100,7 +111,7 @@ def bases(
 ) -> list[tuple[tuple[Term, ...], Array]]:
   """Returns what richer friction is added to: the named effects on constants within tolerances, and
   on freed ones; a name that is theirs needs the freed ones."""
-  gone = {FREE, STICKING, "load_friction", *(k for k in REPLACED if k not in named)}
+  gone = {FREE, STICKING, "load_friction", *(k for k in _REPLACED if k not in named)}
   kept = [
     t
     for t in best.terms
@@ -114,3 +125,26 @@ def bases(
     bases.append((tuple(explainer.freed if t.kind == CONSTANTS else t for t in kept), x))
   rich = {"load_friction"}
   return [(terms, x) for terms, x in bases if kinds_of(terms) | rich >= set(named)]
+
+
+def _rich_friction(plant: JointPlant, carried: int) -> Term:
+  """Returns the friction as a term.
+
+  Args:
+    plant: the joint.
+    carried: which torque loads the gear.
+  """
+  fast, large = typical_speed(plant), typical_torque(plant)
+  names = ("coefficient", "quadratic", "rest", "velocity")
+  return Term(
+    "load_friction",
+    plant.joint,
+    names,
+    (0.0, 0.0, 0.0, 0.002 * fast),
+    (0.8, 3.0 / large, 3.0, _SLOWEST * fast),
+    (0.1, 0.2 / large, 0.2, 0.05 * fast),
+    ((0.1, 0.3 / large, 0.4, 0.1 * fast), (0.05, 1.0 / large, 0.4, 0.03 * fast)),
+    tuple(_EXPECTED.get(name, float("inf")) for name in names),
+    (0.0,) * len(names),
+    fixed=(("carried", float(carried)),),
+  )

@@ -150,6 +150,11 @@ class Explainer:
     self.scored[terms] = result
     return result
 
+  def fitted(self, terms: tuple[Term, ...], x: Array | Fit, iterations: int) -> Scored:
+    """Returns a hypothesis fitted on from values [n], or from a fit, and scored."""
+    fit = Fitter([self.joint], Layout([terms])).fit(x, iterations=iterations)
+    return self.score(terms, fit)
+
   def rescore(self) -> None:
     """Scores all hypotheses anew after the scale has changed, the baseline among them."""
     for s in (self.null, *self.scored.values()):
@@ -208,8 +213,7 @@ class Explainer:
       twin = next((t for t in other.terms if t == term or t.kind == term.kind == CONSTANTS), None)
       values = {} if twin is None else other.fit.values(twin)
       x += [values.get(name, at) for name, at in zip(term.names, term.starts[0], strict=True)]
-    fitter = Fitter([self.joint], Layout([terms]))
-    return self.score(terms, fitter.fit(np.array(x), iterations=8))
+    return self.fitted(terms, np.array(x), 8)
 
   def _other_forms(self, parent: Scored) -> list[Scored]:
     """Returns a hypothesis with each of its effects in the other forms that its kind has, where
@@ -221,8 +225,7 @@ class Explainer:
           continue
         terms = (*parent.terms[:at], form, *parent.terms[at + 1 :])
         if terms not in self.scored:
-          fitter = Fitter([self.joint], Layout([terms]))
-          self.score(terms, fitter.fit(parent.fit.x, iterations=4))
+          self.fitted(terms, parent.fit.x, 4)
         item = self.scored[terms]
         if not self.joint.alike(item.fit.residuals[0] - parent.fit.residuals[0]):
           found.append(item)
@@ -299,9 +302,7 @@ class Explainer:
   def constants_alone(self) -> list[Scored]:
     """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
     if self.freed is not None:
-      terms = (self.freed, *self.null.terms[1:])
-      fitter = Fitter([self.joint], Layout([terms]))
-      self.score(terms, fitter.fit(self.null.fit.x, iterations=4))
+      self.fitted((self.freed, *self.null.terms[1:]), self.null.fit.x, 4)
     return self.ranked()
 
   def adopt(self, best: Scored) -> Scored:
@@ -316,8 +317,7 @@ class Explainer:
       if best.fit.cost > before - self.settings.settled:
         break
     if self.joint.follows and best.names & set(UNREPEATED):
-      fitter = Fitter([self.joint], Layout([best.terms]))
-      drawn = self.score(best.terms, fitter.fit(rough.draw(fitter, best.fit).x, iterations=8))
+      drawn = self.fitted(best.terms, rough.draw(fitter, best.fit).x, 8)
       best = max(drawn, best, key=lambda item: item.evidence)
       self.scored[best.terms] = best
       self.joint.rescale(best.fit.residuals[0])
@@ -326,8 +326,7 @@ class Explainer:
 
   def refit(self, item: Scored, iterations: int = 6) -> Scored:
     """Returns a hypothesis fitted on under the present scale."""
-    fit = Fitter([self.joint], Layout([item.terms])).fit(item.fit, iterations=iterations)
-    return self.score(item.terms, fit)
+    return self.fitted(item.terms, item.fit, iterations)
 
   def ranked(self) -> list[Scored]:
     """Returns all scored hypotheses, the best first."""

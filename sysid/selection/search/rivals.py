@@ -25,7 +25,7 @@ def lacking(explainer: Explainer, item: Scored, kind: str) -> Scored:
   kept = tuple(t for t in terms if t is not None)
   if kept not in explainer.scored:
     x = np.concatenate([list(item.fit.values(t).values()) for t in _alike(item.terms, kept)])
-    explainer.score(kept, Fitter([explainer.joint], Layout([kept])).fit(x, iterations=4))
+    explainer.fitted(kept, x, 4)
   return explainer.scored[kept]
 
 
@@ -35,8 +35,7 @@ def with_freed(explainer: Explainer, item: Scored) -> Scored:
     return item
   terms = (explainer.freed, *item.terms[1:])
   if terms not in explainer.scored:
-    fitter = Fitter([explainer.joint], Layout([terms]))
-    explainer.score(terms, fitter.fit(item.fit.x, iterations=6))
+    explainer.fitted(terms, item.fit.x, 6)
   return explainer.scored[terms]
 
 

@@ -39,12 +39,6 @@ class Candidate(NamedTuple):
     return Effect(self.kind, self.target, {self.parameter: value})
 
 
-class _Course(NamedTuple):
-  """What walks would be with a candidate."""
-
-  figures: dict[float, Array]  # [K, D] at each value that was simulated
-
-
 class Found(NamedTuple):
   """A candidate at the value that leaves least."""
 
@@ -93,7 +87,7 @@ def best_first(
     nothing: figures [K, D] without any.
     judge: of what is left.
   """
-  courses = {c: _Course({c.nothing: nothing}) for c in listed}
+  courses = {c: {c.nothing: nothing} for c in listed}  # figures [K, D] by value
 
   def ranked() -> list[Found]:
     found = [_fitted(candidate, course, judge) for candidate, course in courses.items()]
@@ -101,8 +95,8 @@ def best_first(
 
   def add(candidate: Candidate, *values: float) -> None:
     for value in values:
-      if value not in courses[candidate].figures and value != candidate.nothing:
-        courses[candidate].figures[value] = simulated(candidate, value)
+      if value not in courses[candidate] and value != candidate.nothing:
+        courses[candidate][value] = simulated(candidate, value)
 
   for candidate in listed:
     add(candidate, candidate.values[1])
@@ -121,10 +115,10 @@ def _scatter(missed: Array) -> tuple[Array, Array]:
   return missed.mean(axis=0), variance * (1 + 1 / len(missed))
 
 
-def _fitted(candidate: Candidate, course: _Course, judge: Judge) -> Found:
+def _fitted(candidate: Candidate, course: dict[float, Array], judge: Judge) -> Found:
   """Returns a candidate at the value that leaves least; figures between are interpolated."""
-  nodes = np.array(sorted(course.figures))
-  figures = np.stack([course.figures[value] for value in nodes])
+  nodes = np.array(sorted(course))
+  figures = np.stack([course[value] for value in nodes])
   between = PchipInterpolator(nodes, figures)
   values = np.linspace(nodes[0], nodes[-1], _STEPS + 1)
   squares = judge.squares(between(values))

@@ -79,7 +79,8 @@ def test_the_error_of_one_model_is_its_own():
   model = mujoco.MjModel.from_xml_string(PENDULUM)
   log = log_of(PENDULUM, "slow", [RICH], duration=3.0)
   errors = simulation.errors(model, [log], [Member([], {})])
-  assert errors == {"after": pytest.approx(simulation.error(model, [log]))}
+  own = pytest.approx(simulation.error(model, [log]))
+  assert errors == {"before": own, "after": own}
   both = simulation.errors(model, [log], [Member([RICH], {}), Member([], {})])
   course = [simulation.simulate(model, log, e)[:, 0] for e in ([RICH], [])]
   mean = np.sqrt(np.mean((np.mean(course, axis=0) - log.states.position[:, 0]) ** 2))
