@@ -42,7 +42,7 @@ _PICTURES_VERSION = 5  # of all others; 5: colours of other profiles
 # what came with depth; 13: uncertain pictures of films are left out, too; 14: patches are aligned;
 # 15: a film is held by a hand's motion
 _POSES_VERSION = 17
-_ALIGNED_VERSION = 1
+_ALIGNED_VERSION = 2  # 2: sightings in the sensor's metre, as the depth pictures
 _MATCHES = "matches.db"  # what pictures with depth show alike
 _ALIGNED_RECORD = "aligned.json"  # the factor on the depth's unit
 _SENSOR_VERSION = 2  # 2: depth at the pictures' times
@@ -185,6 +185,8 @@ def aligned(
   factor = json.loads((stage.folder / _ALIGNED_RECORD).read_text())["depth_unit"]
   if factor is None:
     return capture, poses
-  scaled = dataclasses.replace(known, depth_unit=known.depth_unit * factor)
+  scaled = dataclasses.replace(
+    known, depth_unit=known.depth_unit * factor, sightings=known.sightings * [1, 1, 1, factor]
+  )
   moved = dataclasses.replace(capture.value, known=scaled)
   return Made(moved, stage), Made(localisation.load(stage.folder / "sfm"), stage)

@@ -102,7 +102,9 @@ def test_a_sensors_other_metre_goes_into_its_unit(capture, refined):
   taken, after = localising.aligned(
     cache, _made(dataclasses.replace(capture[0], known=short), "short"), before
   )
-  assert taken.value.known.depth_unit == pytest.approx(UNIT, rel=0.02)
+  known = taken.value.known
+  assert known.depth_unit == pytest.approx(UNIT, rel=0.02)
+  np.testing.assert_allclose(known.sightings, known.lifted().sightings, rtol=1e-12)
   _, places = _to_truth(after.value, capture[1])
   extent = np.ptp(capture[1][:, :3, 3], axis=0).max()
   assert np.ptp(places, axis=0).max() == pytest.approx(extent, rel=0.02)
