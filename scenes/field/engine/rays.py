@@ -163,7 +163,10 @@ def march(
     norm = largest(p)
     if norm < 1.0:
       q = (p + wp.vec3(1.0, 1.0, 1.0)) * half_size
-      index = (wp.int32(q[0]) * size + wp.int32(q[1])) * size + wp.int32(q[2])
+      x = wp.min(wp.int32(q[0]), size - 1)  # the largest number below 1 is rounded to 2
+      y = wp.min(wp.int32(q[1]), size - 1)
+      z = wp.min(wp.int32(q[2]), size - 1)
+      index = (x * size + y) * size + z
       away = wp.int32(grids.inner_distance[index])
       if away == 0:
         if at >= 0:

@@ -66,3 +66,23 @@ def test_march_visits_every_occupied_cell_on_its_way():
     expected = np.flatnonzero(occupied[cells[:, 0], cells[:, 1], cells[:, 2]]).size
     assert abs(count - expected) <= 2  # rounding at the faces of cells
     np.testing.assert_allclose(lengths[ray, :count], step)
+
+
+def test_a_ray_at_the_last_number_below_one_stays_in_the_grid():
+  """What lies behind the grid in memory is full, the grid is empty."""
+  size, outer = 8, 4
+  device = Device()
+  distances = device.put(np.array([12] * size**3 + [0] * (size**2 + size + 1), np.uint8))
+  grids, settings = layout.Occupancy(), layout.Settings()
+  grids.inner_size, grids.outer_size = size, outer
+  grids.inner_distance = distances[: size**3]
+  grids.inner_density = device.zeros(distances.size)[: size**3]
+  grids.outer_distance = device.put(np.full(outer**3, 6, np.uint8))
+  grids.outer_density = device.zeros(outer**3)
+  settings.step, settings.ray_samples = 0.01, 512
+  below = np.nextafter(np.float32(1), np.float32(0))
+  origin = device.put(np.array([[below, below, -0.9]], np.float32), wp.vec3)
+  direction = device.put(np.array([[0.0, 0.0, 1.0]], np.float32), wp.vec3)
+  samples, counts = device.zeros(1024), device.zeros(1, np.int32)
+  device.launch(_march, [grids, settings, origin, direction, samples, 512, counts], dim=1)
+  assert counts.numpy()[0] == 0
