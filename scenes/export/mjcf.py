@@ -79,9 +79,9 @@ def add_camera(
   spec: mujoco.MjSpec, camera: Camera, world_from_camera: np.ndarray, *, name: str
 ) -> None:
   """Adds a camera with calibrated intrinsics at a pose [4, 4] with OpenCV axes."""
-  if camera.width * camera.height > 1280 * 960:
-    spec.visual.global_.offwidth = max(1280, camera.width)
-    spec.visual.global_.offheight = max(960, camera.height)
+  shown = spec.visual.global_
+  shown.offwidth = max(shown.offwidth, camera.width)
+  shown.offheight = max(shown.offheight, camera.height)
   size = _SENSOR_WIDTH * np.array([1.0, camera.height / camera.width])
   spec.worldbody.add_camera(
     name=name,

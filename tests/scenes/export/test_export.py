@@ -107,6 +107,13 @@ def test_mujoco_opens_the_mjcf_and_its_camera_is_the_calibrated_one(parts, visua
   np.testing.assert_allclose(centre, [LENS.cx, LENS.cy], rtol=1e-5)
 
 
+def test_pictures_of_an_upright_camera_fit_into_the_offscreen_buffer(parts):
+  spec = mjcf.scene_spec(parts, extent=EXTENT, name="room")
+  mjcf.add_camera(spec, Camera.from_vertical_fov(1.0, 720, 1280), POSE, name="capture")
+  seen = spec.compile().vis.global_
+  assert (seen.offwidth, seen.offheight) == (1280, 1280)
+
+
 def test_a_robot_in_the_mjcf_keeps_standing(parts, tmp_path):
   from nerf2real.suite.op3 import constants
   from nerf2real.suite.standalone import standing_robot
