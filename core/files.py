@@ -156,13 +156,22 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def replace_folder(source: Path, target: Path) -> None:
-  """Renames a folder to `target` on the same disk; an older target is removed."""
+  """Renames a folder to `target` on the same disk; an older folder or file there is removed."""
   retired = target.with_name(f".{target.name}.retired")
-  shutil.rmtree(retired, ignore_errors=True)
+  _remove(retired)
   if target.exists():
     target.rename(retired)
   source.rename(target)
-  shutil.rmtree(retired, ignore_errors=True)
+  _remove(retired)
+
+
+def _remove(path: Path) -> None:
+  """Removes a file, a link or a folder; what is not there or cannot be removed is left."""
+  if path.is_dir() and not path.is_symlink():
+    shutil.rmtree(path, ignore_errors=True)
+  else:
+    with contextlib.suppress(OSError):
+      path.unlink(missing_ok=True)
 
 
 def copy_atomically(source: Path, target: Path) -> None:
@@ -179,7 +188,8 @@ def hash_path(path: str | Path, *, named: Iterable[Path] = ()) -> str:
   """Returns the SHA-256 of a file's content, or of all files below a folder with their names.
 
   Args:
-    path: The file or folder. What is hidden below it (a name that begins with ".") does not count.
+    path: The file or folder. What is hidden below it (a name that begins with ".") does not count;
+      folders that are linked below it do.
     named: Files that it names, which count with their names where they do not lie below it.
 
   Raises:
@@ -189,9 +199,7 @@ def hash_path(path: str | Path, *, named: Iterable[Path] = ()) -> str:
   if not path.exists():
     raise FileNotFoundError(f"{path} does not exist; give an existing file or folder.")
   digest = hashlib.sha256()
-  below = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-  if path.is_dir():
-    below = [p for p in below if not any(s.startswith(".") for s in p.relative_to(path).parts)]
+  below = [path] if path.is_file() else sorted(_files_below(path))
   folder = path if path.is_dir() else path.parent
   for file in (*below, *sorted(set(named) - set(below))):
     if file != path:
@@ -199,3 +207,16 @@ def hash_path(path: str | Path, *, named: Iterable[Path] = ()) -> str:
     with file.open("rb") as stream:
       digest.update(hashlib.file_digest(stream, "sha256").digest())
   return digest.hexdigest()
+
+
+def _files_below(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[Path]:
+  """Yields all files below a folder but hidden ones; a link to a folder `above` it is passed by."""
+  above |= {folder.resolve()}
+  with contextlib.suppress(PermissionError):
+    for path in folder.iterdir():
+      if path.name.startswith("."):
+        continue
+      if path.is_file():
+        yield path
+      elif path.is_dir() and path.resolve() not in above:
+        yield from _files_below(path, above)

@@ -3,6 +3,7 @@
 import errno
 import pickle
 import resource
+import shutil
 
 import pytest
 from hypothesis import given
@@ -61,6 +62,18 @@ def test_failed_folder_keeps_the_old_one(tmp_path):
     (partial / "c").write_text("c")
     raise KeyboardInterrupt
   assert listing(target) == ["b"] and listing(tmp_path) == ["folder"]
+
+
+def test_a_folder_replaces_a_file_and_a_link_whole(tmp_path):
+  kept = tmp_path / "kept"
+  kept.mkdir()
+  (tmp_path / "file").write_text("old")
+  (tmp_path / "link").symlink_to(kept)
+  for name in ("file", "link"):
+    with files.atomic_folder(tmp_path / name) as partial:
+      (partial / "new").write_text("whole")
+    assert listing(tmp_path / name) == ["new"]
+  assert listing(tmp_path) == ["file", "kept", "link"] and listing(kept) == []
 
 
 def test_leftovers_of_a_killed_process_are_not_mixed_in(tmp_path):
@@ -155,6 +168,21 @@ def test_hidden_files_do_not_count_and_named_ones_do(tmp_path):
     first = files.hash_path(path, named=[beside])
     beside.write_text("3")
     assert len({files.hash_path(path), first, files.hash_path(path, named=[beside])}) == 3
+
+
+def test_linked_folders_count_and_a_link_to_a_folder_above_does_not(tmp_path):
+  capture, linked = tmp_path / "capture", tmp_path / "linked"
+  for folder in (capture / "images", linked / "images"):
+    folder.mkdir(parents=True)
+    (folder / "x").write_text("1")
+  plain = files.hash_path(capture)
+  shutil.rmtree(capture / "images")
+  (capture / "images").symlink_to(linked / "images")
+  assert files.hash_path(capture) == plain
+  (capture / "again").symlink_to(capture)
+  assert files.hash_path(capture) == plain
+  (linked / "images" / "y").write_text("2")
+  assert files.hash_path(capture) != plain
 
 
 def test_a_line_is_appended_whole_or_not_at_all(tmp_path):
