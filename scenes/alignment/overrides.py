@@ -123,10 +123,10 @@ def read(path: pathlib.Path) -> Overrides:
   if not path.is_file():
     what = "is a folder, expected a file" if path.is_dir() else "does not exist"
     raise ValueError(f"The override file {path} {what}.")
-  text = path.read_text(encoding="utf-8")
   try:
+    text = path.read_text(encoding="utf-8")
     values = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-  except (json.JSONDecodeError, yaml.YAMLError) as error:
+  except (UnicodeDecodeError, json.JSONDecodeError, yaml.YAMLError) as error:
     reason = " ".join(str(error).split())
     raise ValueError(f"{path} is no valid {path.suffix[1:] or 'YAML'}: {reason}") from error
   return from_dict(values, source=str(path))

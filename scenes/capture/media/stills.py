@@ -8,6 +8,7 @@ quarter, so that its sensor lies as theirs; of several lenses the most common on
 import collections
 import contextlib
 import hashlib
+import numbers
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -129,7 +130,8 @@ def look_of(path: Path) -> Look:
   if exif.get(PIL.ExifTags.Base.Orientation) in _TURNED:
     width, height = height, width
   focal = detail.get(PIL.ExifTags.Base.FocalLengthIn35mmFilm)
-  return Look(width, height, float(focal) if focal else None)
+  known = isinstance(focal, numbers.Real) and focal > 0  # EXIF may hold several numbers, or text
+  return Look(width, height, float(focal) if known else None)
 
 
 def unreadable(lost: Sequence[Path], count: int) -> list[str]:

@@ -1,6 +1,7 @@
 """Known poses of a transforms.json, as nerfstudio and instant-ngp write it."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,22 @@ def find_transforms(source: Path) -> Path | None:
 
 def _transforms_camera(values: dict[str, Any], path: Path) -> Camera:
   """Reads the intrinsics of a transforms.json or of one of its frames."""
+
+  def number(name: str, default: float = 0.0) -> float:
+    try:
+      value = float(values.get(name, default))
+    except (TypeError, ValueError):
+      value = math.nan
+    if not math.isfinite(value):
+      raise CaptureError(f"{path}: {name} = {values[name]!r} found, expected a number.")
+    return value
+
   model = values.get("camera_model", "OPENCV")
   if values.get("is_fisheye"):  # instant-ngp's word for OpenCV's model
     model = "OPENCV_FISHEYE"
   if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
     raise CaptureError(f"{path}: camera_model {model} found, expected OPENCV: {_UNDISTORT}.")
-  more = [name for name in ("k3", "k4") if float(values.get(name, 0.0)) != 0]
+  more = [name for name in ("k3", "k4") if number(name) != 0]
   if more:
     raise CaptureError(
       f"{path}: {more[0]} = {values[more[0]]} found, expected a lens of k1, k2, p1, p2 alone: "
@@ -44,22 +55,25 @@ def _transforms_camera(values: dict[str, Any], path: Path) -> Camera:
     )
   if "w" not in values or "h" not in values:
     raise CaptureError(f"{path}: no picture size 'w' and 'h' found; add it.")
-  width, height = int(values["w"]), int(values["h"])
+  width, height = int(number("w")), int(number("h"))
   if "fl_x" in values:
-    fx = float(values["fl_x"])
+    fx = number("fl_x")
   elif "camera_angle_x" in values:
-    fx = focal_length(float(values["camera_angle_x"]), width)
+    fx = focal_length(number("camera_angle_x"), width)
   else:
     raise CaptureError(f"{path}: no focal length: expected 'fl_x' or 'camera_angle_x'.")
   if "fl_y" in values:
-    fy = float(values["fl_y"])
+    fy = number("fl_y")
   elif "camera_angle_y" in values and "fl_x" not in values:
-    fy = focal_length(float(values["camera_angle_y"]), height)
+    fy = focal_length(number("camera_angle_y"), height)
   else:
     fy = fx
-  distortion = {name: float(values.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2")}
-  cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-  return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, **distortion)
+  distortion = {name: number(name) for name in ("k1", "k2", "p1", "p2")}
+  cx, cy = number("cx", width / 2), number("cy", height / 2)
+  try:
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, **distortion)
+  except ValueError as error:
+    raise CaptureError(f"{path}: {error}") from error
 
 
 def _frame_file(folder: Path, name: str) -> Path:
@@ -90,6 +104,9 @@ def read_transforms(source: Path) -> KnownPoses:
     raise CaptureError(f"{path} is no transforms file of nerfstudio: {error!r}.") from error
   if not frames:
     raise CaptureError(f"{path} lists no frames.")
+  for name in (frame.get(key) for frame in frames for key in ("file_path", "depth_file_path")):
+    if not isinstance(name, str | None):
+      raise CaptureError(f"{path}: {name!r} found as a picture's path, expected text.")
   poses = []
   for frame, matrix in zip(frames, matrices, strict=True):
     if matrix.shape == (3, 4):

@@ -56,7 +56,11 @@ def lists_without_poses(source: Path) -> str | None:
 
 def _table(path: Path, columns: int) -> list[list[str]]:
   """Rows of a text file of TUM's: words, without comments."""
-  lines = (line.strip() for line in path.read_text().replace(",", " ").splitlines())
+  try:
+    text = path.read_text(encoding="utf-8")
+  except UnicodeDecodeError as error:
+    raise CaptureError(f"{path} is no text in UTF-8 ({error}): save it as such.") from error
+  lines = (line.strip() for line in text.replace(",", " ").splitlines())
   rows = [line.split(maxsplit=columns - 1) for line in lines if line[:1] not in ("", "#")]
   if not rows or any(len(row) < columns for row in rows):
     raise CaptureError(f"{path} is no list of TUM's layout: expected {columns} columns a line.")

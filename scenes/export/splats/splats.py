@@ -66,6 +66,13 @@ class Splats:
         f"{path} is no PLY of splats of degree 0 (properties {names[:4]}...): give a file that "
         "launch/export_scene.py --to splat wrote."
       )
+    count = next((line.split()[-1] for line in lines if line.startswith("element vertex ")), "")
+    size = 4 * len(_FIELDS)  # bytes of a splat
+    if not count.isdecimal() or len(body) != int(count) * size:
+      raise ValueError(
+        f"{path} is cut or damaged: found {len(body) / size:g} splats, expected {count or 'none'}: "
+        "copy or export it again."
+      )
     rows = np.frombuffer(body, "<f4").reshape(-1, len(_FIELDS)).astype(np.float64)
     rotations = rows[:, 13:17] / np.linalg.norm(rows[:, 13:17], axis=1, keepdims=True)
     return cls(

@@ -239,11 +239,12 @@ def test_alignment_survives_json(room):
     ("extent_lower: [1, 0, 0]\nextent_upper: [0, 1, 1]", "must be below"),
     ("- 3", "expected keys"),
     ("scale: [", "no valid yaml"),
+    ("# \xe9", "no valid yaml: 'utf-8' codec"),
   ],
 )
 def test_mistakes_in_the_override_file_are_one_line(tmp_path, text, message):
   path = tmp_path / "o.yaml"
-  path.write_text(text)
+  path.write_text(text, encoding="latin-1")
   with pytest.raises(ValueError, match=message) as error:
     overrides.read(path)
   assert "\n" not in str(error.value) and str(path) in str(error.value)

@@ -36,6 +36,13 @@ def _still(path, size, *, focal=None, orientation=None, seed=0):
   PIL.Image.fromarray(pixels).save(path, exif=exif)
 
 
+def test_a_lens_that_exif_tells_wrongly_is_not_known(tmp_path):
+  for name, focal in (("one", 26), ("two", (26, 26)), ("none", 0)):
+    _still(tmp_path / f"{name}.jpg", (80, 60), focal=focal)
+  looks = [stills.look_of(tmp_path / f"{name}.jpg").focal for name in ("one", "two", "none")]
+  assert looks == [26.0, None, None]
+
+
 def test_most_stills_are_kept_and_the_rest_is_named(tmp_path):
   for number in range(12):
     focal = 13 if number in (3, 4) else None if number == 5 else 26

@@ -147,6 +147,11 @@ def test_the_file_opens_with_plyfile(tmp_path):
   )
   np.testing.assert_allclose(1 / (1 + np.exp(-vertex["opacity"])), splats.opacities, rtol=1e-5)
   np.testing.assert_allclose(0.5 + 0.28209479 * vertex["f_dc_1"], splats.colors[:, 1], rtol=1e-5)
+  content = (tmp_path / "room.ply").read_bytes()
+  for lost in (68, 30):
+    (tmp_path / "cut.ply").write_bytes(content[:-lost])
+    with pytest.raises(ValueError, match=r"cut\.ply is cut or damaged: found .* expected"):
+      Splats.load_ply(tmp_path / "cut.ply")
   again = Splats.load_ply(tmp_path / "room.ply")
   np.testing.assert_allclose(again.rotations, splats.rotations, atol=1e-6)
 

@@ -65,6 +65,14 @@ def test_transforms_errors(tmp_path):
     synthetic.write_transforms(tmp_path, poses, synthetic.CAMERA, **extra)
     with pytest.raises(CaptureError, match=words):
       read_transforms(tmp_path)
+  for extra, words in (
+    ({"k1": None}, "k1 = None found, expected a number"),
+    ({"w": "wide"}, "w = 'wide' found, expected a number"),
+    ({"fl_x": 0}, "Focal lengths must be positive"),
+  ):
+    synthetic.write_transforms(tmp_path, poses, synthetic.CAMERA, **extra)
+    with pytest.raises(CaptureError, match=rf"transforms\.json: {words}"):
+      read_transforms(tmp_path)
   synthetic.write_transforms(tmp_path, poses, synthetic.CAMERA, k3=0.0, k4=0.0)
   assert len(read_transforms(tmp_path).files) == 8
   (tmp_path / "images" / "view_003.png").unlink()
@@ -73,6 +81,10 @@ def test_transforms_errors(tmp_path):
   for number in range(4, 8):
     (tmp_path / "images" / f"view_{number:03d}.png").unlink()
   with pytest.raises(CaptureError, match=r"5 of 8 pictures are missing, as view_003.png"):
+    read_transforms(tmp_path)
+  frame = {"file_path": 3, "transform_matrix": np.eye(4).tolist()}
+  (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+  with pytest.raises(CaptureError, match=r"transforms\.json: 3 found as a picture's path"):
     read_transforms(tmp_path)
   (tmp_path / "transforms.json").write_text('{"frames": 3}')
   with pytest.raises(CaptureError, match="no transforms file"):

@@ -35,6 +35,9 @@ def test_damaged_sequences_are_one_clear_line(tum, tmp_path):
   (folder / "groundtruth.txt").write_text("1.0 0 0\n")
   with pytest.raises(CaptureError, match="expected 8 columns"):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  (folder / "groundtruth.txt").write_bytes(b"# caf\xe9\n1.0 0 0 0 0 0 0 1\n")
+  with pytest.raises(CaptureError, match=r"groundtruth\.txt is no text in UTF-8"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
 
 
 def test_a_sequence_without_trajectory_says_what_is_missing(tum, tmp_path):
