@@ -40,8 +40,16 @@ def choose_scale(
     camera_height: That height where it is known [m].
     guessed_camera_height: That height where nothing is known [m].
     max_marker_spread: A marker whose scale is less certain (relative) is not used.
+
+  Raises:
+    ValueError: The floor lies above the cameras.
   """
   height = float(np.median(floor.heights(evidence.positions)))  # units
+  if height <= 0:
+    raise ValueError(
+      f"The floor lies above the cameras, by {-height:.3g} units in the median: correct "
+      "floor_points or up in the override file."
+    )
   warnings: tuple[str, ...] = ()
   if override.scale is not None:
     return Choice(Scale(override.scale), "manual")

@@ -12,9 +12,9 @@ from nerf2real.scenes.alignment.overrides import Overrides
 FLOOR = Floor(np.array([0, 0, 1.0]), 0.0, 100, 1.0, 0.0, 0.0)
 
 
-def _chosen(*, assumed, camera_height=None, marker=None):
+def _chosen(*, assumed, camera_height=None, marker=None, height=2.0):
   poses = np.tile(np.eye(4), (3, 1, 1))
-  poses[:, 2, 3] = 2.0  # units above the floor
+  poses[:, 2, 3] = height  # units above the floor
   evidence = Evidence(
     np.zeros((1, 3)), poses, marker=marker, sensor_scale=1.0, metres_assumed=assumed
   )
@@ -51,3 +51,9 @@ def test_a_marker_comes_before_any_depth():
   for assumed in (False, True):
     chosen = _chosen(assumed=assumed, camera_height=1.5, marker=marker)
     assert chosen.source == "marker" and not chosen.warnings
+
+
+@pytest.mark.parametrize("height", [-1.0, 0.0])
+def test_a_floor_above_the_cameras_gives_no_metre(height):
+  with pytest.raises(ValueError, match="floor lies above the cameras"):
+    _chosen(assumed=True, camera_height=1.5, height=height)
