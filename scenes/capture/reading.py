@@ -10,6 +10,7 @@ import numpy as np
 
 from nerf2real.core import files
 from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.picture_files import write_picture
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
 from nerf2real.scenes.capture.kinds import source_kind
@@ -269,8 +270,7 @@ def _write(frames: Iterator[Frame], folder: Path) -> list[_Written]:
         "expected one camera, one zoom and one orientation for the whole capture."
       )
     path = folder / f"frame_{frame.index:06d}.png"
-    if not cv2.imwrite(str(path), frame.image, _WITHOUT_LOSS):
-      raise OSError(f"{path} could not be written: is the disk full?")
+    write_picture(path, frame.image, _WITHOUT_LOSS)
     written.append(_Written(path, frame.index, frame.time, frame.travelled, frame.sharpness))
   if not written:
     raise CaptureError("The capture holds no picture.")

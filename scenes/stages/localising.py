@@ -8,9 +8,9 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from nerf2real.core.picture_files import write_picture
 from nerf2real.core.progress import Progress, part
 from nerf2real.core.serialization import write_json
 from nerf2real.scenes.capture import keyframes as keyframe_files
@@ -128,9 +128,7 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
       if own is not None:
         camera = found.camera.resized(raw.shape[1], raw.shape[0])
         aligned = own.aligned(raw * known.depth_unit, camera) / known.depth_unit
-      path = folder / f"{Path(name).stem}.png"
-      if not cv2.imwrite(str(path), np.rint(aligned).astype(np.uint16)):
-        raise OSError(f"{path} could not be written: is the disk full?")
+      write_picture(folder / f"{Path(name).stem}.png", np.rint(aligned).astype(np.uint16))
       written = (number + 1) / len(depth)
       progress(0.8 + 0.2 * written, f"depth of picture {number + 1} of {len(depth)} written")
 

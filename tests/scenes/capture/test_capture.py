@@ -2,17 +2,19 @@
 
 import dataclasses
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 import pytest
 
+from nerf2real.core.files import DiskFullError
 from nerf2real.scenes.capture import reading
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.media.spacing import ImageMotion, spread
-from nerf2real.scenes.capture.media.video import inspect_video, sharpest_frames, sharpness
+from nerf2real.scenes.capture.media.video import Frame, inspect_video, sharpest_frames, sharpness
 from nerf2real.scenes.capture.reading import read_capture
 from tests.scenes import synthetic_capture as synthetic
 
@@ -251,6 +253,14 @@ def test_stills_without_a_place_are_named_as_their_files(tmp_path):
   assert capture.told(text) == f"{names[3]} sees fewest points (20)."
   film = dataclasses.replace(capture, origins=None)
   assert film.without_place([]) is None and film.told(text) == text
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_disk_that_fills_up_is_told_as_such(tmp_path):
+  (tmp_path / "frame_000003.png").symlink_to("/dev/full")
+  frame = Frame(3, 0.0, 1.0, np.zeros((4, 4, 3), np.uint8))
+  with pytest.raises(DiskFullError, match="the disk is full"):
+    reading._write(iter([frame]), tmp_path)
 
 
 def test_an_error_leaves_the_last_good_keyframes(frames, tmp_path, monkeypatch):
