@@ -61,7 +61,7 @@ def make_scene(
       Stages(out / STAGES, show_progress=show_progress),
       settings=settings,
       given=given,
-      name=name or out.name,
+      name=name or out.resolve().name,
       measure=measure,
       watcher=watcher,
     )

@@ -117,6 +117,8 @@ def _check_replaced(kind: Kind, order: Order) -> None:
       f"--out {order.out} is or holds the scene bundle {order.bundle.folder}, which the export "
       "would replace: name a folder or file of its own."
     )
+  if Path.cwd().is_relative_to(out):
+    raise ValueError(f"--out {order.out} is or holds the folder that you are in: name another one.")
   if STAGES in out.parts or out == order.bundle.visual_path.resolve():
     raise ValueError(
       f"--out {order.out} is a part of a scene bundle, which the export would replace: name "

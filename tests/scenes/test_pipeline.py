@@ -163,6 +163,13 @@ def test_incomplete_bundles_are_refused(scene, tmp_path):
     Bundle.load(out)
 
 
+def test_the_folder_that_one_is_in_names_the_scene(source, settings, tmp_path, monkeypatch):
+  (tmp_path / "room").mkdir()
+  monkeypatch.chdir(tmp_path / "room")
+  monkeypatch.setattr(pipeline, "_run_stages", lambda *_, name, **__: name)
+  assert pipeline.make_scene(source, ".", settings=settings) == "room"
+
+
 def test_no_source_is_one_clear_line(settings, tmp_path):
   with pytest.raises(ValueError, match="does not exist"):
     pipeline.make_scene(tmp_path / "none.mp4", tmp_path / "out", settings=settings)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -238,6 +239,14 @@ def test_a_folder_that_is_no_earlier_export_stays(kind, tmp_path):
     assert (taken / "mine").is_file()
   with pytest.raises(ValueError, match="is a file"):
     exporting.export(kind, exporting.Order(bundle, tmp_path / "plain"))
+
+
+def test_the_folder_that_one_is_in_is_not_replaced(tmp_path, monkeypatch):
+  (tmp_path / "out").mkdir()
+  monkeypatch.chdir(tmp_path / "out")
+  for out in (Path("."), tmp_path / "out"):
+    with pytest.raises(ValueError, match="the folder that you are in"):
+      exporting.export("mjcf", exporting.Order(Bundle(tmp_path / "room", {}), out))
 
 
 def test_an_earlier_export_is_replaced(parts, tmp_path):
