@@ -28,7 +28,7 @@ class TrainSettings:
   paper's padding, held-out views of the built-in room lose 0.6 dB; the paper's table: 4e-5."""
   variance_rate: float = 0.1
   """Factor on the rate of the weights that see the variance. Chosen: it gives away direction and
-  distance of the camera, and a field that learns those first finds no geometry."""
+  distance of the camera, and a field that learns those first finds no geometry. Engine "fused"."""
   warmup_steps: int = 64
   """Steps over which the learning rate rises from a hundredth. Chosen: 1 % of the steps;
   the paper's table: 2048, 5 % of its own."""
@@ -47,7 +47,8 @@ class TrainSettings:
   """Weight of the distortion loss. Paper, NeRF table."""
   distortion_start: int = 1000
   """Step at which the distortion loss sets in; it has its weight at twice this step. Chosen: from
-  the start it favours fog before the camera. The paper's table has no such value."""
+  the start it favours fog before the camera. The paper's table has no such value. Engine "fused";
+  the reference has the whole weight from the start."""
   blur_max: float = 12.0
   """Largest blur of a training ray [training pixel]; 0 turns the augmentation off. Paper."""
   blur_sharp_fraction: float = 0.5

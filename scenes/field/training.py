@@ -141,7 +141,7 @@ def train(
   else:
     trainer = ReferenceTrainer(views, settings, seed=seed, initial=initial)
   checkpoint = Path(checkpoint_dir) / _CHECKPOINT if checkpoint_dir is not None else None
-  key = _run_key(views, settings, seed)
+  key = _run_key(views, settings, seed, initial)
   spent, resumed = 0.0, None
   if checkpoint is not None:
     checkpoint.parent.mkdir(parents=True, exist_ok=True)
@@ -209,12 +209,15 @@ def _not_finite(what: str, step: int, rate: float) -> str:
   )
 
 
-def _run_key(views: Views, settings: TrainSettings, seed: int) -> str:
+def _run_key(views: Views, settings: TrainSettings, seed: int, initial: Field | None) -> str:
   """Hash of all that a checkpoint depends on."""
   digest = hashlib.sha256(json.dumps(to_plain(settings), sort_keys=True).encode())
-  digest.update(json.dumps([to_plain(views.camera), list(views.names), seed]).encode())
-  digest.update(np.ascontiguousarray(views.world_from_camera).tobytes())
-  digest.update(np.ascontiguousarray(views.images).tobytes())
+  about = [to_plain(views.camera), list(views.names), views.uneven, seed]
+  digest.update(json.dumps(about).encode())
+  for array in (views.world_from_camera, views.images, views.anchors):
+    digest.update(np.ascontiguousarray(array).tobytes())
+  if initial is not None:
+    digest.update(_hash_arrays(initial.params).encode())
   return digest.hexdigest()
 
 

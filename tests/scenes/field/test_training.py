@@ -107,6 +107,18 @@ def test_a_checkpoint_of_other_settings_is_not_used(views, tmp_path, monkeypatch
   assert report.resumed_at_step is None
 
 
+def test_a_checkpoint_depends_on_all_that_the_training_does(views):
+  field = FusedTrainer(views, FAST, seed=0).field()
+  anchor = np.array([[0, 1, 1, 2.0]], np.float32)
+  runs = [
+    (views, None),
+    (dataclasses.replace(views, anchors=anchor), None),
+    (dataclasses.replace(views, uneven=True), None),
+    (views, field),
+  ]
+  assert len({train._run_key(seen, FAST, 0, initial) for seen, initial in runs}) == len(runs)
+
+
 def test_a_checkpoint_of_another_format_is_not_used(views, tmp_path, monkeypatch):
   monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
   short = dataclasses.replace(FAST, max_steps=4)
