@@ -16,8 +16,6 @@ from nerf2real.scenes.stages.cache import Stages
 from nerf2real.scenes.stages.pictures import PosedPictures
 from nerf2real.scenes.stages.results import Given, Measure, SceneResults, Source, Watcher
 
-STAGES = bundle.STAGES
-
 
 def make_scene(
   source: Path,
@@ -58,7 +56,7 @@ def make_scene(
     return _run_stages(
       film,
       out,
-      Stages(out / STAGES, show_progress=show_progress),
+      Stages(out / bundle.STAGES, show_progress=show_progress),
       settings=settings,
       given=given,
       name=name or out.resolve().name,

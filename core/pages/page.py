@@ -37,7 +37,6 @@ class Origin:
   """Where a page comes from; shown at its end."""
 
   command: str = ""
-  commit: str = ""
   version: str = ""
 
   @classmethod

@@ -56,7 +56,6 @@ class Floor(NamedTuple):
   points: int  # that lie in it
   cover: float  # ground that its points cover [unit^2]
   residual: float  # root mean square distance of its points [unit]
-  tilt_from_cameras_deg: float  # angle to the cameras' up direction
 
   def heights(self, points: np.ndarray) -> np.ndarray:
     """Signed heights [...] of points [..., 3] above the floor."""
@@ -146,10 +145,9 @@ def find_floor(
     if inside.sum() < 10:
       break
     residual = float(np.sqrt(np.mean((rest[inside] @ normal - offset) ** 2)))
-    tilt = np.degrees(np.arccos(np.clip(normal @ up.direction, -1, 1)))
     cover = _cover(rest[inside], normal, cell)
     if below > 0.9 and _stands_out(points, normal, offset, tolerance=tolerance, cell=cell):
-      candidates.append(Floor(normal, offset, int(inside.sum()), cover, residual, float(tilt)))
+      candidates.append(Floor(normal, offset, int(inside.sum()), cover, residual))
     rest = rest[np.abs(rest @ normal - offset) > _PEEL * tolerance]
   if not candidates:
     raise FloorError(
@@ -231,7 +229,7 @@ def choose_floor(
   if override.floor_points is not None:
     normal, offset = fit_plane(override.floor_points, up.direction)
     error = override.floor_points @ normal - offset
-    floor = Floor(normal, offset, len(error), 0.0, float(np.sqrt(np.mean(error**2))), 0.0)
+    floor = Floor(normal, offset, len(error), 0.0, float(np.sqrt(np.mean(error**2))))
     return Choice(FoundFloor(floor, True), "manual_points")
   found = _search(evidence, up, settings, max_gap)
   warnings: tuple[str, ...] = ()

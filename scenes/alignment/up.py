@@ -49,12 +49,6 @@ class UpBelief(NamedTuple):
       (1 + self.deviations(normals) ** 2 / self.freedom) ** (-(self.freedom + 2) / 2)
     )
 
-  @property
-  def widest(self) -> float:
-    """Standard deviation to the side to which up is least sure [rad]."""
-    plane = across(self.direction)
-    return float(np.linalg.eigvalsh(plane @ self.precision @ plane.T)[0] ** -0.5)
-
 
 def mean_up(frame_from_camera: np.ndarray) -> np.ndarray:
   """The cameras' up direction [3]: a phone is held upright, see `rotations.level_up`.

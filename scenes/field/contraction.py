@@ -14,17 +14,6 @@ def contract(positions: jax.Array) -> jax.Array:
   return positions * ((2.0 - 1.0 / norm) / norm)
 
 
-def uncontract(squashed: jax.Array) -> jax.Array:
-  """Inverts `contract` for points [..., 3] strictly inside [-2, 2]^3."""
-  norm = jnp.maximum(jnp.max(jnp.abs(squashed), axis=-1, keepdims=True), 1.0)
-  return squashed / (norm * (2.0 - norm))
-
-
 def grid_coordinates(positions: jax.Array) -> jax.Array:
   """Maps points [..., 3] of the unit frame to the hash grid's cube [0, 1]^3."""
   return (contract(positions) + 2.0) * 0.25
-
-
-def from_grid_coordinates(coordinates: jax.Array) -> jax.Array:
-  """Inverts `grid_coordinates` for points [..., 3] strictly inside [0, 1]^3."""
-  return uncontract(coordinates * 4.0 - 2.0)

@@ -146,13 +146,6 @@ def _base(
   return density, outputs[..., 1:]
 
 
-def query_density(
-  settings: FieldSettings, params: Params, positions: jax.Array, variances: jax.Array
-) -> jax.Array:
-  """Density [1/unit] [...] at positions [..., 3] averaged over variances [..., 3]."""
-  return _base(settings, params, positions, variances)[0]
-
-
 def query(
   settings: FieldSettings,
   params: Params,

@@ -50,11 +50,6 @@ class Occupancy:
     """Cells along an axis, G."""
     return self.distance.shape[0]
 
-  @property
-  def occupied(self) -> np.ndarray:
-    """Cells with matter, bool [G, G, G], axes z, y, x."""
-    return self.distance == 0
-
   @classmethod
   def from_occupied(cls, occupied: np.ndarray) -> "Occupancy":
     """Builds the distance from a grid of cells with matter, bool [G, G, G], axes z, y, x."""
@@ -65,13 +60,6 @@ class Occupancy:
       return cls(np.full(occupied.shape, _MAX_DISTANCE, np.uint8))
     cells = scipy.ndimage.distance_transform_cdt(~occupied, metric="chessboard")
     return cls(np.minimum(cells, _MAX_DISTANCE).astype(np.uint8))
-
-  def is_occupied(self, coordinates: np.ndarray) -> np.ndarray:
-    """Looks up points of the grid's cube [0, 1]^3, [..., 3]: bool [...]."""
-    x, y, z = np.moveaxis(
-      np.clip((coordinates * self.cells).astype(np.int32), 0, self.cells - 1), -1, 0
-    )
-    return self.distance[z, y, x] == 0
 
 
 def build(

@@ -105,7 +105,6 @@ class Rendered(NamedTuple):
 
   color: jax.Array  # [R, 3], without background
   opacity: jax.Array  # [R]
-  distance: jax.Array  # expected distance [R]
   edges: jax.Array  # normalised [R, N + 1]
   weights: jax.Array  # [R, N]
   proposal_edges: jax.Array  # normalised [R, M + 1]
@@ -140,25 +139,24 @@ def render_rays(
       pixel_angle=pixel_angle,
       footprint=jnp.broadcast_to(jnp.asarray(footprints), origins.shape[:1])[:, None],
     )
-    return positions, along, variances, middles, lengths
+    return positions, along, variances, lengths
 
   coarse = sampling.stratified(
     coarse_key, origins.shape[0], settings.proposal_samples, near=settings.near, far=FAR
   )
-  positions, _, variances, _, lengths = place(coarse)
+  positions, _, variances, lengths = place(coarse)
   density = proposal_density(settings, params, positions, variances)
   proposal_weights = sampling.interval_weights(density, lengths)
   wide_edges, wide_weights = sampling.dilate(
     coarse, proposal_weights, dilation=settings.sample_dilation
   )
   edges = sampling.resample(fine_key, wide_edges, wide_weights, settings.final_samples)
-  positions, along, variances, middles, lengths = place(edges)
+  positions, along, variances, lengths = place(edges)
   density, color = query(settings.field, params, positions, variances, along)
   weights = sampling.interval_weights(density, lengths)
   return Rendered(
     jnp.sum(weights[..., None] * color, axis=-2),
     jnp.sum(weights, axis=-1),
-    sampling.expected_distance(weights, middles),
     edges,
     weights,
     coarse,
@@ -230,7 +228,7 @@ def draw_rays(
 def loss_of_rays(
   params: Params, settings: TrainSettings, key: jax.Array, rays: Rays, *, pixel_angle: float
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-  """Returns the training loss and its parts charbonnier, distortion, interlevel, psnr_db."""
+  """Returns the training loss and charbonnier, distortion, interlevel, anchor and psnr_db."""
   render_key, background_key = jax.random.split(key)
   out = render_rays(
     settings,

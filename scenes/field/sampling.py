@@ -94,9 +94,3 @@ def resample(
   wanted = (jnp.arange(intervals + 1) + jitter) / (intervals + 1)
   drawn = jax.vmap(jnp.interp)(wanted, cumulative, edges)
   return jax.lax.stop_gradient(jnp.sort(drawn, axis=-1))
-
-
-def expected_distance(weights: jax.Array, distances: jax.Array) -> jax.Array:
-  """Mean distance of the matter that a ray sees [...]; 0 where it sees none."""
-  total = jnp.sum(weights, axis=-1)
-  return jnp.sum(weights * distances, axis=-1) / jnp.maximum(total, _TINY)

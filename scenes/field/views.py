@@ -112,12 +112,6 @@ class Views:
     anchors[:, 2] *= height / self.camera.height
     return dataclasses.replace(self, camera=camera, images=np.stack(images), anchors=anchors)
 
-  def rays(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns origin [3] and unit directions [H, W, 3] of a picture's pixels in the unit frame."""
-    pose = self.world_from_camera[index]
-    directions = self.camera.rays() @ pose[:3, :3].T
-    return pose[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
 
 @dataclasses.dataclass(frozen=True)
 class BlurPyramid:

@@ -113,18 +113,16 @@ def solid_grid(
   return meshes.drop_floaters(grid, min_component=settings.min_component)
 
 
-def write_parts(parts: Sequence[convex.Part], folder: pathlib.Path) -> list[pathlib.Path]:
+def write_parts(parts: Sequence[convex.Part], folder: pathlib.Path) -> None:
   """Writes part_000.obj, part_001.obj, ...; older parts in the folder are removed."""
   folder.mkdir(parents=True, exist_ok=True)
   for old in folder.glob("part_*.obj"):
     old.unlink()
-  paths = []
   for number, part in enumerate(parts):
     lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in part.vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in part.faces + 1]
-    paths.append(folder / f"part_{number:03d}.obj")
-    paths[-1].write_text("\n".join(lines) + "\n", encoding="ascii")
-  return paths
+    path = folder / f"part_{number:03d}.obj"
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def read_parts(folder: pathlib.Path) -> list[convex.Part]:

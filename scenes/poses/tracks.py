@@ -37,11 +37,6 @@ class Tracks(NamedTuple):
       np.array(view, np.int64), np.array(point, np.int64), np.array(pixel, float).reshape(-1, 2)
     )
 
-  @classmethod
-  def none(cls) -> "Tracks":
-    """No observations, as of poses that came with the pictures."""
-    return cls(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-
   def of_points(self, chosen: np.ndarray) -> "Tracks":
     """Keeps the observations of chosen points, bool [P]."""
     keep = chosen[self.point]

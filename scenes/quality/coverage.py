@@ -32,11 +32,6 @@ class Coverage(NamedTuple):
     """Covered share of the floor and of the walls."""
     return float(self.floor_covered.mean()), float(self.walls_covered.mean())
 
-  @property
-  def gaps(self) -> np.ndarray:
-    """The places that are not covered [P, 3]."""
-    return np.concatenate([self.floor[~self.floor_covered], self.walls[~self.walls_covered]])
-
 
 def views_of(
   places: np.ndarray, normals: np.ndarray, camera: Camera, world_from_camera: np.ndarray

@@ -112,7 +112,7 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
 
   def write(folder: Path, progress: Progress) -> None:
     depth = np.stack([depth_pictures.read(of_name[name]) for name in found.names])
-    moved = own = None
+    moved = None
     if (motion := known.picture_from_depth) is not None:
       rows = [list(of_name).index(name) for name in found.names]
       moved = sensor.at_their_time(

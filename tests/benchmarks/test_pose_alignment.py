@@ -8,6 +8,7 @@ from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks
+from tests.scenes.synthetic_model import NO_TRACKS
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=80.0, cy=60.0, k1=0.05)
 FREQUENCIES = np.array([[9.0, 4.0], [-5.0, 11.0], [13.0, -7.0]])
@@ -49,7 +50,7 @@ def _true_pose() -> np.ndarray:
 def test_a_pose_is_found_by_the_field_s_colours():
   color, depth = _picture(np.eye(4))
   image, _ = _picture(_true_pose())
-  alone = _localisation(Tracks.none(), np.zeros((0, 3)))
+  alone = _localisation(NO_TRACKS, np.zeros((0, 3)))
   found = pose_alignment.align(alone, 0, image, color, depth)
   assert found.moved_px > 0.5
   assert found.color[1] < 0.1 * found.color[0]

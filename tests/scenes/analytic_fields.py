@@ -3,14 +3,19 @@
 import dataclasses
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 
-from nerf2real.scenes.field.contraction import from_grid_coordinates
 from nerf2real.scenes.field.encoding import is_dense
 from nerf2real.scenes.field.field import Field, FieldSettings
 
 _GAIN = 3.0  # the layer norm makes +-8 of the feature's sign; times this it is the raw density
+
+
+def from_grid_coordinates(coordinates: np.ndarray) -> np.ndarray:
+  """Inverts `contraction.grid_coordinates` for points [..., 3] strictly inside [0, 1]^3."""
+  squashed = coordinates * 4.0 - 2.0
+  norm = np.maximum(np.abs(squashed).max(axis=-1, keepdims=True), 1.0)
+  return squashed / (norm * (2.0 - norm))
 
 
 def from_signed_distance(
@@ -44,7 +49,7 @@ def from_signed_distance(
   cells = settings.resolutions[level]
   z, y, x = np.meshgrid(*[np.arange(cells + 1) / cells] * 3, indexing="ij")
   inner = np.clip(np.stack([x, y, z], -1), 0.01, 0.99)
-  distance = signed_distance(np.asarray(from_grid_coordinates(jnp.asarray(inner)), np.float64))
+  distance = signed_distance(from_grid_coordinates(inner))
   params["table"][level, : (cells + 1) ** 3, 0] = -slope * distance.ravel()
   feature = level * settings.features
   # swish(x) - swish(-x) = x, and the layer norm turns it into its sign.

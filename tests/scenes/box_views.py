@@ -36,6 +36,18 @@ def wall_color(points: np.ndarray) -> np.ndarray:
   return 0.5 + 0.4 * np.sin(points * [9.0, 11.0, 13.0] + [0.0, 1.0, 2.0])
 
 
+def _directions(camera: Camera, pose: np.ndarray) -> np.ndarray:
+  """Unit directions [H, W, 3] of a picture's pixels."""
+  rays = camera.rays() @ pose[:3, :3].T
+  return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def rays(views: Views, index: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns origin [3] and unit directions [H, W, 3] of a picture's pixels in the unit frame."""
+  pose = views.world_from_camera[index]
+  return pose[:3, 3], _directions(views.camera, pose)
+
+
 def make_views(
   count: int, *, width: int = 32, height: int = 24, seed: int = 0, anchors: int = 0
 ) -> Views:
@@ -53,8 +65,7 @@ def make_views(
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
     pose[:3, 3] = rng.uniform(-0.4, 0.4, 3)
-    rays = camera.rays() @ pose[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = _directions(camera, pose)
     hits = pose[:3, 3] + wall_distance(pose[:3, 3], rays)[..., None] * rays
     images.append(np.rint(255 * wall_color(hits)).astype(np.uint8))
     poses.append(pose)

@@ -1,6 +1,12 @@
 """A made-up model of pictures and points, known exactly."""
 
+import numpy as np
 import pycolmap
+
+from nerf2real.scenes.poses.tracks import Tracks
+
+# As of poses that came with the pictures.
+NO_TRACKS = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
 
 
 def exact(*, frames: int, points: int) -> pycolmap.Reconstruction:

@@ -103,17 +103,15 @@ def test_report_is_one_file_that_opens_offline(scene):
 
 
 def test_second_run_does_nothing_anew(scene, source, settings):
-  stamp = (scene.folder / pipeline.STAGES / "field" / "field.safetensors").stat().st_mtime_ns
+  stamp = (scene.folder / bundle.STAGES / "field" / "field.safetensors").stat().st_mtime_ns
   again = pipeline.make_scene(source, scene.folder, settings=settings, show_progress=False)
   assert again.scene["hashes"] == scene.scene["hashes"]
-  assert (
-    scene.folder / pipeline.STAGES / "field" / "field.safetensors"
-  ).stat().st_mtime_ns == stamp
+  assert (scene.folder / bundle.STAGES / "field" / "field.safetensors").stat().st_mtime_ns == stamp
 
 
 def _stamps(folder):
   """What identifies each stage's run: its name and when it was made."""
-  records = (folder / pipeline.STAGES).glob("*/stage.json")
+  records = (folder / bundle.STAGES).glob("*/stage.json")
   return {path.parent.name: json.loads(path.read_text())["made"] for path in records}
 
 
@@ -151,7 +149,7 @@ def test_incomplete_bundles_are_refused(scene, tmp_path):
   with pytest.raises(BundleError, match=r"no scene\.json"):
     Bundle.load(tmp_path)
   out = tmp_path / "room"
-  shutil.copytree(scene.folder, out, ignore=shutil.ignore_patterns(pipeline.STAGES))
+  shutil.copytree(scene.folder, out, ignore=shutil.ignore_patterns(bundle.STAGES))
   (out / "field.safetensors").unlink()
   with pytest.raises(BundleError, match=r"lacks field\.safetensors"):
     Bundle.load(out)

@@ -49,8 +49,6 @@ class VideoInfo:
   """Those, or what the header promises where the packets end early."""
   frames_per_second: float
   """Mean rate [1/s]; 0 where unknown."""
-  codec: str
-  """Name of the codec."""
 
   @property
   def duration(self) -> float:
@@ -112,7 +110,6 @@ def inspect_video(path: Path) -> VideoInfo:
         num_frames=count,
         expected_frames=max(count, stream.frames) if early else count,
         frames_per_second=rate,
-        codec=stream.codec_context.name,
       )
   except av.error.FFmpegError as error:
     size = path.stat().st_size

@@ -44,11 +44,6 @@ class PairSettings:
   # further than 10 keyframes apart 97 % have them, of all others a quarter has not
 
 
-def exhaustive_pairs(count: int) -> list[Pair]:
-  """Returns all pairs of `count` keyframes."""
-  return list(itertools.combinations(range(count), 2))
-
-
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
   """Pairs each keyframe with the next `overlap` ones and with those 2 overlap, 4 overlap, ... away.
 
@@ -164,7 +159,8 @@ def choose_pairs(
   number = len(counts)
   cost = (counts.sum() ** 2 - (counts**2).sum()) / 2
   if cost <= settings.exhaustive_cost:
-    return exhaustive_pairs(number), f"exhaustive ({number} keyframes)"
+    everything = list(itertools.combinations(range(number), 2))
+    return everything, f"exhaustive ({number} keyframes)"
   chain = sequential_pairs(number, settings.overlap)
   keyframes = sparse_keyframes(number, settings.loop_keyframes)
   # In sparse keyframes: what the camera saw moments ago scores best, and closes no loop.

@@ -9,7 +9,7 @@ from nerf2real.scenes.alignment.floor import Floor
 from nerf2real.scenes.alignment.markers import MarkerScale
 from nerf2real.scenes.alignment.overrides import Overrides
 
-FLOOR = Floor(np.array([0, 0, 1.0]), 0.0, 100, 1.0, 0.0, 0.0)
+FLOOR = Floor(np.array([0, 0, 1.0]), 0.0, 100, 1.0, 0.0)
 
 
 def _chosen(*, assumed, camera_height=None, marker=None, height=2.0):

@@ -61,7 +61,7 @@ def test_known_points_lie_on_their_pixels_rays():
   assert len(known) > 40
   nearest = []
   for picture, x, y, distance in known:
-    origin, directions = views.rays(int(picture))
+    origin, directions = box_views.rays(views, int(picture))
     place = origin + distance * directions[int(y), int(x)]
     nearest.append(np.linalg.norm(points - place, axis=-1).min() / distance)
   # A pixel's middle is at most 0.71 pixels from the point that lies in it.

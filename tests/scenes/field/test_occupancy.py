@@ -1,13 +1,13 @@
 """The occupancy grid against shapes known in closed form and brute force."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nerf2real.scenes.field import occupancy
-from nerf2real.scenes.field.contraction import from_grid_coordinates, grid_coordinates
 from nerf2real.scenes.field.field import FieldSettings
 from tests.scenes import analytic_fields
+from tests.scenes.analytic_fields import from_grid_coordinates
+from tests.scenes.field.render.reference import is_occupied
 
 SETTINGS = occupancy.OccupancySettings(cells=128)
 CENTRES = np.array([[0.3, -0.2, 0.1], [2.5, 0.4, 0.3]])  # the second lies in squashed space
@@ -34,7 +34,6 @@ def test_distance_is_the_maximum_norm_to_the_nearest_matter():
   cells = np.argwhere(np.ones_like(occupied))
   expected = np.abs(cells[:, None] - matter).max(-1).min(-1).reshape(occupied.shape)
   np.testing.assert_array_equal(grid.distance, expected)
-  np.testing.assert_array_equal(grid.occupied, occupied)
 
 
 def test_matter_is_found_inside_and_outside_the_unit_cube(found):
@@ -46,16 +45,16 @@ def test_matter_is_found_inside_and_outside_the_unit_cube(found):
       offset, axis=-1, keepdims=True
     )
     inside = centre + part * offset
-    assert found.is_occupied(np.asarray(grid_coordinates(jnp.asarray(inside)))).all()
+    assert is_occupied(found, inside).all()
 
 
 def test_free_space_is_empty(found):
   z, y, x = np.meshgrid(*[(np.arange(128) + 0.5) / 128] * 3, indexing="ij")
-  points = np.asarray(from_grid_coordinates(jnp.asarray(np.stack([x, y, z], -1))), np.float64)
+  points = from_grid_coordinates(np.stack([x, y, z], -1))
   near = np.abs(points).max(-1) < 1.0
   # The field itself is trilinear between vertices 0.065 apart; one cell is 0.031.
-  assert not found.occupied[near & (_distance(points) > 0.08)].any()
-  assert found.occupied[near & (_distance(points) < -0.04)].all()
+  assert not (found.distance[near & (_distance(points) > 0.08)] == 0).any()
+  assert (found.distance[near & (_distance(points) < -0.04)] == 0).all()
   assert found.distance[near].max() > 10
 
 
@@ -73,9 +72,9 @@ def test_a_plate_that_stands_by_itself_is_found_wherever_it_is(layer):
   found = occupancy.build(analytic_fields.from_signed_distance(plate, settings=shape))
   x, y = np.meshgrid(np.linspace(-0.15, 0.35, 40), np.linspace(-0.2, 0.3, 40))
   inside = np.stack([x, y, np.full_like(x, height)], axis=-1)
-  assert found.is_occupied(np.asarray(grid_coordinates(jnp.asarray(inside)))).all()
+  assert is_occupied(found, inside).all()
   beside = inside + np.array([0, 0, 0.15])
-  assert not found.is_occupied(np.asarray(grid_coordinates(jnp.asarray(beside)))).any()
+  assert not is_occupied(found, beside).any()
 
 
 def test_empty_grids_and_wrong_shapes():

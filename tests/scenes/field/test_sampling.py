@@ -48,10 +48,3 @@ def test_dilation_is_the_maximum_within_the_window():
   width = np.diff(np.asarray(new_edges)[0])
   inside = (centres > 0.3) & (centres < 0.6) & (width > 1e-6)
   np.testing.assert_allclose(mass[inside] / width[inside], 0.6 / 0.3, rtol=1e-4)
-
-
-def test_expected_distance():
-  found = sampling.expected_distance(
-    jnp.array([[0.2, 0.6], [0.0, 0.0]]), jnp.array([[1.0, 3.0]] * 2)
-  )
-  np.testing.assert_allclose(found, [2.5, 0.0], rtol=1e-6)

@@ -59,7 +59,7 @@ def test_fused_training_reproduces_views_it_has_not_seen(trained, renderer):
   for index in range(3):
     picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
     figures.append(image_quality.psnr(picture, held_out.images[index]))
-    origin, directions = held_out.rays(index)
+    origin, directions = box_views.rays(held_out, index)
     origins = np.broadcast_to(origin, directions.shape).reshape(-1, 3)
     flat = directions.reshape(-1, 3)
     _, _, opacity = renderer.render_rays(origins, flat, held_out.camera.pixel_angle)
@@ -185,7 +185,7 @@ def test_known_points_make_the_geometry_better(renderer):
     off = []
     for index in range(4):
       _, depth = candidate.render(held_out.camera, held_out.world_from_camera[index])
-      origin, directions = held_out.rays(index)
+      origin, directions = box_views.rays(held_out, index)
       norms = np.linalg.norm(held_out.camera.rays(), axis=-1)
       off.append(np.abs(depth - box_views.wall_distance(origin, directions) / norms))
     errors.append(np.mean(off))

@@ -21,7 +21,7 @@ def test_split_keeps_every_picture_once():
 
 def test_rays_hit_what_the_picture_shows():
   views = box_views.make_views(2)
-  origin, directions = views.rays(1)
+  origin, directions = box_views.rays(views, 1)
   distance = box_views.wall_distance(origin, directions)
   color = box_views.wall_color(origin + distance[..., None] * directions)
   np.testing.assert_allclose(255 * color, views.images[1], atol=0.51)

@@ -5,7 +5,7 @@ import numpy as np
 from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.scenes.poses.localisation import Localisation
-from nerf2real.scenes.poses.tracks import Tracks
+from tests.scenes.synthetic_model import NO_TRACKS
 
 
 def test_overlooking_is_the_keyframe_with_the_most_points_before_its_lens():
@@ -24,6 +24,6 @@ def test_overlooking_is_the_keyframe_with_the_most_points_before_its_lens():
     registered_fraction=1.0,
     strategy="given",
     unit_from_source=Similarity(),
-    tracks=Tracks.none(),
+    tracks=NO_TRACKS,
   )
   assert found.overlooking() == 2

@@ -11,6 +11,7 @@ from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.quality import advice
 from nerf2real.scenes.quality.coverage import coverage
 from tests.scenes import furnished_room
+from tests.scenes.synthetic_model import NO_TRACKS
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 EXTENT = (np.array([-2.5, -2.0, 0.0]), np.array([2.5, 2.0, 2.5]))
@@ -63,7 +64,8 @@ def test_a_walk_that_looks_everywhere_covers_floor_and_walls():
 def test_the_side_that_was_not_filmed_is_named_and_drawn():
   poses = _poses(np.linspace(-1.0, 1.0, 40), 0.3)  # towards +x only: 12 o'clock is 57 degrees right
   found = coverage(CAMERA, poses, EXTENT)
-  assert found.gaps[:, 0].mean() < -0.3
+  bare = np.concatenate([found.floor[~found.floor_covered], found.walls[~found.walls_covered]])
+  assert bare[:, 0].mean() < -0.3
   walls = advice.judge_coverage(found, poses)[1]
   assert not walls.good
   hours = {int(word) for word in walls.text.replace(",", "").split() if word.isdigit()}
@@ -99,7 +101,7 @@ def test_a_loop_is_closed_where_the_end_sees_what_the_beginning_saw(last, closed
 def test_a_film_of_which_parts_were_left_out_is_told_when(tmp_path):
   capture = _capture(tmp_path)
   names = [path.name for path in capture.images]
-  poses = types.SimpleNamespace(names=names, left_out=(), tracks=Tracks.none())
+  poses = types.SimpleNamespace(names=names, left_out=(), tracks=NO_TRACKS)
   assert all(finding.name != "line" for finding in advice.judge_poses(capture, poses))
   poses.names, poses.left_out = [*names[:7], *names[9:]], tuple(names[7:9])
   found = {finding.name: finding for finding in advice.judge_poses(capture, poses)}
@@ -111,4 +113,4 @@ def test_without_poses_the_verdict_is_the_reason(tmp_path):
   verdict = advice.judge(_capture(tmp_path), CaptureSettings(), reason="3 of 20 were localised.")
   assert not verdict.good and verdict.picture is None
   assert verdict.words.startswith("Film again") and "- bad: 3 of 20" in verdict.words
-  assert advice._shared_points(Tracks.none(), 0) is None
+  assert advice._shared_points(NO_TRACKS, 0) is None

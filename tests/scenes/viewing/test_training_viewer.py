@@ -7,10 +7,10 @@ import pytest
 from nerf2real.scenes.capture.capture import Capture
 from nerf2real.scenes.field import training
 from nerf2real.scenes.poses.localisation import Localisation
-from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.viewing.training_viewer import TrainingViewer, sheet
 from tests.scenes import box_views
 from tests.scenes.field.test_training import FAST
+from tests.scenes.synthetic_model import NO_TRACKS
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def test_the_page_shows_points_then_the_newest_field(viewer, snapshots, views):
       registered_fraction=1.0,
       strategy="none",
       unit_from_source=None,
-      tracks=Tracks.none(),
+      tracks=NO_TRACKS,
     )
   )
   _wait_for(viewer, f"{len(views)} keyframes and 30 points")

@@ -175,7 +175,7 @@ def test_known_poses_and_depth_keep_the_scale(capture, tmp_path):
   assert found.registered_fraction == 1.0 and "rgbd" in found.strategy
   metres = found.unit_from_source.inverse()
   assert off_the_planes(metres.apply(found.points)).max() < 0.006
-  floor = Floor(np.array([0, 0, 1.0]), -0.5, 100, 1.0, 0.0, 0.0)
+  floor = Floor(np.array([0, 0, 1.0]), -0.5, 100, 1.0, 0.0)
   evidence = Evidence(found.points, found.world_from_camera, sensor_scale=metres.scale)
   chosen = scale.choose_scale(
     evidence,

@@ -37,7 +37,7 @@ def test_training_reproduces_views_it_has_not_seen(views, phased):
   for index in range(3):
     picture, depth = renderer.render(held_out.camera, held_out.world_from_camera[index])
     figures.append(image_quality.psnr(picture, held_out.images[index]))
-    origin, directions = held_out.rays(index)
+    origin, directions = box_views.rays(held_out, index)
     z = held_out.camera.rays()
     truth = box_views.wall_distance(origin, directions) / np.linalg.norm(z, axis=-1)
     assert np.median(np.abs(depth - truth)) < 0.1

@@ -20,6 +20,13 @@ from nerf2real.scenes.field.render.kernels import MEDIAN
 _CHUNK = 1024  # rays at a time
 
 
+def is_occupied(occupancy: Occupancy, points: np.ndarray) -> np.ndarray:
+  """Looks up points of the unit frame [..., 3] in a grid: bool [...]."""
+  cells, coordinates = occupancy.cells, np.asarray(grid_coordinates(jnp.asarray(points)))
+  x, y, z = np.moveaxis(np.clip((coordinates * cells).astype(np.int32), 0, cells - 1), -1, 0)
+  return occupancy.distance[z, y, x] == 0
+
+
 def lattice(settings: render.RenderSettings, pixel_angle: float) -> tuple[np.ndarray, np.ndarray]:
   """Returns the distances of the samples [S] and the lengths of their intervals [S]."""
   growth = settings.growth_steps(pixel_angle)
@@ -84,7 +91,7 @@ def render_rays(
     points = positions(origin, direction, distances).astype(np.float32)
     occupied = np.ones(points.shape[:2], bool)
     if occupancy is not None:
-      occupied = occupancy.is_occupied(np.asarray(grid_coordinates(jnp.asarray(points))))
+      occupied = is_occupied(occupancy, points)
     trained = field.settings.march_step * np.maximum(np.abs(points).max(-1), 1)
     variances = encoding.sample_variance(
       jnp.broadcast_to(direction[:, None], points.shape),

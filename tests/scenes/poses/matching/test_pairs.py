@@ -10,7 +10,6 @@ from nerf2real.scenes.poses.matching.features import FeatureSettings
 from nerf2real.scenes.poses.matching.pairs import (
   PairSettings,
   choose_pairs,
-  exhaustive_pairs,
   loop_pairs,
   overlap_scores,
   repair_pairs,
@@ -112,7 +111,6 @@ def test_sequential_pairs_by_hand():
     (2, 4),
     (3, 4),
   ]
-  assert exhaustive_pairs(3) == [(0, 1), (0, 2), (1, 2)]
   np.testing.assert_array_equal(sparse_keyframes(10, 4), [0, 3, 6, 9])
   assert len(sparse_keyframes(1000, 300)) <= 300
 
