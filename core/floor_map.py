@@ -117,11 +117,11 @@ class FloorMap:
     cv2.circle(self.picture, (x, y), size, color, width, cv2.LINE_AA, _FINE)
     return self
 
-  def box(self, lower: np.ndarray, upper: np.ndarray, color: Rgb, *, width: int = 2) -> Self:
+  def box(self, lower: np.ndarray, upper: np.ndarray, color: Rgb) -> Self:
     """Draws the outline of a rectangle between two corners [2]."""
     (left, bottom), (right, top) = np.asarray(lower)[:2], np.asarray(upper)[:2]
     corners = [(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)]
-    return self.path(np.array(corners), color, width=width)
+    return self.path(np.array(corners), color)
 
   def cross(self, xy: np.ndarray, color: Rgb) -> Self:
     """Marks a place [2] with an X."""
@@ -171,10 +171,10 @@ class FloorMap:
     self.picture = (opacity * color + (1 - opacity) * _DIMMED * self.picture).astype(np.uint8)
     return self
 
-  def scale_bar(self, length: float = 1.0) -> Self:
-    """Draws a bar of a length [m] with its name into the lower left corner, on a pale ground."""
+  def scale_bar(self) -> Self:
+    """Draws a bar of a metre with its name into the lower left corner, on a pale ground."""
     height, ink = self.picture.shape[0], palette.rgb(palette.INK)
-    size, font = round(length * self._scale), max(0.4, height / 900)
+    size, font = round(self._scale), max(0.4, height / 900)
     text_height = round(25 * font)
     cv2.rectangle(
       self.picture, (6, height - 22 - text_height), (size + 22, height - 6), REACHABLE, -1
@@ -182,7 +182,7 @@ class FloorMap:
     cv2.line(self.picture, (14, height - 12), (14 + size, height - 12), ink, 2)
     cv2.putText(
       self.picture,
-      f"{length:g} m",
+      "1 m",
       (14, height - 19),
       cv2.FONT_HERSHEY_SIMPLEX,
       font,

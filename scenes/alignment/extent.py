@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerf2real.core.geometry.similarity import Similarity
-from nerf2real.scenes.alignment.evidence import Choice, Evidence
+from nerf2real.scenes.alignment.evidence import Evidence
 from nerf2real.scenes.alignment.marker_place import MarkerPlace
 from nerf2real.scenes.alignment.overrides import Overrides
 
@@ -33,7 +33,7 @@ def choose_extent(
   margin: float,
   camera_margin: float,
   marker_at: MarkerPlace | None = None,
-) -> Choice[Extent]:
+) -> Extent:
   """Finds the box that holds nearly all surface and all cameras, and the origin.
 
   Args:
@@ -67,18 +67,17 @@ def choose_extent(
   shift = np.array([centre[0], centre[1], 0.0])
   lower, upper = lower - shift, upper - shift
   lower[2], upper[2] = 0.0, min(upper[2], max_height)
-  source = "points"
   if override.extent_lower is not None:
-    lower, source = override.extent_lower, "manual"
+    lower = override.extent_lower
   if override.extent_upper is not None:
-    upper, source = override.extent_upper, "manual"
+    upper = override.extent_upper
   if not (lower < upper).all():
     raise ValueError(
       f"The extent is empty: lower {np.round(lower, 2).tolist()}, upper "
       f"{np.round(upper, 2).tolist()} m. Correct extent_lower and extent_upper in the override "
       "file."
     )
-  return Choice(Extent(shift + down, lower, upper), source)
+  return Extent(shift + down, lower, upper)
 
 
 def _cells(points: np.ndarray) -> np.ndarray:

@@ -157,11 +157,11 @@ def align(
     camera_margin=settings.camera_margin,
     marker_at=settings.marker_at,
   )
-  world_from_unit = similarity.Similarity(metres, rotation.value, -extent.value.origin)
+  world_from_unit = similarity.Similarity(metres, rotation.value, -extent.origin)
   progress(1.0, "aligned")
   up = cameras_up(evidence, override)
   tilt = float(np.degrees(np.arccos(np.clip(floor.normal @ up.direction, -1, 1))))
-  warnings = found.warnings + scale.warnings + rotation.warnings + extent.warnings
+  warnings = found.warnings + scale.warnings + rotation.warnings
   if found.source == "plane" and up.deviations(floor.normal) > UNLIKELY:
     warnings += (
       f"The floor tilts {tilt:.0f} degrees against the cameras' up direction, more than they are "
@@ -170,8 +170,8 @@ def align(
     )
   return Alignment(
     world_from_unit=world_from_unit,
-    extent_lower=extent.value.lower,
-    extent_upper=extent.value.upper,
+    extent_lower=extent.lower,
+    extent_upper=extent.upper,
     scale_source=scale.source,
     scale_spread=scale.value.spread,
     floor_source=found.source,

@@ -10,6 +10,8 @@ import itertools
 import cv2
 import numpy as np
 
+_PLANK = 0.35  # mean length of a board, of the picture's width
+
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], *, slope=1.0, stretch=(1.0, 1.0)):
   """Returns tileable noise [H, W], amplitude spectrum 1/f^slope, mean 0, standard deviation 1.
@@ -56,7 +58,7 @@ def wood(rng: np.random.Generator, shape: tuple[int, int], *, dark, light) -> np
 
 
 def planks(
-  rng: np.random.Generator, shape: tuple[int, int], *, rows: int, dark, light, mean_length=0.35
+  rng: np.random.Generator, shape: tuple[int, int], *, rows: int, dark, light
 ) -> np.ndarray:
   """Returns boards along x with seams, knots and boards of different tint, float [H, W, 3]."""
   height, width = shape
@@ -64,9 +66,9 @@ def planks(
   picture = np.empty((height, width, 3))
   edges = np.linspace(0, height, rows + 1).astype(int)
   for top, bottom in itertools.pairwise(edges):
-    left = -int(rng.uniform(0, mean_length) * width)
+    left = -int(rng.uniform(0, _PLANK) * width)
     while left < width:
-      right = left + int(rng.uniform(0.7, 1.3) * mean_length * width)
+      right = left + int(rng.uniform(0.7, 1.3) * _PLANK * width)
       a, b = max(left, 0), min(right, width)
       if b > a:
         down, along = rng.integers(0, [height, width])

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 _TINY = 1e-7
+_PADDING = 1e-5  # added to the weights: a ray without matter is sampled evenly
 
 
 def spacing(distances: jax.Array) -> jax.Array:
@@ -69,9 +70,7 @@ def dilate(edges: jax.Array, weights: jax.Array, *, dilation: float) -> tuple[ja
   return new_edges, new_weights * (total / spread)
 
 
-def resample(
-  key: jax.Array, edges: jax.Array, weights: jax.Array, intervals: int, *, padding: float = 1e-5
-) -> jax.Array:
+def resample(key: jax.Array, edges: jax.Array, weights: jax.Array, intervals: int) -> jax.Array:
   """Draws new interval edges from a step function by inverting its cumulative sum.
 
   Args:
@@ -79,14 +78,13 @@ def resample(
     edges: Sorted edges [R, N + 1].
     weights: Weights of the intervals [R, N]; not normalised.
     intervals: Intervals to return, M.
-    padding: Added to the weights, so that a ray without matter is sampled evenly.
 
   Returns:
     Sorted edges [R, M + 1], without gradient.
 
   Source: Barron et al. 2022, Mip-NeRF 360, section 3 and supplement.
   """
-  weights = weights + padding * jnp.diff(edges)
+  weights = weights + _PADDING * jnp.diff(edges)
   mass = weights / jnp.sum(weights, axis=-1, keepdims=True)
   cumulative = jnp.minimum(jnp.cumsum(mass, axis=-1), 1.0)
   cumulative = jnp.concatenate([jnp.zeros_like(cumulative[..., :1]), cumulative], axis=-1)

@@ -63,7 +63,6 @@ def evaluate(
   renderer: Renderer,
   views: Views,
   *,
-  robot_sizes: Sequence[tuple[int, int]] = ROBOT_SIZES,
   progress: Progress = no_progress,
 ) -> tuple[list[ViewScore], dict[str, float]]:
   """Scores all views at full and at robot resolution.
@@ -71,7 +70,6 @@ def evaluate(
   Args:
     renderer: Draws the field.
     views: Held-out pictures with their poses in the field's frame.
-    robot_sizes: Picture sizes (height, width) beside the full one.
     progress: Called with the fraction done and a text.
 
   Returns:
@@ -87,7 +85,7 @@ def evaluate(
     "held_out_psnr_db": float(np.mean([score.psnr_db for score in full])),
     "held_out_ssim": float(np.mean([score.ssim for score in full])),
   }
-  for height, width in robot_sizes:
+  for height, width in ROBOT_SIZES:
     scores = [compare(renderer, views, index, height, width) for index in range(count)]
     size = f"{height}x{width}"
     figures[f"held_out_psnr_{size}_db"] = float(np.mean([score.psnr_db for score in scores]))

@@ -74,9 +74,9 @@ def test_heat_has_row_0_at_the_top_and_dims_the_rest(floor):
 
 
 def test_scale_bar_has_its_length(floor):
-  drawn = FloorMap.of(floor, height=400).scale_bar(0.5)
+  drawn = FloorMap.of(floor, height=400).scale_bar()
   ink = (drawn.picture[388] == palette.rgb(palette.INK)).all(-1)
-  assert 100 <= ink.sum() <= 103  # 200 pixel a metre
+  assert 200 <= ink.sum() <= 203  # 200 pixel a metre
 
 
 def test_colors_of_many_things_repeat():
