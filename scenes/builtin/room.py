@@ -17,7 +17,9 @@ from nerf2real.core.geometry.cameras import Camera
 from nerf2real.scenes.builtin import furniture, solids, surfaces
 from nerf2real.scenes.builtin.mujoco_renderer import Eye
 from nerf2real.scenes.builtin.placing import ROOM_SIZE
+from nerf2real.scenes.geometry import triangles
 
+_MARGIN = 0.02  # free space before a point of the surface [m]
 _TRUE_VIEW_ROWS = 960  # a true view is sampled with about this many rows
 LIGHTS = (  # direction of travel, strength: a window in the west, bounce from everywhere else
   ((0.80, -0.15, -0.55), (0.40, 0.40, 0.38)),
@@ -47,40 +49,30 @@ class TrueRoom:
     """
     return solids.distance(self.solids, points, limit=limit)
 
-  def surface(
-    self, count: int, *, seed: int = 0, margin: float = 0.02
-  ) -> tuple[np.ndarray, np.ndarray]:
+  def surface(self, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns points on the surfaces that border free space, uniform by area.
 
     Args:
       count: Number of points N.
-      seed: Of the choice of points.
-      margin: Free space that must lie in front of a point along its normal [m].
 
     Returns:
       Points [N, 3] and outward normals [N, 3].
     """
-    rng = np.random.default_rng([seed, 2])
+    rng = np.random.default_rng([0, 2])
     meshes = [(solids.tessellate(solid), solid) for solid in self.solids]
-    triangles = np.concatenate(
+    faces = np.concatenate(
       [m.vertices[m.faces] @ solid.rotation.T + solid.position for m, solid in meshes]
     )
     normals = np.concatenate([m.normals[m.faces].mean(1) @ s.rotation.T for m, s in meshes])
-    area = np.linalg.norm(
-      np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1
-    )
     kept_points, kept_normals, found = [], [], 0
     half = np.array(self.size) / 2
     centre = np.array([0, 0, half[2]])
     while found < count:
-      pick = rng.choice(len(triangles), 2 * count, p=area / area.sum())
-      a, b = np.sqrt(rng.random((2 * count, 1))), rng.random((2 * count, 1))
-      t = triangles[pick]
-      points = (1 - a) * t[:, 0] + a * (1 - b) * t[:, 1] + a * b * t[:, 2]
+      points, pick = triangles.draw(rng, faces, 2 * count)
       outward = normals[pick] / np.linalg.norm(normals[pick], axis=-1, keepdims=True)
-      probe = points + margin * outward
+      probe = points + _MARGIN * outward
       keep = (np.abs(probe - centre) < half).all(-1)
-      keep[keep] = self.distance(probe[keep], limit=margin) > 0.8 * margin
+      keep[keep] = self.distance(probe[keep], limit=_MARGIN) > 0.8 * _MARGIN
       kept_points.append(points[keep])
       kept_normals.append(outward[keep])
       found += int(keep.sum())

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerf2real.scenes.geometry import fusion
+from nerf2real.scenes.geometry import fusion, triangles
 from nerf2real.scenes.geometry.mesh import Mesh, point_colors
 
 _BORDER = 1.0  # texels between a triangle and its cell's edge: bilinear reads stay inside the cell
@@ -108,12 +108,9 @@ class _Atlas(NamedTuple):
 def _atlas(mesh: Mesh, *, texel: float) -> _Atlas:
   """Lays the faces out for texels of this edge on the mean face [m]."""
   corners = mesh.vertices[mesh.faces]  # [F, 3, 3]
-  areas = 0.5 * np.linalg.norm(
-    np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
-  )
   across = -(-len(mesh.faces) // 2)
   cells = int(np.ceil(np.sqrt(across)))
-  inner = min(np.ceil(np.sqrt(2 * areas.mean()) / texel), _MAX_SIZE)
+  inner = min(np.ceil(np.sqrt(2 * triangles.areas(corners).mean()) / texel), _MAX_SIZE)
   size = int(np.clip(inner + 4 * _BORDER, _MIN_CELL, max(_MAX_SIZE // cells, _MIN_CELL)))
   place = np.empty(len(mesh.faces), np.int64)
   place[_morton_order(corners.mean(1))] = np.arange(len(mesh.faces))
