@@ -1,7 +1,7 @@
 """Messages for bad input: what was found, what was expected, what to do."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,12 @@ from dm_env import specs
 def unknown_name(kind: str, found: Any, known: Iterable[str]) -> str:
   """Returns the message for a name that does not exist."""
   return f"Unknown {kind} {found!r}: expected one of {', '.join(repr(name) for name in known)}."
+
+
+def first_few(names: Sequence[str], most: int) -> str:
+  """Returns up to `most` names: "a, b and 3 more"."""
+  rest = f" and {len(names) - most} more" if len(names) > most else ""
+  return ", ".join(names[:most]) + rest
 
 
 def not_compiled(error: ValueError, scene: Any) -> str:

@@ -61,10 +61,10 @@ def show(result: "Calibration") -> None:
   from rich.console import Console
   from rich.table import Table
 
-  from nerf2real.real.camera import calibration
+  from nerf2real.core.geometry.cameras import LENS
 
   table = Table("", "value", "+-", "unit")
-  for name, value, stddev in zip(calibration.NAMES, result.values, result.stddevs, strict=True):
+  for name, value, stddev in zip(LENS, result.values, result.stddevs, strict=True):
     unit = "pixel" if name in _PIXELS else ""
     digits = 2 if unit else 4
     table.add_row(name, f"{value:.{digits}f}", f"{stddev:.{digits}f}", unit)

@@ -158,7 +158,6 @@ def _watched(arguments: Arguments) -> Iterator["Watcher | None"]:
 def run(arguments: Arguments) -> int:
   """Makes the scene and prints its figures; returns the exit status."""
   from nerf2real.scenes import pipeline
-  from nerf2real.scenes.alignment import overrides
   from nerf2real.scenes.builtin import ground_truth
   from nerf2real.scenes.field.engine.device import Device
 
@@ -167,8 +166,6 @@ def run(arguments: Arguments) -> int:
   source, measure = Path(arguments.capture), None
   if arguments.capture == BUILT_IN:
     source, measure = ground_truth.VIDEO, ground_truth.measure
-  if arguments.override is not None:
-    overrides.read(arguments.override)
   if arguments.check:
     return _check(arguments, source, settings)
   with _watched(arguments) as watcher:

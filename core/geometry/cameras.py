@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 PIXEL_CENTRE = 0.5  # of the upper left pixel, here and in COLMAP, against OpenCV's and ROS's 0
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # what a calibration finds, COLMAP's order
 _UNDISTORT_ITERATIONS = 20  # Newton steps; converges in fewer than 10 for lenses of phones
 
 
@@ -61,6 +62,11 @@ class Camera:
   def distortion(self) -> np.ndarray:
     """The coefficients k1, k2, p1, p2 [4], in OpenCV's order."""
     return np.array([self.k1, self.k2, self.p1, self.p2], np.float64)
+
+  @property
+  def lens(self) -> tuple[float, ...]:
+    """The eight numbers of `LENS`."""
+    return tuple(float(getattr(self, name)) for name in LENS)
 
   @property
   def opencv_matrix(self) -> np.ndarray:

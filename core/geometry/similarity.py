@@ -29,6 +29,11 @@ class Similarity:
     poses[..., :3, :3] = self.rotation @ poses[..., :3, :3]
     return poses
 
+  @property
+  def matrix(self) -> np.ndarray:
+    """[3, 4], which maps homogeneous points."""
+    return np.hstack([self.scale * self.rotation, self.translation[:, None]])
+
   def inverse(self) -> "Similarity":
     """Returns the transform that undoes this one."""
     rotation = self.rotation.T

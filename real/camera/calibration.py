@@ -15,9 +15,8 @@ import numpy as np
 import yaml
 
 from nerf2real.core import files
-from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.cameras import LENS, Camera
 
-NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 MIN_VIEWS = 8  # chosen: eight numbers of the lens need well more than two views
 _MIN_CORNERS = 3  # along a row or a column: OpenCV's
 _OUTLIER = 2.5  # views with more than this times the median error are left out: chosen
@@ -48,7 +47,7 @@ class Calibration:
   height: int
   """Of the pictures [pixel]."""
   values: np.ndarray
-  """[8] as NAMES; focal lengths and centre in pixels, OpenCV's convention."""
+  """[8] as `LENS`; focal lengths and centre in pixels, OpenCV's convention."""
   stddevs: np.ndarray
   """[8] standard deviations, block jackknife over the views."""
   rms: float
@@ -239,7 +238,7 @@ def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
 
 def write_camera_info(path: Path, calibration: Calibration, *, name: str = "camera") -> None:
   """Writes the camera_info YAML; the uncertainties stand in comments, which ROS skips."""
-  figures = zip(NAMES, calibration.values, calibration.stddevs, strict=True)
+  figures = zip(LENS, calibration.values, calibration.stddevs, strict=True)
   lines = [f"# {figure} {value:.6g} +- {stddev:.2g}" for figure, value, stddev in figures]
   lines.append(f"# RMS {calibration.rms:.3f} pixel over {len(calibration.views)} views")
   info = camera_info(calibration, name=name)

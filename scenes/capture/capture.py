@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerf2real.core.errors import first_few
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 
 MIN_IMAGES = 8  # fewer pictures do not cover a room
@@ -92,8 +93,7 @@ class Capture:
   def called(self, chosen: np.ndarray, *, most: int) -> str:
     """Names up to `most` of chosen keyframes (bool [N]) as whoever took them knows them."""
     found = [name for name, wanted in zip(self.names.values(), chosen, strict=True) if wanted]
-    rest = f" and {len(found) - most} more" if len(found) > most else ""
-    return ", ".join(found[:most]) + rest
+    return first_few(found, most)
 
   def without_place(self, placed: Collection[str]) -> str | None:
     """Names the stills that are not among the placed keyframes; None where all are, or of films."""
@@ -105,6 +105,11 @@ class Capture:
       f"{self.called(lost, most=4)}. Each needs half of its view in common with others that were "
       "taken a step beside it."
     )
+
+  @property
+  def has_depth(self) -> bool:
+    """Whether a sensor measured the keyframes' depth."""
+    return self.known is not None and bool(self.known.depth_files)
 
   @property
   def unit_up(self) -> np.ndarray | None:

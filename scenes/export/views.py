@@ -74,7 +74,5 @@ def capture_views(
 ) -> fusion.DepthViews:
   """Renders the field at up to `count` evenly chosen poses of the capture, at a width [pixel]."""
   camera, poses, _ = capture_cameras(bundle)
-  width = min(width, camera.width)
   chosen = np.unique(np.linspace(0, len(poses) - 1, count).astype(int))
-  small = camera.resized(width, round(camera.height * width / camera.width))
-  return render_views(bundle, renderer, small, poses[chosen], progress=progress)
+  return render_views(bundle, renderer, camera.at_most(width), poses[chosen], progress=progress)

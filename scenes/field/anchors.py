@@ -12,14 +12,12 @@ import numpy as np
 from scipy import ndimage
 
 from nerf2real.core.geometry.cameras import Camera
-from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.poses.localisation import Localisation, sure_tracks
 
 if TYPE_CHECKING:
   from nerf2real.scenes.field.views import Views
 
 # Chosen, not tuned, for points that may be wrong:
-_MOST_ERROR = 2.0  # points with a larger reprojection error are left out [pixel]
-_FEWEST_VIEWS = 3  # so are points in fewer pictures: the third one checks the first two
 EMPTY_CELLS = 80  # cells along the unit cube: 6 cm in a room of 5 m, finer than furniture
 _CROSSINGS = 4  # sight lines that cross an empty cell; fewer may all end at wrong points
 _CLEARANCE = 0.4  # no matter this near a camera, as a share of the nearest points' distance
@@ -36,8 +34,7 @@ def known_points(found: Localisation, camera: Camera) -> np.ndarray:
   Returns:
     float32 [A, 4]: index of the picture, pixel x and y, distance along the pixel's ray [unit].
   """
-  often = found.tracks.lengths(len(found.points)) >= _FEWEST_VIEWS
-  seen = found.tracks.of_points(often & (found.point_errors < _MOST_ERROR))
+  seen = sure_tracks(found)
   place = seen.pixel * camera.size_ratio(found.camera)
   distance = np.linalg.norm(
     found.points[seen.point] - found.world_from_camera[seen.view, :3, 3], axis=-1

@@ -244,10 +244,6 @@ def fuse(
       np.where(picture > 0, picture, np.inf).astype(np.float32), np.ones((3, 3))
     )
     _, cosine[n] = pixel_normals(picture, rays)
-  camera = views.camera
-  lens = tuple(
-    float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-  )
   limit = float(1.05 * (rays[..., :2] ** 2).sum(-1).max())
   inverse = np.linalg.inv(views.frame_from_camera).astype(np.float32)
   values, weights = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -259,7 +255,7 @@ def fuse(
       np.float32(voxel),
       np.float32(truncation),
       inverse[part],
-      lens,
+      views.camera.lens,
       limit,
       depth[part],
       nearest[part],

@@ -15,13 +15,16 @@ from nerf2real.core import files
 from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.serialization import from_plain, write_json
-from nerf2real.scenes.capture.posed.colmap_model import to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import camera_of
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.film.shutter import Shutter
 from nerf2real.scenes.poses.tracks import Tracks
 
 _FIGURES = "localisation.json"
+# Of points that may be wrong; chosen, not tuned:
+_MOST_ERROR = 2.0  # a larger reprojection error [pixel]
+_FEWEST_VIEWS = 3  # or fewer pictures: the third one checks the first two
 
 
 class LocalisationError(ValueError):
@@ -97,6 +100,12 @@ class Localisation:
     return image if self.shutter is None else self.shutter.rectify(image, self.camera, index)
 
 
+def sure_tracks(found: Localisation) -> Tracks:
+  """Returns the observations of points that are hardly wrong."""
+  often = found.tracks.lengths(len(found.points)) >= _FEWEST_VIEWS
+  return found.tracks.of_points(often & (found.point_errors < _MOST_ERROR))
+
+
 def reprojection_error(model: pycolmap.Reconstruction) -> float:
   """Mean over the observations [pixel]; over the points where there are no observations."""
   points = list(model.points3D.values())
@@ -120,7 +129,7 @@ def from_model(model: pycolmap.Reconstruction, values: dict[str, Any]) -> Locali
   images = mapping.registered(model)
   points = list(model.points3D.values())
   return Localisation(
-    camera=to_opencv(next(iter(model.cameras.values()))),
+    camera=camera_of(model),
     names=tuple(image.name for image in images),
     world_from_camera=poses_of(images),
     points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),

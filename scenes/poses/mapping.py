@@ -11,7 +11,7 @@ import numpy as np
 
 from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import camera_of, to_colmap
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.matching.features import image_ids, quiet
@@ -262,7 +262,7 @@ def refine(
   drop_points_in_cameras(model)
   base = pycolmap.Reconstruction(model)
   _adjust(base, principal=False, distortion=True, anchors=anchors)
-  fault = camera_fault(_camera(base))
+  fault = camera_fault(camera_of(base))
   if fault is not None:
     base = pycolmap.Reconstruction(model)
     for camera in base.cameras.values():
@@ -273,15 +273,11 @@ def refine(
   report(0.5, "adjusting poses and lens, principal point free")
   full = pycolmap.Reconstruction(base)
   _adjust(full, principal=True, distortion=True, anchors=anchors)
-  fault = camera_fault(_camera(full)) or moved_fault(_camera(base), _camera(full))
+  fault = camera_fault(camera_of(full)) or moved_fault(camera_of(base), camera_of(full))
   if fault is not None:
     words = f"all OPENCV parameters but the principal point, because {fault}"
     return base, FreeLens(distortion=True, principal=False, words=words)
   return full, FreeLens(distortion=True, principal=True, words="all OPENCV parameters")
-
-
-def _camera(model: pycolmap.Reconstruction) -> Camera:
-  return to_opencv(next(iter(model.cameras.values())))
 
 
 def model_from_poses(known: KnownPoses, names: list[str], ids: dict[str, int] | None = None):

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from nerf2real.core.errors import first_few
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.scenes.capture.media.stills import list_images, upright_poses
-from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import camera_of, to_colmap
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping, sharpening
@@ -192,9 +193,8 @@ def _map(
       f"({weakest.num_points3D}): take more pictures there, slowly and with more in view."
     )
   if alike:
-    rest = f" and {len(alike) - _NAMED} more" if len(alike) > _NAMED else ""
     warnings.append(
-      f"Things that look alike: {', '.join(alike[:_NAMED])}{rest} do not show most of what others "
+      f"Things that look alike: {first_few(alike, _NAMED)} do not show most of what others "
       "show that stand as close to it, so that they may be placed before the wrong one of two: "
       "cover one of the two, and take those of both anew."
     )
@@ -271,7 +271,7 @@ def _without_shutter(mapped: Mapped, times: Mapping[str, float], steps: Steps) -
     report=steps.report,
   )
   mapping.drop_bad_observations(model)
-  fault = mapping.camera_fault(to_opencv(next(iter(model.cameras.values()))))
+  fault = mapping.camera_fault(camera_of(model))
   if fault is not None:
     words = f"{mapped.strategy}; rolling shutter not taken out, because {fault}"
     return dataclasses.replace(mapped, strategy=words)
@@ -306,8 +306,7 @@ def _describe(
   if not solid:
     solid = [p.xyz for p in model.points3D.values()]
   unit = choose_unit_frame(poses, np.array(solid).reshape(-1, 3))
-  matrix = np.hstack([unit.scale * unit.rotation, unit.translation[:, None]])
-  model.transform(pycolmap.Sim3d(matrix))
+  model.transform(pycolmap.Sim3d(unit.matrix))
   values = {
     "registered_fraction": model.num_reg_images() / total,
     "reprojection_error_px": reprojection_error(model),

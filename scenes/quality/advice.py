@@ -13,6 +13,7 @@ import numpy as np
 
 from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
+from nerf2real.core.picture_files import write_picture
 from nerf2real.scenes.alignment.world_frame import Alignment
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings
 from nerf2real.scenes.poses.film import continuity
@@ -69,9 +70,8 @@ class Verdict:
   def save_picture(self, path: Path) -> None:
     """Writes the picture as PNG."""
     assert self.picture is not None
-    done, content = cv2.imencode(".png", self.picture[..., ::-1])
-    assert done
-    files.write_atomically(path, content.tobytes())
+    with files.atomic_path(path) as partial:
+      write_picture(partial, self.picture[..., ::-1])
 
 
 def _spans(times: np.ndarray, chosen: np.ndarray) -> str:

@@ -23,7 +23,7 @@ from nerf2real.scenes.poses.depth import alignment, sensor
 from nerf2real.scenes.poses.depth.matched import keep_matches
 from nerf2real.scenes.poses.localisation import Localisation, LocalisationError
 from nerf2real.scenes.poses.settings import LocaliseSettings
-from nerf2real.scenes.stages.cache import Made, Stages
+from nerf2real.scenes.stages.cache import Made, StageResult, Stages
 from nerf2real.scenes.stages.results import Source
 
 # 2: stills turned and without copies, depth checked with the pictures, a video's keyframes where
@@ -87,11 +87,10 @@ def poses(cache: Stages, capture: Made[Capture], settings: LocaliseSettings) -> 
         raise
       lost = taken.called(np.isin(names, sorted(error.missing)), most=4)
       raise LocalisationError(f"{error} Without a place: {lost}.") from error
-    if has_depth and (database := folder / "work" / "database.db").is_file():
+    if capture.value.has_depth and (database := folder / "work" / "database.db").is_file():
       keep_matches(database, folder / _MATCHES)
     shutil.rmtree(folder / "work", ignore_errors=True)  # features and matches: large
 
-  has_depth = capture.value.known is not None and bool(capture.value.known.depth_files)
   inputs = {"keyframes": capture.stamp}
   stage = cache.run("poses", write, settings=settings, inputs=inputs, version=_POSES_VERSION)
   return Made(localisation.load(stage.folder / "sfm"), stage)
@@ -139,7 +138,7 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
     return capture
   files = [aligned.get(Path(name).stem, file) for name, file in of_name.items()]
   warnings = list(capture.value.warnings)
-  if _is_beside(Made(capture.value, stage)):
+  if _is_beside(stage):
     warnings.append(
       "The depth was measured by a camera beside the pictures' own, of another focal length: both "
       "were aligned by localised points."
@@ -148,9 +147,9 @@ def sensed(cache: Stages, capture: Made[Capture], poses: Made[Localisation]) -> 
   return Made(dataclasses.replace(capture.value, known=still.lifted(), warnings=warnings), stage)
 
 
-def _is_beside(capture: Made[Capture]) -> bool:
-  """Tells whether a capture's depth was measured by a camera beside the pictures' own."""
-  record = capture.stage.folder / _SENSOR_RECORD
+def _is_beside(stage: StageResult) -> bool:
+  """Tells whether a stage's depth was measured by a camera beside the pictures' own."""
+  record = stage.folder / _SENSOR_RECORD
   return record.is_file() and bool(json.loads(record.read_text())["beside"])
 
 
@@ -164,7 +163,7 @@ def aligned(
   """
   known, found = capture.value.known, poses.value
   database = poses.stage.folder / _MATCHES
-  if known is None or not known.depth_files or not database.is_file() or _is_beside(capture):
+  if known is None or not known.depth_files or not database.is_file() or _is_beside(capture.stage):
     return capture, poses
   of_name = {path.name: row for row, path in enumerate(capture.value.images)}
   rows = [of_name[name] for name in found.names]

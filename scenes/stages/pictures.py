@@ -27,8 +27,7 @@ class PosedPictures:
   @property
   def measured(self) -> bool:
     """Whether a sensor measured the keyframes' depth."""
-    known = self.capture.value.known
-    return known is not None and bool(known.depth_files)
+    return self.capture.value.has_depth
 
   def views(self) -> Views:
     """Reads all pictures.

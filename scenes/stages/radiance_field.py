@@ -134,7 +134,7 @@ def depth(
     np.savez(folder / "depth.npz", color=color, depth=distance)
 
   inputs = {"field": field.stamp, "poses": poses.stamp}
-  if capture.value.known is not None and capture.value.known.depth_files:
+  if capture.value.has_depth:
     inputs["keyframes"] = capture.stamp
   stage = cache.run("depth", write, settings=width, inputs=inputs, version=renderer.VERSION)
   arrays = np.load(stage.folder / "depth.npz")

@@ -112,12 +112,14 @@ def sparse_evidence(
   capture: Capture, poses: Localisation, marker: markers.MarkerScale | None
 ) -> Evidence:
   """What is known of the world frame before there is a field."""
+  known = capture.known
+  is_metric = known is not None and known.is_metric
   return Evidence(
     poses.points,
     poses.world_from_camera,
     marker=marker,
-    sensor_scale=_sensed_scale(capture, poses),
-    metres_assumed=_assumes_metres(capture),
+    sensor_scale=1 / poses.unit_from_source.scale if is_metric else None,
+    metres_assumed=known is not None and not known.names_unit,
     up=capture.unit_up,
   )
 
@@ -125,17 +127,6 @@ def sparse_evidence(
 def _key(settings: world_frame.AlignSettings, given: Given) -> dict[str, Any]:
   """What the world frame depends on besides earlier results."""
   return {"align": settings, "marker_side": given.marker_side, "override": given.override_key}
-
-
-def _sensed_scale(capture: Capture, poses: Localisation) -> float | None:
-  """Metres a unit of length of poses that came with the capture; None where they are not metric."""
-  known = capture.known
-  return 1 / poses.unit_from_source.scale if known is not None and known.is_metric else None
-
-
-def _assumes_metres(capture: Capture) -> bool:
-  """Whether poses that came with the capture are metric only by assumption."""
-  return capture.known is not None and not capture.known.names_unit
 
 
 def world(
@@ -158,22 +149,12 @@ def world(
     settings: Of the alignment.
     given: Overrides, and the side of a marker.
   """
-  found = poses.value
 
   def write(folder: Path, progress: Progress) -> None:
     points, normals = depth.value.surface_points(stride=2)
-    sensed = _sensed_scale(capture.value, found)
+    evidence = sparse_evidence(capture.value, poses.value, outlook.value.scale)
     result = world_frame.align(
-      Evidence(
-        found.points,
-        found.world_from_camera,
-        points,
-        normals,
-        outlook.value.scale,
-        sensed,
-        _assumes_metres(capture.value),
-        capture.value.unit_up,
-      ),
+      evidence._replace(surface_points=points, surface_normals=normals),
       settings=settings,
       override=given.override,
       progress=progress,

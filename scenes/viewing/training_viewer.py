@@ -111,10 +111,7 @@ class TrainingViewer:
 
   def _due(self) -> bool:
     """Whether a field waits to be shown; what nobody looks at costs the training no time."""
-    return self._newest is not None and self._watched()
-
-  def _watched(self) -> bool:
-    return bool(self._server.get_clients())
+    return self._newest is not None and bool(self._server.get_clients())
 
   def _wake(self) -> None:
     with self._condition:

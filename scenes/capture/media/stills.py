@@ -7,7 +7,6 @@ quarter, so that its sensor lies as theirs; of several lenses the most common on
 
 import collections
 import contextlib
-import hashlib
 import numbers
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,6 +18,8 @@ import pi_heif
 import PIL.ExifTags
 import PIL.Image
 
+from nerf2real.core.errors import first_few
+from nerf2real.core.files import hash_path
 from nerf2real.scenes.capture.media import colors
 from nerf2real.scenes.capture.media.errors import CaptureError
 
@@ -138,9 +139,8 @@ def unreadable(lost: Sequence[Path], count: int) -> list[str]:
   """Says which of `count` files cannot be read, if any."""
   if not lost:
     return []
-  rest = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
-  names = ", ".join(path.name for path in lost[:_NAMED])
-  return [f"{len(lost)} of {count} files cannot be read as a picture, left out: {names}{rest}."]
+  names = first_few([path.name for path in lost], _NAMED)
+  return [f"{len(lost)} of {count} files cannot be read as a picture, left out: {names}."]
 
 
 def _without_copies(files: Sequence[Path]) -> list[Path]:
@@ -149,7 +149,7 @@ def _without_copies(files: Sequence[Path]) -> list[Path]:
   first: dict[str, Path] = {}
   for path in files:
     if path.suffix.lower() not in APPLE_SUFFIXES or path.stem not in others:
-      first.setdefault(hashlib.sha256(path.read_bytes()).hexdigest(), path)
+      first.setdefault(hash_path(path), path)
   return list(first.values())
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.cameras import LENS, Camera
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses, one_camera
 from nerf2real.scenes.colmap import pycolmap
@@ -25,23 +25,26 @@ def to_opencv(camera: pycolmap.Camera) -> Camera:
     values["fx"] = values["fy"] = values.pop("f")
   if "k" in values:
     values["k1"] = values.pop("k")
-  known = {"fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"}
-  extra = {name for name in set(values) - known if values[name] != 0}
+  extra = {name for name in set(values) - set(LENS) if values[name] != 0}
   if extra or "FISHEYE" in camera.model_name or camera.model_name == "FOV":
     raise CaptureError(
       f"The COLMAP model has a {camera.model_name} camera, expected one that OPENCV contains "
       "(SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV): give the pictures alone, or "
       "undistort them."
     )
-  values = {name: float(values[name]) for name in values if name in known}
+  values = {name: float(values[name]) for name in values if name in LENS}
   return Camera(width=camera.width, height=camera.height, **values)
+
+
+def camera_of(model: pycolmap.Reconstruction) -> Camera:
+  """Returns the camera of a model that has one; see `to_opencv`."""
+  return to_opencv(next(iter(model.cameras.values())))
 
 
 def to_colmap(camera: Camera) -> pycolmap.Camera:
   """Converts to COLMAP's OPENCV camera."""
-  params = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
   return pycolmap.Camera(
-    camera_id=1, model="OPENCV", width=camera.width, height=camera.height, params=params
+    camera_id=1, model="OPENCV", width=camera.width, height=camera.height, params=camera.lens
   )
 
 

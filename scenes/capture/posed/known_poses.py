@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.cameras import LENS, Camera
 from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed import depth_pictures
 from nerf2real.scenes.capture.posed.pictures import read_as_posed
@@ -136,7 +136,6 @@ def one_camera(cameras: list[Camera], source: Path) -> Camera:
         f"{other.width}x{other.height} focal {other.fx:.0f}); expected one camera and one zoom."
       )
   values: dict[str, Any] = {
-    name: float(np.median([getattr(c, name) for c in cameras]))
-    for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    name: float(np.median([getattr(c, name) for c in cameras])) for name in LENS
   }
   return dataclasses.replace(first, **values)

@@ -208,14 +208,12 @@ def _compared(
   poses = np.asarray(views.frame_from_camera, np.float64)
   inverses = np.linalg.inv(poses)
   images = np.ascontiguousarray(pictures, np.float32)
-  names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-  lens = tuple(float(getattr(views.camera, name)) for name in names)
   found = np.zeros((*depth.shape[1:], 6))
   for number, index in enumerate(chosen):
     others = _others(number, poses, chosen)
     if len(others):
       found[...] = 0
-      _compare(index, others, images, depth, rays, poses, inverses, lens, found)
+      _compare(index, others, images, depth, rays, poses, inverses, views.camera.lens, found)
       yield found[found[..., 5] > 0]
     progress((number + 1) / len(chosen), "floor behind wrong surfaces")
 

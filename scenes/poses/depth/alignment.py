@@ -79,10 +79,7 @@ def aligned(
   model.update_point_3d_errors()
   model.extract_colors_for_all_images(str(images[0].parent))
   refinement.with_sensor(after, model, names)
-  to_unit = found.unit_from_source
-  model.transform(
-    pycolmap.Sim3d(np.hstack([to_unit.scale * to_unit.rotation, to_unit.translation[:, None]]))
-  )
+  model.transform(pycolmap.Sim3d(found.unit_from_source.matrix))
   words = (
     f"{found.strategy}; then laid onto each other's surfaces, which leaves {off[1]:.1f} pixels in "
     f"place of {off[0]:.1f}"

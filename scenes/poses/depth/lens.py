@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.geometry.cameras import LENS, Camera
 
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _STEPS = (0.5, 0.5, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4)  # of differences
 _OFF = (0.02, 0.02, 0.02, 0.02, 0.1, 0.1, 0.01, 0.01)  # what they may be; four in focal lengths
 

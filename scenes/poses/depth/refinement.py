@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from nerf2real.core.geometry.similarity import Similarity
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.scenes.capture.posed import agreement
-from nerf2real.scenes.capture.posed.colmap_model import to_colmap, to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import camera_of, to_colmap
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
@@ -189,11 +189,9 @@ def _moved_back(model: pycolmap.Reconstruction, known: KnownPoses, names: list[s
   rows = [names.index(image.name) for image in images]
   poses = np.array(known.world_from_camera)
   back = Similarity.fit(poses_of(images)[:, :3, 3], poses[rows, :3, 3])
-  model.transform(
-    pycolmap.Sim3d(np.hstack([back.scale * back.rotation, back.translation[:, None]]))
-  )
+  model.transform(pycolmap.Sim3d(back.matrix))
   poses[rows] = poses_of(images)
-  camera = to_opencv(next(iter(model.cameras.values())))
+  camera = camera_of(model)
   return dataclasses.replace(known, camera=camera, world_from_camera=poses)
 
 

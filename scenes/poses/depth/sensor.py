@@ -16,10 +16,8 @@ from scipy import optimize
 from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.posed import depth_pictures
-from nerf2real.scenes.poses.localisation import Localisation
+from nerf2real.scenes.poses.localisation import Localisation, sure_tracks
 
-_MOST_ERROR = 2.0  # points with a larger reprojection error are left out [pixel]
-_FEWEST_VIEWS = 3  # so are points in fewer pictures
 _FEWEST = 500  # observations for each half: fewer decide nothing
 _OUTLIER = 0.05  # relative error of the depth from which it counts no more
 _CLEARLY = 0.8  # of the error of depth that is taken as aligned; less, and a sensor of its own is
@@ -85,8 +83,7 @@ class _Sighted(NamedTuple):
 
 
 def _sighted(found: Localisation, depth: np.ndarray, unit: float) -> _Sighted:
-  often = found.tracks.lengths(len(found.points)) >= _FEWEST_VIEWS
-  seen = found.tracks.of_points(often & (found.point_errors < _MOST_ERROR))
+  seen = sure_tracks(found)
   poses = found.world_from_camera[seen.view]
   local = np.einsum("oji,oj->oi", poses[:, :3, :3], found.points[seen.point] - poses[:, :3, 3])
   size = np.array([depth.shape[2], depth.shape[1]]) / [found.camera.width, found.camera.height]

@@ -61,7 +61,7 @@ class System:
     for row, place in enumerate(poses[:, :3, 3]):
       by_pose = np.zeros((6, 6))
       by_pose[:3, :3] = np.eye(3) / turn
-      by_pose[3:, :3] = -_cross_matrix(place) / shift
+      by_pose[3:, :3] = -np.cross(np.eye(3), place) / shift
       by_pose[3:, 3:] = np.eye(3) / shift
       self._blocks[row, row] += by_pose.T @ by_pose
       self._slope[row] += by_pose.T @ off[row]
@@ -87,8 +87,3 @@ class System:
 def turns_between(poses: np.ndarray, other: np.ndarray) -> np.ndarray:
   """Returns rotation vectors [N, 3] [rad] from other poses [N, 4, 4] to these."""
   return Rotation.from_matrix(poses[:, :3, :3] @ np.swapaxes(other[:, :3, :3], 1, 2)).as_rotvec()
-
-
-def _cross_matrix(vector: np.ndarray) -> np.ndarray:
-  x, y, z = vector
-  return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -20,7 +20,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture.posed.colmap_model import to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import camera_of
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.elimination import Sights, eliminate
@@ -97,7 +97,7 @@ class _Film:
 
   def __init__(self, model: pycolmap.Reconstruction, times: np.ndarray, deviation: float):
     self._images = registered(model)
-    self._camera = to_opencv(next(iter(model.cameras.values())))
+    self._camera = camera_of(model)
     seen = [[place for place in i.points2D if place.has_point3D()] for i in self._images]
     ids = np.array([place.point3D_id for places in seen for place in places])
     self._ids, self._point = np.unique(ids, return_inverse=True)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.scenes.capture.posed.colmap_model import to_opencv
+from nerf2real.scenes.capture.posed.colmap_model import camera_of
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses import mapping
 from nerf2real.scenes.poses.elimination import Sights, eliminate
@@ -129,7 +129,7 @@ def _move_observations(
   model: pycolmap.Reconstruction, measured: list[_Sight], moved: Shutter
 ) -> None:
   """Moves the observations of a model, in place, to the middle of the readout."""
-  camera = to_opencv(next(iter(model.cameras.values())))
+  camera = camera_of(model)
   for index, (image, sight) in enumerate(zip(registered(model), measured, strict=True)):
     points = _local_points(model, image, sight.rows)
     shift = moved.project(points, instants(sight.pixels, camera), index, camera)
@@ -160,7 +160,7 @@ def _change(
     readout: The present one [s].
     longest: Of the readout [s].
   """
-  camera, moves = to_opencv(next(iter(model.cameras.values()))), motion(model, times, _SMALL)
+  camera, moves = camera_of(model), motion(model, times, _SMALL)
   still, ids, pictures = np.zeros(3), [], []
   by_pose, by_point, by_all, errors = [], [], [], []  # all: lens and readout
   for index, (image, sight) in enumerate(zip(registered(model), measured, strict=True)):

@@ -98,7 +98,7 @@ def test_a_field_that_nobody_looks_at_is_not_drawn(viewer, snapshots, monkeypatc
     viewer.field(snapshot)
   time.sleep(0.2)
   assert not drawn
-  monkeypatch.setattr(viewer, "_watched", lambda: True)
+  monkeypatch.setattr(viewer._server, "get_clients", lambda: {1: None})
   viewer._wake()  # as a browser does that opens the page
   end = time.monotonic() + 60
   while not drawn:
