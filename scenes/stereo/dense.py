@@ -1,7 +1,8 @@
 """Finds depth in posed pictures by dense stereo: anchors of a field's training.
 
-Of few pictures a field finds little depth by itself, and localised points are sparse. What a
-picture's search finds counts where two others' own searches found the same place.
+Of few pictures a field finds little depth by itself, and localised points are sparse. A picture is
+compared with those that see its known points from beside it; what its search finds counts where two
+others' own searches found the same place.
 Shapes: N pictures, H height, W width, h rows and w columns of pixels that look for depth, A points.
 """
 
@@ -14,10 +15,21 @@ from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.field.views import Views
 from nerf2real.scenes.stereo import patchmatch
-from nerf2real.scenes.stereo.neighbours import NeighbourSettings, neighbours
 
 _CLOSER = 0.6  # depths are sought from so much of the nearest known point's, and as far beyond
 _SEEDS = 100_000  # between two pictures' random numbers: more than a search takes
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NeighbourSettings:
+  """Settings of the choice; chosen, not tuned."""
+
+  most: int = 5
+  """Of each picture."""
+  least_angle: float = 0.05
+  """Between two pictures' sight lines to a point [rad]: with less its depth is uncertain."""
+  most_angle: float = 0.6
+  """With more patches look too different."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,6 +70,38 @@ def _pinhole(views: Views, width: int) -> tuple[Camera, np.ndarray]:
     x, y = at[..., 0], at[..., 1]
     pictures.append(cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
   return plain, np.stack(pictures)
+
+
+def neighbours(views: Views, settings: NeighbourSettings) -> list[np.ndarray]:
+  """Lists each picture's neighbours int [<= most], those first that see most of its anchors."""
+  camera, eyes = views.camera, views.world_from_camera[:, :3, 3]
+  size = np.array([camera.width, camera.height])
+  owner = views.anchors[:, 0].astype(int)
+  x, y = views.anchors[:, 1:3].astype(int).T
+  every = camera.rays()
+  widest = np.square(every[..., :2]).sum(-1).max()  # farther out a lens may fold back
+  rays = every[y, x]
+  ways = np.einsum("aij,aj->ai", views.world_from_camera[owner, :3, :3], rays)
+  ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+  points = eyes[owner] + views.anchors[:, 3:] * ways
+  found = []
+  for n in range(len(views)):
+    mine, way = points[owner == n], ways[owner == n]
+    scores = np.zeros(len(views), int)
+    for k, pose in enumerate(views.world_from_camera):
+      if k == n or pose[:3, 2] @ views.world_from_camera[n, :3, 2] <= 0:
+        continue
+      offset = mine - eyes[k]
+      local = offset @ pose[:3, :3]
+      ahead = np.square(local[:, :2]).sum(-1) < widest * np.square(np.maximum(local[:, 2], 0))
+      pixel = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+      cosine = (offset * way).sum(-1) / np.maximum(np.linalg.norm(offset, axis=-1), 1e-12)
+      angle = np.arccos(np.clip(cosine, -1, 1))
+      seen = ahead & ((pixel >= 0) & (pixel < size)).all(-1)
+      scores[k] = (seen & (angle > settings.least_angle) & (angle < settings.most_angle)).sum()
+    order = np.argsort(-scores, kind="stable")[: settings.most]
+    found.append(order[scores[order] > 0])
+  return found
 
 
 class _Search:

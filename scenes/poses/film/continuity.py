@@ -8,8 +8,11 @@ and contradict at right places: how many pairs so far apart do is counted in the
 pair says is worth the less the more do.
 
 The film is a line then, of which parts stand elsewhere: the smaller of two groups that clearly lack
-each other (`groups`), and those without which least is left that contradicts. Evidence is log
-odds, which add. Shapes: N pictures in the film's order.
+each other, and those without which least is left that contradicts. Before two windows alike every
+other part may stand at the other one, so that half of the film does: each part is whole, and
+contradicts what comes before and after it; which belong together what they ought to see of each
+other tells, whenever they were filmed (`overlap`). Evidence is log odds, which add.
+Shapes: N pictures in the film's order.
 """
 
 from collections.abc import Collection, Mapping
@@ -20,9 +23,8 @@ import numpy as np
 
 from nerf2real.scenes.colmap import pycolmap
 from nerf2real.scenes.poses.checks import agreement
-from nerf2real.scenes.poses.checks.overlap import overlap
-from nerf2real.scenes.poses.film.groups import smaller_group
-from nerf2real.scenes.poses.film.leaps import leaps
+from nerf2real.scenes.poses.checks.division import divide
+from nerf2real.scenes.poses.checks.overlap import CLEAR, Overlap, overlap
 from nerf2real.scenes.poses.mapping import registered
 
 _NEIGHBOURS = 3  # pictures before and after that see much of the same, chosen
@@ -33,6 +35,10 @@ _ROUNDS = 3  # of counting without the pictures that stand elsewhere
 # at one picture of twenty at most, and has about ten.
 _BEGINS = float(np.log(0.95 / 0.05))
 _GOES_ON = 0.1
+_LEAP = 6.0  # times the median change of velocity, chosen: at right places 4.6 times at most, where
+# things alike deceive 10 and more
+_USUAL = 0.9  # share of the steps from picture to picture that are as long as the film's usual one
+# at most, chosen: a hand that is knocked changes its velocity, but goes no farther
 
 
 class Votes(NamedTuple):
@@ -140,6 +146,56 @@ def _line(evidence: np.ndarray) -> np.ndarray:
     at = before[at]
     kept[at] = True
   return kept[1:-1]
+
+
+def leaps(centers: np.ndarray, times: np.ndarray) -> np.ndarray:
+  """Tells between which pictures a hand would have had to leap, bool [N, N], the earlier first.
+
+  It leaps where its velocity is not that before nor that after, by far more than between most
+  pictures as many apart, and it comes out farther off than a usual step is long: a hand goes on
+  much as it moved the moment before, or after.
+
+  Args:
+    centers: Positions [N, 3].
+    times: When [s] [N]; where they do not grow, nothing is said.
+  """
+  count = len(times)
+  found = np.zeros((count, count), bool)
+  if count < 3 or np.diff(times).min() <= 0:
+    return found
+  way, passed = centers - centers[:, None], times - times[:, None]
+  steps = np.diff(centers, axis=0)
+  velocity = steps / np.diff(times)[:, None]
+  off = np.full((2, count, count), np.inf)  # from where the hand before, and after, leads
+  off[0, 1:] = np.linalg.norm(way[1:] - velocity[:, None] * passed[1:, :, None], axis=2)
+  off[1, :, :-1] = np.linalg.norm(way[:, :-1] - velocity * passed[:, :-1, None], axis=2)
+  usual = np.quantile(np.linalg.norm(steps, axis=1), _USUAL)
+  for later in range(1, count):
+    first = np.arange(count - later)
+    second = first + later
+    nearest = off[:, first, second].min(axis=0)
+    change = nearest / passed[first, second]
+    found[first, second] = (change > _LEAP * np.median(change)) & (nearest > usual)
+  return found
+
+
+def smaller_group(parts: np.ndarray, seen: Overlap) -> np.ndarray:
+  """Tells which pictures are of the smaller of two groups that clearly lack each other, bool [N].
+
+  Single pictures do not tell it: blurred ones have little in common.
+
+  Args:
+    parts: Of which part of the film each picture is, counted from 0 [N].
+    seen: What the pictures have in common.
+  """
+  of_part = np.arange(parts.max(initial=-1) + 1)[:, None] == parts
+  weights = of_part @ (seen.common - seen.missing) @ of_part.T
+  between = weights - np.diag(np.diagonal(weights))
+  group = divide(between)
+  if group is None or between[group][:, ~group].sum() > -CLEAR * abs(weights.sum()) / 2:
+    return np.zeros(len(parts), bool)
+  found: np.ndarray = group[parts]
+  return found if 2 * found.sum() <= len(parts) else ~found
 
 
 def drop_out_of_line(

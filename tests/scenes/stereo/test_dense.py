@@ -8,8 +8,12 @@ import pytest
 from nerf2real.core.geometry.cameras import PIXEL_CENTRE, Camera
 from nerf2real.core.geometry.rotations import camera_axes
 from nerf2real.scenes.field.views import Views
-from nerf2real.scenes.stereo.dense import StereoSettings, dense_points
-from nerf2real.scenes.stereo.neighbours import NeighbourSettings, neighbours
+from nerf2real.scenes.stereo.dense import (
+  NeighbourSettings,
+  StereoSettings,
+  dense_points,
+  neighbours,
+)
 from tests.scenes import box_views
 
 CAMERA = Camera(width=160, height=120, fx=140, fy=140, cx=80, cy=60, k1=0.05)

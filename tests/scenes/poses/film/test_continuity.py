@@ -134,3 +134,78 @@ def test_what_is_left_out_is_told_by_its_times():
   text = continuity.gaps({"3", "8", "9"}, placed, times)
   assert text.startswith("Pictures at 1.5 s, from 4.0 s to 4.5 s stand apart")
   assert "those parts" in text
+
+
+def walk(count: int) -> tuple[np.ndarray, np.ndarray]:
+  """A hand that turns and changes its speed, and when: [N, 3], [N]."""
+  times = np.cumsum(np.random.default_rng(0).uniform(0.2, 0.6, count))
+  return np.stack([np.sin(0.5 * times), np.cos(0.3 * times), 0.1 * np.sin(times)], 1), times
+
+
+def test_a_hand_does_not_leap_however_fast_it_is():
+  centers, times = walk(60)
+  assert not continuity.leaps(centers, times).any()
+  assert not continuity.leaps(10 * centers, times).any()
+  waits = np.maximum(np.arange(60.0) - 45, 0.0)  # three quarters of it stand still
+  assert not np.diagonal(
+    continuity.leaps(np.stack([waits, 0 * waits, 0 * waits], 1), times), 1
+  ).any()
+
+
+def test_pictures_that_stand_elsewhere_are_leapt_to_and_from():
+  centers, times = walk(60)
+  centers[20:27, 2] += 1.0
+  found = continuity.leaps(centers, times)
+  assert np.flatnonzero(np.diagonal(found, 1)).tolist() == [19, 26]
+  assert not np.tril(found).any()
+
+
+def test_a_knock_is_no_leap():
+  """The hand's velocity changes, but it comes out close to where it would have been."""
+  centers, times = walk(60)
+  times[20] = times[19] + 0.03
+  centers[20] = centers[19] + [0.0, 0.0, 0.1]
+  assert not np.diagonal(continuity.leaps(centers, times), 1).any()
+
+
+def test_without_times_nothing_is_said():
+  centers, times = walk(60)
+  centers[20, 2] += 5.0
+  assert not continuity.leaps(centers, times[::-1]).any()
+  assert not continuity.leaps(centers[:2], times[:2]).any()
+  assert continuity.leaps(centers[:0], times[:0]).shape == (0, 0)
+
+
+def seen_of(world: np.ndarray, reach: int = 12) -> Overlap:
+  """What pictures have in common within their world: those of as many places elsewhere in a film
+  do, and lack it of the other."""
+  near = abs(np.subtract.outer(np.arange(len(world)), np.arange(len(world)))) % reach < 4
+  same = world == world[:, None]
+  return Overlap([*range(len(world))], 9.0 * (near & same), 9.0 * (near & ~same), 0.0)
+
+
+def test_every_other_part_is_a_group():
+  parts = np.repeat(np.arange(6), [12, 9, 12, 9, 12, 9])
+  assert (continuity.smaller_group(parts, seen_of(parts % 2)) == (parts % 2 == 1)).all()
+
+
+def test_the_smaller_group_is_that_of_fewer_pictures():
+  parts = np.repeat(np.arange(4), [30, 4, 4, 4])
+  world = np.array([0, 1, 1, 1])[parts]
+  assert (continuity.smaller_group(parts, seen_of(world)) == (world == 1)).all()
+
+
+def test_parts_of_one_world_are_no_groups():
+  parts = np.repeat(np.arange(4), 10)
+  assert not continuity.smaller_group(parts, seen_of(0 * parts)).any()
+  assert not continuity.smaller_group(
+    0 * parts, seen_of(parts % 2)
+  ).any()  # nothing contradicts in the film
+  assert len(continuity.smaller_group(parts[:0], seen_of(parts[:0]))) == 0
+
+
+def test_a_small_lack_is_not_clear():
+  seen = seen_of(np.zeros(40, int))
+  seen.missing[20:23] += 1.0
+  parts = np.repeat(np.arange(3), [20, 3, 17])
+  assert not continuity.smaller_group(parts, seen).any()
