@@ -1,7 +1,8 @@
 """Procedural textures of the built-in room: every picture is computed from a seed.
 
-Textures are uint8 [H, W, 3]. Power-law noise gives structure at every scale, as real surfaces have:
-features for SIFT from near and far, and little energy at the finest scale, so that nothing aliases.
+Textures are float [H, W, 3], levels of 0 to 255, which `to_uint8` rounds. Power-law noise gives
+structure at every scale, as real surfaces have: features for SIFT from near and far, and little
+energy at the finest scale, so that nothing aliases.
 """
 
 import functools

@@ -40,7 +40,8 @@ _PICTURES_VERSION = 5  # of all others; 5: colours of other profiles
 # pictures some may have no place; 11: photographs without pairs whose rotations contradict;
 # 12: by what pictures lack; a film's line is the one that least contradicts; matches are kept of
 # what came with depth; 13: uncertain pictures of films are left out, too; 14: patches are aligned;
-# 15: a film is held by a hand's motion
+# 15: a film is held by a hand's motion; 16: what a film's map lacks is placed once more; 17: as 16,
+# made anew
 _POSES_VERSION = 17
 _ALIGNED_VERSION = 2  # 2: sightings in the sensor's metre, as the depth pictures
 _MATCHES = "matches.db"  # what pictures with depth show alike

@@ -37,7 +37,7 @@ class RenderSettings:
   """Distance [unit] at which a ray ends. Chosen: 31/32 of the squashed space is used up."""
   stop: float = 0.05
   """Transmittance at which a ray ends; what is left is shared out among its samples. Chosen:
-  0.02   gains 0.05 dB and takes a third longer where surfaces are soft."""
+  0.02 gains 0.05 dB and takes a third longer where surfaces are soft."""
   weight_floor: float = 0.01
   """Samples of less weight get no colour of their own. Chosen: 1 % of a colour is 2 of 255."""
 
