@@ -101,9 +101,7 @@ def without_falloff(views: Views) -> Views:
 
 
 def blur_of(capture: Capture) -> dict[str, float]:
-  """Blur of each keyframe by its name; raises ValueError where a scene has none."""
-  if capture.blur is None:
-    raise ValueError("The scene's keyframes have no blur: make them again.")
+  """Blur of each keyframe by its name."""
   return dict(zip((path.name for path in capture.images), capture.blur.tolist(), strict=True))
 
 

@@ -64,6 +64,8 @@ class Capture:
   """Variance of the Laplacian at the standard size [N]."""
   brightness: np.ndarray
   """Mean grey level [N], 0 to 255."""
+  blur: np.ndarray
+  """Deviation of the blur along its widest direction at the standard size [N] [pixel]."""
   times: np.ndarray | None
   """In the video [N] [s]; None for pictures."""
   warnings: list[str]
@@ -72,12 +74,8 @@ class Capture:
   """Cameras that came with the pictures."""
   turned: np.ndarray | None = None
   """Keyframes that were turned counter-clockwise to lie as the others, bool [N]; None: none."""
-
   origins: list[str] | None = None
   """Names of the files that the keyframes were made of; None for a video."""
-  blur: np.ndarray | None = None
-  """Deviation of the blur along its widest direction at the standard size [N] [pixel]; None in a
-  record of an earlier version."""
 
   @property
   def names(self) -> dict[str, str]:
@@ -125,13 +123,12 @@ def quality_warnings(capture: Capture, settings: CaptureSettings) -> list[str]:
       f"Low resolution: {capture.width}x{capture.height}, expected a short side of "
       f"{settings.warn_short_side} or more."
     )
-  if capture.blur is not None:
-    blurred = float(np.mean(capture.blur > settings.warn_blur))
-    if blurred > settings.warn_blurred_fraction:
-      found.append(
-        f"Blur: {blurred:.0%} of the keyframes are blurred; move slower, add light, or lock the "
-        "focus."
-      )
+  blurred = float(np.mean(capture.blur > settings.warn_blur))
+  if blurred > settings.warn_blurred_fraction:
+    found.append(
+      f"Blur: {blurred:.0%} of the keyframes are blurred; move slower, add light, or lock the "
+      "focus."
+    )
   low, high = np.percentile(capture.brightness, [5, 95])
   if high > settings.warn_brightness_range * max(low, 1.0):
     found.append(

@@ -95,13 +95,12 @@ def _where(capture: Capture, chosen: np.ndarray) -> str:
 def judge_pictures(capture: Capture, settings: CaptureSettings) -> list[Finding]:
   """Judges blur and exposure of the keyframes."""
   found = []
-  if capture.blur is not None:
-    blurred = capture.blur > settings.warn_blur
-    share, good = float(blurred.mean()), float(blurred.mean()) <= settings.warn_blurred_fraction
-    text = f"{share:.0%} of the pictures lose half of the robot's finest detail: they are blurred"
-    if not good:
-      text += f", {_where(capture, blurred)}: walk and turn slower there, or switch the light on"
-    found.append(Finding("blur", good, text + "."))
+  blurred = capture.blur > settings.warn_blur
+  share, good = float(blurred.mean()), float(blurred.mean()) <= settings.warn_blurred_fraction
+  text = f"{share:.0%} of the pictures lose half of the robot's finest detail: they are blurred"
+  if not good:
+    text += f", {_where(capture, blurred)}: walk and turn slower there, or switch the light on"
+  found.append(Finding("blur", good, text + "."))
   low, high = np.percentile(capture.brightness, [5, 95])
   ratio = float(high / max(low, 1.0))
   good = ratio <= settings.warn_brightness_range

@@ -52,7 +52,8 @@ def _capture(folder, count):
   images = [folder / f"frame_{k:06d}.png" for k in range(count)]
   for k, path in enumerate(images):
     cv2.imwrite(str(path), np.full((48, 64, 3), (0, 0, 10 * k), np.uint8))
-  return Capture("video", folder, images, 64, 48, np.ones(count), np.ones(count), None, [])
+  ones = np.ones(count)
+  return Capture("video", folder, images, 64, 48, ones, ones, ones, None, [])
 
 
 def test_keyframes_are_shown_in_the_order_of_the_film(viewer, tmp_path):

@@ -42,4 +42,4 @@ def recorded(
     **known,
   ).lifted()
   ones, size = np.ones(len(images)), (camera.width, camera.height)
-  return Capture("rgbd", folder / "pictures", images, *size, ones, ones, None, [], about)
+  return Capture("rgbd", folder / "pictures", images, *size, ones, ones, ones, None, [], about)
