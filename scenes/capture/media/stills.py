@@ -7,7 +7,6 @@ quarter, so that its sensor lies as theirs; of several lenses the most common on
 
 import collections
 import contextlib
-import numbers
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -130,9 +129,10 @@ def look_of(path: Path) -> Look:
     ) from error
   if exif.get(PIL.ExifTags.Base.Orientation) in _TURNED:
     width, height = height, width
-  focal = detail.get(PIL.ExifTags.Base.FocalLengthIn35mmFilm)
-  known = isinstance(focal, numbers.Real) and focal > 0  # EXIF may hold several numbers, or text
-  return Look(width, height, float(focal) if known else None)
+  focal = 0.0
+  with contextlib.suppress(TypeError, ValueError):  # EXIF may hold several numbers, or text
+    focal = float(detail.get(PIL.ExifTags.Base.FocalLengthIn35mmFilm, 0))
+  return Look(width, height, focal if focal > 0 else None)
 
 
 def unreadable(lost: Sequence[Path], count: int) -> list[str]:
