@@ -6,6 +6,7 @@ then. The time a policy needs is therefore part of the robot's delay, as everyth
 """
 
 import collections
+import contextlib
 import logging
 from typing import Any
 
@@ -178,22 +179,28 @@ class RobotEnvironment(dm_env.Environment):
     return dm_env.transition(reward=0.0, observation=observation)
 
   def close(self) -> None:
-    """Has the robot held, moves it slowly to its pose, switches the torque off, ends everything."""
+    """Has the robot held, moves it slowly to its pose, switches the torque off, ends everything.
+
+    What raises is raised when all the rest has ended.
+    """
     if self._closed:
       return
     self._closed = True
     self._running = False
     relaxed = False
-    try:
-      relaxed = self._motion.rest()
-    finally:
-      self._cycle.close()
+
+    def switch_off() -> None:
       if not relaxed and not self.dry_run and not self.servos.torque(False):
         _log.error("not every servo confirmed that its torque is off: switch the robot off")
-      self._bus.close()
-      self._operator.close()
+
+    with contextlib.ExitStack() as endings:  # from the last one to the first
       if self._pictures is not None:
-        self._pictures.close()
+        endings.callback(self._pictures.close)
+      endings.callback(self._operator.close)
+      endings.callback(self._bus.close)
+      endings.callback(switch_off)
+      endings.callback(self._cycle.close)
+      relaxed = self._motion.rest()
 
   # ---- beyond dm_env ----
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import dynamixel_sdk as sdk
 import numpy as np
-import serial
 
 from nerf2real.real.clock import Clock, RealClock
 from nerf2real.real.wire import op3, opencr
@@ -162,7 +161,7 @@ class Bus:
             raw, result, _ = self._handler.fastSyncReadRx(port, sdk.BROADCAST_ID, size - _FAST_HEAD)
             if raw or result != sdk.COMM_SUCCESS:
               break
-      except (serial.SerialException, OSError):
+      except OSError:
         result, raw = sdk.COMM_RX_FAIL, []
       finally:
         port.deadline = None
@@ -212,7 +211,7 @@ class Bus:
         if result == sdk.COMM_SUCCESS:
           self._expect(_INSTRUCTION_SIZE + _STATUS_SIZE + opencr.MEASURED_LENGTH, delay=0.0)
           raw, result, _ = self._handler.readRx(port, op3.BOARD_ID, opencr.MEASURED_LENGTH)
-      except (serial.SerialException, OSError):
+      except OSError:
         result, raw = sdk.COMM_RX_FAIL, []
       finally:
         port.deadline = None
@@ -237,7 +236,7 @@ class Bus:
       with self._lock:
         try:
           found = transaction()
-        except (serial.SerialException, OSError):
+        except OSError:
           return None
         finally:
           self._port.is_using = False
@@ -284,7 +283,12 @@ class Bus:
   def reboot(self, device: int) -> None:
     """Restarts a device."""
     with self._lock:
-      self._handler.reboot(self._port, device)
+      try:
+        self._handler.reboot(self._port, device)
+      except OSError:
+        pass  # the readings notice a lost bus
+      finally:
+        self._port.is_using = False
 
   def write_all(self, address: int, size: int, values: list[int]) -> None:
     """Writes a register of every servo in one sync write, without an answer."""
@@ -295,7 +299,7 @@ class Bus:
     with self._lock:
       try:
         self._handler.syncWriteTxOnly(self._port, address, size, data, len(data))
-      except (serial.SerialException, OSError):
+      except OSError:
         pass  # the readings notice a lost bus
       finally:
         self._port.is_using = False

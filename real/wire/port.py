@@ -6,6 +6,7 @@ packet.
 """
 
 import contextlib
+import termios
 from pathlib import Path
 
 import dynamixel_sdk
@@ -44,7 +45,7 @@ class Port(dynamixel_sdk.PortHandler):
     self._last = float("-inf")  # s, when a wait ends whatever still comes
     try:
       opened = self.setBaudRate(baud)
-    except (serial.SerialException, OSError, ValueError) as error:
+    except (OSError, ValueError) as error:
       raise PortError(
         f"The serial port {path} cannot be opened ({error}): check the cable, the path, and that "
         "this user is in the group of the port (often `dialout`)."
@@ -57,9 +58,16 @@ class Port(dynamixel_sdk.PortHandler):
     # The SDK's own takes paths alone; pyserial's function opens URLs, too.
     self.ser = serial.serial_for_url(self.port_name, baudrate=self.baudrate, timeout=0)
     self.is_open = True
-    self.ser.reset_input_buffer()
+    self.clearPort()
     self.tx_time_per_byte = 1000 * self.byte_time
     return True
+
+  def clearPort(self) -> None:
+    # Of an adapter that was unplugged pyserial raises what is no OSError.
+    try:
+      super().clearPort()
+    except termios.error as error:
+      raise serial.SerialException(f"{self.port_name}: {error}") from error
 
   def getCurrentTime(self) -> float:
     return 1000 * self._clock.now()

@@ -277,6 +277,33 @@ def test_wrong_arguments_are_explained(robot, quick, load):
     environment.reset()
 
 
+@pytest.mark.parametrize("failing", ["_motion.rest", "_cycle.close", "servos.torque"])
+def test_closing_ends_everything_though_a_part_of_it_fails(
+  robot, load, picture, monkeypatch, failing
+):
+  environment = load(pictures=picture)
+  closed = []
+  monkeypatch.setattr(robot.operator, "close", lambda: closed.append("operator"))
+  monkeypatch.setattr(environment._bus, "close", lambda: closed.append("bus"))
+  monkeypatch.setattr(environment._motion, "rest", lambda: False)
+
+  def fail(*_):
+    raise RuntimeError("the cable was pulled")
+
+  owner, name = failing.split(".")
+  monkeypatch.setattr(getattr(environment, owner), name, fail)
+  with pytest.raises(RuntimeError, match="cable was pulled"):
+    environment.close()
+  assert closed == ["bus", "operator"] and picture.closed
+
+
+def test_a_wrong_goal_leaves_nothing_running(robot, quick, picture):
+  connection = dataclasses.replace(robot.connection(), camera=picture)
+  with pytest.raises(ValueError, match="Unknown goal 7"):
+    real.load("nerf_nav", robot=connection, settings=quick, goal=7)
+  assert picture.closed and not robot.clock._jobs
+
+
 def test_lost_packets_cost_readings_and_no_deadline(robot, load):
   environment = load()
   environment.reset()

@@ -258,3 +258,21 @@ def test_a_line_that_never_falls_silent_does_not_hold_the_reader(noise):
     os.close(master)
     os.close(slave)
   assert took < 0.5  # a few hundredths on an idle machine; it was endless
+
+
+def test_an_adapter_that_was_unplugged_gives_lost_readings_and_no_trace():
+  master, slave = os.openpty()
+  tty.setraw(slave)
+  bus = Bus(os.ttyname(slave))
+  os.close(slave)
+  os.close(master)
+  try:
+    assert bus.read_joints() is None and bus.read_imu() is None
+    assert bus.counts.joint_losses == bus.counts.imu_losses == 1
+    bus.drop_torque()
+    bus.reboot(1)
+    assert bus.ping(1) is None
+    with pytest.raises(BusError, match="does not answer"):
+      bus.read(1, 64, 1)
+  finally:
+    bus.close()
