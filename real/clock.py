@@ -103,7 +103,6 @@ class Thread:
 
   def __init__(self, clock: RealClock, period: float, work: Callable[[], None], *, name: str):
     self.missed = 0
-    self.error: BaseException | None = None  # what ended it
     self._clock, self._period, self._work = clock, period, work
     self._stop = threading.Event()
     # With Python's 5 ms a computing thread would take the bus thread's whole period.
@@ -114,19 +113,15 @@ class Thread:
   def _run(self) -> None:
     prefer_this_thread()
     due = self._clock.now()
-    try:
-      while not self._stop.is_set():
-        self._clock.sleep_until(due)
-        self._work()
-        due += self._period
-        late = self._clock.now() - due
-        if late > 0:
-          skipped = int(late / self._period) + 1
-          self.missed += skipped
-          due += skipped * self._period
-    except BaseException as error:
-      self.error = error
-      raise
+    while not self._stop.is_set():
+      self._clock.sleep_until(due)
+      self._work()
+      due += self._period
+      late = self._clock.now() - due
+      if late > 0:
+        skipped = int(late / self._period) + 1
+        self.missed += skipped
+        due += skipped * self._period
 
   def stop(self) -> None:
     self._stop.set()

@@ -80,6 +80,7 @@ def load(
   bus = Bus(connection.port, settings=settings.bus, wiring=wiring, clock=connection.clock)
   camera: CameraSource | None = None
   operator: Operator | None = None
+  environment: RobotEnvironment | None = None
   try:
     if image_size is not None:
       camera = _open_camera(connection.camera, image_size)
@@ -91,6 +92,9 @@ def load(
     if recorder is not None and lens is not None:
       recorder.camera_info(bus.clock.wall(bus.clock.now()), lens)
   except BaseException:
+    if environment is not None:  # it reads already, and closes what it was given
+      environment.close()
+      raise
     bus.close()
     for opened in (camera, operator):
       if opened is not None:
