@@ -71,6 +71,7 @@ def load(
     ValueError: An argument is none of what is expected.
     BusError: A device does not answer or cannot be set up.
     PortError: The serial port cannot be used.
+    SafetyError: A key was pressed when it asked to hold a robot that stood under torque.
   """
   connection = Connection(port=robot) if isinstance(robot, str) else robot
   settings = settings or RobotSettings()

@@ -8,6 +8,7 @@ then. The time a policy needs is therefore part of the robot's delay, as everyth
 import collections
 import contextlib
 import logging
+import threading
 from typing import Any
 
 import dm_env
@@ -21,7 +22,7 @@ from nerf2real.real.loop.motion import SUPPORTED_POSE, Motion
 from nerf2real.real.loop.pictures import Pictures
 from nerf2real.real.loop.settings import RobotSettings, TaskSpec
 from nerf2real.real.loop.timing import Timing
-from nerf2real.real.safety.monitor import Limiter, Stop
+from nerf2real.real.safety.monitor import Limiter, Reason, SafetyError, Stop
 from nerf2real.real.safety.operator import Operator
 from nerf2real.real.wire.bus import Bus
 from nerf2real.real.wire.servos import Servos
@@ -59,6 +60,7 @@ class RobotEnvironment(dm_env.Environment):
 
     Raises:
       BusError: A device is missing or cannot be set up.
+      SafetyError: A key was pressed instead of holding a robot under torque.
       ValueError: A camera without image_size, or the other way round.
     """
     image_size = task.image_size
@@ -101,7 +103,7 @@ class RobotEnvironment(dm_env.Environment):
     self.servos.power_on()
     if not self.dry_run:
       if any(self.servos.torque_states()):  # a program died: without torque the robot would fall
-        operator.support(True)
+        self._take_over()
       self.servos.set_up()
     self._cycle = Cycle(
       bus,
@@ -120,6 +122,25 @@ class RobotEnvironment(dm_env.Environment):
       clock=self._clock,
       settings=self.settings,
     )
+
+  def _take_over(self) -> None:
+    """Has the robot held under the torque that a program has left; a key drops it at once."""
+    stopped = threading.Event()
+
+    def look() -> None:
+      if self._operator.pressed():
+        self._bus.drop_torque()
+        stopped.set()
+
+    watch = self._clock.every(constants.BUS_PERIOD, look, name="operator")
+    try:
+      self._operator.support(True)
+    finally:
+      watch.stop()
+      look()
+    if stopped.is_set():
+      self.servos.torque(False)
+      raise SafetyError(f"Torque was switched off: {Reason.OPERATOR} (a key was pressed).")
 
   # ---- dm_env ----
 

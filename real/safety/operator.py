@@ -22,7 +22,11 @@ class Operator(Protocol):
     """Returns whether a key was pressed since the last call; never waits."""
 
   def support(self, held: bool) -> None:
-    """Requests to hold the robot (True) or to let it go (False); returns when that is so."""
+    """Requests to hold the robot (True) or to let it go (False); returns when that is so.
+
+    Raises:
+      RuntimeError: Nobody can be asked, or nobody is there any more to answer.
+    """
 
   def close(self) -> None:
     """Gives the terminal back."""
@@ -44,11 +48,12 @@ class Terminal:
     self._asking = self._confirmed = self._stopped = False
     self._answer: bytearray | None = None  # to a question, as far as it has been typed
     if self._open:
-      tty.setcbreak(self._descriptor, termios.TCSANOW)
+      tty.setcbreak(self._descriptor, termios.TCSAFLUSH)  # what was typed before is no key
 
   def pressed(self) -> bool:
     self._take()
-    found, self._stopped = self._stopped, False
+    with self._lock:
+      found, self._stopped = self._stopped, False
     return found
 
   def support(self, held: bool) -> None:
@@ -58,11 +63,16 @@ class Terminal:
       )
     asked = "HOLD the robot by its torso, feet off the ground" if held else "Set it down, let go"
     print(f"\n{asked}, then press Enter. Any other key stops.", flush=True)
-    self._confirmed, self._asking = False, True
+    self._take()  # what was typed before the question is no answer to it
+    with self._lock:
+      self._confirmed, self._asking = False, True
     while self._open and not self._confirmed:
       self._take()
       time.sleep(_LOOK_PERIOD)
-    self._asking = False
+    with self._lock:
+      self._asking = False
+    if not self._confirmed:
+      raise RuntimeError("The terminal is gone: nobody confirms to hold the robot, or to let go.")
 
   def ask(self, question: str) -> str:
     """Returns the line typed to a question; meanwhile Escape stops the robot, no other key."""

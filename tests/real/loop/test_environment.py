@@ -9,7 +9,7 @@ import pytest
 from nerf2real import real, suite
 from nerf2real.real.loop.motion import SUPPORTED_POSE
 from nerf2real.real.loop.settings import RobotSettings
-from nerf2real.real.safety.monitor import SafetySettings
+from nerf2real.real.safety.monitor import SafetyError, SafetySettings
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors import filters
 from nerf2real.suite.tasks.state import standing_posture
@@ -101,6 +101,20 @@ def test_a_robot_that_a_program_has_left_standing_is_held_before_its_torque_goes
   assert seen == [(True, True)] and not robot.body.motors.enabled.any()
   robot.operator._hold = hold
   environment._closed = True
+
+
+def test_a_key_at_the_question_to_hold_a_robot_under_torque_ends_it(robot, load):
+  environment = load()
+  environment.reset()
+  environment._cycle.close()  # as the program dies
+  environment._bus.close()
+  environment._closed = True
+  hold = robot.operator._hold
+  robot.operator._hold = lambda held: (robot.operator.press(), hold(held))
+  with pytest.raises(SafetyError, match="operator"):
+    load()
+  robot.truth()
+  assert not robot.body.motors.enabled.any() and not robot.clock._jobs
 
 
 def test_control_runs_at_40_hz_and_the_bus_at_125(robot, load):
