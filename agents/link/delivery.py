@@ -95,12 +95,14 @@ class Ledger:
 
   def confirm(self, actor: int, *, oldest: int) -> None:
     """Takes the actor's word that all before `oldest` is acknowledged, if by a former learner."""
-    top = max(self._contiguous.get(actor, 0), oldest - 1)
-    beyond = self._beyond.get(actor, set())
+    top, beyond = self._contiguous.get(actor, 0), self._beyond.setdefault(actor, set())
+    if oldest - 1 > top:
+      top = oldest - 1
+      beyond.difference_update([n for n in beyond if n <= top])
     while top + 1 in beyond:
       top += 1
+      beyond.remove(top)
     self._contiguous[actor] = top
-    self._beyond[actor] = {n for n in beyond if n > top}
 
   def acknowledged(self, actor: int) -> int:
     """All numbers up to this one are here."""
