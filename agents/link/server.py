@@ -85,6 +85,8 @@ class LearnerLink:
       known: (actor's key, number) of trajectories that the replay holds already.
     """
     self.lock = threading.Lock()
+    self.taking = threading.Lock()
+    """Held, before `lock`, from a trajectory's insertion until its steps are counted."""
     self.limiter = limiter
     self.counters = Counters()
     self.failure = ""  # why nothing is taken in any more; empty while all is well
@@ -321,17 +323,18 @@ class LearnerLink:
       if self._ledger.seen(key, number):
         self.counters.duplicates += 1
         return
-    try:
-      steps = self._insert(message.arrays, key, number)
-    except ValueError as error:
-      self._drop(actor, number, claimed)
-      self._refuse(f"trajectory {number} of {actor}: {error}")
-      return
-    with self.lock:
-      self._ledger.record(key, number)
-      self.limiter.delivered(actor, steps)
-      self.counters.trajectories += 1
-      self.counters.bytes += len(data)
+    with self.taking:
+      try:
+        steps = self._insert(message.arrays, key, number)
+      except ValueError as error:
+        self._drop(actor, number, claimed)
+        self._refuse(f"trajectory {number} of {actor}: {error}")
+        return
+      with self.lock:
+        self._ledger.record(key, number)
+        self.limiter.delivered(actor, steps)
+        self.counters.trajectories += 1
+        self.counters.bytes += len(data)
 
   def _drop(self, actor: str, number: int, steps: int) -> None:
     """Acknowledges a trajectory that does not fit, so that its actor does not send it for ever."""

@@ -286,9 +286,10 @@ class Learner:
       _log.error("%s", error)
 
   def _info(self) -> dict[str, Any]:
-    with self.link.lock:
+    with self.link.taking, self.link.lock:  # the steps are those of what the replay holds
       steps, updates = self.limiter.steps, self.limiter.updates
       refill_until, unpaid = self.limiter.refill_until, self.limiter.unpaid
+      inserted = self.replay.inserted
     return {
       "environment": self._settings.environment,
       "config": to_plain(self._config),
@@ -298,7 +299,7 @@ class Learner:
       "updates": updates,
       "refill_until": refill_until,
       "unpaid_steps": unpaid,
-      "replay_inserted": self.replay.inserted,
+      "replay_inserted": inserted,
       **self._best.record(),
       "seconds": round(self._seconds, 1),
       "init_from": self._init_from,

@@ -14,7 +14,7 @@ from nerf2real.agents.dmpo import config, learning, networks, presets, scaling, 
 from nerf2real.agents.dmpo.policy import export
 from nerf2real.agents.dmpo.replay.ring import trajectory_fields
 from nerf2real.agents.dmpo.specs import Layout
-from nerf2real.agents.link import sessions
+from nerf2real.agents.link import schema, sessions
 from nerf2real.agents.link.client import ActorLink
 from nerf2real.agents.processes import actor, beginning
 from nerf2real.agents.processes.checkpoints import read_info
@@ -224,6 +224,38 @@ def test_a_full_disk_ends_the_learner_with_a_reason(tmp_path, monkeypatch):
   with pytest.raises(LearnerError, match="No trajectory can be taken in.*No space left"):
     run.go()
   assert time.monotonic() - begin < 120
+
+
+def test_steps_are_counted_with_what_the_replay_holds(tmp_path):
+  run = Run(tmp_path)
+  learner, inserted, counted = run.learner, threading.Event(), threading.Event()
+  insert = learner.link._insert
+
+  def insert_slowly(*trajectory):
+    steps = insert(*trajectory)
+    inserted.set()
+    counted.wait(10)
+    return steps
+
+  learner.link._insert = insert_slowly
+  fields = trajectory_fields(learner.layout, lstm_size=0)
+  arrays = {name: np.zeros((5, *field.shape), field.dtype) for name, field in fields.items()}
+  values = {"actor": "actor-0-t", "number": 1, "steps": 4}
+  message = schema.encode("trajectory", values, arrays)
+  taking = threading.Thread(target=learner.link._take_trajectory, args=(message,))
+  found = []
+  reading = threading.Thread(target=lambda: found.append(learner._info()))
+  try:
+    taking.start()
+    assert inserted.wait(10)
+    reading.start()
+    reading.join(0.2)  # it waits until the steps are counted, or it would be over
+  finally:
+    counted.set()
+    for thread in (taking, reading):
+      thread.join(10)
+    run.close()
+  assert (found[0]["replay_inserted"], found[0]["steps"]) in ((0, 0), (1, 4))
 
 
 def _report(learner, **values):
