@@ -24,6 +24,7 @@ def main() -> None:
     "nerf_nav",
     driver=chosen.make,
     image_size=chosen.image_size or (30, 40),
+    camera=chosen.camera,
     seconds=arguments.seconds,
     seed=3,
     video=arguments.out,

@@ -56,6 +56,7 @@ def run(arguments: Arguments) -> None:
     driver=chosen.make,
     seconds=arguments.seconds,
     image_size=chosen.image_size or (height, height * 4 // 3),
+    camera=chosen.camera,
     pushes=arguments.pushes,
     seed=arguments.seed,
     video=arguments.video,

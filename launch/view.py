@@ -56,6 +56,7 @@ def run(arguments: Arguments) -> None:
       scene=arguments.bundle,
       drivers={chosen.name: chosen.make} | SCRIPTED,
       image_size=chosen.image_size or (30, 40),
+      camera=chosen.camera,
       host=host,
       port=port,
     )

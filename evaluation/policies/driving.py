@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf2real.agents.dmpo.policy import belief_plot
+from nerf2real.agents.environments.loading import camera_settings
 from nerf2real.core.floor_map import Extent
 from nerf2real.evaluation.plants.plant import Sight
 from nerf2real.evaluation.policies.learned import LearnedPolicy
@@ -46,6 +47,7 @@ class Chosen(NamedTuple):
   name: str
   make: MakeDriver
   image_size: tuple[int, int] | None  # of the pictures that it needs; None: of any size
+  camera: Any = None  # the `CameraSettings` that it was trained with; None: the suite's own
 
 
 def choose_driver(name: str, *, task: str, seed: int = 0) -> Chosen:
@@ -58,6 +60,7 @@ def choose_driver(name: str, *, task: str, seed: int = 0) -> Chosen:
 
   Raises:
     ValueError: There is no such policy.
+    OSError: The file of the lens that it was trained with cannot be read.
   """
   if name in WALKERS:
     name = WALKER
@@ -65,4 +68,9 @@ def choose_driver(name: str, *, task: str, seed: int = 0) -> Chosen:
     return Chosen(name, SCRIPTED[name], None)
   folder: Path = policy_folder(name, task=task)
   policy = LearnedPolicy(folder, seed=seed, stochastic=False)
-  return Chosen(policy.name, lambda built: LearnedDriver(built, policy), policy.image_size)
+  return Chosen(
+    policy.name,
+    lambda built: LearnedDriver(built, policy),
+    policy.image_size,
+    camera_settings(policy.trained_on),
+  )

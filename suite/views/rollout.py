@@ -9,6 +9,7 @@ from rich.progress import track
 from nerf2real import suite
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.randomisation.draws import RandomisationSettings
+from nerf2real.suite.sensors.camera import CameraSettings
 from nerf2real.suite.tasks.base import Outcome
 from nerf2real.suite.views.drivers import MakeDriver, Walking, move_on
 from nerf2real.suite.views.film import Film, describe, open_film
@@ -22,6 +23,7 @@ def run_episodes(
   driver: MakeDriver = Walking,
   seconds: float = 10.0,
   image_size: tuple[int, int] = (60, 80),
+  camera: CameraSettings | None = None,
   seed: int = 0,
   pushes: bool = False,
   video: Path | None = None,
@@ -35,6 +37,7 @@ def run_episodes(
     driver: Makes what acts.
     seconds: Length of the run, over as many episodes as it takes [s].
     image_size: Height and width of the robot's picture [pixel].
+    camera: Of the robot; the suite's own if None.
     seed: Of the episodes.
     pushes: Whether the robot is pushed at random, as in training.
     video: Where to write a film (.mp4, .webp, .gif); None writes none.
@@ -45,6 +48,7 @@ def run_episodes(
     effects=effects,
     random=seed,
     image_size=image_size,
+    camera=camera,
     randomisation=RandomisationSettings(pushes=pushes),
   )
   timestep = environment.reset()

@@ -20,6 +20,7 @@ from nerf2real.suite import loading
 from nerf2real.suite.op3 import constants, op3
 from nerf2real.suite.randomisation.draws import RandomisationSettings
 from nerf2real.suite.scene import open_scene
+from nerf2real.suite.sensors.camera import CameraSettings
 from nerf2real.suite.views.drivers import SCRIPTED, Driver, MakeDriver, move_on
 from nerf2real.suite.views.third_person import best_angles, clear_distance, direction
 from nerf2real.suite.views.viewer_elements import bars, geom_mesh
@@ -307,6 +308,7 @@ def view_task(
   scene: Path | None = None,
   drivers: Mapping[str, MakeDriver] = SCRIPTED,
   image_size: tuple[int, int] = (30, 40),
+  camera: CameraSettings | None = None,
   host: str = "127.0.0.1",
   port: int = 8080,
 ) -> TaskViewer:
@@ -317,6 +319,7 @@ def view_task(
     scene: Folder of a scene bundle; None is the built-in room.
     drivers: What may act, by name; the first one does.
     image_size: Height and width of the robot's picture [pixel].
+    camera: Of the robot; the suite's own if None.
     host: Address to serve on.
     port: Port to serve on.
   """
@@ -327,6 +330,7 @@ def view_task(
     scene=bundle,
     renderer=renderer,
     image_size=image_size,
+    camera=camera,
     time_limit=_TIME_LIMIT,
     randomisation=RandomisationSettings(pushes=False),  # by hand only
   )

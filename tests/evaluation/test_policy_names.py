@@ -50,7 +50,7 @@ def test_shipped_policy_is_found_where_it_is_dropped(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["walker", "gait"])
 def test_the_walker_has_two_names(name):
-  assert choose_driver(name, task="nerf_nav") == ("walker", drivers.Walking, None)
+  assert choose_driver(name, task="nerf_nav") == ("walker", drivers.Walking, None, None)
 
 
 class _Task:
