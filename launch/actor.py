@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # NumPy is loaded after the environment is set
   from nerf2real.agents.link.client import ActorLink
   from nerf2real.agents.processes.joining import JoinedProcess
 
-_EVALUATOR_SEED = 1_000_000  # far from the actors' seeds
+_EVALUATOR_SEED = 1_000_000  # else actor 0's: NumPy's SeedSequence((s,)) is that of (s, 0, 0, 0)
 _ENVIRONMENT = {
   **command.NOT_DRAWING,
   **command.ONE_THREAD,
@@ -39,8 +39,8 @@ class Arguments:
   """The learner or router to join, such as tcp/127.0.0.1:7447."""
   index: int = 0
   """Number of this process, for its seed."""
-  seed: int = 0
-  """The run's seed."""
+  seed: int | None = None
+  """Seed in place of the run's, which the learner says."""
   evaluate: bool = False
   """Be the evaluator."""
   wait: float = 120.0
@@ -101,8 +101,9 @@ def _process(link: "ActorLink", arguments: Arguments, stopped: threading.Event) 
   from nerf2real.agents.distill.settings import KIND
   from nerf2real.agents.processes.joining import wait_for
 
-  seed, index = arguments.seed, arguments.index
   description = wait_for(link.status, stopped)["description"]
+  index = arguments.index
+  seed = description["seed"] if arguments.seed is None else arguments.seed
   if description.get("kind") == KIND:
     from nerf2real.agents.distill.collecting.collector import Collector
     from nerf2real.agents.distill.collecting.evaluator import Evaluator

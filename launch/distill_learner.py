@@ -58,8 +58,9 @@ class Arguments:
   """Training time over all parts of the run [min]."""
   keep_minutes: float | None = None
   """Training time between students that are kept in the run's policy/ beside the newest [min]."""
-  seed: int = 0
-  """Seed of first weights, augmentation and sampling."""
+  seed: int | None = None
+  """Seed of first weights, augmentation, sampling and, with a collector's number, of its episodes;
+  0, or a resumed run's own, if not given."""
   threads: int = 1
   """Processor threads of the updates."""
   resume: bool = False
@@ -128,7 +129,7 @@ def _distil(arguments: Arguments) -> None:
     settings = settings_of(arguments)
     sessions.check_listening(arguments.listen, arguments.link)
     if arguments.relabel is not None and not (arguments.run / STATE).exists():
-      relabel_for(settings, arguments.relabel, arguments.run / "data", seed=arguments.seed)
+      relabel_for(settings, arguments.relabel, arguments.run / "data", seed=arguments.seed or 0)
     learner = Learner(
       settings,
       arguments.run,

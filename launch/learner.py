@@ -51,8 +51,9 @@ class Arguments:
   given."""
   set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], _ASSIGNMENT] = ()
   """Changes a setting of the agent, such as network.vmax=10; may be repeated."""
-  seed: int = 0
-  """Seed of parameters, sampling and, with an actor's number, of its episodes."""
+  seed: int | None = None
+  """Seed of parameters, sampling and, with an actor's number, of its episodes; 0, or a resumed
+  run's own, if not given."""
   max_env_steps: int | None = None
   """Environment steps of the run; until it is stopped if not given."""
   minutes: float | None = None
@@ -116,6 +117,16 @@ def agent_settings(arguments: Arguments) -> tuple[str, configs.DmpoConfig]:
   return environment, configs.override(config, dict(map(_assignment, arguments.set)))
 
 
+def seed_of(arguments: Arguments) -> int:
+  """Returns the run's seed: the one given, or else a resumed run's own, or 0."""
+  from nerf2real.agents.processes.checkpoints import read_info
+
+  if arguments.seed is not None:
+    return arguments.seed
+  info = read_info(arguments.run) if arguments.resume else None
+  return 0 if info is None else int(info.get("seed", 0))
+
+
 def set_threads(count: int) -> None:
   """Limits XLA's threads on the processor; to be called before the first computation."""
   os.environ.setdefault("NPROC", str(count))  # size of XLA's thread pool
@@ -158,9 +169,11 @@ def _learn(arguments: Arguments) -> None:
     environment, config = agent_settings(arguments)
     if arguments.connect is None:
       sessions.check_listening(arguments.listen, arguments.link)
-    names = {field.name for field in dataclasses.fields(RunSettings)} - {"environment"}
+    names = {field.name for field in dataclasses.fields(RunSettings)} - {"environment", "seed"}
     settings = RunSettings(
-      environment=environment, **{name: getattr(arguments, name) for name in names}
+      environment=environment,
+      seed=seed_of(arguments),
+      **{name: getattr(arguments, name) for name in names},
     )
     learner = Learner(
       settings,

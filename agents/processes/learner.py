@@ -129,7 +129,6 @@ class Learner:
         "evaluation_environment": settings.evaluation_env or evaluation_name(settings.environment),
         "evaluation_period": settings.evaluation_period,
         "evaluation_episodes": settings.evaluation_episodes,
-        "max_env_steps": settings.max_env_steps,
       },
     )
     self._publish()
@@ -293,7 +292,6 @@ class Learner:
     return {
       "environment": self._settings.environment,
       "config": to_plain(self._config),
-      "layout": to_plain(self.layout),
       "seed": self._settings.seed,
       "steps": steps,
       "updates": updates,

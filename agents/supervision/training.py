@@ -58,8 +58,8 @@ class TrainingSettings:
   """Environment steps of the run; until it is stopped if not given."""
   preset: str | None = None
   """Settings of the agent to start from: paper, state, ...; "paper" if not given."""
-  seed: int = 0
-  """Seed of the run."""
+  seed: int | None = None
+  """Seed of the run; 0, or a resumed run's own, if not given."""
   resume: bool = False
   """Continue from the newest checkpoint."""
   evaluator: bool = True
@@ -109,12 +109,11 @@ def make_jobs(
     actor: how an actor joins, such as ("--connect", ...).
     forwarded: further arguments of the learner, such as ("--set", "batch_size=16").
   """
-  seed = ["--seed", str(settings.seed)]
-  own = [*learner, *seed, "--run", str(settings.run), *forwarded]
-  for name in ("env", "preset", "max_env_steps"):
+  own = [*learner, "--run", str(settings.run), *forwarded]
+  for name in ("env", "preset", "max_env_steps", "seed"):
     if getattr(settings, name) is not None:
       own += [f"--{name.replace('_', '-')}", str(getattr(settings, name))]
-  common = [*actor, *seed, "--wait", str(_JOIN_TIMEOUT)]
+  common = [*actor, "--wait", str(_JOIN_TIMEOUT)]  # the learner says the seed
   roles = {f"actor-{i}": ["--index", str(i)] for i in range(settings.actors)}
   if settings.evaluator:
     roles["evaluator"] = ["--evaluate"]

@@ -31,6 +31,8 @@ class Counters:
   """s of training, over all parts of the run."""
   begun: int | None = None
   """Frames at which the run's first own student was published."""
+  seed: int = 0
+  """The run's."""
 
 
 def save_state(path: Path, state: TrainingState, counters: Counters) -> None:

@@ -21,7 +21,13 @@ import numpy as np
 from nerf2real.agents.distill import settings as stages
 from nerf2real.agents.distill.dataset import Dataset
 from nerf2real.agents.distill.learning.beginning import begin_with
-from nerf2real.agents.distill.learning.checkpoint import STATE, Counters, load_state, save_state
+from nerf2real.agents.distill.learning.checkpoint import (
+  STATE,
+  Counters,
+  load_counters,
+  load_state,
+  save_state,
+)
 from nerf2real.agents.distill.learning.training import Trainer
 from nerf2real.agents.distill.schedule import BORROWED, stage_at
 from nerf2real.agents.distill.settings import SETTINGS, DistillSettings
@@ -60,7 +66,7 @@ class Learner:
     *,
     endpoint: str,
     link: sessions.LinkSettings,
-    seed: int,
+    seed: int | None,
     minutes: float,
     resume: bool,
   ):
@@ -71,7 +77,7 @@ class Learner:
       run: the run's folder.
       endpoint: where to listen.
       link: the link's settings.
-      seed: of first weights, augmentation and sampling.
+      seed: of first weights, augmentation and sampling; None: 0, or a continued run's own.
       minutes: training time over all parts of the run [min].
       resume: continues the run in the folder.
 
@@ -80,13 +86,16 @@ class Learner:
         of other observations or actions.
       LinkError: the endpoint is taken, or open to the network without users.
     """
-    self._settings, self._run, self._minutes, self._seed = settings, run, minutes, seed
+    self._settings, self._run, self._minutes = settings, run, minutes
     if (run / STATE).exists() != resume:
       raise ValueError(
         f"{run} holds no run to continue: leave --resume out."
         if resume
         else f"{run} holds a run already: continue it with --resume, or take another folder."
       )
+    counters = load_counters(run / STATE) if resume else Counters()
+    seed = self._seed = counters.seed if seed is None else seed
+    self._counters = dataclasses.replace(counters, seed=seed)
     environment = make_environment(settings.environment, seed=seed)
     self._layout = Layout.of(environment)
     environment.close()
@@ -98,9 +107,8 @@ class Learner:
     )
     self._times = StageTimes()
     self._trainer = Trainer(settings, self._layout, self._data, seed=seed, times=self._times)
-    self._counters = Counters()
     if resume:
-      self._trainer.state, self._counters = load_state(run / STATE, like=self._trainer.state)
+      self._trainer.state, _ = load_state(run / STATE, like=self._trainer.state)
     borrowed = None
     if settings.init_from and self._counters.begun is None:  # it drives from the first frame on
       check_beginning(settings.init_from, self._layout)
@@ -138,6 +146,7 @@ class Learner:
         "settings": to_plain(settings),
         "layout": to_plain(self._layout),
         "kind": stages.KIND,
+        "seed": seed,
         "begin_steps": self._data.frames,
         "begun": self._counters.begun,
       },

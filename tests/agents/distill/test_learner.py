@@ -180,10 +180,10 @@ def make_learner(tmp_path, monkeypatch):
   for number in (1, 2):
     data.insert({n: rng.random((20, *s)).astype(d) for n, (s, d) in kept.items()}, 7, number)
 
-  def make(*, resume, **changes):
+  def make(*, resume, seed=0, **changes):
     found = dataclasses.replace(TINY, init_from=str(source), **changes)
     return Learner(
-      found, run, endpoint="", link=sessions.LinkSettings(), seed=0, minutes=1.0, resume=resume
+      found, run, endpoint="", link=sessions.LinkSettings(), seed=seed, minutes=1.0, resume=resume
     )
 
   return make
@@ -193,6 +193,13 @@ def test_a_run_goes_on_when_its_last_frame_is_there(make_learner):
   learner = make_learner(resume=False, max_frames=40)
   assert learner._data.frames == 40
   assert not learner._link.limiter.finished  # or the evaluator would leave
+
+
+def test_a_resumed_run_keeps_its_seed(make_learner):
+  assert make_learner(resume=False, seed=5)._seed == 5
+  for given, expected in ((None, 5), (3, 3), (None, 3)):
+    learner = make_learner(resume=True, seed=given)
+    assert learner._seed == learner._counters.seed == expected
 
 
 def test_a_policy_of_other_observations_is_refused_with_what_differs(make_learner, tmp_path):

@@ -66,6 +66,7 @@ def description(environment, name, **changes):
     "evaluation_environment": name,
     "config": to_plain(settings),
     "layout": to_plain(Layout.of(environment)),
+    "seed": 0,
     "begin_steps": 0,
     "evaluation_period": 100,
     "evaluation_episodes": None,

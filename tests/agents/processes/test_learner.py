@@ -22,6 +22,7 @@ from nerf2real.agents.processes.learner import Learner, LearnerError
 from nerf2real.agents.processes.settings import RunSettings
 from nerf2real.agents.supervision.training import free_port
 from nerf2real.core.serialization import to_plain
+from nerf2real.launch import learner as command
 from tests.agents.processes.stubs import documented
 
 ENVIRONMENT = "dm_control:cartpole:swingup"
@@ -311,6 +312,13 @@ def test_a_folder_that_holds_a_run_is_resumed_or_refused(finished):
   with pytest.raises(ValueError, match="holds a run: add --resume"):
     Run(folder)
   assert read_info(folder) == before
+
+
+def test_a_resumed_run_keeps_its_seed(tmp_path):
+  Run(tmp_path, seed=5).close()
+  assert command.seed_of(command.Arguments(run=tmp_path, resume=True)) == 5
+  assert command.seed_of(command.Arguments(run=tmp_path, resume=True, seed=3)) == 3
+  assert command.seed_of(command.Arguments(run=tmp_path)) == 0
 
 
 def test_another_price_of_updates_holds_from_where_a_run_is_resumed(tmp_path):

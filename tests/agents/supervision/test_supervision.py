@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from nerf2real.agents.supervision import training
 from nerf2real.agents.supervision.statuses import NOT_SAVED, REFUSED
 from nerf2real.agents.supervision.supervisor import Job, LocalProcess, Supervisor
 from tests.agents.processes.test_runs import CARTPOLE, SMALL, finish, rows, start, wait_until
@@ -89,6 +90,15 @@ def test_what_a_save_that_was_cut_off_leaves_is_nothing_to_go_on_from(tmp_path):
   (tmp_path / "newest-0000000000-000000000000.orbax-checkpoint-tmp").mkdir()
   assert run.die(0, -signal.SIGKILL) is None
   assert run.started[2].job == LEARNER
+
+
+@pytest.mark.parametrize(("seed", "said"), [(None, ()), (5, ("--seed", "5"))])
+def test_a_seed_is_said_to_the_learner_alone_and_where_one_was_given(seed, said):
+  settings = training.TrainingSettings(run=Path("x"), resume=True, seed=seed)
+  scripts = training.Scripts(learner=Path("learner.py"), actor=Path("actor.py"))
+  learner, others = training.make_jobs(settings, scripts, learner=(), actor=(), forwarded=())
+  assert learner.arguments == ("--run", "x", *said)
+  assert not any("--seed" in job.arguments for job in others)
 
 
 def test_the_first_start_resumes_where_that_was_said(tmp_path):
