@@ -40,11 +40,17 @@ class Trials(dm_env.Environment):
     """
     self._trials, self._seed, self._given = tuple(trials), seed, 0
 
-  def spread(self, count: int, *, shift: int = 0) -> list[Any]:
-    """Returns `count` trials, evenly spread over the protocol; another shift gives others."""
-    total = len(self._trials)
+  def spread(self, count: int, *, without: Sequence[Any] = ()) -> list[Any]:
+    """Returns `count` trials, or all there are, evenly spread over the protocol.
+
+    Args:
+      count: how many.
+      without: trials that are left out, unless these are all.
+    """
+    left = [trial for trial in self._trials if trial not in without] or list(self._trials)
+    total = len(left)
     count = min(count, total)
-    return [self._trials[(index * total // count + shift) % total] for index in range(count)]
+    return [left[index * total // count] for index in range(count)]
 
   def reset(self) -> dm_env.TimeStep:
     again, index = divmod(self._given, len(self._trials))

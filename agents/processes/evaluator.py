@@ -38,10 +38,12 @@ class EvaluatorProcess(PolicyProcess):
     wanted = self.description["evaluation_episodes"]
     default = _EPISODES if self._trials is None else (self._trials.count + 1) // 2
     self._episodes = default if wanted is None else wanted
-    # The trials that evaluate, and others that confirm.
-    self._subsets = [
-      [] if self._trials is None else self._trials.spread(self._episodes, shift=s) for s in (0, 1)
-    ]
+    # The trials that evaluate, and others that confirm, with other draws where they are too few.
+    self._subsets: tuple[list[Any], list[Any]] = ([], [])
+    if self._trials is not None:
+      self._episodes = min(self._episodes, self._trials.count)
+      first = self._trials.spread(self._episodes)
+      self._subsets = (first, self._trials.spread(self._episodes, without=first))
 
   def run(self) -> None:
     """Evaluates until the run is over or `stop` is called.
@@ -95,8 +97,7 @@ class EvaluatorProcess(PolicyProcess):
     results: list[dict[str, Any]] = []
     if self._trials is not None:
       self._trials.choose(trials, seed=seed)
-    count = len(trials) or self._episodes
-    while len(results) < count:
+    while len(results) < self._episodes:
       if self._stop.is_set():
         return None
       results.append(acting.run_episode(self.agent, self.environment))

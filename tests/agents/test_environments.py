@@ -67,7 +67,11 @@ def test_trials_of_the_protocol_are_set_up_and_seeded():
   assert wrapped.count == 54
   listed = protocols.navigation()
   assert wrapped.spread(27) == [t for t in listed if t.trial == 0]
-  assert wrapped.spread(27, shift=1) == [t for t in listed if t.trial == 1]
+  assert wrapped.spread(27, without=wrapped.spread(27)) == [t for t in listed if t.trial == 1]
+  most = wrapped.spread(36)
+  assert len(most) == 36
+  assert wrapped.spread(36, without=most) == [t for t in listed if t not in most]
+  assert wrapped.spread(54, without=listed) == list(listed)
   assert wrapped.spread(99) == list(listed)
   other.choose(listed[7:8], seed=5)
   second.reset()

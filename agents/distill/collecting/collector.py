@@ -8,6 +8,7 @@ import logging
 import time
 
 import numpy as np
+import zenoh
 
 from nerf2real.agents.distill.collecting.episodes import EpisodeRunner
 from nerf2real.agents.distill.schedule import BORROWED, may_collect, mixture_at, push_level, pushed
@@ -16,6 +17,7 @@ from nerf2real.agents.distill.teacher import make_teacher
 from nerf2real.agents.dmpo.policy.acting import task_of
 from nerf2real.agents.dmpo.policy.inference import Policy
 from nerf2real.agents.link.client import ActorLink
+from nerf2real.agents.link.schema import MessageError
 from nerf2real.agents.processes.joining import AWAY_POLL, JoinedProcess, make_known_environment
 from nerf2real.core.serialization import from_plain
 
@@ -58,6 +60,8 @@ class Collector(JoinedProcess):
         try:
           self._episode(frames)
           self._failures.reset()
+        except (MessageError, zenoh.ZError):  # the link failed, not the episode
+          raise
         except Exception as error:
           self._failures.add(error)
     finally:

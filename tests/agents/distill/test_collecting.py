@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from nerf2real.agents.distill import schedule, settings
-from nerf2real.agents.distill.collecting import episodes, evaluator
+from nerf2real.agents.distill.collecting import collector, episodes, evaluator
 from nerf2real.agents.distill.settings import MixtureSettings
 from nerf2real.agents.distill.teacher import Label
 from nerf2real.agents.dmpo.policy.inference import PolicyState, PolicyStep
 from nerf2real.agents.dmpo.specs import Layout
 from nerf2real.agents.environments.loading import make_environment
+from nerf2real.agents.link.schema import MessageError
 from nerf2real.agents.processes import joining
 from nerf2real.suite import protocols
 
@@ -100,6 +101,22 @@ def test_an_evaluation_that_fails_is_followed_by_another(monkeypatch):
   with pytest.raises(joining.EpisodesFailed, match="5 episodes in a row failed.*ZeroDivision"):
     found.run()
   assert reports == [{"failed_episode": 1}] * 5
+
+
+def test_a_failing_link_is_no_failed_episode():
+  reports = []
+  found = collector.Collector.__new__(collector.Collector)
+  found.link = SimpleNamespace(report=reports.append, drain=lambda timeout: None)
+  found._failures, found._stop = joining.Failures(found.link), threading.Event()
+  found._ask = lambda: 0
+
+  def episode(frames):
+    raise MessageError("refused")
+
+  found._episode = episode
+  with pytest.raises(MessageError, match="refused"):
+    found.run()
+  assert reports == []
 
 
 def test_trials_during_a_run_are_not_those_that_are_reported():

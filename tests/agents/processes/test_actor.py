@@ -1,6 +1,7 @@
 """Actor and evaluator without a network: seeds, failing episodes, trials, confirmation."""
 
 import collections
+import threading
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from dm_control.rl import control
 
 from nerf2real.agents.environments import loading, trials
 from nerf2real.agents.processes import actor, evaluator, joining
+from nerf2real.launch import actor as command
 from tests.agents.processes.stubs import Reach, StubLink, description, documented
 
 CARTPOLE = "dm_control:cartpole:swingup"
@@ -52,6 +54,14 @@ def test_seed_and_index_decide_the_first_episodes(cartpole):
   ):
     assert not np.array_equal(first[0]["state"], other[0]["state"])
     assert not np.array_equal(first[0]["action"], other[0]["action"])
+
+
+@pytest.mark.parametrize(("given", "seed"), [(None, 5), (3, 3)])
+def test_processes_take_the_seed_that_the_learner_says(cartpole, given, seed):
+  link = StubLink(cartpole | {"seed": 5})
+  arguments = command.Arguments(connect="", index=1, seed=given)
+  found = command._process(link, arguments, threading.Event())
+  assert found.seed == actor.ActorProcess(link, seed=seed, index=1).seed
 
 
 def test_a_failing_episode_is_followed_by_another(reach, caplog):
@@ -123,6 +133,14 @@ def test_success_is_measured_on_the_protocol_and_confirmed_on_fresh_trials(reach
   assert first["length"] == 3.0  # won episodes end at the second of four steps
   process._evaluate(800)
   assert [t.seed for t in reach.seen[8:12]] == [0, 2, 4, 6]  # the same, to be compared
+
+
+def test_most_trials_are_confirmed_on_those_that_are_left(reach, monkeypatch):
+  listed = [Trial(wins=i % 4 == 0, seed=i) for i in range(8)]
+  process, link = _evaluator(reach, monkeypatch, listed, evaluation_episodes=6)
+  process._evaluate(700)
+  assert [t.seed for t in reach.seen] == [0, 1, 2, 4, 5, 6, 3, 7, 3, 7, 3, 7]
+  assert [report["episodes"] for report in link.reports] == [6, 6]
 
 
 def test_only_a_rival_of_the_best_is_confirmed(reach, monkeypatch):
