@@ -32,7 +32,7 @@ class RepeatError(Exception):
 
 
 class OperatedPlant(RobotPlant):
-  """Episodes on a robot. Any key ends one; there is no pose unless an observer gives it."""
+  """Episodes on a robot. Any key ends one; nobody measures its pose."""
 
   name = "robot"
   plant_id = "op3"
@@ -44,7 +44,6 @@ class OperatedPlant(RobotPlant):
     *,
     image_size: tuple[int, int] | None,
     record: Path | None = None,
-    observer: Callable[[], Sight] | None = None,
     ask: Callable[[str], str] | None = None,
     say: Callable[[str], None] = print,
   ):
@@ -56,22 +55,25 @@ class OperatedPlant(RobotPlant):
         what is its own. In a dry run nothing moves, and no verdict is asked for.
       image_size: Height and width of the policy's picture; None for no camera.
       record: Where the run is recorded; not recorded if None.
-      observer: Motion capture, if there is any.
       ask: Puts a question to the operator and returns the answer; None: at this terminal.
       say: Shows the operator a line.
     """
     super().__init__(scene, settings, record=record)
-    robot: Any = settings.robot
-    connection = Connection(port=robot) if isinstance(robot, str) else robot
-    own = {name: getattr(settings, name) for name in ("camera", "offsets", "lens")}
-    given = {name: value for name, value in own.items() if value is not None}
-    connection = dataclasses.replace(connection, **given)
-    if ask is None:  # through the terminal that the stop key is read from, never beside it
-      terminal = Terminal()
-      connection = dataclasses.replace(connection, operator=terminal)
-      ask = terminal.ask
-    self._observer, self._ask, self._say = observer, ask, say
-    try:
+    self._say, self._dry_run, self._steps = say, settings.dry_run, 0
+    with contextlib.ExitStack() as undone:  # unless all succeeds
+      undone.callback(self._abandon_recording)
+      robot: Any = settings.robot
+      connection = Connection(port=robot) if isinstance(robot, str) else robot
+      own = {name: getattr(settings, name) for name in ("camera", "offsets", "lens")}
+      given = {name: value for name, value in own.items() if value is not None}
+      connection = dataclasses.replace(connection, **given)
+      if ask is None:  # through the terminal that the stop key is read from, never beside it
+        terminal = Terminal()
+        connection = dataclasses.replace(connection, operator=terminal)
+        ask = terminal.ask
+      if connection.operator is not None:  # a terminal that was taken is given back
+        undone.callback(connection.operator.close)
+      self._ask = ask
       self._environment = real.load(
         TASKS[self.protocol],
         robot=connection,
@@ -81,17 +83,12 @@ class OperatedPlant(RobotPlant):
         settings=RobotSettings(dry_run=settings.dry_run),
         recorder=self._recorder,
       )
-    except BaseException:
-      if connection.operator is not None:  # a terminal that was taken is given back
-        connection.operator.close()
-      self._abandon_recording()
-      raise
-    if isinstance(self._environment.bus.clock, RealClock):
-      prefer_this_thread(acting=True)
-    self._dry_run = settings.dry_run
-    self._steps = 0
-    if scene.marker is not None:
-      self._say(f"Places are on the scene's map. {scene.marker.words}")
+      undone.callback(self._environment.close)
+      if isinstance(self._environment.bus.clock, RealClock):
+        prefer_this_thread(acting=True)
+      if scene.marker is not None:
+        self._say(f"Places are on the scene's map. {scene.marker.words}")
+      undone.pop_all()
 
   def start(self, trial: Trial) -> dm_env.TimeStep:
     pose, ball = self._places(trial)
@@ -123,16 +120,12 @@ class OperatedPlant(RobotPlant):
     return self._environment.step(action)
 
   def sight(self) -> Sight:
-    if self._observer is not None:
-      return self._observer()
     pose = self._start_pose if self._steps == 0 else None
     return Sight(pose, None, False, self._stopped_by_a_fall())
 
   def judge(self) -> tuple[str, float | None, str] | None:
     if self._dry_run:
       return episodes.STOPPED, None, f"dry run; {self._environment.timing.line()}"
-    if self._observer is not None:
-      return None
     time = self._steps * constants.CONTROL_TIMESTEP
     while True:
       answer = self._ask(_QUESTION).strip().lower()[:1]
@@ -145,7 +138,9 @@ class OperatedPlant(RobotPlant):
     return outcome, time if outcome == episodes.SUCCESS else None, self.stopped()
 
   def close(self) -> None:
-    self._environment.close()
-    if self._recorder is not None:
-      with contextlib.suppress(OSError):
-        self._recorder.close()
+    try:
+      self._environment.close()
+    finally:
+      if self._recorder is not None:
+        with contextlib.suppress(OSError):
+          self._recorder.close()

@@ -1,5 +1,6 @@
 """The virtual robot as a plant: reached over its wires, placed and watched as by an observer."""
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -90,35 +91,34 @@ class RehearsedPlant(RobotPlant):
     robot_seed = settings.robot_seed[0]
     self.plant_id = f"robot {robot_seed}"
     self._placing = settings.placing
-    self._intruder = make_intruder(self, self._starts)
-    if altered:
-      self.plant_id += ", altered"
-    known = swaps.PHYSICS in settings.swap
-    build = undeclared.build(None if known else robot_seed, altered, age=session)
-    simulated = simulated or CameraSettings()
-    camera = swaps.camera_on_the_robot(build.camera, simulated, settings.swap)
-    view = None
-    if image_size is not None and swaps.PICTURE in settings.swap:
-      view = swaps.field_view(scene, image_size, camera.lens)
-    self.robot = VirtualRobot(
-      world=world,
-      seed=robot_seed,
-      hidden=build.hidden,
-      stepped=True,
-      camera=None if image_size is None else camera,
-      ball=self.protocol == BALL,
-      furnish=None if self._intruder is None else self._intruder.add_to_spec,
-      view=view,
-    )
-    if self._intruder is not None:
-      self._intruder.bind(self.robot.body.model)
     self._camera: CoveredCamera | None = None
-    try:
+    with contextlib.ExitStack() as undone:  # unless all succeeds
+      undone.callback(self._abandon_recording)
+      self._intruder = make_intruder(self, self._starts)
+      if altered:
+        self.plant_id += ", altered"
+      known = swaps.PHYSICS in settings.swap
+      build = undeclared.build(None if known else robot_seed, altered, age=session)
+      simulated = simulated or CameraSettings()
+      camera = swaps.camera_on_the_robot(build.camera, simulated, settings.swap)
+      view = None
+      if image_size is not None and swaps.PICTURE in settings.swap:
+        view = swaps.field_view(scene, image_size, camera.lens)
+      self.robot = VirtualRobot(
+        world=world,
+        seed=robot_seed,
+        hidden=build.hidden,
+        stepped=True,
+        camera=None if image_size is None else camera,
+        ball=self.protocol == BALL,
+        furnish=None if self._intruder is None else self._intruder.add_to_spec,
+        view=view,
+      )
+      undone.callback(self.robot.close)
+      if self._intruder is not None:
+        self._intruder.bind(self.robot.body.model)
       self._environment = self._connect(image_size, settings.time_limit)
-    except BaseException:
-      self.robot.close()
-      self._abandon_recording()
-      raise
+      undone.pop_all()
 
   def _connect(self, image_size: tuple[int, int] | None, time_limit: float | None) -> Any:
     connection = self.robot.connection()
@@ -179,7 +179,8 @@ class RehearsedPlant(RobotPlant):
     return Sight(truth.pose, ball, touched or self._hit, bool(fallen))
 
   def close(self) -> None:
-    self._environment.close()
-    self.robot.close()
-    if self._recorder is not None:
-      self._recorder.close()
+    with contextlib.ExitStack() as endings:  # from the last one to the first
+      if self._recorder is not None:
+        endings.callback(self._recorder.close)
+      endings.callback(self.robot.close)
+      endings.callback(self._environment.close)

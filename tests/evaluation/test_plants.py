@@ -9,7 +9,7 @@ import pytest
 
 from nerf2real import suite
 from nerf2real.evaluation import runner
-from nerf2real.evaluation.plants import making, operated, perturbations
+from nerf2real.evaluation.plants import making, operated, perturbations, rehearsed, robot_plant
 from nerf2real.evaluation.plants import plant as plants
 from nerf2real.evaluation.plants.rehearsed import RehearsedPlant, put_down
 from nerf2real.evaluation.plants.simulated import SimulatedPlant
@@ -285,3 +285,83 @@ def test_a_robot_that_is_not_there_leaves_terminal_and_folder_as_they_were(
   with pytest.raises(OSError, match="cannot be opened"):
     operated.OperatedPlant(scene, settings, image_size=None, record=tmp_path / "log.mcap")
   assert len(given_back) == 1 and list(tmp_path.iterdir()) == []
+
+
+class _Recorder:
+  """Keeps how its recording ended."""
+
+  def __init__(self, path):
+    self.ended = []
+
+  def abandon(self):
+    self.ended.append("abandoned")
+
+  def close(self):
+    self.ended.append("closed")
+
+  def __getattr__(self, name):
+    return lambda *args, **kwargs: None
+
+
+@pytest.fixture
+def recorders(monkeypatch):
+  """Recorders that were opened, in place of processes."""
+  opened = []
+
+  def make(path):
+    opened.append(_Recorder(path))
+    return opened[-1]
+
+  monkeypatch.setattr(robot_plant, "Recorder", make)
+  return opened
+
+
+def _fail(*_, **__):
+  raise RuntimeError("the cable was pulled")
+
+
+@pytest.mark.parametrize(
+  ("module", "name"),
+  [
+    (rehearsed, "make_intruder"),
+    (rehearsed, "VirtualRobot"),
+    (rehearsed.real, "load"),
+    (operated, "Connection"),
+    (operated, "Terminal"),
+  ],
+)
+def test_what_fails_at_the_start_leaves_no_recording_open(
+  scene, monkeypatch, tmp_path, recorders, module, name
+):
+  monkeypatch.setattr(module, name, _fail)
+  make = operated.OperatedPlant if module is operated else RehearsedPlant
+  with pytest.raises(RuntimeError, match="cable was pulled"):
+    make(scene, EvaluationSettings(), image_size=None, record=tmp_path / "log.mcap")
+  assert [recorder.ended for recorder in recorders] == [["abandoned"]]
+
+
+def test_robot_and_recording_are_closed_where_the_environment_fails_to(
+  scene, monkeypatch, tmp_path, recorders
+):
+  virtual = RehearsedPlant(
+    scene, EvaluationSettings(), image_size=None, record=tmp_path / "virtual.mcap"
+  )
+  robot = VirtualRobot(world="floor", seed=1, stepped=True)
+  operator = operated.OperatedPlant(
+    scene,
+    EvaluationSettings(robot=robot.connection(), camera=None),
+    image_size=None,
+    record=tmp_path / "robot.mcap",
+    ask=lambda question: "",
+    say=lambda text: None,
+  )
+  closed = []
+  monkeypatch.setattr(virtual.robot, "close", lambda: closed.append("robot"))
+  for plant in (virtual, operator):
+    close = plant.environment.close
+    monkeypatch.setattr(plant.environment, "close", lambda close=close: (close(), _fail()))
+    with pytest.raises(RuntimeError, match="cable was pulled"):
+      plant.close()
+  robot.close()
+  assert closed == ["robot"]
+  assert [recorder.ended for recorder in recorders] == [["closed"], ["closed"]]
