@@ -32,7 +32,7 @@ class EvaluationSettings:
   effects: Path | None = None
   """An effects.json for the simulation: what the nominal model lacks."""
   trials: int | None = None
-  """Runs only the first trials of the protocol, spread over it; all if not given."""
+  """Runs so many trials of the protocol, spread over it; all if not given."""
   repetition: int | None = None
   """Runs only this repetition of every start, counted from 0; all if not given."""
   group: str | None = None

@@ -163,7 +163,7 @@ class Camera:
   def set_controls(self, controls: Controls) -> dict[str, Readback]:
     """Changes what is held fixed from now on; returns what the driver made of it.
 
-    A device is reopened by its thread; a network camera at once.
+    It is set at once, in the caller's thread, and again whenever the source is found anew.
     """
     self._asked = controls
     if _is_http(self.source):

@@ -28,7 +28,8 @@ def check_shape(picture: np.ndarray, size: tuple[int, int]) -> None:
   if abs(width * size[0] / height - size[1]) > 0.5:
     raise ValueError(
       f"The camera gives {width} x {height} pixels, which do not shrink to {size[1]} x {size[0]}: "
-      "ask for another capture_size, or calibrate this one."
+      "give another camera, stream or file, of that shape, or a policy with pictures of this shape "
+      "(in Python a device is asked for one by CaptureSettings.capture_size)."
     )
 
 
