@@ -156,11 +156,13 @@ class _Rank(NamedTuple):
 
 
 class _Trials:
-  """Trials of the protocol that walkers are ranked on."""
+  """Trials that walkers are ranked on: neither those that are reported nor those of a search."""
 
   def __init__(self, plant: Plant, scene: Any):
     self._plant, self._scene = plant, scene
-    self.chosen = [trial for _, (_, trial) in choose(plants.trials(NAVIGATION), _TRIALS)]
+    listed = [trial for _, (_, trial) in choose(plants.trials(NAVIGATION), _TRIALS)]
+    unmet = len(plants.trials(NAVIGATION)) + _GENERATIONS  # beyond the seeds of a search
+    self.chosen = [trial._replace(seed=trial.seed + unmet) for trial in other_trials(listed)]
 
   def rank(self, settings: WalkerSettings) -> _Rank:
     ran = [

@@ -7,6 +7,7 @@ import pytest
 
 from nerf2real.agents.distill.teacher import TEACHERS, WalkerTeacher, make_teacher
 from nerf2real.evaluation.loop import teachers
+from nerf2real.evaluation.plants import plant as plants
 from nerf2real.suite.gaits.floor import EmptyFloor
 
 _LOAD = 0.02  # m that the feet must stand to the side of, in these tests
@@ -83,7 +84,20 @@ def test_one_that_copes_standing_taller_is_taken_without_a_fit(monkeypatch, tmp_
 def test_a_fit_meets_no_trial_of_the_protocol(monkeypatch):
   seen = _episodes(monkeypatch, _LOAD)
   teachers.fit(_Plant(), EmptyFloor(), TEACHERS["quick"](), seed=0)
-  from nerf2real.evaluation.plants import plant as plants
+  assert not {trial.seed for trial in seen} & _reported("seed")
 
-  protocol = [trial for _, trial in plants.trials("navigation")]
-  assert not any(trial.seed == other.seed for trial in seen for other in protocol)
+
+def test_a_choice_meets_no_trial_of_the_protocol_and_none_of_the_fit(monkeypatch, tmp_path):
+  seen = _episodes(monkeypatch, 0.0)
+  found = teachers.choose_teacher(tmp_path, tmp_path / "effects.json", EmptyFloor(), seed=0)
+  assert len({trial.seed for trial in seen}) == found.trials
+  assert not {trial.seed for trial in seen} & _reported("seed")
+  assert not {trial.yaw for trial in seen} & _reported("yaw")
+  met = _episodes(monkeypatch, _LOAD)
+  for seed in range(3):
+    teachers.fit(_Plant(), EmptyFloor(), TEACHERS["quick"](), seed=seed)
+  assert not {trial.seed for trial in seen} & {trial.seed for trial in met}
+
+
+def _reported(name):
+  return {getattr(trial, name) for _, trial in plants.trials("navigation")}
