@@ -1,11 +1,11 @@
 """Schedules of a distillation: stages, learning rate, shares of the drivers, forces of pushes."""
 
-import urllib.parse
 from typing import NamedTuple
 
 import numpy as np
 
 from nerf2real.agents.distill.settings import DistillSettings, MixtureSettings
+from nerf2real.agents.environments.loading import with_options
 
 _FINAL_RATE = 0.02  # of the learning rate, at a stage's end
 _NO_PUSH = 1e-6  # N
@@ -72,10 +72,6 @@ def push_level(settings: DistillSettings, frames: int) -> tuple[float, float]:
 
 def pushed(environment: str, forces: tuple[float, float]) -> str:
   """Returns an environment's name with pushes of these forces [N], or with none."""
-  path, _, query = environment.partition("?")
-  options = dict(urllib.parse.parse_qsl(query))
   if forces[1] < _NO_PUSH:
-    options["pushes"] = "false"
-  else:
-    options |= {"pushes": "true", "push_force": f"{forces[0]},{forces[1]}"}
-  return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
+    return with_options(environment, {"pushes": "false"})
+  return with_options(environment, {"pushes": "true", "push_force": f"{forces[0]},{forces[1]}"})

@@ -153,20 +153,25 @@ def evaluation_name(name: str) -> str:
   `launch/evaluate.py` runs it in simulation; scene, lens, effects and all else as in training. For
   other environments: the same.
   """
-  path, _, query = name.partition("?")
-  family, _, task = path.partition(":")
+  family, _, task = name.partition("?")[0].partition(":")
   if family != "suite" or task not in catalogue.PROTOCOLS:
     return name
-  options = dict(urllib.parse.parse_qsl(query))
-  options = {"protocol": catalogue.PROTOCOLS[task][0]} | options | {"pushes": "false"}
-  return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
+  protocol = {"protocol": catalogue.PROTOCOLS[task][0]}
+  return with_options(name, {"pushes": "false"}, defaults=protocol)
 
 
 def in_scene(name: str, scene: str | Path) -> str:
   """The name of a suite's environment that is the same in another scene bundle."""
+  return with_options(name, {"scene": str(scene)})
+
+
+def with_options(
+  name: str, options: Mapping[str, str], *, defaults: Mapping[str, str] | None = None
+) -> str:
+  """The name of an environment with options changed, and others where it has none of its own."""
   path, _, query = name.partition("?")
-  options = dict(urllib.parse.parse_qsl(query)) | {"scene": str(scene)}
-  return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
+  every = {**(defaults or {}), **dict(urllib.parse.parse_qsl(query)), **options}
+  return f"{path}?{urllib.parse.urlencode(every, safe='/,')}"
 
 
 def trials_of(environment: Any) -> Trials | None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import signal
-import urllib.parse
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +9,7 @@ from typing import Any, NamedTuple
 from nerf2real.agents.distill import settings as distillation
 from nerf2real.agents.distill.learning.checkpoint import STATE, load_counters
 from nerf2real.agents.dmpo.policy import export
+from nerf2real.agents.environments.loading import with_options
 from nerf2real.agents.supervision import training
 from nerf2real.evaluation.loop.settings import AUTO, LoopSettings
 from nerf2real.evaluation.loop.teachers import choose_teacher
@@ -35,12 +35,10 @@ def environment_name(settings: LoopSettings, policy: Path | None, effects: Path)
   own = distillation.preset(settings.preset).environment
   if policy is not None:
     own = str(export.read_record(policy)["environment"])
-  path, _, query = own.partition("?")
-  options = dict(urllib.parse.parse_qsl(query))
-  options |= {"effects": str(effects), "draw_effects": "true"}
+  options = {"effects": str(effects), "draw_effects": "true"}
   if settings.scene is not None:
     options["scene"] = str(settings.scene)
-  return f"{path}?{urllib.parse.urlencode(options, safe='/,')}"
+  return with_options(own, options)
 
 
 def train(

@@ -60,6 +60,12 @@ def test_evaluation_is_the_table_s_protocol_without_pushes():
   assert evaluation_name("agents:cue") == "agents:cue"
 
 
+def test_options_of_a_name_are_changed_added_or_left():
+  changed = loading.with_options("suite:x?a=1,2&s=out/b", {"a": "3"}, defaults={"s": "y", "d": "4"})
+  assert changed == "suite:x?s=out/b&d=4&a=3"
+  assert loading.with_options("suite:x", {"a": "1"}) == "suite:x?a=1"
+
+
 def test_trials_of_the_protocol_are_set_up_and_seeded():
   name = "suite:nerf_nav?protocol=navigation&time_limit=0.05"
   first, second = (make_environment(name, seed=5) for _ in range(2))
