@@ -16,10 +16,9 @@ import numpy as np
 
 from nerf2real.agents.distill.teacher import COMMAND_SIZE
 from nerf2real.agents.dmpo.replay.prior import read_arrays, write_layout
-from nerf2real.agents.dmpo.specs import BALL, Layout
+from nerf2real.agents.dmpo.specs import BALL, POSE_SIZE, Layout
 from nerf2real.core import files
 
-POSE_SIZE = 3  # x [m], y [m], yaw [rad]
 BALL_SIZE = 3  # x ahead [m], y to the left [m] of the robot, pan of its head [rad]
 _UNROLL_FIELDS = ("state", "label", "command", "pose", "goal_distance", "ball")
 

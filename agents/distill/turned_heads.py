@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.dmpo.specs import BALL, POSITION, ROTATION, Layout
+from nerf2real.agents.dmpo.specs import BALL, JOINTS, POSITION, ROTATION, Layout
 from nerf2real.suite import specs
 from nerf2real.suite.op3 import constants
 
-_JOINTS = "privileged/joint_positions"
 TILT = constants.JOINT_NAMES.index("head_tilt")
 # Of the way to its target that a servo goes in a control step: a first-order lag, damping / gain.
 _SHARE = 1 - np.exp(-constants.CONTROL_TIMESTEP * constants.POSITION_GAIN / constants.JOINT_DAMPING)
@@ -34,11 +33,11 @@ class TurnedHead:
       episode: its recorded arrays.
     """
     self._task, self._rows = task, episode["privileged"]
-    names = (POSITION, ROTATION, BALL, _JOINTS)
+    names = (POSITION, ROTATION, BALL, JOINTS)
     self._columns = {name: layout.privileged_column(name) for name in names}
     lower, upper = constants.joint_limits()
     self._middle, self._half_range = (lower + upper)[TILT] / 2, (upper - lower)[TILT] / 2
-    self._angle = float(self._read(0, _JOINTS, TILT + 1)[TILT])
+    self._angle = float(self._read(0, JOINTS, TILT + 1)[TILT])
     self._control = (self._angle - self._middle) / self._half_range
     self._angles = np.full(specs.HISTORY, self._angle)
     self._controls = np.full(specs.HISTORY, self._control)
@@ -56,7 +55,7 @@ class TurnedHead:
   def picture(self, step: int) -> np.ndarray:
     """Returns what is seen at a step, uint8 [H, W, 3]."""
     seen = max(0, step - 1)
-    joints = self._read(seen, _JOINTS, len(constants.JOINT_NAMES))
+    joints = self._read(seen, JOINTS, len(constants.JOINT_NAMES))
     joints[TILT] = self._angles[-1]
     ball = self._read(seen, BALL, 3)
     self._task.put_ball(ball[:2], height=ball[2])

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.agents.distill.dataset import BALL_SIZE, POSE_SIZE
+from nerf2real.agents.distill.dataset import BALL_SIZE
 from nerf2real.agents.dmpo.policy.acting import task_of
-from nerf2real.agents.dmpo.specs import BALL, POSITION, ROTATION, Layout
+from nerf2real.agents.dmpo.specs import BALL, JOINTS, POSE_SIZE, POSITION, ROTATION, Layout
 from nerf2real.agents.environments.loading import make_environment
 from nerf2real.core import files
 from nerf2real.core.geometry import rotations
@@ -24,7 +24,6 @@ from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.suite.op3 import constants
 from nerf2real.suite.sensors.light import draw_light
 
-_JOINTS = "privileged/joint_positions"
 _PAN, _TILT = (constants.JOINT_NAMES.index(name) for name in ("head_pan", "head_tilt"))
 _MAX_PAN = 2.3  # rad, drawn up to it; chosen: as far as a search sweeps
 # Chosen: half the picture's width and a little more, so that balls are cut by its sides, too.
@@ -70,7 +69,7 @@ def make_views(
     row = postures[rng.integers(len(postures))].astype(np.float64)
     position, rotation, joints = (
       _part(layout, row, name, size)
-      for name, size in ((POSITION, 3), (ROTATION, 9), (_JOINTS, len(constants.JOINT_NAMES)))
+      for name, size in ((POSITION, 3), (ROTATION, 9), (JOINTS, len(constants.JOINT_NAMES)))
     )
     turned = _turned_to(rotation.reshape(3, 3), place[2])
     position[:2] = place[:2]

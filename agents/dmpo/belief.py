@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from nerf2real.agents.dmpo import networks
 from nerf2real.agents.dmpo.config import NetworkConfig
 from nerf2real.agents.dmpo.shapes import check_shapes
+from nerf2real.agents.dmpo.specs import POSE_SIZE
 
-POSE_SIZE = 3  # x [m], y [m], yaw [rad]
 _MIN_STDDEV = (
   0.01  # m and rad: chosen: far below the error, so that no component collapses onto a state
 )

@@ -16,6 +16,8 @@ PRIVILEGED = "privileged/"
 POSITION = "privileged/robot_position"
 ROTATION = "privileged/robot_rotation"
 BALL = "privileged/ball_position"
+JOINTS = "privileged/joint_positions"
+POSE_SIZE = 3  # x [m], y [m], yaw [rad]
 
 
 class FlatObservation(NamedTuple):
