@@ -11,9 +11,8 @@ import numpy as np
 from scipy import optimize, stats
 
 from nerf2real.evaluation.episodes import Episode
-from nerf2real.evaluation.twin import Interval
+from nerf2real.evaluation.twin import Interval, interval
 
-_TAILS = (2.5, 97.5)  # percentiles of a 95 % interval
 _QUANTILE = float(stats.norm.ppf(0.975))
 
 
@@ -73,8 +72,7 @@ def mean(values: Sequence[float], *, resamples: int = 10_000, seed: int = 0) -> 
   if not len(values):
     return None
   drawn = np.random.default_rng(seed).choice(values, (resamples, len(values))).mean(axis=1)
-  low, high = np.percentile(drawn, _TAILS)
-  return Interval(float(np.mean(values)), float(low), float(high))
+  return interval(float(np.mean(values)), drawn)
 
 
 def success_difference(won: int, lost: int, trials: int) -> Interval:

@@ -117,7 +117,7 @@ def run_trial(
     reached = not failed and bool(plant.reached(sight))
     if reached or failed or timestep.last():
       break
-  outcome, time, detail = _classify(plant, sight, timestep, reached, step)
+  outcome, time, detail = _classify(plant, sight, reached, step)
   judged = plant.judge()
   if judged is not None:
     outcome, time, detail = judged
@@ -139,7 +139,7 @@ def run_trial(
 
 
 def _classify(
-  plant: Plant, sight: Sight, timestep: dm_env.TimeStep, reached: bool, steps: int
+  plant: Plant, sight: Sight, reached: bool, steps: int
 ) -> tuple[str, float | None, str]:
   """Returns outcome, time [s] to the goal and detail."""
   if reached:

@@ -39,7 +39,8 @@ def run(functions: Sequence[Callable[[Say], T]], *, processes: int, say: Say) ->
   running = [_start(*one) for one in itertools.islice(waiting, processes)]
   try:
     while running:
-      for one in [r for r in running if r.messages in wait([r.messages for r in running])]:
+      ready = wait([one.messages for one in running])
+      for one in [one for one in running if one.messages in ready]:
         kind, value = _received(one)
         if kind == _SAID:
           say(value)

@@ -116,8 +116,8 @@ def agreement(pairs: Sequence[Pair], *, resamples: int = 10_000, seed: int = 0) 
   correlations = _correlation(drawn[..., 0], drawn[..., 1])
   differences = (drawn[..., 0] - drawn[..., 1]).mean(axis=1)
   return Agreement(
-    _interval(float(_correlation(*rates.T[:, None])[0]), correlations),
-    _interval(float((rates[:, 0] - rates[:, 1]).mean()), differences),
+    interval(float(_correlation(*rates.T[:, None])[0]), correlations),
+    interval(float((rates[:, 0] - rates[:, 1]).mean()), differences),
   )
 
 
@@ -130,6 +130,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
   return np.where(varied, (a * b).sum(axis=1), np.nan) / np.where(varied, spread, 1.0)
 
 
-def _interval(value: float, drawn: np.ndarray) -> Interval:
+def interval(value: float, drawn: np.ndarray) -> Interval:
+  """Returns a figure with the interval of its resamples [R]; those that are NaN are left out."""
   low, high = np.nanpercentile(drawn, _TAILS)
   return Interval(value, float(low), float(high))

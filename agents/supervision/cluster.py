@@ -184,7 +184,6 @@ def _connect(address: str) -> Any:
       address=None if address == "local" else address,
       log_to_driver=False,
       include_dashboard=False,
-      num_cpus=None,
     )
   except ConnectionError as error:
     raise RunRefusedError(

@@ -89,10 +89,8 @@ class OP3(composer.Robot):
     )
     self._imu = self.torso.add("site", name="imu", pos=constants.IMU_POSITION, size=(0.004,))
     self._imu.group = 4  # hidden in pictures
-    self._gyroscope = self._root.sensor.add("gyro", name="gyroscope", site=self._imu)
-    self._accelerometer = self._root.sensor.add(
-      "accelerometer", name="accelerometer", site=self._imu
-    )
+    self._root.sensor.add("gyro", name="gyroscope", site=self._imu)
+    self._root.sensor.add("accelerometer", name="accelerometer", site=self._imu)
 
   def _add_link(self, link: constants.Link) -> Any:
     """Adds one link with its inertial, joint and geoms; returns the body."""

@@ -26,7 +26,6 @@ CHIP_DELAY = 0.002  # s, data-sheet delay minus that of a first-order low-pass; 
 CHIP_ACCELERATION = 2 * 9.80665  # m/s^2
 CHIP_TURNING_RATE = 32767 / 16.4 * np.pi / 180  # rad/s
 _CHIP_RANGE = np.repeat([CHIP_TURNING_RATE, CHIP_ACCELERATION], 3)
-ACTION_FILTER_STRENGTH = 0.8  # paper, "an exponential filter with strength 0.8"
 MIN_DELAY, MAX_DELAY = 0.010, 0.050  # s, paper, constant over an episode
 JITTER = 0.005  # s, paper
 
@@ -83,7 +82,7 @@ class ExponentialFilter:
   of the new one) hardly smooths, 16 ms. The first is taken.
   """
 
-  def __init__(self, strength: float = ACTION_FILTER_STRENGTH):
+  def __init__(self, strength: float):
     if not 0 <= strength < 1:
       raise ValueError(f"Found filter strength {strength}, expected at least 0 and less than 1.")
     self.strength = strength

@@ -13,6 +13,8 @@ import numpy as np
 
 Array = np.ndarray
 
+# Step along the gradient: how fast the accelerometer corrects the gyroscope. Larger follows the
+# accelerometer (also when the body accelerates), smaller the gyroscope (also its bias).
 BETA = 0.033  # rad/s, Madgwick 2010, section 5: the best value for the IMU form
 SAMPLE_RATE_HZ = 125.0  # paper: "filtered at 125Hz"
 
@@ -24,22 +26,9 @@ class Madgwick:
   (Madgwick's ^S_E q). The heading is not observable and drifts; gravity does not depend on it.
   """
 
-  def __init__(self, sample_rate_hz: float = SAMPLE_RATE_HZ, *, beta: float = BETA):
-    """Creates the filter.
-
-    Args:
-      sample_rate_hz: rate of the updates, Hz.
-      beta: step along the gradient, rad/s: how fast the accelerometer corrects the gyroscope.
-        Larger follows the accelerometer (also when the body accelerates), smaller the gyroscope
-        (also its bias).
-    """
-    if sample_rate_hz <= 0 or beta < 0:
-      raise ValueError(
-        f"Found sample rate {sample_rate_hz} Hz and beta {beta}, expected a positive rate and beta"
-        " of at least 0."
-      )
-    self.period = 1 / sample_rate_hz
-    self.beta = beta
+  def __init__(self) -> None:
+    """Creates the filter; `period` is the time between updates [s]."""
+    self.period = 1 / SAMPLE_RATE_HZ
     self.quaternion = (1.0, 0.0, 0.0, 0.0)
     self._started = False
 
@@ -84,7 +73,7 @@ class Madgwick:
       s3 = 2 * q1 * f0 + 2 * q2 * f1
       length = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2 + s3 * s3)
       if length > 0:
-        step = self.beta / length
+        step = BETA / length
         d0, d1, d2, d3 = d0 - step * s0, d1 - step * s1, d2 - step * s2, d3 - step * s3
     q0, q1, q2, q3 = (
       q0 + d0 * self.period,

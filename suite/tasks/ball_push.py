@@ -19,7 +19,7 @@ from nerf2real.suite.tasks.ball import Ball
 from nerf2real.suite.tasks.base import RobotTask
 from nerf2real.suite.tasks.privileged import Quantity
 from nerf2real.suite.tasks.settings import TaskSettings
-from nerf2real.suite.tasks.workspace import Workspace, find_workspace
+from nerf2real.suite.tasks.workspace import find_workspace
 
 NAME = catalogue.BALL_PUSH
 TIME_LIMIT = catalogue.TIME_LIMITS[NAME]  # s
@@ -41,7 +41,6 @@ class BallPush(RobotTask):
     *,
     camera: RobotCamera | None = None,
     settings: TaskSettings | None = None,
-    workspace: Workspace | None = None,
   ):
     """Builds the task; see `RobotTask`.
 
@@ -49,7 +48,6 @@ class BallPush(RobotTask):
       scene: The scene's bundle.
       camera: The robot's camera.
       settings: Settings of the task.
-      workspace: Where the workspace lies; found in the free floor of the scene if None.
     """
     super().__init__(
       scene,
@@ -57,7 +55,7 @@ class BallPush(RobotTask):
       settings=settings or TaskSettings(time_limit=TIME_LIMIT),
       head_pan_limit=constants.BALL_PUSHING_HEAD_PAN,
     )
-    self.workspace = workspace or find_workspace(scene)
+    self.workspace = find_workspace(scene)
     self.ball = Ball()
     self._arena.add_free_entity(self.ball)
     self.ball_start: tuple[float, float] | None = None  # if set, the ball starts here

@@ -8,7 +8,7 @@ import scipy.io
 import scipy.signal
 
 from nerf2real.suite.sensors import filters
-from nerf2real.suite.sensors.madgwick import Madgwick
+from nerf2real.suite.sensors.madgwick import BETA, SAMPLE_RATE_HZ, Madgwick
 
 _IMU = Path(__file__).parents[4] / "shared" / "data" / "imu"
 
@@ -59,8 +59,8 @@ def test_exponential_filter_keeps_the_strength_of_the_old_value():
 def test_madgwick_equals_ahrs():
   ahrs = pytest.importorskip("ahrs", reason="the ahrs package, an independent implementation")
   rng = np.random.default_rng(3)
-  ours = Madgwick(125.0, beta=0.08)
-  theirs = ahrs.filters.Madgwick(frequency=125.0, gain=0.08)
+  ours = Madgwick()
+  theirs = ahrs.filters.Madgwick(frequency=SAMPLE_RATE_HZ, gain=BETA)
   ours.update(np.zeros(3), np.array([0.2, -0.4, 9.0]))
   attitude = np.array(ours.quaternion)
   for _ in range(300):
@@ -72,7 +72,7 @@ def test_madgwick_equals_ahrs():
 
 
 def test_madgwick_starts_at_the_first_accelerometer_sample_and_follows_the_gyroscope():
-  level = Madgwick(125.0)
+  level = Madgwick()
   np.testing.assert_allclose(level.update(np.zeros(3), [0, 0, 9.81]), [0, 0, -1])
   up = np.array([0.6, 0.0, -0.8])
   np.testing.assert_allclose(Madgwick().update(np.zeros(3), up), -up, atol=1e-12)
@@ -107,7 +107,7 @@ def test_madgwick_against_measured_attitude(trial, bound):
   start = scipy.signal.lfilter_zi(b, a)[:, None] * raw[0]
   smooth, _ = scipy.signal.lfilter(b, a, raw, axis=0, zi=start)
   chosen = np.round(np.arange(0, len(raw) / rate - 1 / 125, 1 / 125) * rate).astype(int)
-  madgwick = Madgwick(125.0)
+  madgwick = Madgwick()
   estimate = np.array([madgwick.update(s[:3], s[3:]) for s in smooth[chosen]])
   w, x, y, z = data["opt_quat"][chosen].T
   up = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
