@@ -79,6 +79,9 @@ class Log:
   """How many pictures the file holds."""
   recorded: JointSeries | None = None
   """All states, where `states` leave out those before the first command; None where none are."""
+  aside: JointSeries | None = None
+  """Commands of joints that are not judged, which move all the same; None where all are in
+  `commands`."""
 
   @property
   def whole(self) -> "Log":

@@ -15,7 +15,7 @@ from nerf2real.sysid.data.bam import UNNAMED, read_bam
 from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.tables import read_csv
 from nerf2real.sysid.model.drive import joint_of
-from nerf2real.sysid.model.supported import left_out
+from nerf2real.sysid.model.supported import without_disabled
 
 
 def read_log(path: str | Path) -> Log:
@@ -64,7 +64,7 @@ def load_model(path: Path) -> mujoco.MjModel:
   if not Path(path).is_file():
     raise FileNotFoundError(f"Found no file {path}, expected a MuJoCo model (.xml).")
   try:
-    return mujoco.MjModel.from_xml_path(str(path))
+    return without_disabled(mujoco.MjModel.from_xml_path(str(path)))
   except ValueError as error:
     first = str(error).strip().splitlines()[0]
     raise ValueError(f"{path} is not a MuJoCo model: {first}") from error
@@ -100,27 +100,31 @@ def from_first_command(log: Log) -> Log:
   return dataclasses.replace(log, states=begun, recorded=states)
 
 
-def without_commands(log: Log, joints: Collection[str]) -> Log:
-  """Returns a log in which joints are measured and not commanded."""
-  commands = log.commands
-  kept = [n for n, name in enumerate(commands.joints) if name not in joints]
-  fields = (commands.position, commands.velocity, commands.effort)
-  told = JointSeries(
-    *(tuple(commands.joints[n] for n in kept), commands.stamp, commands.log_time),
+def set_aside(log: Log, joints: Collection[str]) -> Log:
+  """Returns a log of which joints are not judged: their commands are in `aside`."""
+  names = log.commands.joints
+  apart = [n for n, name in enumerate(names) if name in joints]
+  if not apart:
+    return log
+  kept = [n for n in range(len(names)) if n not in apart]
+  return dataclasses.replace(
+    log, commands=_columns(log.commands, kept), aside=_columns(log.commands, apart)
+  )
+
+
+def _columns(series: JointSeries, kept: Sequence[int]) -> JointSeries:
+  fields = (series.position, series.velocity, series.effort)
+  return JointSeries(
+    *(tuple(series.joints[n] for n in kept), series.stamp, series.log_time),
     *(None if values is None else values[:, kept] for values in fields),
   )
-  return dataclasses.replace(log, commands=told)
 
 
 def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:
-  """Reads logs, whose states begin with their commands, and checks them against the model; joints
-  that cannot be simulated alone are not commanded there, unless all are such."""
+  """Reads logs, whose states begin with their commands, and checks them against the model."""
   logs = []
   for path in paths:
     log = from_first_command(without_fillers(named(read_log(path), model)))
     check_against_model(log, model)
-    beyond = left_out(model, log.commands.joints)
-    if len(beyond) < len(log.commands.joints):
-      log = without_commands(log, beyond)
     logs.append(log)
   return logs

@@ -12,13 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress
-from nerf2real.core.robot_logs.reading import moves
 from nerf2real.sysid.design import excitation
 from nerf2real.sysid.design.information import Place, beside, information, of_logs, places
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.terms import Term
-from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection.joints.subject import own_library
 from nerf2real.sysid.settings import Settings
@@ -104,14 +102,7 @@ def of_machine(
     settings: tolerances.
     progress: called with the fraction done and a text.
   """
-  model, logs = machine.model, machine.logs
-  joints = [
-    name
-    for name in logs[0].commands.joints
-    if actuator_of(model, name) >= 0
-    and all(name in log.commands.joints for log in logs)
-    and moves(logs, name)
-  ]
+  joints = machine.moving()
   if repeated:
     settings = dataclasses.replace(settings, tolerances=settings.repeat)
   result = []

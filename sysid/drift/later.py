@@ -7,12 +7,12 @@ from typing import Any
 
 from nerf2real.core.files import write_atomically
 from nerf2real.core.pages import page
-from nerf2real.core.robot_logs.reading import check_motion
+from nerf2real.core.robot_logs.reading import Log, check_motion
 from nerf2real.core.serialization import to_plain
-from nerf2real.sysid.data.opening import read_logs
+from nerf2real.sysid.data.opening import read_logs, set_aside
 from nerf2real.sysid.drift import page as drift_page
 from nerf2real.sysid.drift.judgement import Drift, judge
-from nerf2real.sysid.drift.stored import read
+from nerf2real.sysid.drift.stored import Stored, read
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -32,7 +32,7 @@ def evaluate(folder: Path, held: Sequence[Path]) -> list[dict[str, Any]]:
   stored = read(folder)
   window = stored.content["window_s"] or SETTINGS.window_s
   rows = []
-  for log in read_logs(held, stored.model):
+  for log in _logs(held, stored):
     errors = simulation.errors(stored.model, [log], stored.near, window_s=window)
     rows.append({"log": log.name, **errors})
   return rows
@@ -56,7 +56,7 @@ def check_drift(
     ValueError: the folder is not of this version.
   """
   stored = read(folder)
-  logs = read_logs(held, stored.model)
+  logs = _logs(held, stored)
   check_motion(logs)
   found = judge(stored, logs, settings=settings)
   out = Path(out or folder)
@@ -70,3 +70,8 @@ def check_drift(
   write_atomically(out / "drift.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
   page.write(out / "drift.html", drift_page.page(found, stored, logs))
   return found
+
+
+def _logs(paths: Sequence[Path], stored: Stored) -> list[Log]:
+  """Returns later logs, of which those joints are judged that were."""
+  return [set_aside(log, stored.not_judged) for log in read_logs(paths, stored.model)]

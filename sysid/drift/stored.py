@@ -70,6 +70,8 @@ class Stored:
   near: list[Member]
   """The extended model, and others whose fits are near the best."""
   joints: list[StoredJoint]
+  not_judged: tuple[str, ...] = ()
+  """Joints that have what identification leaves out."""
 
 
 def remembered(found: Identified, held: Sequence[Log], settings: Settings) -> list[StoredJoint]:
@@ -187,4 +189,5 @@ def read(folder: Path) -> Stored:
     stand,
     [_member(item) for item in (details, *details.get("near", []))],
     [from_plain(joint, StoredJoint, source=folder / "details.json") for joint in details["joints"]],
+    tuple(details.get("not_judged", ())),
   )

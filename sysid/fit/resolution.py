@@ -42,7 +42,7 @@ def numerics(machine: Machine) -> Numerics:
     machine: the declared model along the logs.
   """
   declared = Numerics(machine.reductions[0].step)
-  seen = [_Seen(machine.joint(joint)) for joint in machine.logs[0].commands.joints]
+  seen = [_Seen(machine.joint(joint)) for joint in machine.moving()]
   held = declared._replace(prompt=True)
   found = held if any(s.differs(declared, held) for s in seen) else declared
   for s in seen:

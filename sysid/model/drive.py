@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.robot_logs.series import JointSeries
 
 Array = np.ndarray
 
@@ -58,11 +59,15 @@ def takes(model: mujoco.MjModel, actuator: int) -> str:
 def command_of(log: Log, model: mujoco.MjModel, joint: str) -> Array | None:
   """Returns a joint's commands [N] in what its actuator takes, within what it takes of that; None
   where a log lacks those."""
+  return _command_in(log.commands, model, joint)
+
+
+def _command_in(commands: JointSeries, model: mujoco.MjModel, joint: str) -> Array | None:
   u = actuator_of(model, joint)
-  values = getattr(log.commands, takes(model, u))
+  values = getattr(commands, takes(model, u))
   if values is None:
     return None
-  column: Array = values[:, log.commands.column(joint)]
+  column: Array = values[:, commands.column(joint)]
   if np.isnan(column).all():  # it is told another quantity
     return None
   return np.clip(column, *model.actuator_ctrlrange[u]) if model.actuator_ctrllimited[u] else column
@@ -72,8 +77,8 @@ class Told:
   """A log's commands as the actuators of a model take them: of the model as it is when this is
   made, as effects that are bound to it write into its actuators while it is simulated.
 
-  A joint that is measured and not commanded is held at its first reading where its actuator holds
-  a position: it was not told to go to 0.
+  Those of joints that are not judged move them, too. A joint that is measured and not commanded is
+  held at its first reading where its actuator holds a position: it was not told to go to 0.
   """
 
   def __init__(self, model: mujoco.MjModel, log: Log):
@@ -86,13 +91,16 @@ class Told:
     self._stamp = log.commands.stamp
     spans = np.diff(self._stamp, append=self._stamp[-1])
     self._still = np.zeros(model.nu)
-    for name in set(log.joints) - set(log.commands.joints):
+    both = [series for series in (log.commands, log.aside) if series is not None]
+    told = {name: series for series in both for name in series.joints}
+    for name in set(log.joints) - set(told):
       for u in actuators_of(model, name):
         self._still[u] = _holding(model, log, name, u)
     self._commands: dict[int, tuple[Array, Array]] = {}
-    for name in log.commands.joints:
-      command = command_of(log, model, name)
-      assert command is not None
+    for name, series in told.items():
+      command = _command_in(series, model, name)
+      if command is None:  # only of joints that are not judged
+        continue
       total = np.concatenate([[0.0], np.cumsum(command * spans)[:-1]])
       self._commands[actuator_of(model, name)] = command, total
 

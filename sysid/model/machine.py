@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import mujoco
 
-from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.robot_logs.reading import Log, moves
+from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.reduction import Reduction
 
@@ -23,6 +24,21 @@ class Machine:
     self.model, self.logs, self._window_s = model, list(logs), window_s
     self.reductions = [Reduction(model, log) for log in logs]
     self._joints: dict[str, JointModel] = {}
+
+  def moving(self, reference: Sequence[Log] = ()) -> list[str]:
+    """Returns the joints with an actuator that all logs command, and that move in them.
+
+    Args:
+      reference: further logs, in which they must be commanded and move, too.
+    """
+    recordings = [part for part in (self.logs, reference) if part]
+    return [name for name in self.commanded(reference) if all(moves(p, name) for p in recordings)]
+
+  def commanded(self, reference: Sequence[Log] = ()) -> list[str]:
+    """Returns the joints with an actuator that all logs, and those of a reference, command."""
+    every = [set(log.commands.joints) for log in (*self.logs, *reference)]
+    names = self.logs[0].commands.joints
+    return [n for n in names if actuator_of(self.model, n) >= 0 and all(n in e for e in every)]
 
   def joint(self, name: str) -> JointModel:
     """Returns one of its joints."""

@@ -22,6 +22,7 @@ Array = np.ndarray
 
 
 _SENSORS = ("imu_", "camera_")  # kinds that move no joint
+_FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 _SPOILT = 1.02  # times the declared model's error: beyond rounding and the scatter of a fit; ours
 
 
@@ -100,6 +101,7 @@ def simulate(
   late_by = _delays(delays, model)
   moving = [e for e in delays if e.kind != "command_delay" and not e.kind.startswith(_SENSORS)]
   told = Told(model, log)
+  filters = np.isin(model.actuator_dyntype, _FILTERS)  # begin settled at what they are told
   stack = EffectStack(moving).bind(model)
   try:
     rate = _of_joint(effects, "clock_drift", "rate", None)
@@ -119,6 +121,7 @@ def simulate(
       data.time = first
       times = first + step * np.arange(count + 1)
       ctrl = told.mean(times[:-1], step, late_by)
+      data.act[model.actuator_actadr[filters]] = ctrl[0, filters]
       history = np.vstack([data.qpos[qpos], _roll(stack, data, ctrl, qpos)])
       for j in range(len(ids)):
         stamps = time[start:end] / (1 + rate) - late[j]

@@ -38,6 +38,7 @@ def write(
   *,
   clocks: Mapping[str, Clocks] | None = None,
   numerics: Numerics | None = None,
+  on_stand: bool = False,
 ) -> list[Effect]:
   """Writes the extended model.
 
@@ -47,6 +48,7 @@ def write(
     effects: corrections of constants and effects.
     clocks: latencies by joint, which a comment names.
     numerics: of the model that is written; the source's if left out.
+    on_stand: whether errors are stated of a free base that is held, which a comment says.
 
   Returns:
     The effects that MJCF cannot hold.
@@ -73,7 +75,7 @@ def write(
   spec.compile()
   _absolute(spec, source.resolve().parent)
   head, body = spec.to_xml().split("\n", 1)
-  write_atomically(target, f"{head}\n{_comment(written, left, clocks or {})}{body}")
+  write_atomically(target, f"{head}\n{_comment(written, left, clocks or {}, on_stand)}{body}")
   return left
 
 
@@ -87,7 +89,7 @@ def _settle_servos(spec: mujoco.MjSpec) -> None:
 
 
 def _comment(
-  written: Sequence[Effect], left: Sequence[Effect], clocks: Mapping[str, Clocks]
+  written: Sequence[Effect], left: Sequence[Effect], clocks: Mapping[str, Clocks], on_stand: bool
 ) -> str:
   """Returns what a reader of the file must know, as an XML comment."""
   lines = [
@@ -100,6 +102,8 @@ def _comment(
     "encoder_offset": "Positions read are the joint's plus the offset, which is in the servo only.",
   }
   lines += [note for kind, note in notes.items() if any(e.kind == kind for e in written)]
+  if on_stand:
+    lines.append("The base is free in this model; errors are stated with it held where it is here.")
   for effect in left:
     values = ", ".join(f"{name} {value}" for name, value in effect.parameters.items())
     lines.append(f"Not in this model: {effect.kind} on {effect.target or 'all'} ({values}).")

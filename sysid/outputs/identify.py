@@ -7,7 +7,7 @@ logs: the declared model's path, the extended model as effects, the joints' hypo
 import collections
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,21 +22,22 @@ from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_mot
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.sysid.data.checks import check_length
-from nerf2real.sysid.data.opening import load_model, read_logs
+from nerf2real.sysid.data.opening import load_model, read_logs, set_aside
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import resolution, whitening
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.simulation import Member, errors
-from nerf2real.sysid.model.supported import check_supported, on_a_stand
+from nerf2real.sysid.model.supported import left_out, on_a_stand
 from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.outputs.notes import (
   another_session,
-  beyond,
   finer,
   long_step,
+  not_judged,
   of_one,
+  on_stand,
   spread,
   still,
   supply,
@@ -91,16 +92,22 @@ def identify(
   compiled = load_model(Path(model))
   logs, others = read_logs(train, compiled), read_logs(held, compiled)
   healthy = read_logs(reference, compiled)
-  check_supported(compiled, logs[0].commands.joints)
   for recorded in filter(None, (logs, healthy)):
     check_motion(recorded)
     check_length(recorded, settings.block_s)
   _check_joints(logs, [*others, *healthy])
+  stand = on_a_stand(Path(model), compiled)
+  beyond = left_out(stand, [*logs, *healthy])
+  logs, others, healthy = (
+    [set_aside(log, beyond) for log in part] for part in (logs, others, healthy)
+  )
   with lock_folder(out):
     return _identify(
       Path(model),
       compiled,
+      stand,
       logs,
+      beyond=beyond,
       held=others,
       reference=healthy,
       out=Path(out),
@@ -112,8 +119,10 @@ def identify(
 def _identify(
   model: Path,
   compiled: mujoco.MjModel,
+  stand: mujoco.MjModel,
   logs: list[Log],
   *,
+  beyond: Mapping[str, str],
   held: list[Log],
   reference: list[Log],
   out: Path,
@@ -123,7 +132,6 @@ def _identify(
   """Analyses logs that were read, and writes; see `identify`."""
   began = time.perf_counter()
   progress(0.0, "one joint of many: what each feels of the others")
-  stand = on_a_stand(model, compiled)
   machine = Machine(stand, logs, window_s=settings.window_s)
   declared, used = Numerics(machine.reductions[0].step), resolution.numerics(machine)
   if used != declared:
@@ -177,7 +185,8 @@ def _identify(
     "notes": [
       *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
       *still(found.still),
-      *beyond(compiled, logs[0]),
+      *not_judged(beyond),
+      *on_stand(free=stand is not compiled),
       *finer(declared, used),
       *long_step(found.joints),
       *supply(logs, reference),
@@ -209,10 +218,16 @@ def _identify(
   write_effects(out / "effects.json", servo.apart(drawn, by_duty))
   finer_ones = None if used == declared else used
   extended_model.write(
-    model, out / "model_extended.xml", whole, clocks=found.clocks, numerics=finer_ones
+    model,
+    out / "model_extended.xml",
+    whole,
+    clocks=found.clocks,
+    numerics=finer_ones,
+    on_stand=stand is not compiled,
   )
   details = _details(found, model, near, sensed)
   details["numerics"] = to_plain(finer_ones)
+  details["not_judged"] = dict(beyond)
   details["identifiability"] = [to_plain(item) for item in shown]
   details["joints"] = stored.to_json(stored.remembered(found, held, settings))
   write_atomically(out / "details.json", json.dumps(details, indent=2, allow_nan=False) + "\n")

@@ -1,16 +1,13 @@
 """Sentences of a report that follow from what was found."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
-from nerf2real.sysid.model.drive import actuators_of
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.supported import left_out
 from nerf2real.sysid.selection.joints.changed import Changed
 from nerf2real.sysid.settings import SETTINGS
 
@@ -33,15 +30,23 @@ def still(joints: Sequence[str]) -> list[str]:
   ]
 
 
-def beyond(model: mujoco.MjModel, log: Log) -> list[str]:
-  """Returns a sentence on measured joints that are driven and cannot be simulated alone; none where
+def not_judged(beyond: Mapping[str, str]) -> list[str]:
+  """Returns a sentence on joints that cannot be simulated alone, and what they have; none where
   there are none."""
-  driven = [name for name in log.joints if actuators_of(model, name)]
-  found = left_out(model, driven)
-  if not found:
+  if not beyond:
     return []
-  each = ", ".join(f"{name} ({what})" for name, what in found.items())
+  each = ", ".join(f"{name} ({what})" for name, what in beyond.items())
   return [f"Not judged, as the model has there what identification leaves out: {each}."]
+
+
+def on_stand(*, free: bool) -> list[str]:
+  """Returns a sentence on a machine whose base is free in its model; none of one that is fixed."""
+  if not free:
+    return []
+  return [
+    "The base is free in the model and held here where the model has it, in the errors, too: the "
+    "logs must be of a machine on a stand."
+  ]
 
 
 def long_step(joints: Sequence[Changed]) -> list[str]:

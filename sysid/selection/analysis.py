@@ -8,14 +8,13 @@ import mujoco
 import numpy as np
 
 from nerf2real.core.progress import Progress, no_progress, part
-from nerf2real.core.robot_logs.reading import Log, moves
+from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING
 from nerf2real.sysid.model import chains
-from nerf2real.sysid.model.drive import actuator_of
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import claims, whole_machine
@@ -59,19 +58,12 @@ def analyse(
   Raises:
     ValueError: no joint has an actuator and commands in all logs, and moves.
   """
-  commanded = [
-    name
-    for name in logs[0].commands.joints
-    if actuator_of(model, name) >= 0
-    and all(name in log.commands.joints for log in (*logs, *reference))
-  ]
-  recordings = [part for part in (logs, reference) if part]
-  joints = [name for name in commanded if all(moves(part, name) for part in recordings)]
+  machine = machine or Machine(model, logs, window_s=settings.window_s)
+  joints = machine.moving(reference)
   if not joints:
     raise ValueError(
       "Found no joint with an actuator that all logs command and that moves, expected at least one."
     )
-  machine = machine or Machine(model, logs, window_s=settings.window_s)
   before = Machine(model, reference, window_s=settings.window_s) if reference else None
   subjects = []
   for k, joint in enumerate(joints):
@@ -87,7 +79,7 @@ def analyse(
     )
   )
   result = Identified(model, list(logs), changed, audits=[audit(log) for log in logs])
-  result.still = [name for name in commanded if name not in joints]
+  result.still = [name for name in machine.commanded(reference) if name not in joints]
   for effect in shared:
     _write_shared(result, effect, own_latency=not reference)
   for item in changed:

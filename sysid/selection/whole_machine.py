@@ -23,12 +23,13 @@ def discard_refuted(found: Identified, settings: Settings) -> None:
   they refute what a fit brings along (a torque's scale, say, that no joint shows alone), but no
   claim of a joint that is judged by following, for they begin without knowing where its play lies.
 
+  A single joint is the whole machine: its parts were fitted together, and go together where they
+  leave more than the declared model does.
+
   Args:
-    found: of a machine of several joints; changed.
+    found: of a machine; changed.
     settings: length of windows where an actuator does not hold its position.
   """
-  if len(found.joints) < 2:
-    return
 
   def left_by(effects: Sequence[Effect]) -> float:
     return error(
@@ -40,6 +41,13 @@ def discard_refuted(found: Identified, settings: Settings) -> None:
       restart=bool(found.followed),
     )
 
+  if len(found.joints) < 2:
+    parts = [*found.calibration, *found.objects]
+    judged = bool(parts) and not found.followed
+    if judged and is_worse({"before": left_by([]), "after": left_by(parts)}):
+      for effect in parts:
+        _take_out(found, effect)
+    return
   while True:
     whole, refuted = left_by([*found.calibration, *found.objects]), []
     for part in _parts(found):

@@ -101,9 +101,9 @@ def conclude(
     if same:
       top = max(same, key=lambda s: s.evidence)
       idle = [s for s in ranked if s.neutral and s.names < top.names]
-      if all(clear(top, s) > beyond[size - 1] for s in (best, *idle)):
+      if all(clear(top, s) > _of_size(beyond, size) for s in (best, *idle)):
         best = top
-  last = beyond[max(len(best.names), 1) - 1]
+  last = _of_size(beyond, len(best.names))
   best = _usual(joint, best, ranked, last)
   names = _names(joint, best, ranked, beyond)
   for general, special in SPECIAL.items():
@@ -121,11 +121,17 @@ def _names(
   joint: JointLikelihood, best: Scored, ranked: Sequence[Scored], beyond: Sequence[float]
 ) -> tuple[Name, ...]:
   """Returns the effects of a hypothesis, and whether each is certain."""
-  last = beyond[max(len(best.names), 1) - 1]
+  last = _of_size(beyond, len(best.names))
   names = [_name(joint, best, kind, ranked, last) for kind in sorted(best.names)]
   clearest = sorted(names, key=lambda n: -n.clear)
   certain = {n.kind for n, z in zip(clearest, beyond, strict=False) if n.certain and n.clear >= z}
   return tuple(dataclasses.replace(n, certain=n.kind in certain) for n in names)
+
+
+def _of_size(beyond: Sequence[float], count: int) -> float:
+  """Returns what counts as clear for so many effects: constants that are off may come on top of as
+  many as are looked for."""
+  return beyond[min(max(count, 1), len(beyond)) - 1]
 
 
 def _certain(names: Sequence[Name]) -> set[str]:

@@ -8,10 +8,12 @@ import pytest
 
 from nerf2real.core.robot_logs.reading import LogError, check_motion, moves
 from nerf2real.sysid.design import identifiability
+from nerf2real.sysid.fit import resolution
 from nerf2real.sysid.fit.noise import timing
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.measured import fresh
+from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.outputs import notes
 from nerf2real.sysid.selection import analysis
 from nerf2real.sysid.settings import SETTINGS
@@ -67,3 +69,9 @@ def test_logs_in_which_nothing_moves_are_refused():
   assert moves([log], "elbow") and not moves([_frozen(log, "elbow")], "elbow")
   with pytest.raises(LogError, match="no commanded joint that moves"):
     check_motion([_frozen(log, "elbow", "shoulder")])
+
+
+def test_a_joint_that_does_not_move_asks_for_no_finer_step():
+  model = mujoco.MjModel.from_xml_string(ARM.replace('timestep="0.001"', 'timestep="0.002"'))
+  logs = [_frozen(log_of(ARM, "sweep", duration=4.0), "elbow")]
+  assert resolution.numerics(Machine(model, logs)) == Numerics(0.002)

@@ -79,10 +79,18 @@ def test_windows_refute_what_is_not_claimed_where_courses_do_not_repeat() -> Non
   assert [j.verdict for j in found.joints] == ["effects", "effects"]
 
 
-@pytest.mark.parametrize("single", [True, False])
-def test_one_joint_and_courses_that_do_not_repeat_refute_no_claim(single: bool) -> None:
-  found = _found(follows=not single)
-  if single:
-    found.joints = found.joints[:1]
+def test_courses_that_do_not_repeat_refute_no_claim() -> None:
+  found = _found(follows=True)
   discard_refuted(found, SETTINGS)
   assert found.objects == [_TRUE, _WRONG] and len(found.effects) == 2
+
+
+@pytest.mark.parametrize("worse", [True, False])
+def test_one_joint_claims_nothing_where_it_leaves_more_than_the_declared_model(worse: bool) -> None:
+  found = _found()
+  found.joints = [j for j in found.joints if j.joint == (_WRONG if worse else _TRUE).target]
+  found.objects = [_WRONG if worse else _TRUE]
+  found.effects = [row for row in found.effects if row["joint"] == found.joints[0].joint]
+  discard_refuted(found, SETTINGS)
+  assert bool(found.objects) is bool(found.effects) is not worse
+  assert [j.verdict for j in found.joints] == ["unexplained" if worse else "effects"]
