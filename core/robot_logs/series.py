@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerf2real.core.robot_logs.messages import TEMPERATURE_TYPE
+from nerf2real.core.robot_logs.messages import STATES, TEMPERATURE_TYPE
 from nerf2real.core.robot_logs.streaming import NANO, LogError, Reading
 
 
@@ -59,7 +59,8 @@ class JointSeries:
   velocity: np.ndarray | None
   """[N, J] rad/s or m/s."""
   effort: np.ndarray | None
-  """[N, J] N m or N; of `/joint_pwm` the duty, -1 to 1."""
+  """[N, J] N m or N; of `/joint_pwm` the duty, -1 to 1. Of any field but the states' positions a
+  column is NaN throughout where that joint has none."""
 
   def column(self, joint: str) -> int:
     """Returns the column of a joint."""
@@ -101,7 +102,8 @@ def joint_series(name: str, topic: Topic, start: int) -> JointSeries:
     start: ns, zero of all times.
 
   Raises:
-    LogError: joints differ between messages, a field has not one value a joint, or NaNs.
+    LogError: joints differ between messages, a field has not one value a joint, or NaNs where a
+      joint has other values, too.
   """
   joints = tuple(topic.messages[0].name)
   if not joints or len(set(joints)) < len(joints):
@@ -132,11 +134,18 @@ def joint_series(name: str, topic: Topic, start: int) -> JointSeries:
     if len(orders) > 1:
       order = np.array([orders[tuple(message.name)] for message in topic.messages])
       values = np.take_along_axis(values, order, axis=1)
-    # ros2_control fills interfaces that a servo lacks with NaN throughout: not measured.
-    if field != "position" and np.all(np.isnan(values)):
+    # ros2_control fills interfaces that a joint lacks with NaN throughout: not measured.
+    lacking = np.isnan(values).all(axis=0)
+    if topic.name == STATES and field == "position" and lacking.any():
+      unread = [joint for joint, none in zip(joints, lacking, strict=True) if none]
+      raise LogError(
+        f"{name}: positions of {unread} in {topic.name} are NaN throughout, expected numbers: "
+        "record them, or leave those joints out of the topic."
+      )
+    if lacking.all():
       fields[field] = None
       continue
-    _check_finite(name, f"{field}s of {topic.name}", values, topic, start)
+    _check_finite(name, f"{field}s of {topic.name}", values[:, ~lacking], topic, start)
     fields[field] = values
   return JointSeries(
     joints, _seconds(topic.stamp_ns, start), _seconds(topic.log_ns, start), **fields

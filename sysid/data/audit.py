@@ -69,7 +69,7 @@ def _drift(series: JointSeries) -> float:
 def _saturated(states: JointSeries) -> float:
   if states.effort is None:
     return 0.0
-  size = np.abs(states.effort)
+  size = np.abs(np.nan_to_num(states.effort))  # NaN: of a joint without
   top = size.max(axis=0)
   return round(float(np.mean(size > SETTINGS.saturated * np.maximum(top, 1e-12), axis=0).max()), 4)
 

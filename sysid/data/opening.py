@@ -72,9 +72,9 @@ def load_model(path: Path) -> mujoco.MjModel:
 
 def without_fillers(log: Log) -> Log:
   """Returns a log without what drivers fill in for what they do not measure: efforts that never
-  change, and voltages that are not above 0."""
+  change or are NaN, and voltages that are not above 0."""
   states, battery = log.states, log.battery
-  if states.effort is not None and not np.ptp(states.effort, axis=0).any():
+  if states.effort is not None and not (np.ptp(states.effort, axis=0) > 0.0).any():
     states = dataclasses.replace(states, effort=None)
   if battery is not None and not np.all(battery.value > 0.0):
     read = battery.value > 0.0

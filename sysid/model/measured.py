@@ -58,7 +58,9 @@ def measured(log: Log, motion: Motion, joint: str, model: mujoco.MjModel) -> Mea
   series = log.temperatures.get(joint)
   duty = None
   if log.pwm is not None and log.pwm.effort is not None and joint in log.pwm.joints:
-    duty = np.interp(states.stamp, log.pwm.stamp, log.pwm.effort[:, log.pwm.column(joint)])
+    given = log.pwm.effort[:, log.pwm.column(joint)]
+    if not np.isnan(given).all():  # it has none
+      duty = np.interp(states.stamp, log.pwm.stamp, given)
   return Measured(
     name=log.name,
     time=states.stamp,
