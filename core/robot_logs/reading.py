@@ -163,18 +163,31 @@ def read_log(path: str | pathlib.Path, *, recover: bool = False) -> Log:
     path=path,
     pictures=pictures,
   )
+  check_extent(log)
+  return log
+
+
+def check_extent(log: Log) -> None:
+  """Raises a LogError where commands and states do not overlap for `MINIMUM_DURATION`, or states
+  are slower than `MINIMUM_RATE`."""
+  commands, states = log.commands.stamp, log.states.stamp
+  if log.duration < 0.0:
+    spans = [f"{stamp[0]:.3f} to {stamp[-1]:.3f} s" for stamp in (commands, states)]
+    raise LogError(
+      f"{log.name}: commands and states do not overlap: found commands at {spans[0]} and states at "
+      f"{spans[1]}, expected stamps of one clock: record both at once, by the same clock."
+    )
   if log.duration < MINIMUM_DURATION:
     raise LogError(
-      f"{path.name} lasts {max(log.duration, 0.0):.3g} s with commands and states, expected at "
+      f"{log.name} lasts {log.duration:.3g} s with commands and states, expected at "
       f"least {MINIMUM_DURATION:g} s: record a longer log."
     )
-  span = states.stamp[-1] - states.stamp[0]
-  if len(states.stamp) < MINIMUM_RATE * span:
+  span = states[-1] - states[0]
+  if len(states) < MINIMUM_RATE * span:
     raise LogError(
-      f"{path.name} has {len(states.stamp)} readings of {STATES} in {span:.3g} s, expected at "
+      f"{log.name} has {len(states)} readings of the states in {span:.3g} s, expected at "
       f"least {MINIMUM_RATE:g} a second: record faster."
     )
-  return log
 
 
 def check_motion(logs: Sequence[Log]) -> None:

@@ -2,10 +2,12 @@
 `core.robot_logs.reading`."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import MINIMUM_DURATION, MINIMUM_RATE, Log
+from nerf2real.core.files import hash_path
+from nerf2real.core.robot_logs.reading import Log, check_extent
 from nerf2real.core.robot_logs.streaming import LogError
 from nerf2real.sysid.model.measured import block_starts
 
@@ -32,18 +34,24 @@ def checked(log: Log) -> Log:
       told = slice(None) if values is None else ~np.isnan(values).all(axis=0)
       if values is not None and not np.isfinite(values[:, told]).all():
         raise LogError(f"{log.name}: {what} hold infinite {field}s, expected finite numbers.")
-  if log.duration < MINIMUM_DURATION:
-    raise LogError(
-      f"{log.name} lasts {max(log.duration, 0.0):.3g} s with commands and states, expected at "
-      f"least {MINIMUM_DURATION:g} s: record a longer log."
-    )
-  span = log.states.stamp[-1] - log.states.stamp[0]
-  if len(log.states.stamp) < MINIMUM_RATE * span:
-    raise LogError(
-      f"{log.name} has {len(log.states.stamp)} readings in {span:.3g} s, expected at least "
-      f"{MINIMUM_RATE:g} a second: record faster."
-    )
+  check_extent(log)
   return log
+
+
+def check_distinct(paths: Sequence[Path]) -> None:
+  """Raises a LogError where two files have the same content: a log that is given twice counts
+  twice, and one that was fitted says nothing as a held or reference log."""
+  seen: dict[str, Path] = {}
+  for path in map(Path, paths):
+    if not path.is_file():  # what is missing is said where it is read
+      continue
+    first = seen.setdefault(content := hash_path(path), path)
+    if first is not path:
+      same = f"{path} is given twice" if path == first else f"{path} and {first} are the same log"
+      raise LogError(
+        f"{same} (SHA-256 {content[:8]}), expected logs of different recordings among those to "
+        "identify from, --held and --reference: give each once."
+      )
 
 
 def check_length(logs: Sequence[Log], block_s: float) -> None:

@@ -60,9 +60,13 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
         "one: keep the one that is commanded."
       )
     if command_of(log, model, name) is None:
-      wanted = _PLURAL[takes(model, actuator_of(model, name))]
+      quantity = takes(model, actuator_of(model, name))
+      wanted = _PLURAL[quantity]
+      lacks = f"{wanted} in {COMMANDS}"
+      if log.path is not None and log.path.suffix.lower() == ".csv":
+        lacks = f"column command_{quantity}:{name}"
       raise LogError(
-        f"{log.name} has no {wanted} in {COMMANDS}, which the model's actuator on {name!r} takes: "
+        f"{log.name} has no {lacks}, which the model's actuator on {name!r} takes: "
         f"record {wanted}, or give a model with the actuator that was driven."
       )
     _check_range(log, model, name)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf2real.core.robot_logs.reading import Log
+from nerf2real.core.robot_logs.reading import MINIMUM_RATE, Log
 from nerf2real.core.robot_logs.series import JointSeries, ScalarSeries
 from nerf2real.core.robot_logs.streaming import LogError
 from nerf2real.sysid.data.checks import checked
@@ -33,6 +33,10 @@ UNITS = {
   **{"deg": math.pi / 180, "deg/s": math.pi / 180, "%": 0.01},
 }
 """What a number in a unit is in SI."""
+_SEPARATORS = (";", "\t", "|")
+_SELDOM = 1.0
+"""s between readings from which on their time is taken for one in another unit: chosen, twenty
+times the longest that is read."""
 
 
 def read_csv(path: Path) -> Log:
@@ -60,6 +64,7 @@ def read_csv(path: Path) -> Log:
       " or ".join(f"{name}:JOINT" for name in COMMANDED) if commands is None else "position:JOINT"
     )
     raise LogError(f"{path.name} has no column {lacks} with values, found {sorted(columns)}.")
+  _check_unit_of_time(path, states.stamp)
   voltage = _scalar(stamps, columns.get("voltage"))
   heat = {j: _scalar(stamps, v) for j, v in quantities.get("temperature", {}).items()}
   return checked(
@@ -86,6 +91,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     raise LogError(f"{path.name} is no CSV text: {error}.") from error
   if len(rows) < 2:
     raise LogError(f"{path.name} has {len(rows)} lines, expected a header and readings.")
+  _check_header(path, rows[0])
   names, factors = zip(*(_named(path, name.strip()) for name in rows[0]), strict=True)
   for name in names:
     quantity, _, joint = name.partition(":")
@@ -117,6 +123,37 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
           "nothing where none was read."
         )
   return dict(zip(names, (table * factors).T, strict=True))
+
+
+def _check_header(path: Path, fields: Sequence[str]) -> None:
+  """Raises a LogError where the first line is not one of names between commas."""
+  if len(fields) == 1 and (found := [sign for sign in _SEPARATORS if sign in fields[0]]):
+    raise LogError(
+      f"{path.name} has {found[0]!r} between its columns, expected ',' and decimal points: write "
+      "it with those."
+    )
+  try:
+    numbers = [float(field) for field in fields if field.strip()]
+  except ValueError:
+    return
+  raise LogError(
+    f"{path.name} begins with the numbers {numbers[:3]}, expected names in the first line: put the "
+    "header there, such as time,command_position:JOINT,position:JOINT."
+  )
+
+
+def _check_unit_of_time(path: Path, stamps: np.ndarray) -> None:
+  """Raises a LogError where readings come so seldom that their time [N] is not in seconds."""
+  steps = np.diff(stamps)
+  step = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
+  if step < _SELDOM:
+    return
+  unit = next((unit for unit in ("ms", "us", "ns") if step * UNITS[unit] < 1.0 / MINIMUM_RATE), "")
+  if unit:
+    raise LogError(
+      f"{path.name} has a reading every {step:.3g} s, expected at least {MINIMUM_RATE:g} a second: "
+      f"name the unit in the header if it is not s, such as `time [{unit}]`."
+    )
 
 
 def _named(path: Path, column: str) -> tuple[str, float]:

@@ -21,7 +21,7 @@ from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import Effect, write_effects
-from nerf2real.sysid.data.checks import check_length
+from nerf2real.sysid.data.checks import check_distinct, check_length
 from nerf2real.sysid.data.opening import load_model, read_logs, set_aside
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
@@ -84,11 +84,13 @@ def identify(
     FileNotFoundError: a file is missing.
     FolderInUseError: another process identifies into the folder.
     OSError: the folder cannot be written.
-    LogError: a log cannot be used, or the held or reference logs lack a joint of the others.
+    LogError: a log cannot be used or is given twice, or the held or reference logs lack a joint of
+      the others.
     ValueError: the model cannot be read, or has what is not simulated, or there is no log.
   """
   if not train:
     raise ValueError("Found no log to identify from, expected at least one --logs file.")
+  check_distinct([*train, *held, *reference])
   compiled = load_model(Path(model))
   logs, others = read_logs(train, compiled), read_logs(held, compiled)
   healthy = read_logs(reference, compiled)

@@ -123,6 +123,18 @@ def test_columns_follow_names_not_places(tmp_path):
     ({"change": lambda k, i, f: {**f, "position": []} if k == "command" else f}, "no commands"),
     ({"change": lambda k, i, f: {**f, "position": []} if k == "state" else f}, "no positions"),
     ({"joints": ("elbow", "elbow")}, "unique names"),
+    (
+      {"change": lambda k, i, f: {**f, "position": [np.nan, 2.0]} if k == "state" else f},
+      "positions of ['elbow'] in /joint_states are NaN throughout",
+    ),
+    (
+      {
+        "change": lambda k, i, f: (
+          {**f, "time_ns": f["time_ns"] + 1_000_000_000_000} if k == "state" else f
+        )
+      },
+      "do not overlap: found commands at 0.000 to 1.980 s and states at 1000.001 to 1001.991 s",
+    ),
   ],
 )
 def test_bad_logs_are_refused_in_one_line(tmp_path, spoiled, words):
@@ -141,6 +153,15 @@ def test_fields_never_measured_are_none(tmp_path):
   )
   log = logs.read_log(path)
   assert log.states.effort is None and log.states.velocity is not None
+
+
+def test_a_field_that_one_joint_lacks_is_read_of_the_others(tmp_path):
+  """A controller writes NaN where a joint has no such interface."""
+  change = lambda k, i, f: {**f, "effort": [np.nan, 0.5 * i]} if k == "state" else f  # noqa: E731
+  path = _write(tmp_path / "log.mcap", change=change)
+  effort = logs.read_log(path).states.effort
+  assert effort is not None and np.isnan(effort[:, 0]).all()
+  np.testing.assert_array_equal(effort[:, 1], 0.5 * np.arange(200))
 
 
 def test_a_truncated_file_is_refused_and_recovered_when_asked(tmp_path):

@@ -9,16 +9,24 @@ import numpy as np
 import pytest
 
 from nerf2real.core.robot_logs.reading import LogError
+from nerf2real.sysid.data.audit import audit
 from nerf2real.sysid.data.bam import UNNAMED
-from nerf2real.sysid.data.checks import check_length
+from nerf2real.sysid.data.checks import check_distinct, check_length
 from nerf2real.sysid.data.compatibility import check_against_model
-from nerf2real.sysid.data.opening import from_first_command, named, read_log, read_logs
+from nerf2real.sysid.data.opening import (
+  from_first_command,
+  named,
+  read_log,
+  read_logs,
+  without_fillers,
+)
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.drive import command_of
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.measured import measured
 from nerf2real.sysid.model.motion import smooth_motion
+from nerf2real.sysid.outputs.identify import identify
 from nerf2real.sysid.sensors import floor, inertial, optical, sensing
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
@@ -145,6 +153,35 @@ def test_a_recorder_that_starts_before_a_step_shows_no_delay():
   assert simulation.error(model, [from_first_command(log)]) < 0.01
 
 
+def test_an_effort_that_one_joint_lacks_is_not_measured():
+  log = log_of(ARM, "slow", duration=1.5)
+  lacking = np.full(len(log.states.stamp), np.nan)
+  for other, is_kept in ((log.states.position[:, 1], True), (0.0 * lacking, False)):
+    efforts = np.column_stack([lacking, np.nan_to_num(other)])
+    states = dataclasses.replace(log.states, effort=efforts)
+    kept = without_fillers(dataclasses.replace(log, states=states, pwm=states))
+    assert (kept.states.effort is not None) == is_kept
+    model, motion = mujoco.MjModel.from_xml_string(ARM), smooth_motion(log)
+    of = {joint: measured(kept, motion, joint, model) for joint in log.joints}
+    assert of["shoulder"].effort is None and of["shoulder"].duty is None
+    assert (of["elbow"].effort is not None) == is_kept and of["elbow"].duty is not None
+    assert np.isfinite(audit(kept)["saturated_share"])
+
+
+def test_a_log_that_is_given_twice_is_refused(tmp_path):
+  one, two = tmp_path / "one.csv", tmp_path / "two.csv"
+  one.write_text("\n".join(rows()) + "\n")
+  two.write_text("\n".join(rows(start=8.0)) + "\n")
+  (tmp_path / "copy.csv").write_text(one.read_text())
+  (tmp_path / "model.xml").write_text(PENDULUM)
+  check_distinct([one, two, tmp_path / "none.csv", tmp_path / "none.csv"])
+  for train, held, said in (([one, one], [], "one.csv is given twice"), ([two, one], ["copy"], "")):
+    paths = [tmp_path / f"{name}.csv" for name in held]
+    with pytest.raises(LogError, match=said or r"copy\.csv and .*one\.csv are the same") as caught:
+      identify(tmp_path / "model.xml", train, held=paths, out=tmp_path / "out")
+    assert "\n" not in str(caught.value) and not (tmp_path / "out").exists()
+
+
 def test_an_effort_that_never_changes_beside_one_that_does_is_not_measured():
   log = log_of(ARM, "slow", duration=1.5)
   efforts = np.column_stack([np.zeros(len(log.states.stamp)), log.states.position[:, 1]])
@@ -179,7 +216,7 @@ def test_joints_of_one_machine_are_commanded_by_what_each_takes(tmp_path):
   assert log.commands.joints == ("shoulder", "elbow")
   np.testing.assert_allclose(command_of(log, wheel, "shoulder"), 0.5 * PATH, atol=1e-6)
   np.testing.assert_allclose(command_of(log, wheel, "elbow"), 2 * PATH, atol=1e-6)
-  with pytest.raises(LogError, match=r"no positions in .* which the model's actuator on 'elbow'"):
+  with pytest.raises(LogError, match="no column command_position:elbow, which the model's"):
     read_logs([tmp_path / "log.csv"], mujoco.MjModel.from_xml_string(ARM))
   other = [lines[0].replace("position:elbow", "effort:elbow"), *lines[1:]]
   with pytest.raises(LogError, match=r"position of \['shoulder'\] and effort of \['elbow'\]"):
@@ -200,6 +237,12 @@ def test_joints_of_one_machine_are_commanded_by_what_each_takes(tmp_path):
     (lambda t: [*t[:9], t[9].replace(",,,,", ",,inf,,"), *t[10:]], "or nothing where none was"),
     (lambda t: [*t[:9], *t[19:21], *t[9:19], *t[21:]], "time runs backwards"),
     (lambda t: t[:40], "lasts 0.18 s with commands and states"),
+    (lambda t: [line.replace(",", ";") for line in t], "has ';' between its columns, expected ','"),
+    (lambda t: t[1:], r"begins with the numbers \[7.0, 0.0\], expected names in the first line"),
+    (
+      lambda t: [t[0], *(f"{1e3 * float(r.split(',')[0])},{r.split(',', 1)[1]}" for r in t[1:])],
+      r"a reading every 10 s, expected .* such as `time \[ms\]`",
+    ),
     (lambda t: [t[0], *(r for i, r in enumerate(t[1:]) if i % 40 < 2)], "at least 20 a second"),
     (
       lambda t: [*t[:2], t[2].replace(f"{PATH[0]:.6f},", ",", 1), *t[3:]],
