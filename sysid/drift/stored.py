@@ -1,6 +1,7 @@
 """What an identification keeps for later: the joints' hypotheses, and what they left of logs."""
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -149,6 +150,34 @@ def _member(item: dict[str, Any]) -> Member:
   return Member(from_list(item["extended"]), clocks)
 
 
+def model_marks(path: Path, compiled: mujoco.MjModel) -> dict[str, Any]:
+  """Returns by what a declared model is known again, as details.json has it.
+
+  The compiled model holds what its file includes, and its meshes; the same model compiled by
+  another MuJoCo is other bytes, of which the file's own content tells.
+
+  Args:
+    path: of the model.
+    compiled: the same, as it was read.
+  """
+  content = np.empty(mujoco.mj_sizeModel(compiled), np.uint8)
+  mujoco.mj_saveModel(compiled, None, content)
+  return {
+    "model_hash": hash_path(path),
+    "compiled_hash": hashlib.sha256(content.tobytes()).hexdigest(),
+    "compiled_by": mujoco.__version__,
+  }
+
+
+def _is_same(path: Path, compiled: mujoco.MjModel, details: dict[str, Any]) -> bool:
+  """Tells whether a model is the one of a stored result; of older ones the file alone is known,
+  and of the first ones nothing."""
+  now = model_marks(path, compiled)
+  whole = details.get("compiled_by") == now["compiled_by"]
+  mark = "compiled_hash" if whole else "model_hash"
+  return bool(details.get(mark, now[mark]) == now[mark])
+
+
 def to_json(joints: Sequence[StoredJoint]) -> list[dict[str, Any]]:
   """Returns joints as details.json has them."""
   return [to_plain(joint) for joint in joints]
@@ -176,10 +205,10 @@ def read(folder: Path) -> Stored:
     )
   model = Path(details["model"])
   compiled = load_model(model)
-  if details.get("model_hash", hash_path(model)) != hash_path(model):
+  if not _is_same(model, compiled, details):
     raise ValueError(
-      f"Found {model} changed since {folder} was written, expected the same model: restore it, or "
-      "identify from the first logs again."
+      f"Found {model}, or a file that it includes, changed since {folder} was written, expected "
+      "the same model: restore it, or identify from the first logs again."
     )
   stand = on_a_stand(model, compiled)
   if details.get("numerics"):

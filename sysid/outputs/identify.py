@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nerf2real.core.files import hash_path, write_atomically
+from nerf2real.core.files import write_atomically
 from nerf2real.core.folder_lock import lock_folder
 from nerf2real.core.pages import page
 from nerf2real.core.progress import Progress, no_progress, part
@@ -317,7 +317,7 @@ def _details(
   first = found.least_explained
   return {
     "model": str(model.resolve()),
-    "model_hash": hash_path(model),
+    **stored.model_marks(model, load_model(model)),
     **stored.member_to_json(near[0]),
     "near": [stored.member_to_json(member) for member in near[1:]],
     "calibration": {

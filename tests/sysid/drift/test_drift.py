@@ -1,7 +1,10 @@
 """Later logs of the same machine fit a stored result, those of a changed one do not."""
 
 import dataclasses
+import itertools
 import json
+import os
+import time
 from pathlib import Path
 
 import mujoco
@@ -13,9 +16,10 @@ from nerf2real.core.robot_logs.reading import LogError
 from nerf2real.launch import identify as script
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.effects.files import to_list
+from nerf2real.sysid.data.opening import load_model
 from nerf2real.sysid.drift import page
 from nerf2real.sysid.drift.judgement import Drift, Error
-from nerf2real.sysid.drift.stored import joint_of, read, to_json
+from nerf2real.sysid.drift.stored import joint_of, model_marks, read, to_json
 from nerf2real.sysid.fit import intervals
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter, Layout
@@ -212,6 +216,50 @@ def test_a_log_without_the_joint_or_an_older_result_is_one_clear_error(pendulum,
     sysid.check_drift(tmp_path, [Path("same.mcap")])
 
 
+def test_a_model_whose_included_file_or_mesh_changed_is_refused(pendulum, tmp_path):
+  """By another MuJoCo, and in results of earlier versions, the file alone tells."""
+  arm = PENDULUM[PENDULUM.index("<body") : PENDULUM.index("</worldbody>")]
+  mesh = '<asset><mesh name="hull" file="hull.obj"/></asset>'
+  xml = PENDULUM.replace(arm, '<include file="arm.xml"/>').replace(
+    "<worldbody>", f"{mesh}<worldbody>"
+  )
+  arm = arm.replace("</body>", '<geom type="mesh" mesh="hull" mass="0"/></body>')
+  corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+  written = itertools.count()
+  faces = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+  def write(declared=xml, included=arm, hull=corners):
+    (tmp_path / "model.xml").write_text(declared)
+    (tmp_path / "arm.xml").write_text(f"<mujoco>{included}</mujoco>")
+    (tmp_path / "hull.obj").write_text(hull + faces)
+    seconds = time.time() + 10 * next(written)  # MuJoCo reads a mesh again when its second differs
+    os.utime(tmp_path / "hull.obj", (seconds, seconds))
+
+  write()
+  path = tmp_path / "model.xml"
+  details = json.loads((pendulum / "details.json").read_text())
+  details |= {"model": str(path), **model_marks(path, load_model(path))}
+  (tmp_path / "report.json").write_text((pendulum / "report.json").read_text())
+  (tmp_path / "details.json").write_text(json.dumps(details))
+  heavier, longer = arm.replace('mass="0.5"', 'mass="0.7"'), corners.replace("v 0 0 1", "v 0 0 2")
+  read(tmp_path)
+  for change in ({"included": heavier}, {"hull": longer}, {"declared": xml.replace("21", "22")}):
+    write(**change)
+    with pytest.raises(ValueError, match=r"or a file that it includes, changed since") as caught:
+      read(tmp_path)
+    assert "\n" not in str(caught.value)
+  write(declared=xml.replace("<worldbody>", "<!-- a remark --><worldbody>"))
+  read(tmp_path)
+  old = {key: value for key, value in details.items() if not key.startswith("compiled")}
+  for earlier in ({**details, "compiled_by": "1.0"}, old):
+    (tmp_path / "details.json").write_text(json.dumps(earlier))
+    write(included=heavier)
+    read(tmp_path)
+    write(declared=xml.replace("21", "22"))
+    with pytest.raises(ValueError, match="changed since"):
+      read(tmp_path)
+
+
 def test_an_effect_of_the_machine_is_fitted_to_all_joints(later, tmp_path):
   late = [Effect("command_delay", None, {"delay": LATE})]
   folder = store(tmp_path, ARM, late, "command_delay", [LATE], shared=True)
@@ -276,7 +324,7 @@ def test_what_identify_writes_is_judged(later, tmp_path):
   moved = sysid.check_drift(tmp_path / "out", [Path("rubs_more.mcap")]).moved
   assert [value.kind for value in moved] == ["coulomb_friction"]
   (tmp_path / "model.xml").write_text(PENDULUM.replace('mass="0.5"', 'mass="0.7"'))
-  with pytest.raises(ValueError, match="model.xml changed since"):
+  with pytest.raises(ValueError, match=r"model\.xml, or a file that it includes, changed since"):
     sysid.check_drift(tmp_path / "out", [Path("same.mcap")])
 
 
