@@ -33,6 +33,7 @@ from nerf2real.sysid.model.supported import left_out, on_a_stand
 from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.outputs.notes import (
   another_session,
+  far,
   finer,
   long_step,
   not_judged,
@@ -41,6 +42,7 @@ from nerf2real.sysid.outputs.notes import (
   spread,
   still,
   supply,
+  unmeasured,
 )
 from nerf2real.sysid.outputs.rivals import alternatives, next_motion, residual_at
 from nerf2real.sysid.report import capability, samples, servo
@@ -189,6 +191,7 @@ def _identify(
       *still(found.still),
       *not_judged(beyond),
       *on_stand(free=stand is not compiled),
+      *unmeasured(compiled, logs),
       *finer(declared, used),
       *long_step(found.joints),
       *supply(logs, reference),
@@ -214,6 +217,8 @@ def _identify(
       f"At {joints} more remains than the machine leaves anyway: the names are certain, not all."
     )
     content["notes"].append(text)
+  if found.verdict == "none" and not reference:
+    content["notes"] += far(content["error"])
   if len(near) > 1:
     content["notes"].append(spread(content["error"]))
   drawn = samples.with_samples(found, _claimed(found), np.random.default_rng(0))

@@ -3,11 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.numerics import Numerics
+from nerf2real.sysid.report import summary
 from nerf2real.sysid.selection.joints.changed import Changed
 from nerf2real.sysid.settings import SETTINGS
 
@@ -46,6 +48,46 @@ def on_stand(*, free: bool) -> list[str]:
   return [
     "The base is free in the model and held here where the model has it, in the errors, too: the "
     "logs must be of a machine on a stand."
+  ]
+
+
+def unmeasured(model: mujoco.MjModel, logs: Sequence[Log]) -> list[str]:
+  """Returns a sentence on joints of the commanded machine that no log has; none without such.
+
+  What has six degrees of freedom is a base, or a body that lies about.
+  """
+  told = {name for log in logs for name in log.joints}
+  commanded = {name for log in logs for name in log.commands.joints}
+  trees = {int(model.body_rootid[model.jnt_bodyid[model.joint(name).id]]) for name in commanded}
+  names = [
+    model.joint(j).name or f"number {j}"
+    for j in range(model.njnt)
+    if int(model.body_rootid[model.jnt_bodyid[j]]) in trees
+    and int(model.jnt_type[j]) != int(mujoco.mjtJoint.mjJNT_FREE)
+    and model.joint(j).name not in told
+  ]
+  if not names:
+    return []
+  return [
+    f"In the model and in no log, and so held where the model declares them: {', '.join(names)}. If"
+    " they move, what hangs on them moves otherwise than it is simulated, and joints are judged"
+    " wrongly: record their positions, or give a model in which they are fixed, if they are."
+  ]
+
+
+def far(error: dict[str, Any]) -> list[str]:
+  """Returns a sentence on a remainder that is far above the readings' noise though nothing was
+  found; none where it is not.
+
+  Args:
+    error: of report.json.
+  """
+  if not summary.is_far(error):
+    return []
+  return [
+    f"What remains is {summary.times_of_noise(error):.0f} times the readings' noise: that nothing"
+    " is named does not mean that the model fits. Look whether it has all that moves, and whether"
+    " the logs have units, signs and stamps as expected."
   ]
 
 

@@ -93,15 +93,18 @@ def page(
   names = _summary(content["effects"])
   return Page(
     "What the model lacks",
-    f"{_headline(content['verdict'], referred)}{': ' + names if names else ''}. Model:"
+    f"{_headline(content, referred)}{': ' + names if names else ''}. Model:"
     f" {details['model'].rsplit('/', 1)[-1]}. Residuals are measured minus simulated.",
     sections,
     origin=Origin.of_process(),
   )
 
 
-def _headline(verdict: str, referred: bool) -> str:
+def _headline(content: dict[str, Any], referred: bool) -> str:
+  verdict = content["verdict"]
   unchanged = verdict == "none" and referred
+  if verdict == "none" and not referred and summary.is_far(content["error"]):
+    return "Nothing that has a name, yet the model does not fit"
   return "Nothing that the reference does not show, too" if unchanged else _HEADLINES[verdict]
 
 

@@ -1,12 +1,16 @@
 """Sentences of a report that follow from what was found."""
 
+import dataclasses
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 
+from nerf2real.core.robot_logs.series import JointSeries
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.outputs.notes import another_session, long_step, supply
+from nerf2real.sysid.outputs.notes import another_session, far, long_step, supply, unmeasured
+from tests.sysid.synthetic import ARM, log_of
 
 
 @pytest.mark.parametrize(
@@ -38,6 +42,34 @@ def test_a_step_that_is_long_for_a_joints_damping_is_said():
   assert not long_step(found[:1])  # type: ignore[arg-type]
   found[1].verdict = "none"
   assert not long_step(found)  # type: ignore[arg-type]
+
+
+def test_joints_that_no_log_has_are_said():
+  others = (
+    '<body><joint name="door"/><geom size="1"/></body><body><freejoint/><geom size="1"/></body>'
+  )
+  model = mujoco.MjModel.from_xml_string(ARM.replace("</worldbody>", f"{others}</worldbody>"))
+  log = log_of(ARM, "slow", duration=1.5)
+  assert not unmeasured(model, [log])
+
+  def alone(series):
+    return JointSeries(
+      ("shoulder",), series.stamp, series.stamp, series.position[:, :1], None, None
+    )
+
+  log = dataclasses.replace(log, states=alone(log.states), commands=alone(log.commands))
+  (said,) = unmeasured(model, [log])
+  assert "in no log, and so held where the model declares them: elbow. If they move" in said
+  assert said.endswith(
+    "record their positions, or give a model in which they are fixed, if they are."
+  )
+
+
+def test_a_remainder_far_above_the_noise_is_said():
+  error = {"train": {"after": 0.001}, "held": {"after": 0.113}, "floor": 0.000329}
+  (said,) = far(error)
+  assert said.startswith("What remains is 343 times the readings' noise")
+  assert not far({**error, "held": None})
 
 
 def _logs(*volts):

@@ -165,6 +165,30 @@ def test_nothing_and_no_name_are_different_answers(content):
   )
 
 
+def test_a_large_remainder_is_not_called_nothing(content):
+  content |= {"effects": [], "verdict": "none"}
+  content["error"]["held"] = {"before": 0.113, "after": 0.113}
+  missing = answers(content)[0]
+  assert missing.startswith("Nothing that has a name, yet the model does not fit | The model mov")
+  assert tones(content)[0] == "warn"
+  assert answers(content, referred=True)[0] == "Nothing has changed since the reference"
+  content["error"]["held"]["after"] = 0.05  # as healthy machines leave whose physics it lacks
+  assert answers(content)[0] == "Nothing that these logs show"
+
+
+def test_what_gains_nothing_is_not_the_nearest(content):
+  content |= {"effects": [], "verdict": "unexplained"}
+  content["alternatives"] = [{**FRICTION, "evidence": {"held_out_gain_nats": 0.0}}]
+  missing = answers(content)[0]
+  assert missing.endswith(
+    "that has no clear name | No effect that was tried predicts parts of the"
+    " logs better that were left out."
+  )
+  content["alternatives"] += [{**FRICTION, "kind": "backlash"}]
+  content["alternatives"][1]["evidence"] = {"held_out_gain_nats": 0.2}
+  assert "The nearest, which is not claimed: backlash at knee" in answers(content)[0]
+
+
 def test_nothing_new_beside_a_reference_is_not_said_to_be_a_model_that_lacks_nothing(content):
   content |= {"effects": [], "verdict": "none", "in_reference": [FRICTION]}
   missing, _, remains, _ = answers(content, referred=True)
