@@ -51,12 +51,19 @@ def audit(log: Log) -> dict[str, Any]:
 
 
 def _rate(series: JointSeries) -> float:
-  return round(1.0 / max(float(np.median(np.diff(series.stamp))), 1e-9), 3)
+  steps = _steps(series)
+  return round(1.0 / float(np.median(steps)), 3) if len(steps) else 0.0
 
 
 def _gaps(series: JointSeries) -> int:
+  steps = _steps(series)
+  return int(np.sum(steps > _GAP * np.median(steps))) if len(steps) else 0
+
+
+def _steps(series: JointSeries) -> np.ndarray:
+  """Returns the times between messages with different stamps, s."""
   steps = np.diff(series.stamp)
-  return int(np.sum(steps > _GAP * np.median(steps)))
+  return steps[steps > 0.0]
 
 
 def _drift(series: JointSeries) -> float:

@@ -238,6 +238,14 @@ def test_audit_reports_gaps_and_rates() -> None:
   assert audit(log)["state_gaps"] == 1
 
 
+def test_audit_is_of_stamps_that_differ() -> None:
+  log = log_of(PENDULUM, "slow", duration=3.0)
+  log.states.stamp[1::2] = log.states.stamp[: len(log.states.stamp) // 2 * 2 : 2]
+  found = audit(log)
+  assert found["duplicate_stamps"] == len(log.states.stamp) // 2
+  assert found["state_rate_hz"] == pytest.approx(50.0) and found["state_gaps"] == 0
+
+
 def test_a_still_joint_does_not_hide_the_readings_steps() -> None:
   log = log_of(ARM, "slow", duration=3.0)
   step = audit(log)["position_step"]
