@@ -6,6 +6,7 @@ import numpy as np
 from nerf2real.core.robot_logs.messages import COMMANDS, STATES
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.core.robot_logs.streaming import LogError
+from nerf2real.sysid.data.plausibility import check_units
 from nerf2real.sysid.model import chains
 from nerf2real.sysid.model.drive import (
   actuator_of,
@@ -69,6 +70,7 @@ def check_against_model(log: Log, model: mujoco.MjModel) -> None:
         f"{log.name} has no {lacks}, which the model's actuator on {name!r} takes: "
         f"record {wanted}, or give a model with the actuator that was driven."
       )
+    check_units(log, model, name)
     _check_range(log, model, name)
 
 

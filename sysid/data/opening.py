@@ -13,6 +13,7 @@ from nerf2real.core.robot_logs.series import JointSeries, ScalarSeries
 from nerf2real.core.robot_logs.streaming import LogError
 from nerf2real.sysid.data.bam import UNNAMED, read_bam
 from nerf2real.sysid.data.compatibility import check_against_model
+from nerf2real.sysid.data.plausibility import check_plausible
 from nerf2real.sysid.data.tables import read_csv
 from nerf2real.sysid.model.drive import joint_of
 from nerf2real.sysid.model.supported import without_disabled
@@ -127,4 +128,5 @@ def read_logs(paths: Sequence[Path], model: mujoco.MjModel) -> list[Log]:
     log = from_first_command(without_fillers(named(read_log(path), model)))
     check_against_model(log, model)
     logs.append(log)
+  check_plausible(logs, model)
   return logs

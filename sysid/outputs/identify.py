@@ -23,6 +23,7 @@ from nerf2real.core.serialization import to_plain
 from nerf2real.suite.effects import Effect, write_effects
 from nerf2real.sysid.data.checks import check_distinct, check_length
 from nerf2real.sysid.data.opening import load_model, read_logs, set_aside
+from nerf2real.sysid.data.plausibility import doubts
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import resolution, whitening
@@ -189,6 +190,7 @@ def _identify(
     "notes": [
       *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
       *still(found.still),
+      *doubts([*logs, *held, *reference], compiled),
       *not_judged(beyond),
       *on_stand(free=stand is not compiled),
       *unmeasured(compiled, logs),
