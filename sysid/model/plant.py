@@ -278,8 +278,9 @@ def turned_back(zero: Array, quarter: Array, at: Array) -> tuple[Array, Array]:
 
 
 def _other_load(log: Log, joint: str, time: Array) -> Array:
-  """Returns the sum of the other joints' |effort| [N] where efforts were measured, else zeros."""
+  """Returns the sum of the other joints' |effort| [N] where efforts were measured, else zeros; NaN,
+  of a joint without, counts as none."""
   if log.states.effort is None or len(log.states.joints) == 1:
     return np.zeros(len(time))
   others = [i for i, name in enumerate(log.states.joints) if name != joint]
-  return np.abs(log.states.effort[:, others]).sum(axis=1)
+  return np.nansum(np.abs(log.states.effort[:, others]), axis=1)

@@ -24,6 +24,7 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.drive import command_of
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import measured
 from nerf2real.sysid.model.motion import smooth_motion
 from nerf2real.sysid.outputs.identify import identify
@@ -166,6 +167,10 @@ def test_an_effort_that_one_joint_lacks_is_not_measured():
     assert of["shoulder"].effort is None and of["shoulder"].duty is None
     assert (of["elbow"].effort is not None) == is_kept and of["elbow"].duty is not None
     assert np.isfinite(audit(kept)["saturated_share"])
+    plant = JointModel(model, "elbow", [kept])
+    sagging = plant.declared.copy()
+    sagging[INDEX["droop"]] = 0.05  # by what the other joints draw, too
+    assert np.isfinite(plant.run(sagging, (), 0).position).all()
 
 
 def test_a_log_that_is_given_twice_is_refused(tmp_path):
