@@ -93,14 +93,14 @@ def check_plausible(logs: Sequence[Log], model: mujoco.MjModel) -> None:
       )
   found = _all(logs, model)
   flipped = _flipped(found)
-  judged = {joint for (_, joint), item in found.items() if item.best.share > _CLEAR}
+  judged = {joint for _, joint, item in found if item.best.share > _CLEAR}
   if flipped and set(flipped) >= judged:
     raise LogError(
       f"{flipped[next(iter(flipped))]}: readings of {_some(flipped)} go against their commands, "
       "expected readings that follow them: one of the two has the other sign, so turn the sign of "
       "the readings, or of the commands, to that of the model's joint."
     )
-  for (name, joint), item in found.items():
+  for name, joint, item in found:
     fit, hinge = item.along, int(model.joint(joint).type[0]) == int(mujoco.mjtJoint.mjJNT_HINGE)
     turns = round(fit.offset / _TURN)
     near = abs(fit.offset - turns * _TURN) < _OFF_TURN
@@ -128,7 +128,7 @@ def doubts(logs: Sequence[Log], model: mujoco.MjModel) -> list[str]:
       " those of other joints follow theirs: one of the two has the other sign there. Turn it."
     )
   early: dict[str, dict[str, float]] = collections.defaultdict(dict)
-  for (name, joint), item in found.items():
+  for name, joint, item in found:
     fit = item.along
     left = max(1.0 - fit.share, 1e-12)
     if fit.share > _SURE and fit.lag <= -_EARLY and 1.0 - item.prompt > _WORSE * left:
@@ -145,20 +145,20 @@ def doubts(logs: Sequence[Log], model: mujoco.MjModel) -> list[str]:
   return texts
 
 
-def _all(logs: Sequence[Log], model: mujoco.MjModel) -> dict[tuple[str, str], Following]:
-  """Returns how joints follow, by log and joint."""
-  found = {
-    (log.name, joint): following(log, model, joint) for log in logs for joint in servos(log, model)
-  }
-  return {key: item for key, item in found.items() if item is not None}
+def _all(logs: Sequence[Log], model: mujoco.MjModel) -> list[tuple[str, str, Following]]:
+  """Returns how joints follow that move, each with its log's name and its own."""
+  found = [
+    (log.name, joint, following(log, model, joint)) for log in logs for joint in servos(log, model)
+  ]
+  return [(name, joint, item) for name, joint, item in found if item is not None]
 
 
-def _flipped(found: dict[tuple[str, str], Following]) -> dict[str, str]:
+def _flipped(found: Sequence[tuple[str, str, Following]]) -> dict[str, str]:
   """Returns joints whose readings go against their commands, with the first log that shows it: by
   far better than they follow them at any lag, as a delay of half a period is no other sign."""
   against: dict[str, str] = {}
   along = set()
-  for (name, joint), item in found.items():
+  for name, joint, item in found:
     if item.along.share > _CLEAR:
       along.add(joint)
     elif (
