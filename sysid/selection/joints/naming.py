@@ -97,12 +97,12 @@ def conclude(
   """
   bare = best = max(of_size(ranked, 0), key=lambda s: s.evidence)
   for size in range(1, max(len(s.names) for s in ranked) + 1):
-    same = of_size(ranked, size)
-    if same:
-      top = max(same, key=lambda s: s.evidence)
+    # What is likelier and not clear of the best so far says nothing against one that is.
+    for top in sorted(of_size(ranked, size), key=lambda s: -s.evidence):
       idle = [s for s in ranked if s.neutral and s.names < top.names]
       if all(clear(top, s) > _of_size(beyond, size) for s in (best, *idle)):
         best = top
+        break
   last = _of_size(beyond, len(best.names))
   best = _usual(joint, best, ranked, last)
   names = _names(joint, best, ranked, beyond)

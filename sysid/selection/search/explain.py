@@ -36,6 +36,8 @@ _TWINS = {
   "encoder_offset": "zero",
 }
 """Effects of one value that does what a constant does, and that constant."""
+_LOADS = ("damping", "armature", "friction", "mass")
+"""Constants that are all larger by one share where a motor is weaker by it."""
 
 
 def scored_on(
@@ -62,18 +64,45 @@ def _handed_over(parent: Scored, term: Term) -> list[Array]:
   return [x]
 
 
+def _in_common(parent: Scored, term: Term) -> list[Array]:
+  """Returns where a parent's fit is with what its constants are off by in common as a gain, and all
+  torques of its effects larger by that: about the same motion, at constants nearer to those that
+  are known. Where constants have taken a motor's weakness single steps do not lead there."""
+  constants = next((t for t in parent.terms if t.kind == CONSTANTS), None)
+  if term.kind != WEAK or constants is None:
+    return []
+  layout = parent.fit.layout
+  first = layout.spans[layout.terms.index(constants)][0]
+  names = zip(constants.names, constants.prior, strict=True)
+  at = [first + i for i, (name, s) in enumerate(names) if name in _LOADS and np.isfinite(s)]
+  if not at:
+    return []
+  here, known = 1.0 + parent.fit.x[at], 1.0 + layout.centre[at]
+  weight = layout.sigma[at] ** -2.0
+  gain = float(np.clip(weight @ (here * known) / (weight @ here**2), term.low[0], term.high[0]))
+  x = np.where(_torques(parent), gain, 1.0) * parent.fit.x
+  x[at] = gain * here - 1.0
+  return [np.append(x, gain)]
+
+
+def _torques(parent: Scored) -> Array:
+  """Tells which values of a hypothesis are torques of effects [n]."""
+  return np.array(
+    [
+      t.kind != CONSTANTS and kind_of(t.kind).parameter(n).unit.startswith("N m")
+      for t in parent.terms
+      for n in t.names
+    ],
+    bool,
+  )
+
+
 def _scaled(parent: Scored, term: Term) -> list[Array]:
   """Returns where a parent's fit is with all torques of its effects larger by each start of a gain:
   that makes about the same motion, and single steps do not lead from one to the other."""
   if term.kind != WEAK:
     return []
-  torques = np.array(
-    [
-      t.kind != CONSTANTS and kind_of(t.kind).parameter(n).unit.startswith("N m")
-      for t in parent.terms
-      for n in t.names
-    ]
-  )
+  torques = _torques(parent)
   if not torques.any():
     return []
   factors = np.array([s[0] for s in term.starts])[:, None]
@@ -283,8 +312,8 @@ class Explainer:
         continue
       blank = np.zeros((len(term.names), *known.shape[1:]))
       own = [np.concatenate([x, s]) for s in (*term.starts, *self._waves(parent, term))]
-      begin = np.array([*own, *_handed_over(parent, term), *_scaled(parent, term)])
-      begin = _moved((*parent.terms, term), begin)
+      own += [*_handed_over(parent, term), *_in_common(parent, term), *_scaled(parent, term)]
+      begin = _moved((*parent.terms, term), np.array(own))
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
 
