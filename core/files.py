@@ -203,7 +203,7 @@ def hash_path(path: str | Path, *, named: Iterable[Path] = ()) -> str:
   folder = path if path.is_dir() else path.parent
   for file in (*below, *sorted(set(named) - set(below))):
     if file != path:
-      digest.update(os.path.relpath(file, folder).encode())
+      digest.update(os.fsencode(os.path.relpath(file, folder)))
     with file.open("rb") as stream:
       digest.update(hashlib.file_digest(stream, "sha256").digest())
   return digest.hexdigest()

@@ -1,6 +1,7 @@
 """Files and folders are whole or absent; a full disk is one line."""
 
 import errno
+import os
 import pickle
 import resource
 import shutil
@@ -183,6 +184,14 @@ def test_linked_folders_count_and_a_link_to_a_folder_above_does_not(tmp_path):
   assert files.hash_path(capture) == plain
   (linked / "images" / "y").write_text("2")
   assert files.hash_path(capture) != plain
+
+
+def test_a_name_that_is_no_utf8_counts(tmp_path):
+  odd = tmp_path / os.fsdecode(b"caf\xe9")
+  odd.write_text("1")
+  first = files.hash_path(tmp_path)
+  odd.rename(tmp_path / "café")
+  assert len({first, files.hash_path(tmp_path)}) == 2
 
 
 def test_a_line_is_appended_whole_or_not_at_all(tmp_path):
