@@ -1,4 +1,8 @@
-"""Writes pictures: raises where nothing was written, which OpenCV's own writer only returns."""
+"""Writes and decodes pictures where OpenCV's own functions fail.
+
+Its writer only returns that nothing was written; its reader ends the process at a file's name that
+is no UTF-8.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,3 +34,21 @@ def write_picture(path: Path, image: np.ndarray, parameters: Sequence[int] = ())
     raise ValueError(f"{path} cannot hold a picture {image.dtype} {list(image.shape)}: give .png.")
   with files.explain_disk_full(path):
     path.write_bytes(content.tobytes())
+
+
+def decoded(data: bytes, how: int) -> np.ndarray | None:
+  """Decodes what a picture's file holds.
+
+  Args:
+    data: The file's content.
+    how: One of OpenCV's IMREAD_ flags, or several.
+
+  Returns:
+    Pixels [H, W] or [H, W, C], BGR; None where it is damaged or no picture.
+  """
+  if not data:
+    return None
+  try:
+    return cv2.imdecode(np.frombuffer(data, np.uint8), how)
+  except cv2.error:
+    return None

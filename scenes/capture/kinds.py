@@ -27,6 +27,10 @@ def source_kind(source: Path) -> str:
   """
   if not source.exists():
     raise CaptureError(f"{source} does not exist.")
+  try:
+    str(source).encode()
+  except UnicodeEncodeError as error:
+    raise CaptureError(f"The name of {source} is no UTF-8: rename it.") from error
   if find_transforms(source) is not None:
     return "transforms"
   if find_rgbd(source) is not None:
@@ -58,8 +62,7 @@ def _what_instead(source: Path) -> str:
   if below:
     return f"no capture, but folders that do: give one of them, such as {source / below[0]}."
   files = [path for path in sorted(source.iterdir()) if path.is_file() and path.name[0] != "."]
-  videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
-  if videos:
+  if videos := _videos(source):
     others = f", and {len(videos) - 1} more" if len(videos) > 1 else ""
     return f"{videos[0].name}, a video{others}, and no pictures: give {videos[0]} itself."
   kinds = collections.Counter(path.suffix.lower() or "no suffix" for path in files)
@@ -68,6 +71,26 @@ def _what_instead(source: Path) -> str:
     f"no pictures, no COLMAP model and no transforms.json{found}: give a video, or a folder with "
     f"one of these; pictures are {', '.join(IMAGE_SUFFIXES)}."
   )
+
+
+def _videos(folder: Path) -> list[Path]:
+  """Videos of a folder by their names, without hidden files."""
+  return [
+    path
+    for path in sorted(folder.iterdir())
+    if path.suffix.lower() in _VIDEO_SUFFIXES and path.name[0] != "." and path.is_file()
+  ]
+
+
+def holds_more(source: Path, count: int) -> str | None:
+  """Says what to give in place of a folder of `count` pictures: a folder in it, or a video."""
+  if videos := _videos(source):
+    return f"give the video {videos[0]} itself, or take more pictures"
+  held = {child: len(list_images(child)) for child in source.iterdir() if child.is_dir()}
+  most = max(held, key=lambda child: held[child], default=source)
+  if held.get(most, 0) <= count:
+    return None
+  return f"give {most}, which holds {held[most]}, or take more"
 
 
 def _holds(folder: Path) -> bool:

@@ -13,7 +13,7 @@ from nerf2real.core.geometry.cameras import Camera
 from nerf2real.core.picture_files import write_picture
 from nerf2real.core.progress import Progress, no_progress
 from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
-from nerf2real.scenes.capture.kinds import source_kind
+from nerf2real.scenes.capture.kinds import holds_more, source_kind
 from nerf2real.scenes.capture.media import stills
 from nerf2real.scenes.capture.media.blur import blur_width
 from nerf2real.scenes.capture.media.errors import CaptureError
@@ -37,6 +37,7 @@ from nerf2real.scenes.capture.posed.transforms import read_transforms
 # and none of four of JPEGs of quality 95 or 100.
 _WITHOUT_LOSS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # level 1: fast
 _CANDIDATES = 3  # of a video, for each keyframe; chosen: what moves five times as fast is as dense
+_BENT = 0.01  # of a picture's aspect; chosen: as of a known camera's
 _KEYFRAME_RATE = 2.0  # of a long video [1/s]; chosen: about that of the shipped film, 150 in 70 s
 
 
@@ -104,7 +105,7 @@ def _read_video(
     warnings=warnings,
     progress=progress,
   )
-  written = _spread(_write(frames, folder), count)
+  written = _spread(_write(frames, folder, warnings), count)
   return _gather("video", written, folder, settings, warnings)
 
 
@@ -118,9 +119,10 @@ def _read_pictures(
   files = list(known.files) if known else list_images(source) or list_images_below(source)
   if len(files) < settings.min_images:
     lost = f" ({' '.join(known.warnings)})" if known and known.warnings else ""
+    more = None if known else holds_more(source, len(files))
     raise CaptureError(
       f"{source} holds {len(files)} pictures{lost}, expected at least {settings.min_images} that "
-      "overlap: take more, from different places in the room."
+      f"overlap: {more or 'take more, from different places in the room'}."
     )
   if known is None:
     return _read_stills(source, files, folder, settings, progress)
@@ -132,7 +134,7 @@ def _read_pictures(
 
   warnings = list(known.warnings)
   frames = _sharpest_pictures(files, read, settings.num_keyframes, warnings, progress)
-  written = _write(frames, folder)
+  written = _write(frames, folder, warnings)
   _check_count(source, len(written), settings, warnings)
   if kind != "rgbd":
     warnings.extend(_unused(len(written), len(files), settings.num_keyframes))
@@ -140,7 +142,7 @@ def _read_pictures(
   known = known.selected(_numbers(capture), _written_camera(camera, capture))
   known, changed = agreement.settled(known, capture.images)
   capture.warnings.extend(changed)
-  origins = [path.name for path in known.files]
+  origins = [stills.printable(path) for path in known.files]
   return dataclasses.replace(capture, times=None, known=known.lifted(), origins=origins)
 
 
@@ -157,11 +159,17 @@ def _read_stills(
     if found.turned[index]:
       image = stills.quarter_turned(image)
     same = image.shape[1::-1] == size
+    aspect = (image.shape[1] / image.shape[0]) / (size[0] / size[1])
+    if abs(aspect - 1) > max(_BENT, 2 / min(size)):  # 2 pixels: small ones are rounded
+      raise CaptureError(
+        f"{found.files[index]} is {image.shape[1]}x{image.shape[0]}, expected the shape of "
+        f"{size[0]}x{size[1]} that its header tells: copy it again."
+      )
     return image if same else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
   warnings = list(found.warnings)
   frames = _sharpest_pictures(found.files, read, settings.most, warnings, progress)
-  written = _write(frames, folder)
+  written = _write(frames, folder, warnings)
   _check_count(source, len(written), settings, warnings)
   warnings.extend(_unused(len(written), len(found.files), settings.most))
   capture = _gather("images", written, folder, settings, warnings)
@@ -171,7 +179,7 @@ def _read_stills(
     capture,
     times=None,
     turned=turned if turned.any() else None,
-    origins=[found.files[k].name for k in numbers],
+    origins=[stills.printable(found.files[k]) for k in numbers],
   )
 
 
@@ -202,7 +210,7 @@ def _numbers(capture: Capture) -> list[int]:
 def _written_camera(camera: Camera, capture: Capture) -> Camera:
   """Scales the source's camera to the keyframes as written, and checks that it is theirs."""
   ratio = (capture.width / camera.width) / (capture.height / camera.height)
-  if abs(ratio - 1) > 0.01:
+  if abs(ratio - 1) > _BENT:
     raise CaptureError(
       f"The pictures are {capture.width}x{capture.height}, but the known camera is for "
       f"{camera.width}x{camera.height}: expected the same aspect."
@@ -257,8 +265,8 @@ class _Written:
   sharpness: float
 
 
-def _write(frames: Iterator[Frame], folder: Path) -> list[_Written]:
-  """Writes frames as they come."""
+def _write(frames: Iterator[Frame], folder: Path, warnings: list[str]) -> list[_Written]:
+  """Writes frames as they come; `warnings` then say why there are none, if so."""
   written: list[_Written] = []
   size: tuple[int, int] | None = None
   for frame in frames:
@@ -273,7 +281,7 @@ def _write(frames: Iterator[Frame], folder: Path) -> list[_Written]:
     write_picture(path, frame.image, _WITHOUT_LOSS)
     written.append(_Written(path, frame.index, frame.time, frame.travelled, frame.sharpness))
   if not written:
-    raise CaptureError("The capture holds no picture.")
+    raise CaptureError(" ".join(["The capture holds no picture.", *warnings]))
   return written
 
 

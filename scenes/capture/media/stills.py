@@ -7,6 +7,7 @@ quarter, so that its sensor lies as theirs; of several lenses the most common on
 
 import collections
 import contextlib
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,15 +17,19 @@ import numpy as np
 import pi_heif
 import PIL.ExifTags
 import PIL.Image
+import PIL.ImageOps
 
 from nerf2real.core.errors import first_few
 from nerf2real.core.files import hash_path
+from nerf2real.core.picture_files import decoded
 from nerf2real.scenes.capture.media import colors
 from nerf2real.scenes.capture.media.errors import CaptureError
 
 APPLE_SUFFIXES = (".heic", ".heif")  # what iPhones write; OpenCV does not read them
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *APPLE_SUFFIXES)
-_JPEG_SUFFIXES = (".jpg", ".jpeg")  # decoded at a reduced size; OpenCV resamples other formats
+# A file's name may lie: what it holds says how it is read.
+_JPEG = ("JPEG", "MPO")  # decoded at a reduced size; OpenCV resamples other formats
+_BY_PIL = ("HEIF", "TIFF")  # libheif always turns the one, OpenCV fails with the other turned
 _REDUCED = (
   (8, cv2.IMREAD_REDUCED_COLOR_8),
   (4, cv2.IMREAD_REDUCED_COLOR_4),
@@ -32,7 +37,18 @@ _REDUCED = (
 )
 _ENOUGH = 1600  # long side at which features are sought: smaller pictures lose some [pixel]
 _NAMED = 4  # files in a warning
+_WIDE = ("I", "F")  # PIL's modes of one channel of 32 bits
 _TURNED = (5, 6, 7, 8)  # EXIF orientations with width and height exchanged
+_AS_STORED = {  # undoes each EXIF orientation
+  2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,
+  3: PIL.Image.Transpose.ROTATE_180,
+  4: PIL.Image.Transpose.FLIP_TOP_BOTTOM,
+  5: PIL.Image.Transpose.TRANSPOSE,
+  6: PIL.Image.Transpose.ROTATE_90,
+  7: PIL.Image.Transpose.TRANSVERSE,
+  8: PIL.Image.Transpose.ROTATE_270,
+}
+_Tag = PIL.ExifTags.Base
 # Camera axes of the upright picture in those of the one that was turned counter-clockwise.
 _TURNED_FROM_UPRIGHT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -120,18 +136,20 @@ def look_of(path: Path) -> Look:
   """
   try:
     with opened(path) as image:
-      width, height = image.size
       exif = image.getexif()
+      width, height = image.size
+      if image.format == "TIFF":  # PIL turns its size, in some versions before it is loaded
+        width, height = (exif[t] for t in (_Tag.ImageWidth, _Tag.ImageLength))
       detail = exif.get_ifd(PIL.ExifTags.IFD.Exif)
   except (OSError, ValueError, SyntaxError) as error:
     raise CaptureError(
       f"{path} cannot be read as a picture: remove it or copy it again ({error})."
     ) from error
-  if exif.get(PIL.ExifTags.Base.Orientation) in _TURNED:
+  if exif.get(_Tag.Orientation) in _TURNED:
     width, height = height, width
   focal = 0.0
   with contextlib.suppress(TypeError, ValueError):  # EXIF may hold several numbers, or text
-    focal = float(detail.get(PIL.ExifTags.Base.FocalLengthIn35mmFilm, 0))
+    focal = float(detail.get(_Tag.FocalLengthIn35mmFilm, 0))
   return Look(width, height, focal if focal > 0 else None)
 
 
@@ -139,8 +157,23 @@ def unreadable(lost: Sequence[Path], count: int) -> list[str]:
   """Says which of `count` files cannot be read, if any."""
   if not lost:
     return []
-  names = first_few([path.name for path in lost], _NAMED)
+  names = first_few([printable(path) for path in lost], _NAMED)
   return [f"{len(lost)} of {count} files cannot be read as a picture, left out: {names}."]
+
+
+def printable(path: Path) -> str:
+  """A file's name with marks for what is no UTF-8, as of an old archive."""
+  return os.fsencode(path.name).decode(errors="replace")
+
+
+def _depth_maps(files: Sequence[Path]) -> list[Path]:
+  """Files of one channel of 16 bits or more, if others are not so: a depth camera's."""
+  found = []
+  for path in files:
+    with opened(path) as image:
+      if image.mode in _WIDE or image.mode.startswith("I;16"):
+        found.append(path)
+  return found if len(found) < len(files) else []
 
 
 def _without_copies(files: Sequence[Path]) -> list[Path]:
@@ -168,7 +201,7 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   """Keeps the pictures of the most common camera, each once.
 
   Pictures in several sizes, as messengers make them, are all kept while the smallest shows as many
-  features as the others. What is no picture is left out.
+  features as the others. What is no picture, and depth maps beside pictures, are left out.
 
   Raises:
     CaptureError: None is a picture.
@@ -182,6 +215,12 @@ def of_one_camera(files: Sequence[Path]) -> Stills:
   warnings = unreadable(lost, len(files))
   if not look_at:
     raise CaptureError(f"{files[0].parent}: {' '.join(warnings)} Copy the pictures again.")
+  if depth := _depth_maps(list(look_at)):
+    warnings.append(
+      f"{len(depth)} of {len(files)} pictures are depth maps (16-bit grey beside others), as "
+      f"{printable(depth[0])}: left out, as they say nothing without poses."
+    )
+    look_at = {path: look for path, look in look_at.items() if path not in set(depth)}
   once = _without_copies(list(look_at))
   looks = [look_at[path] for path in once]
   common = _most_common(looks)
@@ -218,26 +257,52 @@ def read_still(path: Path, *, least: int | None = None, upright: bool = True) ->
     upright: Whether EXIF turns it; one of Apple's formats always is.
 
   Raises:
-    CaptureError: It is damaged or no picture.
+    CaptureError: It is damaged, cut off, or no picture.
   """
-  image, profile = None, None
+  image, profile, form, how = None, None, None, cv2.IMREAD_COLOR
   with contextlib.suppress(OSError, ValueError, SyntaxError), opened(path) as picture:
-    profile = picture.info.get("icc_profile")
-    if path.suffix.lower() in APPLE_SUFFIXES:  # libheif has turned it
-      image = np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
-  if path.suffix.lower() not in APPLE_SUFFIXES:
-    how = _reduction(path, least) | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
-    image = cv2.imread(str(path), how)
+    form, profile = picture.format, picture.info.get("icc_profile")
+    if form in _BY_PIL:
+      image = _converted(picture, upright=upright)
+    elif form in _JPEG and least is not None:
+      how = _reduction(max(picture.size), least)
+  if form not in _BY_PIL and path.is_file():
+    data = path.read_bytes()
+    if form not in _JPEG or not _is_cut_off(data):
+      image = decoded(data, how | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION))
   if image is None:
     raise CaptureError(f"{path} cannot be read as a picture: remove it or copy it again.")
   return colors.to_srgb(image, profile)
 
 
-def _reduction(path: Path, least: int | None) -> int:
+def _converted(picture: PIL.Image.Image, *, upright: bool) -> np.ndarray | None:
+  """Pixels BGR uint8 [H, W, 3] of an opened picture that PIL turns; None of one of floats."""
+  orientation = picture.getexif().get(_Tag.Orientation)
+  picture = PIL.ImageOps.exif_transpose(picture)
+  if not upright and orientation in _AS_STORED:
+    picture = picture.transpose(_AS_STORED[orientation])
+  if picture.mode.startswith("I;16"):  # which PIL clips at 255
+    return cv2.cvtColor((np.asarray(picture) >> 8).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+  if picture.mode in _WIDE:
+    return None
+  return np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
+
+
+def _is_cut_off(data: bytes) -> bool:
+  """Whether a JPEG lacks its end, in place of which libjpeg would give grey.
+
+  Its end is marked; so may be that of a thumbnail, in a segment before the picture's own scan.
+  Source: ITU-T T.81, annex B.
+  """
+  at = 2
+  while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
+    filled = data[at + 1 : at + 2] == b"\xff"
+    at += 1 if filled else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+  return data.find(b"\xff\xd9", at) < 0
+
+
+def _reduction(long_side: int, least: int) -> int:
   """OpenCV's flag to read a picture with: reduced as far as the long side that is needed allows."""
-  if least is None or path.suffix.lower() not in _JPEG_SUFFIXES:
-    return cv2.IMREAD_COLOR
-  long_side = look_of(path).long_side
   fitting = (flag for divisor, flag in _REDUCED if long_side >= divisor * least)
   return next(fitting, cv2.IMREAD_COLOR)
 

@@ -214,6 +214,14 @@ def test_unusable_inputs_are_one_clear_line(frames, tmp_path):
   for number in range(3):
     cv2.imwrite(str(folder / f"{number}.jpg"), frames[number])
   assert "holds 3 pictures, expected at least 8" in message(folder)
+  assert "take more, from different places" in message(folder)
+  (folder / "walk.MP4").touch()
+  assert f"give the video {folder / 'walk.MP4'} itself" in message(folder)
+  (folder / "walk.MP4").unlink()
+  (folder / "images").mkdir()
+  for number in range(4):
+    (folder / "images" / f"{number}.jpg").touch()
+  assert f"give {folder / 'images'}, which holds 4" in message(folder)
   for number in range(3, 9):
     cv2.imwrite(str(folder / f"{number}.jpg"), frames[number][:100])
   assert "expected one camera" in message(folder)

@@ -1,5 +1,6 @@
 """Photographs of a folder: those of one camera are kept, turned alike, each once."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import PIL.ExifTags
 import PIL.Image
 import pytest
 
+from nerf2real.core.files import hash_path
 from nerf2real.scenes.capture import keyframes
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.kinds import source_kind
@@ -218,3 +220,114 @@ def test_large_photographs_are_decoded_no_larger_than_needed(tmp_path, least, si
   assert image.shape == (*size, 3)  # upright
   expected = cv2.resize(np.rot90(pixels, -1), size[::-1], interpolation=cv2.INTER_AREA)
   assert np.abs(image[..., ::-1].astype(int) - expected).mean() < 2
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_a_jpeg_with_apples_suffix_is_read_by_what_it_holds(tmp_path, orientation):
+  """A messenger names what it has converted as it was."""
+  for number in range(8):
+    _still(tmp_path / "made.jpg", (64, 48), orientation=orientation, seed=number)
+    (tmp_path / "made.jpg").rename(tmp_path / f"{number}.HEIC")
+  expected = cv2.imread(str(tmp_path / "0.HEIC"))
+  assert stills.look_of(tmp_path / "0.HEIC")[:2] == (48, 64) == expected.shape[1::-1]
+  np.testing.assert_array_equal(stills.read_still(tmp_path / "0.HEIC"), expected)
+  capture = read_capture(tmp_path, tmp_path / "out")
+  assert (capture.width, capture.height) == (48, 64)
+
+
+def test_an_apple_picture_with_a_jpegs_suffix_is_read_by_what_it_holds(tmp_path):
+  shutil.copy(UPRIGHT, tmp_path / "0.jpg")
+  np.testing.assert_array_equal(stills.read_still(tmp_path / "0.jpg"), stills.read_still(UPRIGHT))
+  np.testing.assert_array_equal(
+    stills.read_still(tmp_path / "0.jpg", least=16), stills.read_still(UPRIGHT)
+  )
+
+
+def test_a_picture_that_is_not_as_its_header_tells_is_left_out(tmp_path, monkeypatch):
+  for number in range(9):
+    _still(tmp_path / f"{number}.png", (640, 480), seed=number)
+  read = stills.read_still
+
+  def turned(path, **how):
+    return np.rot90(read(path, **how)) if path.name == "3.png" else read(path, **how)
+
+  monkeypatch.setattr(stills, "read_still", turned)
+  capture = read_capture(tmp_path, tmp_path / "out", settings=CaptureSettings(num_keyframes=9))
+  assert capture.origins == [f"{k}.png" for k in range(9) if k != 3]
+
+
+@pytest.mark.parametrize("orientation", [3, 5, 6, 8])
+def test_a_turned_tiff_is_read_once_turned(tmp_path, orientation, capfd):
+  pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+  exif = PIL.Image.Exif()
+  exif[PIL.ExifTags.Base.Orientation] = orientation
+  for suffix in (".tif", ".png"):
+    PIL.Image.fromarray(pixels).save(tmp_path / f"still{suffix}", exif=exif)
+  tiff, png = tmp_path / "still.tif", tmp_path / "still.png"
+  image = stills.read_still(tiff)
+  np.testing.assert_array_equal(image, stills.read_still(png))
+  assert stills.look_of(tiff)[:2] == image.shape[1::-1] == stills.look_of(png)[:2]
+  np.testing.assert_array_equal(stills.read_still(tiff, upright=False), pixels[..., ::-1])
+  assert not capfd.readouterr().err
+
+
+def test_a_tiff_of_sixteen_bits_keeps_its_brightness(tmp_path):
+  grey = np.linspace(0, 65535, 64 * 48).reshape(48, 64).astype(np.uint16)
+  cv2.imwrite(str(tmp_path / "still.tif"), grey)
+  expected = np.repeat(grey[..., None] // 256, 3, axis=-1)
+  np.testing.assert_array_equal(stills.read_still(tmp_path / "still.tif"), expected)
+
+
+@pytest.mark.parametrize("filled", [False, True])
+def test_a_jpeg_that_was_cut_off_is_left_out_and_named(tmp_path, filled):
+  for number in range(9):
+    _still(tmp_path / f"{number}.jpg", (64, 48), seed=number)
+  exif = PIL.Image.Exif()
+  thumbnail = (tmp_path / "0.jpg").read_bytes()[:4000] + b"\xff\xd9"  # an end within a segment
+  exif[PIL.ExifTags.Base.ImageDescription] = thumbnail.decode("latin-1")
+  with PIL.Image.open(tmp_path / "4.jpg") as image:
+    image.save(tmp_path / "4.jpg", exif=exif)
+  data = (tmp_path / "4.jpg").read_bytes()
+  kept = len(data) - 1500
+  (tmp_path / "4.jpg").write_bytes(data[:kept] + (bytes(1500) if filled else b""))
+  (tmp_path / "5.jpg").write_bytes((tmp_path / "5.jpg").read_bytes() + b"a film of the moment")
+  capture = read_capture(tmp_path, tmp_path / "out", settings=CaptureSettings(num_keyframes=9))
+  assert len(capture.images) == 8
+  assert "1 of 9 files cannot be read as a picture, left out: 4.jpg." in capture.warnings
+
+
+def test_pictures_that_are_all_lost_are_named(tmp_path):
+  for number in range(8):
+    _still(tmp_path / f"{number}.jpg", (64, 48), seed=number)
+    data = (tmp_path / f"{number}.jpg").read_bytes()
+    (tmp_path / f"{number}.jpg").write_bytes(data[: len(data) // 2])
+  with pytest.raises(CaptureError, match=r"no picture\. 8 of 8 .* left out: 0\.jpg, 1\.jpg"):
+    read_capture(tmp_path, tmp_path / "out")
+
+
+def test_depth_maps_beside_photographs_are_left_out(tmp_path):
+  for number in range(8):
+    _still(tmp_path / f"frame{number}.png", (64, 48), seed=number)
+    depth = np.random.default_rng(number).integers(900, 4000, (48, 64)).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / f"depth{number}.png"), depth)
+  capture = read_capture(tmp_path, tmp_path / "out")
+  assert capture.origins == [f"frame{number}.png" for number in range(8)]
+  assert any("8 of 16 pictures are depth maps" in text for text in capture.warnings)
+  for path in tmp_path.glob("frame*"):
+    path.unlink()
+  assert len(stills.of_one_camera(sorted(tmp_path.glob("*.png"))).files) == 8  # grey photographs
+
+
+def test_a_name_that_is_no_utf8_is_read_and_shown_with_a_mark(tmp_path):
+  folder = tmp_path / "photos"
+  folder.mkdir()
+  for number in range(8):
+    _still(folder / f"{number}.png", (64, 48), seed=number)
+  os.rename(folder / "3.png", os.fsencode(folder) + b"/caf\xe9.png")
+  assert len(hash_path(folder)) == 64
+  capture = read_capture(folder, tmp_path / "out")
+  assert len(capture.images) == 8 and "caf\N{REPLACEMENT CHARACTER}.png" in capture.origins
+  odd = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")
+  os.rename(folder, odd)
+  with pytest.raises(CaptureError, match="is no UTF-8: rename it"):
+    source_kind(Path(odd))
