@@ -48,6 +48,20 @@ class Recording:
     """Adds a warning."""
     return dataclasses.replace(self, warnings=(*self.warnings, text))
 
+  def placed(self, source: Path) -> "Recording":
+    """Leaves out the pictures whose pose is not finite, as trackers write of lost frames.
+
+    Raises:
+      CaptureError: None has a pose.
+    """
+    finite = np.isfinite(self.poses).all((1, 2))
+    if finite.all():
+      return self
+    if not finite.any():
+      raise CaptureError(f"{source} holds no finite pose: expected one for each picture.")
+    words = f"{(~finite).sum()} of {len(finite)} poses are lost: left out."
+    return self.selected(np.flatnonzero(finite)).warned(words)
+
   def present(self, source: Path) -> "Recording":
     """Leaves out the pictures whose files are missing, and all depth where most of it is.
 

@@ -60,19 +60,12 @@ def _posed(
     if np.isfinite(matrix).all() and not is_rigid(matrix):
       raise CaptureError(f"{path} is no pose: its 3x3 part is no rotation.")
     matrices.append(matrix)
-  stacked = np.stack(matrices)
-  finite = np.flatnonzero(np.isfinite(stacked).all((1, 2)))
-  if not len(finite):
-    raise CaptureError(f"{poses[0].parent}: no file such as {poses[0].name} holds a finite pose.")
-  found = Recording(
+  return Recording(
     files=[picture(path) for path in poses],
-    poses=stacked,
+    poses=np.stack(matrices),
     depth=[depth(path) for path in poses],
     unit=MILLIMETRE,
-  ).selected(finite)
-  if len(finite) < len(poses):
-    found = found.warned(f"{len(poses) - len(finite)} of {len(poses)} poses are lost: left out.")
-  return found
+  ).placed(poses[0].parent)
 
 
 def read_seven_scenes(source: Path) -> Recording:

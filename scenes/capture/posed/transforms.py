@@ -78,7 +78,7 @@ def _transforms_camera(values: dict[str, Any], path: Path) -> Camera:
 
 def _frame_file(folder: Path, name: str) -> Path:
   """Resolves a frame's file_path, which may be missing; instant-ngp may leave its suffix out."""
-  path = folder / name
+  path = folder / name.replace("\\", "/")  # of Windows
   candidates = (path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES))
   return next((candidate for candidate in candidates if candidate.is_file()), path)
 
@@ -111,9 +111,9 @@ def read_transforms(source: Path) -> KnownPoses:
   for frame, matrix in zip(frames, matrices, strict=True):
     if matrix.shape == (3, 4):
       matrix = np.vstack([matrix, [0, 0, 0, 1]])
-    if matrix.shape != (4, 4) or not is_rigid(matrix):
+    if matrix.shape != (4, 4) or (np.isfinite(matrix).all() and not is_rigid(matrix)):
       raise CaptureError(f"{path}: transform_matrix of {frame['file_path']} is no rigid pose.")
-    matrix[:3, :3] = matrix[:3, :3] @ OPENGL_FROM_OPENCV
+    matrix[:3, :3] *= np.diag(OPENGL_FROM_OPENCV)
     poses.append(matrix)
   named = [frame.get("depth_file_path") for frame in frames]
   found = Recording(
@@ -121,7 +121,8 @@ def read_transforms(source: Path) -> KnownPoses:
     poses=np.stack(poses),
     depth=[_frame_file(path.parent, name or _NO_DEPTH) for name in named] if any(named) else [],
     unit=MILLIMETRE,
-  ).present(path)
+  )
+  found = found.placed(path).present(path)
   if "w" not in values and "w" not in frames[0]:
     width, height = picture_size(found.files[0])
     values = {**values, "w": width, "h": height}

@@ -95,7 +95,7 @@ def test_a_scannet_scene_gives_poses_and_depth(tmp_path):
   lost = np.full((4, 4), -np.inf)
   for row in range(len(POSES)):
     np.savetxt(folder / "pose" / f"{row}.txt", lost)
-  with pytest.raises(CaptureError, match="holds a finite pose"):
+  with pytest.raises(CaptureError, match="holds no finite pose"):
     read_capture(folder, tmp_path / "images", settings=SETTINGS)
 
 

@@ -89,3 +89,29 @@ def test_transforms_errors(tmp_path):
   (tmp_path / "transforms.json").write_text('{"frames": 3}')
   with pytest.raises(CaptureError, match="no transforms file"):
     read_transforms(tmp_path)
+
+
+@pytest.mark.parametrize("place", [(0, 3), (1, 1)])
+def test_frames_whose_pose_is_not_finite_are_left_out(tmp_path, place):
+  synthetic.write_transforms(tmp_path, synthetic.walk(9), synthetic.CAMERA)
+  values = json.loads((tmp_path / "transforms.json").read_text())
+  row, column = place
+  values["frames"][4]["transform_matrix"][row][column] = float("nan")
+  (tmp_path / "transforms.json").write_text(json.dumps(values))
+  known = read_transforms(tmp_path)
+  kept = [k for k in range(9) if k != 4]
+  assert [path.name for path in known.files] == [f"view_{k:03d}.png" for k in kept]
+  np.testing.assert_allclose(known.world_from_camera, synthetic.walk(9)[kept], atol=1e-12)
+  assert known.warnings == ("1 of 9 poses are lost: left out.",)
+  for frame in values["frames"]:
+    frame["transform_matrix"] = [[float("inf")] * 4] * 4
+  (tmp_path / "transforms.json").write_text(json.dumps(values))
+  with pytest.raises(CaptureError, match=r"transforms\.json holds no finite pose"):
+    read_transforms(tmp_path)
+
+
+def test_windows_separators_are_read(tmp_path):
+  synthetic.write_transforms(tmp_path, synthetic.walk(8), synthetic.CAMERA)
+  text = (tmp_path / "transforms.json").read_text()
+  (tmp_path / "transforms.json").write_text(text.replace("images/", "images\\\\"))
+  assert len(read_transforms(tmp_path).files) == 8
