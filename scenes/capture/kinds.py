@@ -1,6 +1,7 @@
 """Classifies a capture by its path: video, pictures, or a data set with known poses."""
 
 import collections
+import re
 from pathlib import Path
 
 from nerf2real.scenes.capture.media.errors import CaptureError
@@ -16,6 +17,7 @@ EXPORT_STREAM = (
   "folder."
 )
 _NAMED = 4  # kinds of files in a message
+_MEASURED = re.compile(r"depth|pose|traj|camera|\.log$", re.IGNORECASE)  # of other tools' layouts
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".3gp")
 
 
@@ -60,7 +62,11 @@ def _what_instead(source: Path) -> str:
       f"position and quaternion (x, y, z, w) a line{alone}."
     )
   if below:
-    return f"no capture, but folders that do: give one of them, such as {source / below[0]}."
+    chosen = source / below[0]
+    said = f"no capture, but folders that do: give one of them, such as {chosen}"
+    unread = [] if _posed(chosen) else sorted(filter(_MEASURED.search, _names(source, chosen)))
+    alone = f"; its pictures are localised then, without {', '.join(unread[:_NAMED])}"
+    return f"{said}{alone if unread else ''}."
   files = [path for path in sorted(source.iterdir()) if path.is_file() and path.name[0] != "."]
   if videos := _videos(source):
     others = f", and {len(videos) - 1} more" if len(videos) > 1 else ""
@@ -93,7 +99,16 @@ def holds_more(source: Path, count: int) -> str | None:
   return f"give {most}, which holds {held[most]}, or take more"
 
 
+def _posed(folder: Path) -> bool:
+  """Whether a folder is a capture whose poses came along."""
+  return any(finder(folder) for finder in (find_transforms, find_rgbd, find_colmap_model))
+
+
 def _holds(folder: Path) -> bool:
   """Whether a folder is a capture."""
-  finders = (find_transforms, find_rgbd, find_colmap_model, list_images, list_images_below)
-  return any(finder(folder) for finder in finders)
+  return _posed(folder) or bool(list_images(folder) or list_images_below(folder))
+
+
+def _names(*folders: Path) -> list[str]:
+  """What folders hold."""
+  return [path.name for folder in folders for path in folder.iterdir()]

@@ -9,6 +9,8 @@ from nerf2real.scenes.capture.media.errors import CaptureError
 from nerf2real.scenes.capture.posed.known_poses import KnownPoses, one_camera
 from nerf2real.scenes.colmap import pycolmap
 
+_PARTS = ("cameras", "images", "points3D")  # files of a model
+
 
 def find_colmap_model(source: Path) -> Path | None:
   """Returns the folder inside `source` that holds a COLMAP model, None if there is none."""
@@ -53,6 +55,13 @@ def read_colmap(source: Path) -> KnownPoses:
   folder = find_colmap_model(source)
   if folder is None:
     raise CaptureError(f"{source} holds no COLMAP model: expected cameras.bin or cameras.txt.")
+  suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+  lacks = [f"{part}{suffix}" for part in _PARTS if not (folder / f"{part}{suffix}").is_file()]
+  if lacks:
+    raise CaptureError(
+      f"The COLMAP model in {folder} lacks {' and '.join(lacks)}: copy the whole model, or export "
+      "it again (colmap model_converter)."
+    )
   try:
     model = pycolmap.Reconstruction(str(folder))
   except (ValueError, RuntimeError, IndexError) as error:
@@ -71,11 +80,12 @@ def read_colmap(source: Path) -> KnownPoses:
   if missing:
     raise CaptureError(f"{len(missing)} pictures of the COLMAP model are missing, as {missing[0]}.")
   points = list(model.points3D.values())
+  used = sorted({i.camera_id for i in images})  # a model may list cameras of no picture
   poses = np.tile(np.eye(4), (len(images), 1, 1))
   poses[:, :3] = [i.cam_from_world().inverse().matrix() for i in images]
   return KnownPoses(
     kind="colmap",
-    camera=one_camera([to_opencv(c) for c in model.cameras.values()], source),
+    camera=one_camera([to_opencv(model.cameras[k]) for k in used], source),
     files=tuple(root / i.name for i in images),
     world_from_camera=poses,
     points=np.array([p.xyz for p in points]).reshape(-1, 3),

@@ -222,6 +222,14 @@ def test_unusable_inputs_are_one_clear_line(frames, tmp_path):
   for number in range(4):
     (folder / "images" / f"{number}.jpg").touch()
   assert f"give {folder / 'images'}, which holds 4" in message(folder)
+  other = tmp_path / "redwood"
+  for name in ("rgb", "depth"):
+    (other / name).mkdir(parents=True)
+    cv2.imwrite(str(other / name / "0.png"), frames[0])
+  assert "localised then, without depth." in message(other)
+  (other / "trajectory.log").touch()
+  said = message(other)
+  assert f"such as {other / 'rgb'}; its pictures" in said and "depth, trajectory.log." in said
   for number in range(3, 9):
     cv2.imwrite(str(folder / f"{number}.jpg"), frames[number][:100])
   assert "expected one camera" in message(folder)

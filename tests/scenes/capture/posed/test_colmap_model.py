@@ -14,16 +14,22 @@ from tests.scenes import synthetic_capture as synthetic
 SETTINGS = CaptureSettings(num_keyframes=8)
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_colmap_model(tmp_path, text):
-  poses = synthetic.walk(9)
-  names = synthetic.write_images(tmp_path / "images", poses)
-  points = np.random.default_rng(0).uniform(0, 3, (50, 3))
+def _model(names, poses):
+  """A model of the synthetic camera without points."""
   model = pycolmap.Reconstruction()
   model.add_camera_with_trivial_rig(to_colmap(synthetic.CAMERA))
   for number, (name, pose) in enumerate(zip(names, poses, strict=True), start=1):
     image = pycolmap.Image(name=name, camera_id=1, image_id=number)
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(pose)[:3]))
+  return model
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_model(tmp_path, text):
+  poses = synthetic.walk(9)
+  names = synthetic.write_images(tmp_path / "images", poses)
+  points = np.random.default_rng(0).uniform(0, 3, (50, 3))
+  model = _model(names, poses)
   for point in points:
     model.add_point3D(point, pycolmap.Track(), np.array([10, 20, 30], np.uint8))
   folder = tmp_path / "sparse" / "0"
@@ -82,3 +88,22 @@ def test_known_poses_selection_keeps_order():
   chosen = known.selected([1, 3], synthetic.CAMERA)
   assert chosen.files == ("b", "d")
   np.testing.assert_array_equal(chosen.world_from_camera[:, 0, 0], [1, 3])
+
+
+def test_a_camera_of_no_picture_does_not_count(tmp_path):
+  poses = synthetic.walk(8)
+  model = _model(synthetic.write_images(tmp_path / "images", poses), poses)
+  other = pycolmap.Camera(
+    camera_id=2, model="PINHOLE", width=800, height=600, params=[700, 700, 400, 300]
+  )
+  model.add_camera_with_trivial_rig(other)
+  model.write_text(str(tmp_path))
+  assert read_colmap(tmp_path).camera == synthetic.CAMERA
+
+
+def test_what_a_model_lacks_is_named(tmp_path):
+  poses = synthetic.walk(8)
+  _model(synthetic.write_images(tmp_path / "images", poses), poses).write_text(str(tmp_path))
+  (tmp_path / "points3D.txt").unlink()
+  with pytest.raises(CaptureError, match=r"lacks points3D\.txt: copy the whole model"):
+    read_colmap(tmp_path)
