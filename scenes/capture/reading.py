@@ -26,7 +26,7 @@ from nerf2real.scenes.capture.media.video import (
   sharpest_frames,
   sharpness,
 )
-from nerf2real.scenes.capture.posed import agreement
+from nerf2real.scenes.capture.posed import agreement, depth_pictures
 from nerf2real.scenes.capture.posed.colmap_model import read_colmap
 from nerf2real.scenes.capture.posed.pictures import read_as_posed
 from nerf2real.scenes.capture.posed.rgbd import read_rgbd
@@ -105,7 +105,7 @@ def _read_video(
     warnings=warnings,
     progress=progress,
   )
-  written = _spread(_write(frames, folder, warnings), count)
+  written = _spread(_write(frames, folder), count)
   return _gather("video", written, folder, settings, warnings)
 
 
@@ -133,8 +133,12 @@ def _read_pictures(
     return limit_size(image, settings.max_size)
 
   warnings = list(known.warnings)
-  frames = _sharpest_pictures(files, read, settings.num_keyframes, warnings, progress)
-  written = _write(frames, folder, warnings)
+  measured = depth_pictures.Readable(known.depth_files)
+  frames = _sharpest_pictures(
+    files, read, settings.num_keyframes, warnings, progress, sound=measured.is_sound
+  )
+  written = _write(frames, folder)
+  warnings.extend(measured.warnings())
   _check_count(source, len(written), settings, warnings)
   if kind != "rgbd":
     warnings.extend(_unused(len(written), len(files), settings.num_keyframes))
@@ -169,7 +173,7 @@ def _read_stills(
 
   warnings = list(found.warnings)
   frames = _sharpest_pictures(found.files, read, settings.most, warnings, progress)
-  written = _write(frames, folder, warnings)
+  written = _write(frames, folder)
   _check_count(source, len(written), settings, warnings)
   warnings.extend(_unused(len(written), len(found.files), settings.most))
   capture = _gather("images", written, folder, settings, warnings)
@@ -185,7 +189,7 @@ def _read_stills(
 
 def _check_count(source: Path, count: int, settings: CaptureSettings, warnings: list[str]) -> None:
   """Raises CaptureError, with what was left out, where too few pictures remain."""
-  if count < settings.min_images:
+  if count < max(settings.min_images, 1):
     raise CaptureError(
       f"{source}: {' '.join(warnings)} At least {settings.min_images} different pictures of one "
       "camera are needed."
@@ -224,6 +228,8 @@ def _sharpest_pictures(
   most: int,
   warnings: list[str],
   progress: Progress,
+  *,
+  sound: Callable[[int], bool] = lambda index: True,
 ) -> Iterator[Frame]:
   """Yields the sharpest of each of `most` equal parts of pictures.
 
@@ -233,6 +239,7 @@ def _sharpest_pictures(
     most: Parts, at most one per picture.
     warnings: Receives a line when some cannot be read.
     progress: Called with the fraction done and a text.
+    sound: Tells by its number whether one may be taken, for another reason.
   """
   count, lost = len(files), []
   parts = min(most, count)
@@ -246,7 +253,7 @@ def _sharpest_pictures(
         lost.append(files[index])
         continue
       value = sharpness(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-      if best is None or value > best.sharpness:
+      if (best is None or value > best.sharpness) and sound(index):
         best = Frame(index, 0.0, value, image)
     progress(last / count, f"picture {last} of {count}")
     if best is not None:
@@ -265,8 +272,8 @@ class _Written:
   sharpness: float
 
 
-def _write(frames: Iterator[Frame], folder: Path, warnings: list[str]) -> list[_Written]:
-  """Writes frames as they come; `warnings` then say why there are none, if so."""
+def _write(frames: Iterator[Frame], folder: Path) -> list[_Written]:
+  """Writes frames as they come."""
   written: list[_Written] = []
   size: tuple[int, int] | None = None
   for frame in frames:
@@ -280,8 +287,6 @@ def _write(frames: Iterator[Frame], folder: Path, warnings: list[str]) -> list[_
     path = folder / f"frame_{frame.index:06d}.png"
     write_picture(path, frame.image, _WITHOUT_LOSS)
     written.append(_Written(path, frame.index, frame.time, frame.travelled, frame.sharpness))
-  if not written:
-    raise CaptureError(" ".join(["The capture holds no picture.", *warnings]))
   return written
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from nerf2real.core.geometry.cameras import Camera
+from nerf2real.core.picture_files import decoded
 from nerf2real.scenes.capture.media.errors import CaptureError
 
 MILLIMETRE = 1e-3  # m: 7-Scenes', ScanNet's and nerfstudio's depth
@@ -19,11 +20,45 @@ _INVALID = 65535  # 7-Scenes' value where no depth was measured; 0 is everybody'
 
 def read(path: Path) -> np.ndarray:
   """Reads a depth picture, uint16 [H, W]; what counts as not measured is 0."""
-  depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+  depth = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED)
   if depth is None or depth.ndim != 2 or depth.dtype != np.uint16:
     found = "nothing readable" if depth is None else f"{depth.dtype} of shape {depth.shape}"
     raise CaptureError(f"{path} is no depth picture: found {found}, expected 16-bit grey.")
   return np.where(depth == _INVALID, 0, depth)
+
+
+class Readable:
+  """Which depth pictures can be read, of those that are asked for."""
+
+  def __init__(self, files: Sequence[Path]):
+    self._files = files
+    self._asked = 0
+    self._lost: list[CaptureError] = []
+
+  def is_sound(self, index: int) -> bool:
+    """Whether a picture's depth can be read, or it came without."""
+    if not self._files:
+      return True
+    self._asked += 1
+    try:
+      read(self._files[index])
+    except CaptureError as error:
+      self._lost.append(error)
+      return False
+    return True
+
+  def warnings(self) -> list[str]:
+    """Says how many cannot be read.
+
+    Raises:
+      CaptureError: Most cannot.
+    """
+    if not self._lost:
+      return []
+    words = f"{len(self._lost)} of {self._asked} depth pictures that were tried cannot be read"
+    if 2 * len(self._lost) > self._asked:
+      raise CaptureError(f"{words}: {self._lost[0]}")
+    return [f"{words}: left out with their pictures. {self._lost[0]}"]
 
 
 def measured_depth(path: Path, unit: float, camera: Camera) -> np.ndarray:
