@@ -30,7 +30,7 @@ from nerf2real.scenes.stages.results import Source
 # the picture moves; rgbd 3: depth has its own poses; video 3, rgbd 4, others 3: kept without loss;
 # video 4: spread over its frames' times; rgbd 5, others 4: posed pictures as stored, principal
 # points of text files by half a pixel
-_PICTURES_VERSIONS = {"video": 5, "rgbd": 6}  # 5, 6: colours of HDR and of other profiles
+_PICTURES_VERSIONS = {"video": 5, "rgbd": 7}  # 5, 6: colours of HDR and of other profiles; 7: metre
 _PICTURES_VERSION = 6  # of all others; 5: colours of other profiles; 6: read by what files hold
 # 2: the unit frame's yaw; 3: the rolling shutter is taken out; 4: up by level right axes;
 # 5: wrong places found, fainter features; 6: places that came hold what sees little;

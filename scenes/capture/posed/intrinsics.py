@@ -86,7 +86,13 @@ def _of_numbers(path: Path, values: np.ndarray, picture: Path) -> Camera:
     side = math.isqrt(flat.size)
     matrix = flat.reshape(side, side)
     flat = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-  if flat.size not in (4, 8) or not np.isfinite(flat).all() or flat[:2].min() <= 0:
+  if flat.size in (4, 8) and (flat[:2] <= 0).any():
+    row = int(np.argmax(flat[:2] <= 0))
+    raise CaptureError(
+      f"{path}: {('fx', 'fy')[row]} is {flat[row]:g}, expected more than 0: give its absolute "
+      "value, ICL-NUIM's mirrored poses are told by the depth."
+    )
+  if flat.size not in (4, 8) or not np.isfinite(flat).all():
     raise CaptureError(
       f"{path} holds {values.size} numbers, expected a 3x3 or 4x4 camera matrix or fx, fy, cx, cy."
     )

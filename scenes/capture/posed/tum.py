@@ -17,6 +17,7 @@ _PICTURES, _DEPTH = "rgb.txt", "depth.txt"
 _ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 TRAJECTORY = "groundtruth.txt"
 _POSES = (TRAJECTORY, "gt.txt", "trajectory.txt", "CameraTrajectory.txt")
+_ICL = "[!.]*.gt.freiburg"  # ICL-NUIM's trajectories
 _DEPTH_UNIT = 1 / 5000  # m
 
 
@@ -41,11 +42,14 @@ def _first(source: Path, names: tuple[str, ...]) -> Path | None:
   return next((source / name for name in names if (source / name).is_file()), None)
 
 
+def _poses_of(source: Path) -> Path | None:
+  """The trajectory of a folder; None where there is none."""
+  return _first(source, _POSES) or next(iter(sorted(source.glob(_ICL))), None)
+
+
 def is_tum(source: Path) -> bool:
   """Whether a folder holds lists of pictures and poses in TUM's layout."""
-  return _first(source, (_PICTURES, *_ASSOCIATIONS)) is not None and (
-    _first(source, _POSES) is not None
-  )
+  return _first(source, (_PICTURES, *_ASSOCIATIONS)) is not None and _poses_of(source) is not None
 
 
 def lists_without_poses(source: Path) -> str | None:
@@ -109,7 +113,7 @@ def read_tum(source: Path) -> Recording:
     CaptureError: A list is damaged, or no picture has a pose and, where there is depth, depth.
   """
   listed = _listed(source)
-  path = _first(source, _POSES)
+  path = _poses_of(source)
   assert path is not None  # `is_tum` has found one
   words = [row[:7] + row[7].split()[:1] for row in _table(path, 8)]
   values = np.stack([_stamped(path, list(column)) for column in zip(*words, strict=True)], -1)

@@ -124,6 +124,28 @@ def test_frames_of_transforms_without_picture_or_depth_are_left_out(tmp_path):
   assert "15 of 16 depth pictures are missing: none used." in known.warnings
 
 
+def test_pictures_whose_depth_is_damaged_are_left_out_and_counted(tum, tmp_path):
+  folder = copied(tum, tmp_path / "tum")
+  broken = sorted((folder / "depth").iterdir())
+  broken[3].write_bytes(b"")
+  broken[7].write_bytes(broken[7].read_bytes()[:400])
+  settings = dataclasses.replace(SETTINGS, num_keyframes=16)
+  capture = read_capture(folder, tmp_path / "images", settings=settings)
+  check(capture)
+  assert [path.stem for path in capture.known.files] == [
+    f"{k:03d}" for k in range(16) if k not in (3, 7)
+  ]
+  assert any(
+    text.startswith("2 of 16 depth pictures that were tried cannot be read: left out with")
+    and "003.png" in text
+    for text in capture.warnings
+  )
+  for path in broken[:9]:
+    path.write_bytes(b"")
+  with pytest.raises(CaptureError, match=r"9 of 16 depth .*: .*000\.png is no depth picture"):
+    read_capture(folder, tmp_path / "images", settings=settings)
+
+
 def test_measured_depth_comes_at_the_size_of_the_pictures(capture, tmp_path):
   known = capture.known
   camera = known.camera.resized(80, 60)
@@ -239,3 +261,34 @@ def test_metric_poses_are_adjusted_to_the_pictures(tum, tmp_path):
     assert after < 0.5 * before
   kept = refined.unit_from_source.inverse().apply_pose(refined.world_from_camera)[5]
   np.testing.assert_allclose(kept, capture.known.world_from_camera[5], atol=1e-6)
+
+
+def _resize(folder, about, factor):
+  """Writes the lengths of a transforms.json multiplied, as structure from motion has them."""
+  frames = []
+  for frame in about["frames"]:
+    matrix = np.array(frame["transform_matrix"])
+    matrix[:3, 3] *= factor
+    frames.append(frame | {"transform_matrix": matrix.tolist()})
+  (folder / "transforms.json").write_text(json.dumps(about | {"frames": frames}))
+
+
+@pytest.mark.parametrize("factor", [0.3, 4.1])
+def test_depth_decides_the_metre_of_poses_of_another_size(tmp_path, factor):
+  _resize(tmp_path, write_transforms(tmp_path), factor)
+  capture = read_capture(tmp_path, tmp_path / "images", settings=SETTINGS)
+  known = capture.known
+  numbers = [int(path.stem.split("_")[1]) for path in capture.images]
+  np.testing.assert_allclose(known.world_from_camera[:, :3, 3], POSES[numbers, :3, 3], rtol=0.01)
+  np.testing.assert_allclose(known.world_from_camera[:, :3, :3], POSES[numbers, :3, :3], atol=1e-9)
+  assert known.depth_unit == 1e-3 and np.percentile(off_the_planes(known.points), 90) < 0.02
+  said = [text for text in capture.warnings if "So depth decides the metre" in text]
+  assert len(said) == 1 and f"multiplied by {1 / factor:.1f}" in said[0]
+
+
+def test_depth_in_a_listed_unit_leaves_metric_poses(tmp_path):
+  write_transforms(tmp_path)
+  pictures(tmp_path, "rgb/{:03d}.png", "depth/{:03d}.png", 1 / 5000)
+  capture = read_capture(tmp_path, tmp_path / "images", settings=SETTINGS)
+  check(capture)
+  assert capture.known.depth_unit == 1 / 5000

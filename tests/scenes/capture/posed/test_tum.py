@@ -134,6 +134,40 @@ def test_unit_and_convention_are_read_as_the_pictures_ask_for(tum, tmp_path, axe
   assert capture.known.depth_unit == 1e-3 and any("1 mm" in text for text in capture.warnings)
 
 
+def test_poses_of_another_size_are_refused_with_the_factor(tum, tmp_path):
+  """The layout says metres: what a monocular tracker wrote into it is no metre of anything."""
+  folder = copied(tum, tmp_path / "tum")
+  rows = np.loadtxt(folder / "groundtruth.txt")
+  rows[:, 1:4] *= 0.65
+  np.savetxt(folder / "groundtruth.txt", rows)
+  with pytest.raises(
+    CaptureError, match=r"do not belong .* if their lengths are multiplied by 1\.5"
+  ):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+
+
+def test_mirrored_poses_are_read(tum, tmp_path):
+  """As ICL-NUIM has them: y up in the camera and in the world, both left-handed."""
+  folder = copied(tum, tmp_path / "tum")
+  mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+  rows = []
+  for k, pose in enumerate(POSES):
+    other = mirror @ pose @ mirror
+    numbers = [*other[:3, 3], *Rotation.from_matrix(other[:3, :3]).as_quat()]
+    rows.append(f"{100 + k / 30:.4f} " + " ".join(f"{value:.7f}" for value in numbers))
+  (folder / "groundtruth.txt").unlink()
+  (folder / "livingRoom2.gt.freiburg").write_text("\n".join(rows))
+  assert source_kind(folder) == "rgbd"
+  capture = read_capture(folder, tmp_path / "images", settings=SETTINGS)
+  check(capture)
+  check_motion(capture)
+  assert any("mirrored y axes" in text for text in capture.warnings)
+  (folder / "camera_info.yaml").unlink()
+  (folder / "calibration.txt").write_text("280 -280 159.5 119.5")
+  with pytest.raises(CaptureError, match=r"fy is -280, expected more than 0: .*mirrored"):
+    read_capture(folder, tmp_path / "images", settings=SETTINGS)
+
+
 def test_poses_of_another_recording_are_refused(tum, tmp_path):
   folder = copied(tum, tmp_path / "tum")
   rng = np.random.default_rng(0)
