@@ -12,10 +12,11 @@ import shlex
 import signal
 import socket
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import tyro
 
@@ -125,7 +126,7 @@ def main(
   received = [signal.SIGINT]
   try:
     _check(values[0])
-    with _terminated_as_interrupted(received):
+    with _terminated_as_interrupted(received), _warned_in_lines():
       return function(*values) or 0
   except CommandError as error:
     message, status = str(error), error.status
@@ -194,6 +195,30 @@ def _say(text: str) -> None:
   """Prints to stderr; where that is a file on a full disk, the exit status remains."""
   with contextlib.suppress(OSError):
     print(text, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _warned_in_lines() -> Iterator[None]:
+  """Prints warnings to the user as lines, without the place in the source that Python's show."""
+
+  def show(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+  ) -> None:
+    if category is UserWarning:
+      _say(f"warning: {message}")
+    else:
+      shown(message, category, filename, lineno, file, line)
+
+  shown, warnings.showwarning = warnings.showwarning, show
+  try:
+    yield
+  finally:
+    warnings.showwarning = shown
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from nerf2real.core import files, palette
 from nerf2real.core.floor_map import Floor, FloorMap
 from nerf2real.core.picture_files import write_picture
 from nerf2real.scenes.alignment.world_frame import Alignment
-from nerf2real.scenes.capture.capture import Capture, CaptureSettings
+from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
 from nerf2real.scenes.poses.film import continuity
 from nerf2real.scenes.poses.localisation import Localisation
 from nerf2real.scenes.poses.tracks import Tracks
@@ -53,6 +53,7 @@ class Verdict:
 
   findings: Sequence[Finding]
   picture: np.ndarray | None = None  # RGB [H, W, 3]: the room from above, what to film again marked
+  notes: Sequence[str] = ()  # what was left out or assumed, as the scene's report will say
 
   @property
   def good(self) -> bool:
@@ -61,11 +62,11 @@ class Verdict:
 
   @property
   def words(self) -> str:
-    """A line for the whole and one for each finding, what is wrong first."""
+    """A line for the whole and one for each finding, what is wrong first, and for each note."""
     head = "Good to go:" if self.good else "Film again before you spend an hour on it:"
     ordered = sorted(self.findings, key=lambda finding: finding.good)
     lines = (f"- {'good' if finding.good else 'bad'}: {finding.text}" for finding in ordered)
-    return "\n".join([head, *lines])
+    return "\n".join([head, *lines, *(f"- note: {note}" for note in self.notes)])
 
   def save_picture(self, path: Path) -> None:
     """Writes the picture as PNG."""
@@ -245,13 +246,17 @@ def judge(
     reason: Why there are no poses, or no world frame.
   """
   findings = judge_pictures(capture, settings)
+  judged = quality_warnings(capture, settings)
+  notes = [text for text in capture.warnings if text not in judged]
   if poses is None:
-    return Verdict([Finding("poses", False, reason), *findings])
+    return Verdict([Finding("poses", False, reason), *findings], notes=notes)
   findings += judge_poses(capture, poses)
+  notes += map(capture.told, poses.warnings)
   if frame is None:
-    return Verdict([*findings, Finding("floor", False, reason)])
+    return Verdict([*findings, Finding("floor", False, reason)], notes=notes)
+  notes += frame.warnings
   world = frame.world_from_unit.apply_pose(poses.world_from_camera)
   extent = frame.extent_lower, frame.extent_upper
   found = coverage(poses.camera, world, extent)
   findings += judge_coverage(found, world)
-  return Verdict(findings, draw(found, world, extent))
+  return Verdict(findings, draw(found, world, extent), notes)

@@ -91,7 +91,7 @@ def test_a_reader_that_has_seen_enough_is_no_error():
 
 
 SCRIPT = '''"""A command."""
-import dataclasses, sys, time
+import dataclasses, sys, time, warnings
 from nerf2real.launch import command
 
 @dataclasses.dataclass(frozen=True)
@@ -106,6 +106,9 @@ def run(arguments):
     raise TypeError("of the programmer")
   if arguments.kind == "wrong":
     raise command.CommandError("cannot be together", status=command.WRONG_ARGUMENTS)
+  if arguments.kind == "warning":
+    warnings.warn("film the floor too", stacklevel=2)
+    return 0
   if arguments.kind == "environment":
     print(os.environ["A_TEST"], os.environ["SET_BEFORE"])
     return 5
@@ -139,6 +142,11 @@ def test_the_programmers_errors_show_their_trace(script):
   assert (
     found.returncode == 1 and "Traceback" in found.stderr and "of the programmer" in found.stderr
   )
+
+
+def test_a_warning_is_a_line_without_its_place_in_the_source(script):
+  found = _run(sys.executable, script, "--kind", "warning")
+  assert (found.returncode, found.stderr) == (0, "warning: film the floor too\n")
 
 
 def test_environment_and_statuses(script):

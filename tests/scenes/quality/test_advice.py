@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from nerf2real.core.geometry.cameras import Camera
-from nerf2real.scenes.capture.capture import Capture, CaptureSettings
+from nerf2real.core.geometry.similarity import Similarity
+from nerf2real.scenes.capture.capture import Capture, CaptureSettings, quality_warnings
 from nerf2real.scenes.poses.tracks import Tracks
 from nerf2real.scenes.quality import advice
 from nerf2real.scenes.quality.coverage import coverage
@@ -114,3 +115,29 @@ def test_without_poses_the_verdict_is_the_reason(tmp_path):
   assert not verdict.good and verdict.picture is None
   assert verdict.words.startswith("Film again") and "- bad: 3 of 20" in verdict.words
   assert advice._shared_points(NO_TRACKS, 0) is None
+
+
+def test_what_was_assumed_is_told_and_what_is_judged_is_not_told_twice(tmp_path):
+  capture = _capture(tmp_path, blur=5.0)
+  capture.warnings.extend(quality_warnings(capture, CaptureSettings()))
+  assert any("Blur" in text for text in capture.warnings)
+  capture.warnings.append("Depth decides the metre.")
+  poses = types.SimpleNamespace(
+    names=[path.name for path in capture.images],
+    left_out=(),
+    tracks=NO_TRACKS,
+    warnings=("frame_000003.jpg sees little.",),
+    camera=CAMERA,
+    world_from_camera=_poses(np.linspace(0, 6, 20), 0.3),
+  )
+  found = advice.judge(capture, CaptureSettings(), poses=poses, reason="no floor")
+  assert found.notes == ["Depth decides the metre.", "frame_000003.jpg sees little."]
+  frame = types.SimpleNamespace(
+    world_from_unit=Similarity(1.0, np.eye(3), np.zeros(3)),
+    extent_lower=EXTENT[0],
+    extent_upper=EXTENT[1],
+    warnings=("Metres were assumed.",),
+  )
+  words = advice.judge(capture, CaptureSettings(), poses=poses, frame=frame).words
+  assert words.splitlines()[-1] == "- note: Metres were assumed."
+  assert words.count("- note: ") == 3 and "Blur:" not in words
