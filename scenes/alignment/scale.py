@@ -9,8 +9,9 @@ from nerf2real.scenes.alignment.floor import Floor
 from nerf2real.scenes.alignment.overrides import Overrides
 
 _METRES_ASSUMED = (
-  "Metres were assumed for poses and depth, as their file names no unit: where they are of "
-  "structure from motion, give --camera-height, or film a marker and give --marker-side."
+  "Metres were assumed for depth and the poses that agree with it, as their file names no unit: "
+  "where both are of structure from motion, give --camera-height, or film a marker and give "
+  "--marker-side."
 )
 
 

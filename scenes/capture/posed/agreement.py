@@ -92,8 +92,9 @@ def settled(known: KnownPoses, images: Sequence[Path]) -> tuple[KnownPoses, list
   fits = fits and abs(np.log(free.unit / best.unit)) > _DRIFT
   if fits and not known.names_unit:
     return _enlarged(known, free, own)
-  limit = _WORST if best.unit == known.depth_unit else _FITS
-  if best.distance > limit * known.camera.width or (fits and best is not own):
+  switched = best.unit != known.depth_unit
+  limit = _FITS if switched else _WORST
+  if best.distance > limit * known.camera.width or (fits and switched):
     would = f" They would fit to {free.distance:.1f} pixels if {_size_words(known, free)}."
     raise CaptureError(
       f"Poses and depth do not belong to the pictures: what one picture shows lies "
@@ -144,7 +145,7 @@ def _enlarged(known: KnownPoses, free: _Reading, own: _Reading) -> tuple[KnownPo
   return sized, [
     f"The poses{convention} are not in the metres of the depth: {_size_words(known, free)}, "
     f"{_gain(free, own)}. So depth decides the metre, taken to be in units of "
-    f"{1e3 * known.depth_unit:.3g} mm; where it is not, give --camera-height or --marker-side."
+    f"{1e3 * known.depth_unit:.3g} mm."
   ]
 
 
