@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf2real.core.files import DiskFullError
+from nerf2real.core.files import DiskFullError, disk_full
 from nerf2real.scenes.capture import reading
 from nerf2real.scenes.capture.capture import CaptureSettings
 from nerf2real.scenes.capture.media.errors import CaptureError
@@ -283,8 +283,12 @@ def test_an_error_leaves_the_last_good_keyframes(frames, tmp_path, monkeypatch):
   path = tmp_path / "film.mp4"
   synthetic.write_video(path, frames)
   first = read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
-  monkeypatch.setattr(reading.cv2, "imwrite", lambda *_: False)
-  with pytest.raises(OSError, match="disk full"):
+
+  def full(path, *_):
+    raise disk_full(path)
+
+  monkeypatch.setattr(reading, "write_picture", full)
+  with pytest.raises(DiskFullError, match="the disk is full"):
     read_capture(path, tmp_path / "keyframes", settings=SETTINGS)
   assert all(path.is_file() for path in first.images)
   assert not list(tmp_path.glob("*partial*")) + list(tmp_path.glob(".*"))
