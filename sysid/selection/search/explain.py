@@ -65,36 +65,22 @@ def _handed_over(parent: Scored, term: Term) -> list[Array]:
 
 
 def _in_common(parent: Scored, term: Term) -> list[Array]:
-  """Returns where a parent's fit is with what its constants are off by in common as a gain, and all
-  torques of its effects larger by that: about the same motion, at constants nearer to those that
-  are known. Where constants have taken a motor's weakness single steps do not lead there."""
-  constants = next((t for t in parent.terms if t.kind == CONSTANTS), None)
-  if term.kind != WEAK or constants is None:
+  """Returns where constants are without what they are off by in common, and that as a gain: about
+  the same motion, at constants nearer to those that are known. Where constants have taken a motor's
+  weakness single steps do not lead there. Beside an effect there are none, as its torques are open.
+  """
+  constants = parent.terms[0]
+  if term.kind != WEAK or constants.kind != CONSTANTS or parent.names:
     return []
-  layout = parent.fit.layout
-  first = layout.spans[layout.terms.index(constants)][0]
   names = zip(constants.names, constants.prior, strict=True)
-  at = [first + i for i, (name, s) in enumerate(names) if name in _LOADS and np.isfinite(s)]
+  at = [i for i, (name, sigma) in enumerate(names) if name in _LOADS and np.isfinite(sigma)]
   if not at:
     return []
-  here, known = 1.0 + parent.fit.x[at], 1.0 + layout.centre[at]
-  weight = layout.sigma[at] ** -2.0
+  x, layout = parent.fit.x.copy(), parent.fit.layout
+  here, known, weight = 1.0 + x[at], 1.0 + layout.centre[at], layout.sigma[at] ** -2.0
   gain = float(np.clip(weight @ (here * known) / (weight @ here**2), term.low[0], term.high[0]))
-  x = np.where(_torques(parent), gain, 1.0) * parent.fit.x
   x[at] = gain * here - 1.0
   return [np.append(x, gain)]
-
-
-def _torques(parent: Scored) -> Array:
-  """Tells which values of a hypothesis are torques of effects [n]."""
-  return np.array(
-    [
-      t.kind != CONSTANTS and kind_of(t.kind).parameter(n).unit.startswith("N m")
-      for t in parent.terms
-      for n in t.names
-    ],
-    bool,
-  )
 
 
 def _scaled(parent: Scored, term: Term) -> list[Array]:
@@ -102,7 +88,13 @@ def _scaled(parent: Scored, term: Term) -> list[Array]:
   that makes about the same motion, and single steps do not lead from one to the other."""
   if term.kind != WEAK:
     return []
-  torques = _torques(parent)
+  torques = np.array(
+    [
+      t.kind != CONSTANTS and kind_of(t.kind).parameter(n).unit.startswith("N m")
+      for t in parent.terms
+      for n in t.names
+    ]
+  )
   if not torques.any():
     return []
   factors = np.array([s[0] for s in term.starts])[:, None]

@@ -120,6 +120,18 @@ def test_a_rival_that_needs_the_effect_beside_all_of_its_own_is_beaten():
   assert naming.conclude(_Joint, [null, right, rival, both], beyond).named == ("a",)
 
 
+def test_what_is_likelier_and_not_clear_keeps_no_clear_effect_from_being_named():
+  """b explains a few blocks by far and is not clear; a is, alone and beside it."""
+  small = 0.5 + 0.1 * (-1.0) ** np.arange(30)
+  few = np.zeros(30)
+  few[[4, 5, 17]] = 60.0, -25.0, 25.0
+  null, a = _scored((), np.zeros(30)), _scored(("a",), small)
+  b, both = _scored(("b",), few, prediction=9.0), _scored(("a", "b"), few + small, prediction=14.0)
+  assert b.evidence > a.evidence and clear(b, null) < BEYOND[0] < clear(a, null)
+  assert naming.conclude(_Joint, [null, a, b, both], BEYOND).named == ("a",)
+  assert naming.conclude(_Joint, [null, a, b], BEYOND).named == ()  # b might do without it
+
+
 def test_an_effect_without_which_the_same_is_predicted_is_needless():
   null = _scored((), np.linspace(-4, -3, 30))
   both = _scored(("a", "b"), np.linspace(0, 0.1, 30))

@@ -63,6 +63,20 @@ def test_a_gain_begins_with_the_other_torques_larger_by_as_much(explainer):
   assert explain._scaled(explainer.null, gain) == []  # nothing to scale
 
 
+def test_what_constants_have_taken_in_common_of_a_weak_motor_begins_as_its_gain():
+  weak = _explainer([Effect("motor_gain", "joint", {"gain": 0.93, "scales_limit": 1.0})], KINDS)
+  gain, other = (
+    next(t for t in weak.library if (t.kind == "motor_gain") is is_gain)
+    for is_gain in (True, False)
+  )
+  (begun,) = explain._in_common(weak.null, gain)
+  assert begun[-1] == pytest.approx(0.93, abs=0.03)
+  shares = [weak.base[0].names.index(name) for name in ("damping", "armature", "mass")]
+  assert np.abs(begun[shares]).max() < 0.5 * np.abs(weak.null.fit.x[shares]).max()
+  assert explain._in_common(weak.null, other) == []
+  assert explain._in_common(_of(weak, "coulomb_friction"), gain) == []
+
+
 def test_an_effect_that_was_chosen_too_early_is_exchanged(explainer):
   begun = _of(explainer, "coulomb_friction", "viscous_friction")
   found = growth._exchanged(explainer, begun)
