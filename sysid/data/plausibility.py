@@ -33,7 +33,7 @@ _OFF_TURN = 0.5  # rad between an offset and whole turns, of gravity's sag; chos
 _EARLY = 0.01  # s before its command that a reading cannot come; two steps of the lags
 _WORSE = 1.5  # times what a lag of 0 leaves of what one before it does; chosen
 _SURE = 0.95  # share that commands tell where a lag is read off; chosen
-_SAME_STAMPS = 0.02  # share of readings with another's stamp that is no accident; chosen
+_SAME_STAMPS = 0.1  # share of readings with the stamp of another that makes a log useless; chosen
 _SPIKE = (5.0, 20.0, 0.02, 3.0)
 """Times the motion around, the noise, the range and the resolution: a single reading that leaves
 and returns by more than all of them was not read. Chosen."""
