@@ -25,9 +25,9 @@ from nerf2real.sysid.data.opening import load_model, read_logs
 from nerf2real.sysid.fit import resolution
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.posterior import Fitter
+from nerf2real.sysid.model.limits.supported import on_a_stand
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.supported import on_a_stand
 from nerf2real.sysid.selection.joints.leaving import leaves
 from nerf2real.sysid.selection.joints.subject import Subject, prepare
 from nerf2real.sysid.selection.search.evidence import Scored, clear

@@ -16,7 +16,7 @@ from nerf2real.sysid.data.compatibility import check_against_model
 from nerf2real.sysid.data.plausibility import check_plausible
 from nerf2real.sysid.data.tables import read_csv
 from nerf2real.sysid.model.drive import joint_of
-from nerf2real.sysid.model.supported import without_disabled
+from nerf2real.sysid.model.limits.supported import without_disabled
 
 
 def read_log(path: str | Path) -> Log:

@@ -28,7 +28,7 @@ _NEAR_ONE = (0.7, 1.5)  # of servos that are about where they are told to be; ch
 _DEGREES = (20.0, 170.0)  # of readings in degrees of commands in radians: 57.3, within thrice
 _RADIANS = (1 / 170.0, 1 / 20.0)  # the other way round
 _FAR = 2.0 * _TURN  # rad of motion; servos of arms and legs stay within two turns; chosen
-_FAST = 100.0  # rad/s, 950 rpm: no joint of a robot; chosen
+_FAST = 100.0  # rad/s, 950 rpm: faster than joints of robots, not than all machines; chosen
 _OFF_TURN = 0.5  # rad between an offset and whole turns, of gravity's sag; chosen
 _EARLY = 0.01  # s before its command that a reading cannot come; two steps of the lags
 _WORSE = 1.5  # times what a lag of 0 leaves of what one before it does; chosen
@@ -50,25 +50,26 @@ def check_units(log: Log, model: mujoco.MjModel, joint: str) -> None:
     model: declared.
     joint: that the log commands.
   """
-  hinge = int(model.joint(joint).type[0]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+  index = model.joint(joint).id
+  hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
   if not hinge or joint not in servos(log, model):
     return
   found = following(log, model, joint)
   if found is None:
     return
-  assert log.states.position is not None
   slope, share = abs(found.best.slope), found.best.share
-  column = log.states.column(joint)
-  read, told = log.states.position[:, column], target(log, model, joint)
+  told = target(log, model, joint)
   where = ""
   if share > _CLEAR and _within(slope, _DEGREES):
     where = f"its readings are {slope:.3g} times its commands: the readings are in degrees"
   elif share > _CLEAR and _within(slope, _RADIANS) and np.ptp(told) > _FAR:
     where = f"its readings are 1/{1 / slope:.3g} of its commands: the commands are in degrees"
-  elif _within(slope, _ONE) and np.ptp(read) > _FAR and np.ptp(told) > _FAR:
-    top = float(np.quantile(np.abs(smooth_motion(log).velocity[:, column]), 0.99))
-    if top > _FAST:
-      where = f"it moves at {top:.0f} rad/s: commands and readings are in degrees"
+  elif model.jnt_limited[index] and _within(slope, _ONE):
+    times = float(np.ptp(told)) / float(np.ptp(model.jnt_range[index]))
+    if times > _DEGREES[0]:
+      where = (
+        f"it is told to go over {times:.0f} times its range: commands and readings are in degrees"
+      )
   if where:
     raise LogError(
       f"{log.name}: {where} at {joint!r}, expected radians: convert them, or name the unit in the "
@@ -141,7 +142,7 @@ def doubts(logs: Sequence[Log], model: mujoco.MjModel) -> list[str]:
       " is read."
     )
   for log in logs:
-    texts += [*_lost(log), *_ended(log, model)]
+    texts += [*_fast(log, model), *_lost(log), *_ended(log, model)]
   return texts
 
 
@@ -168,6 +169,25 @@ def _flipped(found: Sequence[tuple[str, str, Following]]) -> dict[str, str]:
     ):
       against.setdefault(joint, name)
   return {joint: name for joint, name in against.items() if joint not in along}
+
+
+def _fast(log: Log, model: mujoco.MjModel) -> list[str]:
+  """Returns a sentence on hinges so fast over so many turns that they may be in degrees."""
+  assert log.states.position is not None
+  speeds: dict[str, float] = {}
+  for joint in servos(log, model):
+    column = log.states.column(joint)
+    hinge = int(model.joint(joint).type[0]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    if hinge and np.ptp(log.states.position[:, column]) > _FAR:
+      top = float(np.quantile(np.abs(smooth_motion(log).velocity[:, column]), 0.99))
+      speeds |= {joint: top} if top > _FAST else {}
+  if not speeds:
+    return []
+  return [
+    f"{log.name}: {_some(speeds)} move at up to {max(speeds.values()):.0f} rad/s over more than two"
+    " turns: if commands and readings are in degrees, convert them, or name the unit in the header"
+    " of a CSV."
+  ]
 
 
 def _lost(log: Log) -> list[str]:

@@ -17,10 +17,10 @@ from nerf2real.suite.effects.files import from_list, to_list
 from nerf2real.sysid.data.opening import load_model
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
+from nerf2real.sysid.model.limits.supported import on_a_stand
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.simulation import Clocks, Member
-from nerf2real.sysid.model.supported import on_a_stand
 from nerf2real.sysid.selection.findings import Identified
 from nerf2real.sysid.settings import Settings
 

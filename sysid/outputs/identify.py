@@ -27,10 +27,10 @@ from nerf2real.sysid.data.plausibility import doubts
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
 from nerf2real.sysid.fit import resolution, whitening
+from nerf2real.sysid.model.limits.supported import left_out, on_a_stand
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
 from nerf2real.sysid.model.simulation import Member, errors
-from nerf2real.sysid.model.supported import left_out, on_a_stand
 from nerf2real.sysid.outputs import extended_model
 from nerf2real.sysid.outputs.notes import (
   another_session,

@@ -14,7 +14,7 @@ import numpy as np
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.sysid.model import chains
 from nerf2real.sysid.model.drive import actuator_of, actuators_of
-from nerf2real.sysid.model.unheld import unheld
+from nerf2real.sysid.model.limits.unheld import unheld
 
 _CHAIN = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 

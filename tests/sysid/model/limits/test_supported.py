@@ -8,7 +8,7 @@ from nerf2real.sysid.data import opening
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.supported import left_out, on_a_stand, without_disabled
+from nerf2real.sysid.model.limits.supported import left_out, on_a_stand, without_disabled
 from nerf2real.sysid.outputs import notes
 from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
