@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from nerf2real.sysid.fit.expectation import Expectation
-from nerf2real.sysid.fit.noise import effort_noise, timing
+from nerf2real.sysid.fit.noise import correlation_time, effort_noise, timing
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
@@ -106,7 +106,7 @@ class JointLikelihood:
     """Returns scales and correlation times [C] of residuals [C, N]."""
     squares = self.squares(residuals)
     alike = residuals / np.sqrt(squares[:, self.block_of] + 1e-30)
-    times = [_correlation_time(row, self.starts) for row in alike]
+    times = [correlation_time(row, self.starts) for row in alike]
     return np.sqrt(np.median(squares, axis=1) + self.floor**2), times
 
   def _cut(self) -> None:
@@ -387,15 +387,3 @@ def _same_commands(one: Measured, other: Measured) -> bool:
   apart = np.abs(values[0] - values[1])
   alike = abs(lengths[0] - lengths[1]) < 0.05 * max(lengths)
   return bool(alike and np.mean(apart > 1e-3 * max(np.ptp(values[0]), 1e-12)) < 0.05)
-
-
-def _correlation_time(row: Array, starts: Array) -> float:
-  """Returns the integrated autocorrelation time in samples, up to where it falls below 0.05."""
-  length = max(8, int(np.median(np.diff(starts)))) if len(starts) > 1 else len(row)
-  centred = row - row.mean()
-  power = np.abs(np.fft.rfft(centred, 2 * len(row))) ** 2
-  correlation = np.fft.irfft(power)[: 2 * length]
-  correlation = correlation / max(correlation[0], 1e-30)
-  small = np.flatnonzero(correlation < 0.05)
-  end = small[0] if len(small) else len(correlation)
-  return float(max(1.0, 1.0 + 2.0 * correlation[1:end].sum()))

@@ -1,4 +1,7 @@
-"""Noise of readings, from their scatter about smooth motion and their resolution."""
+"""Noise of readings, from their scatter about smooth motion and their resolution.
+
+And for how long what is left of readings goes together.
+"""
 
 from collections.abc import Sequence
 
@@ -41,3 +44,20 @@ def _trimmed(values: Array) -> float:
   """Returns the mean of the lower 90 %, made that of all for normal noise."""
   kept = values[values <= np.quantile(values, 0.9)]
   return float(kept.mean()) / _NINE_TENTHS**2 if len(kept) else 0.0
+
+
+def correlation_time(row: Array, starts: Array) -> float:
+  """Returns the integrated autocorrelation time in samples, up to where it falls below 0.05.
+
+  Args:
+    row: residuals [N].
+    starts: first samples of the blocks, over whose usual length it is looked for.
+  """
+  length = max(8, int(np.median(np.diff(starts)))) if len(starts) > 1 else len(row)
+  centred = row - row.mean()
+  power = np.abs(np.fft.rfft(centred, 2 * len(row))) ** 2
+  correlation = np.fft.irfft(power)[: 2 * length]
+  correlation = correlation / max(correlation[0], 1e-30)
+  small = np.flatnonzero(correlation < 0.05)
+  end = small[0] if len(small) else len(correlation)
+  return float(max(1.0, 1.0 + 2.0 * correlation[1:end].sum()))

@@ -9,7 +9,8 @@ import pytest
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.expectation import NEIGHBOURS, NOISE, Expectation
 from nerf2real.sysid.fit.layout import Layout
-from nerf2real.sysid.fit.likelihood import JointLikelihood, _correlation_time, _same_commands
+from nerf2real.sysid.fit.likelihood import JointLikelihood, _same_commands
+from nerf2real.sysid.fit.noise import correlation_time
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
@@ -88,8 +89,8 @@ def test_correlation_time_of_an_autoregression():
   for n in range(1, len(row)):
     row[n] = rho * row[n - 1] + random.normal()
   starts = np.arange(0, len(row), 100)
-  assert _correlation_time(row, starts) == pytest.approx((1 + rho) / (1 - rho), rel=0.25)
-  assert _correlation_time(random.normal(size=40_000), starts) < 1.2
+  assert correlation_time(row, starts) == pytest.approx((1 + rho) / (1 - rho), rel=0.25)
+  assert correlation_time(random.normal(size=40_000), starts) < 1.2
 
 
 def test_a_joint_s_damping_is_known_no_better_than_its_servo_s():
