@@ -20,18 +20,19 @@ from nerf2real.core.pages import page
 from nerf2real.core.progress import Progress, no_progress, part
 from nerf2real.core.robot_logs.reading import COMMANDS, Log, LogError, check_motion
 from nerf2real.core.serialization import to_plain
-from nerf2real.suite.effects import Effect, write_effects
+from nerf2real.suite.effects import write_effects
 from nerf2real.sysid.data.checks import check_distinct, check_length
 from nerf2real.sysid.data.opening import load_model, read_logs, set_aside
 from nerf2real.sysid.data.plausibility import doubts
 from nerf2real.sysid.design import identifiability
 from nerf2real.sysid.drift import stored
-from nerf2real.sysid.fit import resolution, whitening
+from nerf2real.sysid.fit import resolution
 from nerf2real.sysid.model.limits.supported import left_out, on_a_stand
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.numerics import Numerics
-from nerf2real.sysid.model.simulation import Member, errors
+from nerf2real.sysid.model.simulation import errors
 from nerf2real.sysid.outputs import extended_model
+from nerf2real.sysid.outputs.details import claimed_effects, details_of
 from nerf2real.sysid.outputs.notes import (
   another_session,
   far,
@@ -223,7 +224,7 @@ def _identify(
     content["notes"] += far(content["error"])
   if len(near) > 1:
     content["notes"].append(spread(content["error"]))
-  drawn = samples.with_samples(found, _claimed(found), np.random.default_rng(0))
+  drawn = samples.with_samples(found, claimed_effects(found), np.random.default_rng(0))
   write_effects(out / "effects.json", servo.apart(drawn, by_duty))
   finer_ones = None if used == declared else used
   extended_model.write(
@@ -234,7 +235,7 @@ def _identify(
     numerics=finer_ones,
     on_stand=stand is not compiled,
   )
-  details = _details(found, model, near, sensed)
+  details = details_of(found, model, near, sensed)
   details["numerics"] = to_plain(finer_ones)
   details["not_judged"] = dict(beyond)
   details["identifiability"] = [to_plain(item) for item in shown]
@@ -315,43 +316,3 @@ def _floor(logs: Sequence[Log], joints: Sequence[str]) -> float:
 
 def _holds(found: Identified) -> bool:
   return all(j.likelihood.plant.holds for j in found.joints)
-
-
-def _details(
-  found: Identified, model: Path, near: Sequence[Member], sensed: sensing.Sensed
-) -> dict[str, Any]:
-  """Returns what the findings rest on, and what the extended model is simulated with."""
-  first = found.least_explained
-  return {
-    "model": str(model.resolve()),
-    **stored.model_marks(model, load_model(model)),
-    **stored.member_to_json(near[0]),
-    "near": [stored.member_to_json(member) for member in near[1:]],
-    "calibration": {
-      e.target: {n: round(float(v), 5) for n, v in e.parameters.items()}  # type: ignore[arg-type]
-      for e in found.calibration
-    },
-    "tests": {
-      "joint": first.joint,
-      **{
-        name: whitening.tests(first.likelihood, item.fit.residuals[0][0])
-        for name, item in (("declared", first.declared), ("extended", first.extended))
-      },
-    },
-    "audit": found.audits,
-    "servo": {j.joint: to_plain(j.likelihood.law) for j in found.joints if j.likelihood.law},
-    "sensors": sensed.errors(),
-  }
-
-
-def _claimed(found: Identified) -> list[Effect]:
-  """Returns the effects that go into effects.json.
-
-  The constants of a joint go with its effects, which were fitted beside them.
-  """
-  if found.verdict == "none":
-    return []
-  joints = {e["joint"] for e in (*found.effects, *found.nearest)}
-  all_off = any(e["kind"] == "parameter_error" and e["joint"] is None for e in found.effects)
-  constants = [c for c in found.calibration if all_off or c.target in joints]
-  return [*constants, *found.objects]
