@@ -141,13 +141,13 @@ def _plain(term: Term, values: Array) -> Term:
 def member_to_json(member: Member) -> dict[str, Any]:
   """Returns what is simulated with as details.json has it."""
   clocks = {j: {"skew": c.skew, "latency": c.latency} for j, c in member.clocks.items()}
-  return {"extended": to_list(member.effects), "clocks": clocks}
+  return {"extended": to_list(member.effects), "clocks": clocks, "weight": member.weight}
 
 
 def _member(item: dict[str, Any]) -> Member:
   """Returns what was written by `member_to_json`."""
   clocks = {joint: Clocks(**values) for joint, values in item["clocks"].items()}
-  return Member(from_list(item["extended"]), clocks)
+  return Member(from_list(item["extended"]), clocks, item.get("weight", 1))
 
 
 def model_marks(path: Path, compiled: mujoco.MjModel) -> dict[str, Any]:

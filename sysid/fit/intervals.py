@@ -42,7 +42,8 @@ less."""
 _DRAWS, _FEW = 4000, 200  # of the normal distribution, and least that must be within bounds
 _AGAIN = 20  # times at most that draws beyond a bound are taken anew
 _EDGE = 1e-6  # scales by which a value may be beyond its bound
-_WIDTH = 0.004  # of finite differences, of a value's scale
+_MOVED = 3.0  # standard deviations by which a value is moved beside all others, for derivatives
+_MOST = 0.2  # of a value's scale, of those steps
 
 
 def intervals(
@@ -160,7 +161,7 @@ def spread(fit: Fit, joints: Sequence[JointLikelihood]) -> Array:
 
   A fit keeps it as long as the joints' scales stay.
   """
-  scale = b"".join(j.scale.tobytes() + j.independent.tobytes() for j in joints)
+  scale = b"".join(j.scale.tobytes() + j.observations.tobytes() for j in joints)
   if fit.spread is None or fit.spread[0] != scale:
     fit.spread = scale, covariance(central(fit, joints), joints, systematic=SYSTEMATIC)
   return fit.spread[1]
@@ -195,10 +196,13 @@ def central(fit: Fit, joints: Sequence[JointLikelihood]) -> Fit:
   """Returns a fit linearised by central differences.
 
   Where two values do the same (damping and added friction), their derivatives must agree to a part
-  in a thousand, or the difference looks like information.
+  in a thousand, or the difference looks like information: friction makes courses rough, so that
+  each value is moved by what moves the course as much.
   """
-  fitter = Fitter(joints, fit.layout)
-  sides = [fitter.linearise(fit.x, width, residuals=fit.residuals) for width in (_WIDTH, -_WIDTH)]
+  fitter, scale = Fitter(joints, fit.layout), fit.layout.scale
+  told = np.diag(fit.curvature.sum(axis=0)) * scale**2
+  width = np.minimum(_MOVED / np.sqrt(np.maximum(told, 1e-300)), _MOST)
+  sides = [fitter.linearise(fit.x, side, residuals=fit.residuals) for side in (width, -width)]
   jacobians, curvature = [], np.zeros((fit.layout.count, fit.layout.count))
   for joint, index, residual, *both in zip(
     joints, fit.layout.index, fit.residuals, *[side.jacobian for side in sides], strict=True

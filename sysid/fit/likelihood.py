@@ -8,7 +8,10 @@ observations as the block has; with that integrated out
 
 a multivariate t density. n_b counts independent samples: those of the block over the residual's
 correlation time. s is what the best hypothesis leaves in the median block, so that evidence counts
-in units of what remains. Shapes: N samples of all logs, B blocks, C channels, n values.
+in units of what remains. A sample that is less sure than the others, as its stamp is off where a
+joint is fast, counts by the share that the others' variance has in its own: all of one where what
+remains is far larger than what stamps are off by. Shapes: N samples of all logs, B blocks, C
+channels, n values.
 """
 
 from collections.abc import Sequence
@@ -16,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import t as student
 
-from nerf2real.sysid.fit.expectation import Expectation
+from nerf2real.sysid.fit.expectation import NOISE, Expectation
 from nerf2real.sysid.fit.noise import correlation_time, effort_noise, timing
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
@@ -67,16 +70,19 @@ class JointLikelihood:
     self.mask = np.concatenate([log.valid for log in logs]).astype(float)
     self.speed = np.concatenate([log.velocity for log in logs])
     missed = np.concatenate([plant.reduction_error(i) for i in range(len(logs))])
-    unsure = np.hypot(self.stamp_noise * self.speed, missed) / self.position_noise
-    self.gain = np.array([self.mask / np.sqrt(1.0 + unsure**2), self.mask][: len(self.channels)])
+    further = [(self.stamp_noise * self.speed) ** 2 + missed**2]
     if self.effort is not None:
-      self.gain[1] /= np.sqrt(1.0 + (self._jumps() / (4.0 * self.floor[1])) ** 2)
+      further.append((0.25 * self._jumps()) ** 2)
+    self._further = np.array(further)
+    """Variance [C, N] of samples beside the noise that all have."""
+    self.gain = self.mask * np.sqrt(self._shares(np.zeros(len(self.channels))))
     self.effort_unit: float | None = None
     """Effort over torque in a reference: a sensor's unit stays. None where none shows it."""
     self._cut()
     self.expectation: Expectation | None = None
     self.scale = np.maximum(self.floor, 1e-12)
-    self.independent = np.ones(len(self.channels))
+    self.observations = self.counts.copy()
+    """Independent samples of blocks [C, B]."""
     self._known = None if plant.law is None else self._measure(plant.law[1])
 
   def _jumps(self) -> Array:
@@ -94,20 +100,34 @@ class JointLikelihood:
       jumps = [np.maximum(step[1:], step[:-1]) for step in steps]
     return np.concatenate(jumps)
 
-  def _measure(self, left: Array) -> tuple[float, float]:
-    """Returns scale and correlation time of what a servo's law leaves of the duty [N]."""
+  def _shares(self, beyond: Array) -> Array:
+    """Returns what part [C, N] the variance of the surest samples is of each one's, where mean
+    squares `beyond` [C] remain besides the noise."""
+    usual = (np.maximum(self.floor, 1e-12) ** 2 + beyond)[:, None]
+    shares: Array = usual / (usual + self._further)
+    return shares
+
+  def _measure(self, left: Array) -> tuple[float, Array]:
+    """Returns scale and independent samples [B] of what a servo's law leaves of the duty [N]."""
     assert self.law is not None and self.effort is not None
     rows = np.zeros((2, self.size))
     rows[1] = left * self.gain[1]
-    scale, times = self._scales(rows)
-    return scale[1], times[1]
+    scale, samples, times = self._scales(rows)
+    return scale[1], samples[1] / times[1]
 
-  def _scales(self, residuals: Array) -> tuple[Array, list[float]]:
-    """Returns scales and correlation times [C] of residuals [C, N]."""
+  def _scales(self, residuals: Array) -> tuple[Array, Array, list[float]]:
+    """Returns scales [C], samples that count as sure [C, B] and correlation times [C] of residuals
+    [C, N]."""
     squares = self.squares(residuals)
     alike = residuals / np.sqrt(squares[:, self.block_of] + 1e-30)
     times = [correlation_time(row, self.starts) for row in alike]
-    return np.sqrt(np.median(squares, axis=1) + self.floor**2), times
+    noise = self.floor[:, None] ** 2 * np.add.reduceat(self.mask, self.starts) / self.counts
+    if self.expectation is not None:
+      noise *= 1.0 + NOISE
+    beyond = np.maximum(np.median(squares - noise, axis=1), 0.0)
+    shares = np.add.reduceat(self.mask * self._shares(beyond), self.starts, axis=1)
+    scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
+    return scale, np.maximum(shares, 1.0), times
 
   def _cut(self) -> None:
     starts, folds, offset = [], [], 0
@@ -338,8 +358,7 @@ class JointLikelihood:
 
   def loglik(self, squares: Array) -> Array:
     """Returns nats of blocks [..., B], channels added."""
-    n = self.independent[:, None] * self.counts
-    return -(n * np.log1p(squares / self.scale[:, None] ** 2)).sum(axis=-2)
+    return -(self.observations * np.log1p(squares / self.scale[:, None] ** 2)).sum(axis=-2)
 
   def told_apart(self, apart: Array) -> Array:
     """Returns the nats of blocks [B] by which two predictions are told apart if one of them holds
@@ -348,13 +367,12 @@ class JointLikelihood:
     Args:
       apart: one less the other [C, N].
     """
-    n = self.independent[:, None] * self.counts
-    return (n * np.log1p(self.squares(apart) / (2.0 * self.scale[:, None] ** 2))).sum(axis=0)
+    twice = 2.0 * self.scale[:, None] ** 2
+    return (self.observations * np.log1p(self.squares(apart) / twice)).sum(axis=0)
 
   def weights(self, squares: Array) -> Array:
     """Returns the weight of every sample [C, N] in a step of least squares."""
-    n = self.independent[:, None] * self.counts
-    w = n / (self.counts * (self.scale[:, None] ** 2 + squares))
+    w = self.observations / (self.counts * (self.scale[:, None] ** 2 + squares))
     return w[:, self.block_of]
 
   def rescale(self, residuals: Array) -> None:
@@ -363,10 +381,10 @@ class JointLikelihood:
     Channels show one misfit: where courses go together for long, efforts count no more often. A
     duty is of the servo's law alone, which the readings feed: it counts by what that law leaves.
     """
-    self.scale, times = self._scales(residuals)
-    self.independent[:] = 1.0 / np.maximum(times, times[0])
+    self.scale, samples, times = self._scales(residuals)
+    self.observations = samples / np.maximum(times, times[0])[:, None]
     if self._known is not None:
-      self.scale[1], self.independent[1] = self._known[0], 1.0 / self._known[1]
+      self.scale[1], self.observations[1] = self._known
 
 
 def rms_of(courses: Sequence[Array]) -> float:

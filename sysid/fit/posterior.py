@@ -65,7 +65,7 @@ class Fitter:
   def linearise(
     self,
     x: Array,
-    width: float = _WIDTH,
+    width: float | Array = _WIDTH,
     known: list[Array] | None = None,
     fresh: Array | None = None,
     residuals: list[Array] | None = None,
@@ -74,7 +74,7 @@ class Fitter:
 
     Args:
       x: values [n].
-      width: of finite differences, of a value's scale.
+      width: of finite differences, of a value's scale; one for all or each [n].
       known: a Jacobian [n of the joint, C, N] a joint to take over; None for none.
       fresh: which values' columns are computed all the same [n] bool.
       residuals: at x [C, N] a joint; None to simulate them.

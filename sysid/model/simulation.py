@@ -46,6 +46,8 @@ class Member(NamedTuple):
 
   effects: Sequence[Effect]
   clocks: dict[str, Clocks]
+  weight: int = 1
+  """Of its prediction in the mean of several."""
 
 
 def merge_delays(
@@ -196,8 +198,8 @@ def error(
 def errors(
   model: mujoco.MjModel, logs: Sequence[Log], members: Sequence[Member], *, window_s: float = 0.5
 ) -> dict[str, float]:
-  """Returns the RMSE of the model, and of the mean of several models' predictions, over the joints
-  that the logs command, rad (or m).
+  """Returns the RMSE of the model, and of the weighed mean of several models' predictions, over the
+  joints that the logs command, rad (or m).
 
   Args:
     model: compiled model.
@@ -214,7 +216,9 @@ def errors(
     for m in members
   ]
   result = {"before": error(model, logs, window_s=window_s)}
-  result["after"] = _rmse(logs, [np.mean(c, axis=0) for c in zip(*courses, strict=True)])
+  weights = [m.weight for m in members]
+  mean = [np.average(c, axis=0, weights=weights) for c in zip(*courses, strict=True)]
+  result["after"] = _rmse(logs, mean)
   if len(members) > 1:
     each = [_rmse(logs, c) for c in courses]
     result |= {"single": each[0], "median": float(np.median(each)), "least": min(each)}

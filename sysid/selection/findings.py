@@ -1,5 +1,6 @@
 """What an identification found, before it is written down."""
 
+import collections
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -67,6 +68,12 @@ class Zero(NamedTuple):
   deviation: float = 0.0  # its standard deviation, rad
 
 
+def _firsts(drawn: Sequence[Scored]) -> list[int]:
+  """Returns where each draw is first among all."""
+  ids = [id(item) for item in drawn]
+  return [ids.index(one) for one in ids]
+
+
 @dataclasses.dataclass
 class Identified:
   """What an identification found, before it is written down."""
@@ -100,20 +107,33 @@ class Identified:
 
   @property
   def near(self) -> list[Member]:
-    """What to simulate with: the extended model, and others whose fits are near its own."""
+    """What to simulate with: the extended model, and others with other draws from the fits of
+    joints that have several, each weighed by how often it is drawn."""
     count = max((len(j.near) for j in self.joints), default=1)
+    places = [_firsts(j.near) for j in self.joints]
+    drawn = [tuple(row[k % len(row)] for row in places) for k in range(count)]
     own = Member([*self.calibration, *self.objects], self.clocks)
-    return [own, *(self._member(own, k) for k in range(1, count))]
+    return [
+      self._member(own, which)._replace(weight=often)
+      for which, often in collections.Counter(drawn).items()
+    ]
 
-  def _member(self, own: Member, at: int) -> Member:
-    """Returns the extended model with other fits near the best at joints that have several."""
+  def _member(self, own: Member, which: Sequence[int]) -> Member:
+    """Returns the extended model with other fits at joints that have several.
+
+    Args:
+      own: the extended model.
+      which: the place of each joint's fit among its draws, 0 for its own.
+    """
     effects, clocks = list(own.effects), dict(own.clocks)
-    for item in (j for j in self.joints if len(j.near) > 1):
+    for item, at in zip(self.joints, which, strict=True):
+      if not at:
+        continue
       theirs = {(e.kind, e.target) for e in effects_of(item.joint, item.near[0])[0]}
       theirs.add(("encoder_offset", item.joint))
       effects = [e for e in effects if (e.kind, e.target) not in theirs]
-      near, zero = item.near[at % len(item.near)], self.zeros.get(item.joint, Zero())
-      other, clocks[item.joint] = effects_of(item.joint, near, offset=zero.offset)
+      zero = self.zeros.get(item.joint, Zero())
+      other, clocks[item.joint] = effects_of(item.joint, item.near[at], offset=zero.offset)
       effects += other
     return Member(effects, clocks)
 

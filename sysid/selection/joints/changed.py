@@ -34,7 +34,7 @@ class Changed:
   constants_off: bool
   """Whether declared constants are off by more than machines of one kind differ."""
   elaborated: list[Scored] = dataclasses.field(default_factory=list)
-  """Fits with richer friction that predict left-out logs about as well as the best of them."""
+  """Draws from fits with richer friction, the likeliest first."""
 
   @property
   def extended(self) -> Scored:
@@ -55,7 +55,7 @@ class Changed:
 
   @property
   def near(self) -> list[Scored]:
-    """The hypotheses whose mean is predicted with: fits near the best, which is the first."""
+    """The hypotheses whose mean is predicted with: draws from fits, the best of them first."""
     best = self.extended
     return self.elaborated if any(best is s for s in self.elaborated) else [best]
 

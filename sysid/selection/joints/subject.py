@@ -95,7 +95,7 @@ class Subject:
     shown = self.now.expectation, self.now.effort_unit
     known = self.known, self.freed, self.usual, self.paired, shown
     scored = self.explainer, self.explainer.null, dict(self.explainer.scored)
-    scales = [(j.scale, j.independent.copy()) for j in self._judged]
+    scales = [(j.scale, j.observations) for j in self._judged]
     return known, scored, scales
 
   @state.setter
@@ -103,8 +103,8 @@ class Subject:
     known, scored, scales = state
     self.known, self.freed, self.usual, self.paired, shown = known
     self.now.expectation, self.now.effort_unit = shown
-    for joint, (scale, independent) in zip(self._judged, scales, strict=True):
-      joint.scale, joint.independent = scale, independent.copy()
+    for joint, (scale, observations) in zip(self._judged, scales, strict=True):
+      joint.scale, joint.observations = scale, observations
     self.explainer, self.explainer.null, kept = scored
     self.explainer.scored = dict(kept)
     self.explainer.rescore()
@@ -157,7 +157,7 @@ def following(subject: Subject) -> Subject:
 def _tells(joint: JointLikelihood) -> bool:
   """Tells whether what a course leaves in a block is worth an observation: where a joint that stops
   stays a little off, the residual goes together for longer."""
-  return bool(joint.independent[0] * np.median(joint.counts[0]) >= 1.0)
+  return bool(np.median(joint.observations[0]) >= 1.0)
 
 
 def _subject(

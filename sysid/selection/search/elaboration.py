@@ -1,22 +1,21 @@
-"""Fits near the best with a richer friction, where more remains than names explain.
+"""Draws from fits with a richer friction, where more remains than names explain.
 
 Fits of equal cost differ several times over on other motions, as where a joint stops hangs on small
-differences of friction. All that are near the best are kept; their mean predicts better than one.
+differences of friction. Each is drawn as often as it is likely; the mean of all draws predicts
+better than one fit.
 """
 
-import copy
-from collections.abc import Collection
+import dataclasses
+from collections.abc import Collection, Sequence
 
 import numpy as np
-from scipy.stats import chi2
 
 from nerf2real.sysid.fit.layout import CONSTANTS, Layout
-from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses.candidates import typical_speed, typical_torque
 from nerf2real.sysid.hypotheses.terms import FREE, STICKING, Term
 from nerf2real.sysid.model.plant import JointPlant
-from nerf2real.sysid.selection.search.evidence import Scored, kinds_of
+from nerf2real.sysid.selection.search.evidence import NAT, Scored, kinds_of
 from nerf2real.sysid.selection.search.explain import Explainer
 
 Array = np.ndarray
@@ -31,20 +30,16 @@ _SLOWEST = 0.1
 fits of small servos have 0.07 to 0.11 rad/s; chosen, some times that."""
 _EXPECTED = {"coefficient": 0.1, "rest": 0.5}
 """Spread about zero: what a motion does not show stays away; chosen."""
-_NEAR = 0.95
-"""Share of a posterior that lies within so much of the least cost: half a quantile of chi square
-with as many degrees as values."""
-_MOST = 8  # fits that are fitted to the end and anew without each log, chosen
+_MOST = 8  # fits that are fitted to the end, chosen
 _FIRST = 3  # steps after which the best are chosen
 _REFITTED = 3  # Jacobians at most of a fit
 _ROUNDS = 3  # of fitting and setting the scale by the best
+_DRAWS = 16  # chosen: a fit that is less likely than one in 32 is left out
 
 
 def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> list[Scored]:
-  """Returns the fits with richer friction that are near the best of them, the best first; none
-  where one without predicts logs better that it was not fitted to.
-
-  Near are those whose cost is, and of them those whose left-out logs are predicted as well.
+  """Returns draws from the fits with richer friction and the best without, the likeliest first;
+  none where that is the one without.
 
   Args:
     explainer: of the joint; its scale is set by the best fit, all is scored anew.
@@ -60,18 +55,27 @@ def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> li
     joint.rescale(tried[0][1].fit.residuals[0])
   for fitter, item in tried:
     item.fit = fitter.again(item.fit)
-  tried.sort(key=lambda t: t[1].fit.cost)
-  least = tried[0][1].fit
-  reach = 0.5 * float(chi2.ppf(_NEAR, least.layout.count))
-  near = [(fitter, s) for fitter, s in tried if s.fit.cost < least.cost + reach]
-  for fitter, item in near:
     item.nats = joint.loglik(fitter.leave_out(item.fit).held[0])
   explainer.rescore()
-  left_out = sorted(((crossed(joint, s), s) for _, s in near), key=lambda pair: -pair[0])
   plain = next(s for s in explainer.ranked() if not s.neutral and s.names >= set(named))
-  if crossed(joint, plain) > left_out[0][0]:
-    return []
-  return [s for nats, s in left_out if nats > left_out[0][0] - reach]
+  here = Fitter([joint], plain.fit.layout).again(plain.fit)
+  drawn = _drawn([*(item for _, item in tried), dataclasses.replace(plain, fit=here)])
+  return drawn if any(drawn[0] is item for _, item in tried) else []
+
+
+def _drawn(fits: Sequence[Scored]) -> list[Scored]:
+  """Returns fits as often as they are likely by Akaike's weights (Burnham and Anderson 2002), by
+  systematic resampling (Kitagawa 1996)."""
+  fits = sorted(fits, key=_information)
+  costs = np.array([_information(item) for item in fits])
+  ends = np.cumsum(np.exp(costs[0] - costs))
+  places = ends[-1] * (np.arange(_DRAWS) + 0.5) / _DRAWS
+  return [fits[k] for k in np.searchsorted(ends, places)]
+
+
+def _information(item: Scored) -> float:
+  """Returns half of Akaike's criterion, nats."""
+  return item.fit.cost + NAT * item.fit.layout.count
 
 
 def _begun(
@@ -92,18 +96,6 @@ def _begun(
         fit = fitter.fit(begin, iterations=_FIRST, quick=True)
         tried.append((fitter, Scored(joint, (*terms, term), fit, np.zeros(0))))
   return tried
-
-
-def crossed(joint: JointLikelihood, item: Scored) -> float:
-  """Returns the nats of blocks that a hypothesis was fitted anew without, fold by fold."""
-  fitter, total = Fitter([joint], item.fit.layout), 0.0
-  for fold in np.unique(joint.fold):
-    part = copy.copy(joint)
-    part.gain = joint.gain * (joint.fold != fold)[joint.block_of]
-    x = Fitter([part], item.fit.layout).fit(item.fit.x, iterations=_REFITTED).x
-    nats = joint.loglik(joint.squares(fitter.simulated(x[None])[1][0][0]))
-    total += float(nats[joint.fold == fold].sum())
-  return total
 
 
 def bases(

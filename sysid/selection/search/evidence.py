@@ -18,7 +18,7 @@ UNREPEATED = ("backlash",)
 
 _RAREST, _SMALL = 1e-300, 1e-8  # probabilities: the least, and from where on tan is 1 / angle
 _LEAST_SHARE = 1e-3  # of a sum, that others hold beside one block
-_NAT = 1.0  # that a further value costs (Akaike 1974): a smaller difference says nothing
+NAT = 1.0  # that a further value costs (Akaike 1974): a smaller difference says nothing
 
 
 @dataclasses.dataclass
@@ -97,11 +97,11 @@ def clearness(rows: Sequence[Array], prior: float, expected: Sequence[Array]) ->
     expected: nats by which the blocks tell the two apart if one of them holds, as `rows`.
   """
   total = float(sum(row.sum() for row in rows)) - prior
-  by_sum = total / max(float(np.sqrt(sum(variance(row) for row in rows))), _NAT)
+  by_sum = total / max(float(np.sqrt(sum(variance(row) for row in rows))), NAT)
   pairs = np.concatenate([np.add.reduceat(row, np.arange(0, len(row), 2)) for row in rows])
   pairs = pairs - prior / len(pairs)
   ranks = rankdata(np.abs(pairs))
-  agree = np.sign(pairs) * (np.abs(pairs) >= _NAT)
+  agree = np.sign(pairs) * (np.abs(pairs) >= NAT)
   by_ranks = float(agree @ ranks / np.sqrt(ranks @ ranks))
   return combined([by_sum, by_pattern(rows, prior, expected), by_ranks])
 
@@ -145,7 +145,7 @@ def by_pattern(rows: Sequence[Array], prior: float, expected: Sequence[Array]) -
     for row, g in zip(rows, expected, strict=True)
   )
   telling = whole**2 / float(sum(g @ g for g in expected))  # blocks
-  over_error = total / max(float(np.sqrt(squares)), _NAT)
+  over_error = total / max(float(np.sqrt(squares)), NAT)
   rare = student.sf(abs(over_error), max(telling - 1.0, _LEAST_SHARE))
   return float(np.sign(over_error) * norm.isf(rare))
 

@@ -39,9 +39,7 @@ def test_nats_of_a_block_are_those_of_the_formula(viscous):
   residuals[0, chosen] = 3.0 * joint.scale[0]
   squares = joint.squares(residuals)
   nats = joint.loglik(squares)
-  expected = (
-    -joint.independent[0] * joint.counts[0, 2] * np.log1p(squares[0, 2] / joint.scale[0] ** 2)
-  )
+  expected = -joint.observations[0, 2] * np.log1p(squares[0, 2] / joint.scale[0] ** 2)
   assert nats[2] == pytest.approx(expected)
   assert np.all(np.delete(nats, 2) == 0.0)
 
@@ -297,10 +295,26 @@ def test_efforts_count_no_more_often_than_courses(viscous):
   two = np.array([smooth, random.normal(size=joint.size)])
   try:
     joint.gain, joint.floor = np.ones((2, joint.size)), np.full(2, 1e-9)
-    joint.counts, joint.independent = np.repeat(joint.counts, 2, axis=0), np.ones(2)
+    joint.counts, joint._further = np.repeat(joint.counts, 2, axis=0), np.zeros((2, joint.size))
     joint.rescale(two)
-    assert joint.independent[0] == joint.independent[1] < 0.1
+    course, effort = joint.observations[:, 2] / joint.counts[:, 2]
+    assert course == effort < 0.1
     joint.rescale(two[::-1])
-    assert joint.independent[1] < 0.1 < 0.5 < joint.independent[0]
+    course, effort = joint.observations[:, 2] / joint.counts[:, 2]
+    assert effort < 0.1 < 0.5 < course
   finally:
     joint.channels.pop()
+
+
+def test_stamps_matter_as_far_as_more_than_the_noise_remains():
+  _, joint = joint_of()
+  random = np.random.default_rng(0)
+  fast = joint.block_of == 3
+  joint._further = np.where(fast, 9.0 * joint.floor[0] ** 2, 0.0)[None]
+  noise = random.normal(size=(1, joint.size)) * joint.floor[0] * np.where(fast, 0.316, 1.0)
+  counted = []
+  for residuals in (noise, noise + 100.0 * joint.floor[0] * random.normal(size=(1, joint.size))):
+    joint.rescale(residuals)
+    counted.append(joint.observations[0, 3] / joint.observations[0, 2])
+  assert counted[0] == pytest.approx(0.1, abs=0.02)
+  assert counted[1] == pytest.approx(1.0, abs=0.02)

@@ -247,9 +247,9 @@ def test_each_of_several_names_is_tried_beside_a_force(monkeypatch):
   assert found == () and len(tried) == 4
 
 
-@pytest.mark.parametrize(("independent", "follows"), [(0.002, True), (0.05, False)])
+@pytest.mark.parametrize(("observations", "follows"), [(0.2, True), (5.0, False)])
 def test_a_machine_whose_courses_stray_for_long_is_judged_from_each_reading_on(
-  monkeypatch, independent, follows
+  monkeypatch, observations, follows
 ):
   monkeypatch.setattr(subject, "own_library", few)
   model = mujoco.MjModel.from_xml_string(PENDULUM)
@@ -258,7 +258,7 @@ def test_a_machine_whose_courses_stray_for_long_is_judged_from_each_reading_on(
 
   def rescale(joint, residuals):
     strayed(joint, residuals)
-    joint.independent[:] = independent  # of blocks of 100 readings
+    joint.observations[:] = observations
 
   monkeypatch.setattr(JointLikelihood, "rescale", rescale)
   machines = Machine(model, logs[:1]), Machine(model, logs[1:])

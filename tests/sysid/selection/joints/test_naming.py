@@ -30,8 +30,7 @@ class _Joint:
   def squares(residuals):
     return residuals.reshape(1, -1, 10).var(axis=2)
 
-  independent = np.array([0.1])
-  counts = np.full((1, 30), 10.0)
+  observations = np.ones((1, 30))
 
   @classmethod
   def alike(cls, apart):
