@@ -63,7 +63,7 @@ class Fit:
   """[F, n]."""
   jacobian: list[Array]
   """[n of the joint, C, N] a joint."""
-  width: float | None = None
+  width: float | Array | None = None
   """Of the finite differences that the Jacobian is of; None where it was carried along by steps."""
   held: list[Array] = dataclasses.field(default_factory=list)
   """Mean squares [C, B] of left-out blocks, a joint."""

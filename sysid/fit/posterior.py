@@ -106,7 +106,7 @@ class Fitter:
     return self.weighed(x, here, jacobians, width)
 
   def weighed(
-    self, x: Array, residuals: list[Array], jacobian: list[Array], width: float | None
+    self, x: Array, residuals: list[Array], jacobian: list[Array], width: float | Array | None
   ) -> Fit:
     """Returns a fit of these residuals and derivatives under the joints' present scales."""
     layout, n = self.layout, self.layout.count
@@ -157,7 +157,7 @@ class Fitter:
       begun, best = best, self._descended(best, quick)
       if quick:
         continue
-      if best is begun and best.width is not None and best.width <= FINE:
+      if best is begun and best.width is not None and np.all(best.width <= FINE):
         break
       # Friction and held commands are rough: from coarse to fine.
       known = best.jacobian if known is not None else None

@@ -56,7 +56,7 @@ def left(model, logs):
 
 @pytest.mark.parametrize(("xml", "prompt"), [(SMOOTH, False), (RUBBING, True)])
 def test_a_healthy_machine_leaves_noise_where_its_model_is_simulated_finely(xml, prompt):
-  model, logs = recorded(xml, 8e-6, numerics=MACHINE)
+  model, logs = recorded(xml, 4e-6, numerics=MACHINE)
   found = resolution.numerics(Machine(model, logs))
   assert found.step < 4e-3 and found.prompt == prompt
   before = left(model, logs)
