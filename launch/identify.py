@@ -84,6 +84,7 @@ def _print_content(content: dict[str, Any], out: Path) -> None:
 
   from nerf2real.sysid.model import simulation as evaluation
   from nerf2real.sysid.report.alike import place, together
+  from nerf2real.sysid.report.summary import not_told_apart
 
   rich.print(f"[bold]{escape(content['verdict'])}[/bold] in {content['seconds']:.0f} s")
   table = Table("effect", "where", "parameter", "value", "95 %", "unit")
@@ -100,6 +101,8 @@ def _print_content(content: dict[str, Any], out: Path) -> None:
       )
   if table.rows:
     rich.print(table)
+    if rivals := not_told_apart(content["alternatives"]):
+      print(rivals)
   for note in content["notes"]:
     print(f"note: {note}")
   for name in ("train", "held"):

@@ -219,7 +219,7 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
     plant.joint,
     ("amplitude", "periods", "phase"),
     (0.0, longest, -10.0),
-    (0.5 * torque, SHORTEST, 10.0),
+    (strongest(plant), SHORTEST, 10.0),
     (0.03 * torque, 0.05, 0.3),
     tuple(waves),
     choices=max((SHORTEST - longest) * _reach(plant) / np.pi, 1.0),

@@ -17,15 +17,19 @@ _LISTED = 6  # alternatives in the report
 
 
 def residual_at(found: Identified) -> dict[str, Any]:
-  """Returns where the residual of the extended model sits: joint, position, velocity, time."""
+  """Returns where the residual of the extended model sits: joint, position, velocity, time; where
+  a force of any form is in it, that of the best model without, which shows what the force does."""
   item = found.least_explained
+  best = item.extended
+  if best.beside_force:
+    best = next(s for s in item.ranked if not s.beside_force and not s.neutral)
   logs = item.likelihood.plant.logs
   joined = {
     "position": np.concatenate([log.position for log in logs]),
     "velocity": np.concatenate([log.velocity for log in logs]),
     "time": np.concatenate([log.time - log.time[0] for log in logs]),
   }
-  courses = item.likelihood.courses(item.extended.terms, item.extended.fit.x)
+  courses = item.likelihood.courses(best.terms, best.fit.x)
   squares = np.square(np.concatenate(courses))
   read = np.isfinite(squares)
   result: dict[str, Any] = {"joint": item.joint, "rms": rms_of(courses)}

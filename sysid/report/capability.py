@@ -73,7 +73,7 @@ def sentence(found: Sequence[Identifiability]) -> str:
   pairs = [(" and ".join(pair), item.joint) for item in found for pair in item.pairs]
   alike = _counted(pairs, everywhere)
   words = f"Of {len({e.kind for item in found for e in item.effects})} kinds of effect these logs"
-  words += f" would not show {hidden}" if hidden else " would show all"
+  words += f" would not show, at usual sizes, {hidden}" if hidden else " would show all"
   words += f", and not tell apart {alike}." if alike else "."
   resolved: dict[str, list[tuple[str, str]]] = {}
   for item in found:

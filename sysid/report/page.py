@@ -295,8 +295,8 @@ def _where(content: dict[str, Any], details: dict[str, Any], unit: str) -> Secti
     [name, tests["declared"][name]["p"], tests["extended"][name]["p"]] for name in tests["declared"]
   ]
   text = (
-    f"The extended model leaves {1e3 * at['rms']:.3g} {unit} RMS at {at['joint']}, most in"
-    f" {at['log']}. The fifth of the samples that holds most of its square:"
+    f"The extended model, without a force of any form, leaves {1e3 * at['rms']:.3g} {unit} RMS at"
+    f" {at['joint']}, most in {at['log']}. The fifth of the samples that holds most of its square:"
   )
   return Section(
     "Where the rest sits",

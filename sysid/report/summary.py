@@ -127,13 +127,13 @@ def _meaning(effect: dict[str, Any]) -> str:
 
 def _sure(content: dict[str, Any], asked: Sequence[float], shown: str) -> Answer:
   question = "How sure is that?"
-  alike = alike_by_place(content["alternatives"])
+  alike = not_told_apart(content["alternatives"])
   effects = content["effects"]
   if not effects and content["verdict"] == "none":
     return Answer(question, "No effect is clearly better than none", [shown], tone="good")
   if not effects:
     return Answer(question, "Not sure: no name is clear of every other", [], tone="warn")
-  words = [_alike(alike)] if alike else []
+  words = [alike] if alike else []
   tone = "warn" if alike else "good"
   pairs = _clearness(effects, asked)
   if not pairs:
@@ -160,8 +160,12 @@ def alike_by_place(alternatives: Sequence[dict[str, Any]]) -> dict[str, list[str
   return found
 
 
-def _alike(kinds: dict[str, list[str]]) -> str:
-  """Returns in a sentence what logs do not tell apart: of several joints, at which."""
+def not_told_apart(alternatives: Sequence[dict[str, Any]]) -> str:
+  """Returns in a sentence what logs do not tell from what was found, of several joints at which;
+  empty where they tell all."""
+  kinds = alike_by_place(alternatives)
+  if not kinds:
+    return ""
   if len(kinds) == 1:
     (own,) = kinds.values()
     return f"These logs do not tell it from {either(own, ())}."

@@ -19,7 +19,7 @@ from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import claims, whole_machine
 from nerf2real.sysid.selection.findings import Identified, Zero, beside_machine
-from nerf2real.sysid.selection.joints import changes
+from nerf2real.sysid.selection.joints import changes, doubts
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.joints.naming import Name
 from nerf2real.sysid.selection.joints.subject import WHOLE, Subject, explain_reference, prepare
@@ -262,7 +262,8 @@ def _write_down(result: Identified, item: Changed) -> None:
     else:
       result.objects.append(effect)
     if term.known:
-      result.in_reference.append(row)
+      if doubts.exceeds(item.subject, best, term):
+        result.in_reference.append(row)
     else:
       _list(result, item, term.kind, row)
   if offset:

@@ -148,3 +148,17 @@ def test_words_and_paths_are_told_as_they_are(capsys, tmp_path):
   assert "note: held[a].mcap has a bias of 0.1 [rad].\n" in told
   assert "train: 0.00172 -> 6.1e-05 rad" in told  # of a slide, m: micrometres count
   assert f"floor: 3.2e-06; report: {out / 'report.html'}\n" in told
+
+
+def test_what_predicts_the_same_is_told_beside_what_was_found(capsys, tmp_path):
+  delay = {"delay": {"value": 0.0083, "low": 0.002, "high": 0.0106, "unit": "s"}}
+  content = {
+    "verdict": "effects",
+    "seconds": 1.0,
+    "effects": [{"kind": "measurement_delay", "joint": "pitch", "parameters": delay}],
+    "alternatives": [{"kind": "command_delay", "joint": "pitch", "confounded": True}],
+    "notes": [],
+    "error": {"train": {"before": 0.01, "after": 0.001}, "held": None, "floor": 0.001},
+  }
+  script._print_content(content, tmp_path)
+  assert "These logs do not tell it from command delay.\n" in capsys.readouterr().out

@@ -116,13 +116,18 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   term = next(t for t in best.terms if t.name == kind)
   if term.freed and subject.before is not None:
     return _has_changed(subject, best, term)
-  if term.freed or not term.names or kind in _MOMENTS:
+  return term.freed or exceeds(subject, best, term)
+
+
+def exceeds(subject: Subject, item: Scored, term: Term) -> bool:
+  """Tells whether an effect of a hypothesis is more than nothing and than healthy machines have."""
+  if not term.names or term.kind in _MOMENTS:
     return True
   alone = subject.before is None
-  sizes = {p.name: p.nominal for p in kind_of(kind).parameters if not p.shape}
-  bounds = intervals.intervals(subject.now, best.fit, term, own_latency=alone)
+  sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
+  bounds = intervals.intervals(subject.now, item.fit, term, own_latency=alone)
   return any(
-    not low - own_size(subject.now.plant, kind, name, subject.now.settings, repeated=not alone)
+    not low - own_size(subject.now.plant, term.kind, name, subject.now.settings, repeated=not alone)
     <= sizes[name]
     <= high
     for name, (low, high) in bounds.items()

@@ -1,9 +1,9 @@
-"""Where a payload is looked for: where what a body holds can have it."""
+"""How far effects are looked for: a payload where what a body holds can have it."""
 
 import mujoco
 import pytest
 
-from nerf2real.sysid.hypotheses.candidates import library
+from nerf2real.sysid.hypotheses.candidates import cogging, library, strongest
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.model.joint import JointModel
 from tests.sysid.synthetic import ARM, log_of
@@ -31,3 +31,12 @@ def test_a_hand_holds_a_payload_beyond_itself():
 
 def test_what_another_joint_moves_is_not_held():
   assert bounds(HOLDING, "shoulder") == bounds(ARM, "shoulder")
+
+
+def test_torque_that_holds_a_joint_is_looked_for_up_to_what_moves_it():
+  """A wave that ended at half the usual torque left the rest of a larger one to a weak motor."""
+  model = mujoco.MjModel.from_xml_string(ARM)
+  plant = JointModel(model, "elbow", [log_of(ARM, "sweep", duration=2.0)])
+  terms = {t.kind: t for t in (*library(plant), cogging(plant, [(0.1, 14.0, 0.0)]))}
+  kinds = ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "cogging")
+  assert [terms[kind].high[0] for kind in kinds] == [strongest(plant)] * len(kinds)

@@ -29,3 +29,28 @@ def test_what_remains_is_stated_as_it_was_measured():
   joint.mask[:] = joint.gain[0] = 0.1  # what a sample weighs is no size
   left = joint.courses((), np.zeros(0))
   assert rms_of(left) == pytest.approx(simulation.error(model, logs), rel=0.02)
+
+
+def test_where_a_residual_sits_is_told_without_the_force_that_takes_it():
+  """A stop at one end, which a force of any form imitates: what that leaves is elsewhere."""
+  time = np.linspace(0.0, 10.0, 1000)
+  log = SimpleNamespace(position=np.sin(time), velocity=np.cos(time), time=time, name="a.mcap")
+  courses = {"force": 0.01 * (log.position < -0.8), "plain": 0.1 * (log.position > 0.8)}
+  likelihood = SimpleNamespace(
+    plant=SimpleNamespace(logs=[log]), courses=lambda terms, _: [courses[terms]]
+  )
+  force, idle, plain = (
+    SimpleNamespace(terms=terms, fit=SimpleNamespace(x=None), beside_force=beside, neutral=neutral)
+    for terms, beside, neutral in (
+      ("force", True, False),
+      ("force", False, True),
+      ("plain", False, False),
+    )
+  )
+  item = SimpleNamespace(
+    joint="lift", likelihood=likelihood, extended=force, ranked=[force, idle, plain]
+  )
+  at = rivals.residual_at(SimpleNamespace(least_explained=item))
+  assert at["position"]["low"] > 0.8 and at["position"]["share_of_square"] > 0.75
+  item.extended = plain
+  assert rivals.residual_at(SimpleNamespace(least_explained=item)) == at

@@ -111,13 +111,15 @@ def test_a_constant_that_changed_did_so_by_more_than_recordings_differ(
   ("low", "hinge", "something"), [(0.0016, True, False), (0.006, True, True), (0.0016, False, True)]
 )
 def test_play_of_a_healthy_gear_is_nothing(monkeypatch, reference, low, hinge, something):
-  term = SimpleNamespace(name="backlash", names=("gap",), freed=False)
+  term = SimpleNamespace(name="backlash", kind="backlash", names=("gap",), freed=False)
   bounds = {"gap": (low, low + 0.002)}  # rad, or m of a slide
   monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: bounds)
   now = SimpleNamespace(settings=SETTINGS, plant=SimpleNamespace(hinge=hinge))
   judged = SimpleNamespace(before=reference, now=now)
   best = SimpleNamespace(terms=[term], fit=None)
   assert doubts.is_something(judged, best, "backlash") == something
+  term.name = None  # as of one that the reference has
+  assert doubts.exceeds(judged, best, term) == something
 
 
 @pytest.mark.parametrize(
@@ -130,7 +132,8 @@ def test_damping_that_a_servos_own_is_off_by_is_nothing(monkeypatch, reference, 
   declared = np.zeros(len(INDEX))
   declared[INDEX["velocity"]] = -100.0
   now = SimpleNamespace(settings=SETTINGS, plant=SimpleNamespace(declared=declared, holds=True))
-  term = SimpleNamespace(name="viscous_friction", names=("coefficient",), freed=False)
+  kind = "viscous_friction"
+  term = SimpleNamespace(name=kind, kind=kind, names=("coefficient",), freed=False)
   judged = SimpleNamespace(before=reference, now=now)
   best = SimpleNamespace(terms=[term], fit=None)
   assert doubts.is_something(judged, best, "viscous_friction") == something
