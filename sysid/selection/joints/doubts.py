@@ -26,6 +26,8 @@ _MOMENTS = ("payload",)
 """Kinds of which a product of values shows: the product is sure where none of them is."""
 
 
+_CLOCK = {"measurement_delay": "skew", "command_delay": "latency"}
+"""Constants that do to positions what a kind does."""
 _AT_END = 1e-3  # of a range: a value as near to its end has been stopped there
 
 _SCATTER = ("friction",)  # constants that no drawing or data sheet holds
@@ -126,13 +128,26 @@ def exceeds(subject: Subject, item: Scored, term: Term) -> bool:
   alone = subject.before is None
   sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
   bounds = intervals.intervals(subject.now, item.fit, term, own_latency=alone)
+  taken = 0.0 if alone else _taken_back(subject, item, term.kind)
+
+  def own(name: str) -> float:
+    plant, settings = subject.now.plant, subject.now.settings
+    return taken + own_size(plant, term.kind, name, settings, repeated=not alone)
+
   return any(
-    not low - own_size(subject.now.plant, term.kind, name, subject.now.settings, repeated=not alone)
-    <= sizes[name]
-    <= high
+    not low - own(name) <= sizes[name] <= high
     for name, (low, high) in bounds.items()
     if name in sizes
   )
+
+
+def _taken_back(subject: Subject, item: Scored, kind: str) -> float:
+  """Returns the s of a delay that a hypothesis' clock takes back, by being less than it was."""
+  if kind not in _CLOCK:
+    return 0.0
+  before = dict(zip(subject.known[0].names, subject.known[0].centre, strict=True))
+  now = item.fit.values(item.terms[0])
+  return max(before[_CLOCK[kind]] - now[_CLOCK[kind]], 0.0)
 
 
 def _has_changed(subject: Subject, best: Scored, term: Term) -> bool:

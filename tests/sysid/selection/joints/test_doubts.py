@@ -122,6 +122,21 @@ def test_play_of_a_healthy_gear_is_nothing(monkeypatch, reference, low, hinge, s
   assert doubts.exceeds(judged, best, term) == something
 
 
+@pytest.mark.parametrize(("skew", "something"), [(0.0003, True), (-0.0009, False)])
+def test_a_delay_that_a_clock_takes_back_is_nothing(monkeypatch, skew, something):
+  """Readings as late as before, for which a late reading and an early clock stand: their efforts
+  alone come otherwise."""
+  kind = "measurement_delay"
+  monkeypatch.setattr(doubts.intervals, "intervals", lambda *_, **__: {"delay": (0.001, 0.0034)})
+  term = SimpleNamespace(name=kind, kind=kind, names=("delay",), freed=False)
+  own = SimpleNamespace(names=("skew", "latency"), centre=(0.0003, 0.001))
+  values = {"skew": skew, "latency": 0.001}
+  now = SimpleNamespace(settings=SETTINGS, plant=SimpleNamespace(hinge=True, holds=True))
+  judged = SimpleNamespace(before=object(), now=now, known=(own,))
+  best = SimpleNamespace(terms=[own, term], fit=SimpleNamespace(values=lambda _: values))
+  assert doubts.exceeds(judged, best, term) == something
+
+
 @pytest.mark.parametrize(
   ("reference", "low", "something"),
   [(None, 5.0, False), (None, 7.0, True), (object(), 1.0, False), (object(), 2.0, True)],
