@@ -125,7 +125,8 @@ def elaborate(found: Sequence[Changed]) -> None:
     if sum_before > (1.0 - _REST) * most[-1]:
       break
     if item.verdict in ("partly", "unexplained") and not item.likelihood.follows:
-      item.elaborated = elaborated(item.subject.explainer, item.found.best, item.named)
+      explainer, best = item.subject.explainer, item.found.best
+      item.elaborated = elaborated(explainer, best, item.extended, item.named)
 
 
 def _verdict(

@@ -37,13 +37,16 @@ _ROUNDS = 3  # of fitting and setting the scale by the best
 _DRAWS = 16  # chosen: a fit that is less likely than one in 32 is left out
 
 
-def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> list[Scored]:
-  """Returns draws from the fits with richer friction and the best without, the likeliest first;
-  none where that is the one without.
+def elaborated(
+  explainer: Explainer, best: Scored, plain: Scored, named: Collection[str]
+) -> list[Scored]:
+  """Returns draws from the fits with richer friction and from what is simulated with without, the
+  likeliest first; none where all are of that.
 
   Args:
     explainer: of the joint; its scale is set by the best fit, all is scored anew.
-    best: the best hypothesis without.
+    best: the best hypothesis without, whose constants and names richer friction is added to.
+    plain: what is simulated with without.
     named: kinds that every one must have.
   """
   joint = explainer.joint
@@ -57,10 +60,11 @@ def elaborated(explainer: Explainer, best: Scored, named: Collection[str]) -> li
     item.fit = fitter.again(item.fit)
     item.nats = joint.loglik(fitter.leave_out(item.fit).held[0])
   explainer.rescore()
-  plain = next(s for s in explainer.ranked() if not s.neutral and s.names >= set(named))
-  here = Fitter([joint], plain.fit.layout).again(plain.fit)
-  drawn = _drawn([*(item for _, item in tried), dataclasses.replace(plain, fit=here)])
-  return drawn if any(drawn[0] is item for _, item in tried) else []
+  plain.fit = dataclasses.replace(
+    Fitter([joint], plain.fit.layout).again(plain.fit), held=plain.fit.held
+  )
+  drawn = _drawn([*(item for _, item in tried), plain])
+  return drawn if any(item is not plain for item in drawn) else []
 
 
 def _drawn(fits: Sequence[Scored]) -> list[Scored]:

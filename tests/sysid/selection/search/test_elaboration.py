@@ -35,7 +35,7 @@ def explainer():
 
 @pytest.fixture(scope="module")
 def near(explainer):
-  return elaborated(explainer, explainer.null, ()), explainer.joint
+  return elaborated(explainer, explainer.null, explainer.null, ()), explainer.joint
 
 
 def test_every_fit_has_what_is_named(explainer):
