@@ -7,11 +7,11 @@ observations as the block has; with that integrated out
     log p_b = -n_b log(1 + m_b / s^2)
 
 a multivariate t density. n_b counts independent samples: those of the block over the residual's
-correlation time. s is what the best hypothesis leaves in the median block, so that evidence counts
-in units of what remains. A sample that is less sure than the others, as its stamp is off where a
-joint is fast, counts by the share that the others' variance has in its own: all of one where what
-remains is far larger than what stamps are off by. Shapes: N samples of all logs, B blocks, C
-channels, n values.
+correlation time in its log. s is what the best hypothesis leaves in the median block, so that
+evidence counts in units of what remains. A sample that is less sure than the others, as its stamp
+is off where a joint is fast, counts by the share that the others' variance has in its own: all of
+one where what remains is far larger than what stamps are off by. Shapes: N samples of all logs, B
+blocks, C channels, n values.
 """
 
 from collections.abc import Sequence
@@ -115,19 +115,23 @@ class JointLikelihood:
     scale, samples, times = self._scales(rows)
     return scale[1], samples[1] / times[1]
 
-  def _scales(self, residuals: Array) -> tuple[Array, Array, list[float]]:
-    """Returns scales [C], samples that count as sure [C, B] and correlation times [C] of residuals
-    [C, N]."""
+  def _scales(self, residuals: Array) -> tuple[Array, Array, Array]:
+    """Returns scales [C], samples that count as sure [C, B] and correlation times of their logs
+    [C, B] of residuals [C, N]: where a joint stands at steps of its encoder they go together for
+    long, in another motion from one reading to the next."""
     squares = self.squares(residuals)
     alike = residuals / np.sqrt(squares[:, self.block_of] + 1e-30)
-    times = [correlation_time(row, self.starts) for row in alike]
+    alike = alike - alike.mean(axis=1, keepdims=True)
+    length = max(8, int(np.median(np.diff(self.starts)))) if len(self.starts) > 1 else self.size
+    logs = np.split(alike, np.flatnonzero(np.diff(self.log_at)) + 1, axis=1)
+    times = np.array([[correlation_time(row, length) for row in log] for log in logs]).T
     noise = self.floor[:, None] ** 2 * np.add.reduceat(self.mask, self.starts) / self.counts
     if self.expectation is not None:
       noise *= 1.0 + NOISE
     beyond = np.maximum(np.median(squares - noise, axis=1), 0.0)
     shares = np.add.reduceat(self.mask * self._shares(beyond), self.starts, axis=1)
     scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
-    return scale, np.maximum(shares, 1.0), times
+    return scale, np.maximum(shares, 1.0), times[:, self.log_of]
 
   def _cut(self) -> None:
     starts, folds, offset = [], [], 0
@@ -382,7 +386,7 @@ class JointLikelihood:
     duty is of the servo's law alone, which the readings feed: it counts by what that law leaves.
     """
     self.scale, samples, times = self._scales(residuals)
-    self.observations = samples / np.maximum(times, times[0])[:, None]
+    self.observations = samples / np.maximum(times, times[0])
     if self._known is not None:
       self.scale[1], self.observations[1] = self._known
 

@@ -46,16 +46,14 @@ def _trimmed(values: Array) -> float:
   return float(kept.mean()) / _NINE_TENTHS**2 if len(kept) else 0.0
 
 
-def correlation_time(row: Array, starts: Array) -> float:
+def correlation_time(row: Array, length: int) -> float:
   """Returns the integrated autocorrelation time in samples, up to where it falls below 0.05.
 
   Args:
-    row: residuals [N].
-    starts: first samples of the blocks, over whose usual length it is looked for.
+    row: residuals [N] about what they are expected to be.
+    length: samples over which it is looked for.
   """
-  length = max(8, int(np.median(np.diff(starts)))) if len(starts) > 1 else len(row)
-  centred = row - row.mean()
-  power = np.abs(np.fft.rfft(centred, 2 * len(row))) ** 2
+  power = np.abs(np.fft.rfft(row, 2 * len(row))) ** 2
   correlation = np.fft.irfft(power)[: 2 * length]
   correlation = correlation / max(correlation[0], 1e-30)
   small = np.flatnonzero(correlation < 0.05)

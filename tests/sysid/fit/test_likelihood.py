@@ -86,9 +86,20 @@ def test_correlation_time_of_an_autoregression():
   row = np.zeros(40_000)
   for n in range(1, len(row)):
     row[n] = rho * row[n - 1] + random.normal()
-  starts = np.arange(0, len(row), 100)
-  assert correlation_time(row, starts) == pytest.approx((1 + rho) / (1 - rho), rel=0.25)
-  assert correlation_time(random.normal(size=40_000), starts) < 1.2
+  assert correlation_time(row, 100) == pytest.approx((1 + rho) / (1 - rho), rel=0.25)
+  assert correlation_time(random.normal(size=40_000), 100) < 1.2
+
+
+def test_a_standstill_counts_little_and_another_motion_as_before():
+  _, joint = joint_of(("sweep", "steps"))
+  random = np.random.default_rng(0)
+  rows = random.normal(size=(1, joint.size))
+  stands = joint.log_at == 1
+  rows[0, stands] = random.normal(size=joint.size)[joint.block_of[stands]]  # a step of the encoder
+  joint.rescale(rows)
+  share = joint.observations[0] / joint.counts[0]
+  assert share[joint.log_of == 0].min() > 0.7
+  assert share[joint.log_of == 1].max() < 0.05
 
 
 def test_a_joint_s_damping_is_known_no_better_than_its_servo_s():
