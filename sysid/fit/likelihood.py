@@ -25,7 +25,7 @@ from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.model.measured import Measured, block_starts
+from nerf2real.sysid.model.measured import block_starts, same_commands
 from nerf2real.sysid.model.plant import Simulated
 from nerf2real.sysid.model.servo.duty import Asked, command_jump, duty_for
 from nerf2real.sysid.model.threads import at_once
@@ -125,10 +125,8 @@ class JointLikelihood:
     length = max(8, int(np.median(np.diff(self.starts)))) if len(self.starts) > 1 else self.size
     logs = np.split(alike, np.flatnonzero(np.diff(self.log_at)) + 1, axis=1)
     times = np.array([[correlation_time(row, length) for row in log] for log in logs]).T
-    noise = self.floor[:, None] ** 2 * np.add.reduceat(self.mask, self.starts) / self.counts
-    if self.expectation is not None:
-      noise *= 1.0 + NOISE
-    beyond = np.maximum(np.median(squares - noise, axis=1), 0.0)
+    recordings = 1.0 if self.expectation is None else 1.0 + NOISE
+    beyond = np.maximum(np.median(squares - recordings * self._noise, axis=1), 0.0)
     shares = np.add.reduceat(self.mask * self._shares(beyond), self.starts, axis=1)
     scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
     return scale, np.maximum(shares, 1.0), times[:, self.log_of]
@@ -163,7 +161,13 @@ class JointLikelihood:
   def noise_squares(self) -> Array:
     """Mean squares of blocks [B] that the readings' noise leaves: with what the stamps of a joint
     that moves and its simulation among others are off by, so that such samples weigh less."""
-    return self.position_noise**2 * np.add.reduceat(self.mask, self.starts) / self.counts[0]
+    squares: Array = self._noise[0]
+    return squares
+
+  @property
+  def _noise(self) -> Array:
+    """The same of all channels [C, B]."""
+    return self.floor[:, None] ** 2 * np.add.reduceat(self.mask, self.starts) / self.counts
 
   def parts_of(self, fold: int) -> list[slice]:
     """Returns where the samples of a fold are."""
@@ -257,7 +261,7 @@ class JointLikelihood:
     likes = []
     residuals = self._channels_of(reference, residuals / np.maximum(reference.gain, 1e-9))
     for log in self.plant.logs:
-      like = next((i for i, r in enumerate(reference.plant.logs) if _same_commands(log, r)), None)
+      like = next((i for i, r in enumerate(reference.plant.logs) if same_commands(log, r)), None)
       if like is None:
         return False
       other, keep = reference.plant.logs[like], reference.mask[starts[like] : ends[like]] > 0
@@ -394,18 +398,3 @@ class JointLikelihood:
 def rms_of(courses: Sequence[Array]) -> float:
   """Returns the RMS of residual courses [N], rad (m), over readings that are not NaN."""
   return float(np.sqrt(np.nanmean(np.square(np.concatenate(courses)))))
-
-
-def _same_commands(one: Measured, other: Measured) -> bool:
-  """Tells whether two logs hold the same commands, each at the same time since its first."""
-  times = [log.command_time - log.command_time[0] for log in (one, other)]
-  lengths = [float(time[-1]) for time in times]
-  period = float(np.median(np.diff(times[0]))) if len(times[0]) > 1 else 1.0
-  grid = np.arange(0.0, min(lengths), period) + 0.5 * period
-  values = [
-    log.command[np.clip(np.searchsorted(time, grid) - 1, 0, None)]
-    for log, time in zip((one, other), times, strict=True)
-  ]
-  apart = np.abs(values[0] - values[1])
-  alike = abs(lengths[0] - lengths[1]) < 0.05 * max(lengths)
-  return bool(alike and np.mean(apart > 1e-3 * max(np.ptp(values[0]), 1e-12)) < 0.05)

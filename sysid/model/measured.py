@@ -109,3 +109,18 @@ def quantum(values: Array) -> float:
   steps = np.diff(np.unique(values))
   steps = steps[steps > _SAME * max(float(np.ptp(values)), 1e-12)]
   return float(steps.min()) if len(steps) else 0.0
+
+
+def same_commands(one: Measured, other: Measured) -> bool:
+  """Tells whether two logs hold the same commands, each at the same time since its first."""
+  times = [log.command_time - log.command_time[0] for log in (one, other)]
+  lengths = [float(time[-1]) for time in times]
+  period = float(np.median(np.diff(times[0]))) if len(times[0]) > 1 else 1.0
+  grid = np.arange(0.0, min(lengths), period) + 0.5 * period
+  values = [
+    log.command[np.clip(np.searchsorted(time, grid) - 1, 0, None)]
+    for log, time in zip((one, other), times, strict=True)
+  ]
+  apart = np.abs(values[0] - values[1])
+  alike = abs(lengths[0] - lengths[1]) < 0.05 * max(lengths)
+  return bool(alike and np.mean(apart > 1e-3 * max(np.ptp(values[0]), 1e-12)) < 0.05)

@@ -160,7 +160,8 @@ def spread(error: dict[str, Any]) -> str:
   name = "held" if error["held"] else "train"
   found = error[name]
   return (
-    f"Errors after are of the mean of {found['models']} fits near the best, which differ:"
-    f" {found['median']:.3g} rad (or m) in the median, {found['least']:.3g} to {found['most']:.3g}"
-    f" on the {name} logs; the model that is written alone has {found['single']:.3g}."
+    f"Errors after are of the mean of {found['models']} fits, weighed by how likely each is. They"
+    f" differ: {found['median']:.3g} rad (or m) in the median, {found['least']:.3g} to"
+    f" {found['most']:.3g} on the {name} logs; the model that is written alone has"
+    f" {found['single']:.3g}."
   )

@@ -9,13 +9,14 @@ import pytest
 from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.expectation import NEIGHBOURS, NOISE, Expectation
 from nerf2real.sysid.fit.layout import Layout
-from nerf2real.sysid.fit.likelihood import JointLikelihood, _same_commands
+from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.noise import correlation_time
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model import kernel
 from nerf2real.sysid.model.joint import JointModel
+from nerf2real.sysid.model.measured import same_commands
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of
 
@@ -145,11 +146,11 @@ def test_the_mode_is_the_effect_that_is_there(viscous):
 def test_only_the_very_same_commands_are_the_same(viscous):
   plant, _ = viscous
   sweep, slow = plant.logs
-  assert _same_commands(sweep, sweep)
-  assert not _same_commands(sweep, slow)
+  assert same_commands(sweep, sweep)
+  assert not same_commands(sweep, slow)
 
 
-def test_a_recorder_that_starts_earlier_has_the_same_commands():
+def test_a_recorder_that_starts_earlier_has_thesame_commands():
   log, model = log_of(PENDULUM, "sweep", duration=5.0), mujoco.MjModel.from_xml_string(PENDULUM)
   later = {
     name: dataclasses.replace(series, stamp=series.stamp + 0.37)
@@ -159,7 +160,7 @@ def test_a_recorder_that_starts_earlier_has_the_same_commands():
     JointLikelihood(JointModel(model, "joint", [one]))
     for one in (dataclasses.replace(log, **later), log)
   )
-  assert _same_commands(now.plant.logs[0], before.plant.logs[0])
+  assert same_commands(now.plant.logs[0], before.plant.logs[0])
   wave = np.sin(3.0 * (before.plant.logs[0].time - 0.37))
   assert now.expect(before, (wave * before.gain[0])[None])
   expected = now.expectation.under(now.plant.declared)[0]
@@ -167,7 +168,7 @@ def test_a_recorder_that_starts_earlier_has_the_same_commands():
   assert expected[inner] == pytest.approx(np.sin(3.0 * now.plant.logs[0].time)[inner], abs=1e-3)
 
 
-def test_what_a_reference_leaves_cancels_beside_the_same_commands():
+def test_what_a_reference_leaves_cancels_beside_thesame_commands():
   effect = [Effect("cogging", "joint", {"amplitude": 0.1, "periods": 9.0, "phase": 0.3})]
   _, before = joint_of(effects=effect)
   _, now = joint_of(effects=effect)
