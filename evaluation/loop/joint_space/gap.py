@@ -93,14 +93,14 @@ def hidden_table(seed: int, content: dict[str, Any], details: Path) -> str:
   duty = 800 / 128 * motors.COUNTS / (2 * np.pi) / motors.FULL_PWM  # per rad at a P gain of 800
   stall = motors.SPEED_CONSTANT * hidden.motors.battery_voltage / motors.RESISTANCE
   strength = duty * stall * hidden.motors.strength / constants.POSITION_GAIN
-  constants_of = json.loads(details.read_text())["calibration"]
+  calibration = json.loads(details.read_text())["calibration"]  # of joints whose constants stand
   rows = []
   for index, name in enumerate(constants.JOINT_NAMES):
     named = [e for e in content["effects"] if e["joint"] == name]
     own = {e["kind"]: e["parameters"] for e in named if not by_law(e)}
     share = own.pop("load_friction", {}).get("coefficient", {}).get("value")
     gain = own.pop("motor_gain", {}).get("gain", {}).get("value", 1.0)
-    gain *= constants_of[name].get("gain", 1.0)  # that of the servo's law, too
+    gain *= calibration.get(name, {}).get("gain", 1.0)  # that of the servo's law, too
     found = "not named" if share is None else f"{share:.2f}"
     gear = f"{hidden.motors.gear_share[index]:.2f}"
     other = ", ".join(own) or "-"

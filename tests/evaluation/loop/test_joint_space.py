@@ -94,6 +94,7 @@ def test_strength_holds_the_gain_of_the_servos_law_once(tmp_path):
   weak |= {"parameters": {"gain": {"value": 0.5}}}
   rows = [{**by_duty, "joint": joint} for joint in ("l_knee", "r_knee")]
   held = {joint: {"gain": 1.0} for joint in constants.JOINT_NAMES}
+  del held["head_pan"]  # constants that the whole machine refuted
   held |= {joint: {"gain": 0.9 * 1.2} for joint in ("l_knee", "r_knee")}
   (tmp_path / "details.json").write_text(json.dumps({"calibration": held}))
   for effects in ([*rows, weak], [weak, *rows]):
