@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerf2real.suite.effects import kind_of
-from nerf2real.sysid.fit import rough, signatures
+from nerf2real.sysid.fit import rough
 from nerf2real.sysid.fit.layout import CONSTANTS, Fit, Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.fit.posterior import Fitter
-from nerf2real.sysid.hypotheses.terms import COGGING, WEAK, Term
+from nerf2real.sysid.hypotheses.terms import WEAK, Term
+from nerf2real.sysid.selection.search.beginnings import beginnings
 from nerf2real.sysid.selection.search.evidence import UNREPEATED, Scored, kinds_of
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -30,16 +30,6 @@ def _best_of_kinds(
   return list(chosen.values())
 
 
-_TWINS = {
-  "command_delay": "latency",
-  "measurement_delay": "skew",
-  "encoder_offset": "zero",
-}
-"""Effects of one value that does what a constant does, and that constant."""
-_LOADS = ("damping", "armature", "friction", "mass")
-"""Constants that are all larger by one share where a motor is weaker by it."""
-
-
 def scored_on(
   joint: JointLikelihood, terms: tuple[Term, ...], x: Array, *, iterations: int
 ) -> Scored:
@@ -47,71 +37,6 @@ def scored_on(
   fitter = Fitter([joint], Layout([terms]))
   fit = fitter.leave_out(fitter.fit(x, iterations=iterations))
   return Scored(joint, terms, fit, joint.loglik(fit.held[0]))
-
-
-def _handed_over(parent: Scored, term: Term) -> list[Array]:
-  """Returns where a parent's fit is with what a constant is off by as its twin's value, if it has
-  one: the same simulation, and a constant as it was known."""
-  constants = next((t for t in parent.terms if t.kind == CONSTANTS), None)
-  constant = _TWINS.get(term.kind)
-  if constants is None or constant not in constants.names:
-    return []
-  at = parent.fit.layout.spans[parent.fit.layout.terms.index(constants)][0]
-  at += constants.names.index(constant)
-  x = np.append(parent.fit.x, 0.0)
-  x[-1] = np.clip(x[at] - parent.fit.layout.centre[at], term.low[0], term.high[0])
-  x[at] -= x[-1]
-  return [x]
-
-
-def _in_common(parent: Scored, term: Term) -> list[Array]:
-  """Returns where constants are without what they are off by in common, and that as a gain: about
-  the same motion, at constants nearer to those that are known. Where constants have taken a motor's
-  weakness single steps do not lead there. Beside an effect there are none, as its torques are open.
-  """
-  constants = parent.terms[0]
-  if term.kind != WEAK or constants.kind != CONSTANTS or parent.names:
-    return []
-  names = zip(constants.names, constants.prior, strict=True)
-  at = [i for i, (name, sigma) in enumerate(names) if name in _LOADS and np.isfinite(sigma)]
-  if not at:
-    return []
-  x, layout = parent.fit.x.copy(), parent.fit.layout
-  here, known, weight = 1.0 + x[at], 1.0 + layout.centre[at], layout.sigma[at] ** -2.0
-  gain = float(np.clip(weight @ (here * known) / (weight @ here**2), term.low[0], term.high[0]))
-  x[at] = gain * here - 1.0
-  return [np.append(x, gain)]
-
-
-def _scaled(parent: Scored, term: Term) -> list[Array]:
-  """Returns where a parent's fit is with all torques of its effects larger by each start of a gain:
-  that makes about the same motion, and single steps do not lead from one to the other."""
-  if term.kind != WEAK:
-    return []
-  torques = np.array(
-    [
-      t.kind != CONSTANTS and kind_of(t.kind).parameter(n).unit.startswith("N m")
-      for t in parent.terms
-      for n in t.names
-    ]
-  )
-  if not torques.any():
-    return []
-  factors = np.array([s[0] for s in term.starts])[:, None]
-  return list(np.hstack([parent.fit.x * np.where(torques, factors, 1.0), factors]))
-
-
-def _moved(terms: Sequence[Term], starts: Array) -> Array:
-  """Returns starts [S, n], and where an encoder's zero and cogging are among the effects those with
-  its phase moved by the zero: either was found over positions as they were read."""
-  at = {(t.kind, n): i for i, (t, n) in enumerate((t, n) for t in terms for n in t.names)}
-  zero = at.get(("encoder_offset", "offset"))
-  if zero is None or (COGGING, "phase") not in at:
-    return starts
-  moved, phase = starts.copy(), at[COGGING, "phase"]
-  turned = moved[:, phase] + moved[:, at[COGGING, "periods"]] * moved[:, zero]
-  moved[:, phase] = np.angle(np.exp(1j * turned))
-  return np.vstack([starts, moved])
 
 
 class Explainer:
@@ -203,13 +128,9 @@ class Explainer:
       if only is not None and only not in kinds_of(terms):
         continue
       fitter = Fitter([self.joint], Layout([terms]))
-      fits = [
-        fitter.fit(
-          fitter.linearise(x, known=stale, fresh=fresh, residuals=rows), iterations=1, quick=True
-        )
-        for x, rows in self._begin(parent, fitter, starts)
-      ]
-      tried.append((fitter, terms, min(fits, key=lambda f: f.cost)))
+      for x, rows in self._begin(parent, fitter, starts):
+        begun = fitter.linearise(x, known=stale, fresh=fresh, residuals=rows)
+        tried.append((fitter, terms, fitter.fit(begun, iterations=1, quick=True)))
     leading = _best_of_kinds(tried)[: _SCREENED * keep]  # halving: who leads takes another step
     tried = [
       (fitter, terms, fitter.fit(fit, iterations=1, quick=True))
@@ -303,22 +224,9 @@ class Explainer:
       if term.kind in old:
         continue
       blank = np.zeros((len(term.names), *known.shape[1:]))
-      own = [np.concatenate([x, s]) for s in (*term.starts, *self._waves(parent, term))]
-      own += [*_handed_over(parent, term), *_in_common(parent, term), *_scaled(parent, term)]
-      begin = _moved((*parent.terms, term), np.array(own))
+      begin = beginnings(parent, term)
       fresh = np.arange(begin.shape[1]) >= len(x)
       yield (*parent.terms, term), begin, [np.concatenate([known, blank])], fresh
-
-  def _waves(self, parent: Scored, term: Term) -> list[tuple[float, ...]]:
-    """Returns where torque repeats with position under a hypothesis, if that is what a term says:
-    what else is missing hides it in what the declared model leaves."""
-    if term.kind != COGGING or not parent.names:
-      return []
-    plant = self.joint.plant
-    return [
-      tuple(np.clip(wave, term.low, term.high))
-      for wave in signatures.waves(plant, parent.terms, parent.fit.x)
-    ]
 
   def constants_alone(self) -> list[Scored]:
     """Returns the hypotheses that differ in the constants' freedom alone, the best first."""
