@@ -35,6 +35,7 @@ _CARRIED = 3  # steps at most between Jacobians of finite differences, chosen
 _LEAST_CARRIED = 0.03  # scales that a step must be long to correct a Jacobian: costs are rough
 _WIDTH, FINE = 0.2, 0.03  # steps of finite differences, of a value's scale
 _CONVERGED = 0.05  # nats that a step gains at which a fit ends
+_LEAST = 1e-3  # damping of steps by a part of the logs
 
 
 class Fitter:
@@ -219,30 +220,60 @@ class Fitter:
   def leave_out(self, fit: Fit) -> Fit:
     """Fills in what a fit predicts of each fold when its effects are fitted to the others alone.
 
-    The constants stay: all hypotheses have them.
+    The constants stay: all hypotheses have them. Two steps are simulated, both with the fit's own
+    Jacobian. Where neither is better for the others, as costs are rough, what that Jacobian lets
+    expect of the first step stands: the fit itself has seen what is left out.
     """
-    layout, x = self.layout, fit.x
-    moving = np.flatnonzero(layout.is_effect)
+    moving = np.flatnonzero(self.layout.is_effect)
     fit.held = [j.squares(r) for j, r in zip(self.joints, fit.residuals, strict=True)]
     if not len(moving) or len(self.folds) < 2:
       return fit
-    tried = []
-    for f in range(len(self.folds)):
-      g, h = fit.slope - fit.gradient[f], fit.precision - fit.curvature[f]
-      tried += [_bounded(x, h, g, layout, 1e-3, share, moving) for share in (1.0, 0.5)]
-    _, rows = self.simulated(np.array(tried))
-    squares = [j.squares(r) for j, r in zip(self.joints, rows, strict=True)]
-    within = [h.copy() for h in fit.held]
+    within = [held.copy() for held in fit.held]
+    first = np.array([self._without(fit, f, moving) for f in range(len(self.folds))])
+    _, rows = self.simulated(first)
+    here = [self._of_others(fit.x, within, fold) for fold in self.folds]
+    second: list[Array] = []
+    tried: list[list[tuple[float, list[Array]]]] = []
     for f, fold in enumerate(self.folds):
-      values = np.vstack([tried[2 * f : 2 * f + 2], x])
-      costs, own = self.prior(values), []
-      for joint, held, found in zip(self.joints, within, squares, strict=True):
-        own.append(np.concatenate([found[2 * f : 2 * f + 2], held[None]]))
-        costs = costs - joint.loglik(own[-1])[:, joint.fold != fold].sum(axis=1)
-      best = int(np.argmin(costs))
-      for joint, found, out in zip(self.joints, own, fit.held, strict=True):
-        out[:, joint.fold == fold] = found[best][:, joint.fold == fold]
+      own = [r[f] for r in rows]
+      squares = [j.squares(r) for j, r in zip(self.joints, own, strict=True)]
+      cost = self._of_others(first[f], squares, fold)
+      tried.append([(cost, squares)])
+      if cost < here[f]:
+        second.append(self._without(self.weighed(first[f], own, fit.jacobian, None), f, moving))
+      else:
+        second.append(0.5 * (fit.x + first[f]))
+    _, rows = self.simulated(np.array(second))
+    for f, fold in enumerate(self.folds):
+      squares = [j.squares(r[f]) for j, r in zip(self.joints, rows, strict=True)]
+      tried[f].append((self._of_others(second[f], squares, fold), squares))
+      cost, squares = min(tried[f], key=lambda t: t[0])
+      if cost >= here[f]:
+        squares = self._expected(fit, first[f])
+      for joint, out, found in zip(self.joints, fit.held, squares, strict=True):
+        out[:, joint.fold == fold] = found[:, joint.fold == fold]
     return fit
+
+  def _expected(self, fit: Fit, x: Array) -> list[Array]:
+    """Returns the mean squares [C, B] a joint at values [n] near a fit, by its Jacobian."""
+    return [
+      joint.squares(rows + np.tensordot((x - fit.x)[index], jacobian, 1))
+      for joint, rows, index, jacobian in zip(
+        self.joints, fit.residuals, self.layout.index, fit.jacobian, strict=True
+      )
+    ]
+
+  def _without(self, fit: Fit, f: int, moving: Array) -> Array:
+    """Returns a step [n] of the moving values from a fit by all folds but the f-th."""
+    slope, precision = fit.slope - fit.gradient[f], fit.precision - fit.curvature[f]
+    return _bounded(fit.x, precision, slope, self.layout, _LEAST, 1.0, moving)
+
+  def _of_others(self, x: Array, squares: Sequence[Array], fold: int) -> float:
+    """Returns C of values [n] without a fold; they leave mean squares [C, B] a joint."""
+    cost = float(self.prior(x[None])[0])
+    for joint, left in zip(self.joints, squares, strict=True):
+      cost -= float(joint.loglik(left)[joint.fold != fold].sum())
+    return cost
 
 
 def _bounded(
