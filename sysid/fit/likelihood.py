@@ -7,11 +7,11 @@ observations as the block has; with that integrated out
     log p_b = -n_b log(1 + m_b / s^2)
 
 a multivariate t density. n_b counts independent samples: those of the block over the residual's
-correlation time in its log. s is what the best hypothesis leaves in the median block, so that
-evidence counts in units of what remains. A sample that is less sure than the others, as its stamp
-is off where a joint is fast, counts by the share that the others' variance has in its own: all of
-one where what remains is far larger than what stamps are off by. Shapes: N samples of all logs, B
-blocks, C channels, n values.
+correlation time, readings that repeat the one before as one, as they round it once. s is what the
+best hypothesis leaves in the median block, so that evidence counts in units of what remains. A
+sample that is less sure than the others, as its stamp is off where a joint is fast, counts by the
+share that the others' variance has in its own: all of one where what remains is far larger than
+what stamps are off by. Shapes: N samples of all logs, B blocks, C channels, n values.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from nerf2real.sysid.fit.expectation import NOISE, Expectation
-from nerf2real.sysid.fit.noise import correlation_time, effort_noise, timing
+from nerf2real.sysid.fit.noise import correlation_time, effort_noise, once, timing
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
@@ -75,6 +75,8 @@ class JointLikelihood:
       further.append((0.25 * self._jumps()) ** 2)
     self._further = np.array(further)
     """Variance [C, N] of samples beside the noise that all have."""
+    self._once = np.ones((len(self.channels), len(self.mask)))
+    self._once[0] = np.concatenate([once(log.position) for log in logs])
     self.gain = self.mask * np.sqrt(self._shares(np.zeros(len(self.channels))))
     self.effort_unit: float | None = None
     """Effort over torque in a reference: a sensor's unit stays. None where none shows it."""
@@ -116,20 +118,18 @@ class JointLikelihood:
     return scale[1], samples[1] / times[1]
 
   def _scales(self, residuals: Array) -> tuple[Array, Array, Array]:
-    """Returns scales [C], samples that count as sure [C, B] and correlation times of their logs
-    [C, B] of residuals [C, N]: where a joint stands at steps of its encoder they go together for
-    long, in another motion from one reading to the next."""
+    """Returns scales [C], samples that count as sure [C, B] and correlation times [C, 1] of
+    residuals [C, N]."""
     squares = self.squares(residuals)
     alike = residuals / np.sqrt(squares[:, self.block_of] + 1e-30)
-    alike = alike - alike.mean(axis=1, keepdims=True)
+    alike = (alike - alike.mean(axis=1, keepdims=True)) * np.sqrt(self._once)
     length = max(8, int(np.median(np.diff(self.starts)))) if len(self.starts) > 1 else self.size
-    logs = np.split(alike, np.flatnonzero(np.diff(self.log_at)) + 1, axis=1)
-    times = np.array([[correlation_time(row, length) for row in log] for log in logs]).T
+    times = np.array([correlation_time(row, length) for row in alike])
     recordings = 1.0 if self.expectation is None else 1.0 + NOISE
     beyond = np.maximum(np.median(squares - recordings * self._noise, axis=1), 0.0)
-    shares = np.add.reduceat(self.mask * self._shares(beyond), self.starts, axis=1)
+    shares = np.add.reduceat(self.mask * self._once * self._shares(beyond), self.starts, axis=1)
     scale = np.sqrt(np.median(squares, axis=1) + self.floor**2)
-    return scale, np.maximum(shares, 1.0), times[:, self.log_of]
+    return scale, np.maximum(shares, 1.0), times[:, None]
 
   def _cut(self) -> None:
     starts, folds, offset = [], [], 0

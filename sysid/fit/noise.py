@@ -59,3 +59,10 @@ def correlation_time(row: Array, length: int) -> float:
   small = np.flatnonzero(correlation < 0.05)
   end = small[0] if len(small) else len(correlation)
   return float(max(1.0, 1.0 + 2.0 * correlation[1:end].sum()))
+
+
+def once(readings: Array) -> Array:
+  """Returns what readings [N] count: those that repeat the one before are one together."""
+  first = np.flatnonzero(np.append(True, np.diff(readings) != 0.0))
+  lengths = np.diff(np.append(first, len(readings)))
+  return np.repeat(1.0 / lengths, lengths)

@@ -10,7 +10,7 @@ from nerf2real.suite.effects import Effect
 from nerf2real.sysid.fit.expectation import NEIGHBOURS, NOISE, Expectation
 from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.fit.likelihood import JointLikelihood
-from nerf2real.sysid.fit.noise import correlation_time
+from nerf2real.sysid.fit.noise import correlation_time, once
 from nerf2real.sysid.fit.posterior import Fitter
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
@@ -91,16 +91,14 @@ def test_correlation_time_of_an_autoregression():
   assert correlation_time(random.normal(size=40_000), 100) < 1.2
 
 
-def test_a_standstill_counts_little_and_another_motion_as_before():
-  _, joint = joint_of(("sweep", "steps"))
-  random = np.random.default_rng(0)
-  rows = random.normal(size=(1, joint.size))
-  stands = joint.log_at == 1
-  rows[0, stands] = random.normal(size=joint.size)[joint.block_of[stands]]  # a step of the encoder
-  joint.rescale(rows)
-  share = joint.observations[0] / joint.counts[0]
-  assert share[joint.log_of == 0].min() > 0.7
-  assert share[joint.log_of == 1].max() < 0.05
+def test_readings_that_repeat_the_one_before_are_one():
+  np.testing.assert_allclose(once(np.array([4.0, 4.0, 4.0, 5.0, 4.0, 4.0])) * 6, [2, 2, 2, 6, 3, 3])
+  plant, joint = joint_of(("sweep", "steps"))
+  joint.rescale(np.random.default_rng(0).normal(size=(1, joint.size)))
+  counted = [float(joint.observations[0, joint.log_of == index].sum()) for index in (0, 1)]
+  moved = [np.count_nonzero(np.diff(log.position)) + 1 for log in plant.logs]
+  assert moved[0] > 1.5 * moved[1]  # a joint that stands between steps
+  assert counted[0] / counted[1] == pytest.approx(moved[0] / moved[1], rel=0.1)
 
 
 def test_a_joint_s_damping_is_known_no_better_than_its_servo_s():
@@ -324,9 +322,11 @@ def test_stamps_matter_as_far_as_more_than_the_noise_remains():
   fast = joint.block_of == 3
   joint._further = np.where(fast, 9.0 * joint.floor[0] ** 2, 0.0)[None]
   noise = random.normal(size=(1, joint.size)) * joint.floor[0] * np.where(fast, 0.316, 1.0)
+  once = np.add.reduceat(joint._once[0], joint.starts)
   counted = []
   for residuals in (noise, noise + 100.0 * joint.floor[0] * random.normal(size=(1, joint.size))):
     joint.rescale(residuals)
-    counted.append(joint.observations[0, 3] / joint.observations[0, 2])
+    shares = joint.observations[0] / once  # of readings that do not repeat
+    counted.append(shares[3] / shares[2])
   assert counted[0] == pytest.approx(0.1, abs=0.02)
   assert counted[1] == pytest.approx(1.0, abs=0.02)
