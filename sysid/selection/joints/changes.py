@@ -6,6 +6,7 @@ is clearly worse (`naming`), and where the reference logs are clearly worse with
 Where more remains, a name must also stand beside a force of any form.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -43,6 +44,7 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   predicts from each reading on is judged where play is in the best hypothesis of whole logs, or in
   the likeliest, which is seldom clear of the others there. Both are tried there, too: what makes
   all torques smaller hardly shows from one reading to the next, and whole logs find it beside play.
+  What they name that the best hypothesis there holds as well is named by their evidence.
   """
   whole = _explained(subject, settings)
   done = subject.now.follows or whole.verdict in ("none", "effects")
@@ -52,7 +54,14 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
   also = {id(s): s for s in (whole.found.best, likely) if not s.beside_force}
   near = _explained(following(subject), settings, also=list(also.values()))
   stands = near.verdict == "effects" and set(near.named) & set(UNREPEATED)
-  return near if stands else whole
+  if not stands:
+    return whole
+  told = {n.kind: n for n in whole.found.names if n.kind in set(whole.named) - set(near.named)}
+  if not told:
+    return near
+  names = tuple(told.get(n.kind, n) for n in near.found.names)
+  named = tuple(n.kind for n in names if n.kind in (*near.named, *told))
+  return dataclasses.replace(near, found=dataclasses.replace(near.found, names=names), named=named)
 
 
 def _explained(subject: Subject, settings: Settings, also: Sequence[Scored] = ()) -> Changed:
@@ -75,6 +84,7 @@ def _explained(subject: Subject, settings: Settings, also: Sequence[Scored] = ()
   clearly = clear(found.best, explainer.null) > subject.beyond
   unusual = is_unusual(subject, explainer.null, settings)
   something = [k for k in sorted(found.best.names) if is_something(subject, found.best, k)]
+  nameless = any(k not in something for k in found.named)  # clear, and maybe of no size
   if before is not None and usual is not None:
     something = [k for k in something if is_new(subject, found.best, k)]
   # What constants could take of an effect leaves its size open, and is not nothing for that.
@@ -83,9 +93,9 @@ def _explained(subject: Subject, settings: Settings, also: Sequence[Scored] = ()
   named = () if pressed(found.best) else tuple(k for k in found.named if k in something)
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
-  if named and (typical or few):
+  if named and (typical or few or nameless):
     # That constants are off is no effect: beside it a misfit in few blocks needs no force.
-    forced = [k for k in named if typical or k != CONSTANTS_OFF]
+    forced = [k for k in named if typical or nameless or k != CONSTANTS_OFF]
     named = supported(
       explainer, found.best, named, subject.beyond, anyway=float(anyway[1]), forced=forced
     )

@@ -22,9 +22,8 @@ from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
 
-_MOMENTS = ("payload",)
-"""Kinds of which a product of values shows: the product is sure where none of them is."""
-
+_MOMENTS = {"payload": ("mass", ("x", "y", "z"))}
+"""Kinds of which products of a value with others show: these may be sure where none of them is."""
 
 _CLOCK = {"measurement_delay": "skew", "command_delay": "latency"}
 """Constants that do to positions what a kind does."""
@@ -123,7 +122,7 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
 
 def exceeds(subject: Subject, item: Scored, term: Term) -> bool:
   """Tells whether an effect of a hypothesis is more than nothing and than healthy machines have."""
-  if not term.names or term.kind in _MOMENTS:
+  if not term.names or _moment_shows(subject, item, term):
     return True
   alone = subject.before is None
   sizes = {p.name: p.nominal for p in kind_of(term.kind).parameters if not p.shape}
@@ -139,6 +138,24 @@ def exceeds(subject: Subject, item: Scored, term: Term) -> bool:
     for name, (low, high) in bounds.items()
     if name in sizes
   )
+
+
+def _moment_shows(subject: Subject, item: Scored, term: Term) -> bool:
+  """Tells whether a product of an effect's values is surely not zero, if such show."""
+  size, arms = _MOMENTS.get(term.kind, ("", ()))
+  if size not in term.names:
+    return False
+  layout, first = item.fit.layout, term.names.index(size)
+  span = slice(*layout.spans[layout.terms.index(term)])
+  values = item.fit.x[span]
+  covariance = intervals.spread(item.fit, [subject.now])[span, span]
+  for arm in (term.names.index(name) for name in arms if name in term.names):
+    slope = np.zeros(len(values))
+    slope[[first, arm]] = values[[arm, first]]
+    reach = subject.now.settings.sigmas * np.sqrt(slope @ covariance @ slope)
+    if abs(values[first] * values[arm]) > reach:
+      return True
+  return False
 
 
 def _taken_back(subject: Subject, item: Scored, kind: str) -> float:

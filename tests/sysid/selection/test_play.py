@@ -13,7 +13,7 @@ from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.selection.analysis import analyse
-from nerf2real.sysid.selection.joints import changes, subject
+from nerf2real.sysid.selection.joints import changes, naming, subject
 from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.joints.test_changes import KINDS
 from tests.sysid.synthetic import COUNT, PENDULUM, log_of, logs_of
@@ -102,7 +102,10 @@ def test_play_that_is_likeliest_but_not_clear_is_judged_from_each_reading_on(
     names=frozenset(likeliest), neutral=False, evidence=-1.0, beside_force=False
   )
   whole = SimpleNamespace(
-    verdict="unexplained", ranked=[best, nothing], found=SimpleNamespace(best=nothing)
+    verdict="unexplained",
+    ranked=[best, nothing],
+    named=(),
+    found=SimpleNamespace(best=nothing, names=()),
   )
   near = SimpleNamespace(verdict="effects", named=named)
   subject = SimpleNamespace(now=SimpleNamespace(follows=False))
@@ -134,3 +137,35 @@ def test_a_joint_that_is_followed_has_what_others_share_and_what_its_reference_h
   assert near.now.follows
   assert shared in near.known
   assert whole.usual.names == near.usual.names == {"coulomb_friction"}
+
+
+def test_what_whole_logs_name_is_named_where_following_holds_it_too(monkeypatch) -> None:
+  """From each reading on a weaker motor hardly shows; whole logs have it clear beside play."""
+  clear = {kind: naming.Name(kind, 9.0, True, ()) for kind in ("supply_sag", "spring")}
+  unclear = [naming.Name(kind, 1.0, False, ()) for kind in ("backlash", "supply_sag")]
+  best = SimpleNamespace(
+    names=frozenset({"backlash"}), neutral=False, evidence=-1.0, beside_force=False
+  )
+  whole, near = (
+    changes.Changed(
+      None,
+      [best],
+      naming.Explanation(best, tuple(names), 1.0, 1.0),
+      kinds,
+      verdict,
+      1.0,
+      1.0,
+      False,
+      False,
+    )
+    for names, kinds, verdict in (
+      (clear.values(), tuple(clear), "partly"),
+      (unclear, ("backlash",), "effects"),
+    )
+  )
+  again = SimpleNamespace(now=SimpleNamespace(follows=True))
+  monkeypatch.setattr(changes, "following", lambda _: again)
+  monkeypatch.setattr(changes, "_explained", lambda of, *_, **__: near if of is again else whole)
+  told = changes.explain(SimpleNamespace(now=SimpleNamespace(follows=False)))
+  assert told.named == ("backlash", "supply_sag")
+  assert told.found.names == (unclear[0], clear["supply_sag"])

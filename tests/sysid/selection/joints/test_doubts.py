@@ -203,3 +203,19 @@ def test_what_a_healthy_mesh_of_gears_loses_is_no_effect(monkeypatch, low, refer
   joint = SimpleNamespace(before=before, now=SimpleNamespace(plant=plant, settings=SETTINGS))
   best = SimpleNamespace(terms=[term], fit=None)
   assert doubts.is_something(joint, best, "load_friction") == something
+
+
+@pytest.mark.parametrize(("together", "shows"), [(-0.99, True), (0.0, False)])
+def test_a_load_is_something_where_its_moment_is_sure(monkeypatch, together, shows):
+  """Its mass may be open: half of it at twice the arm does the same."""
+  term = SimpleNamespace(kind="payload", names=("mass", "x"))
+  layout = SimpleNamespace(terms=[term], spans=[(1, 3)])
+  fit = SimpleNamespace(layout=layout, x=np.array([9.0, 0.3, 0.1]))
+  spread = np.diag([0.3, 0.1])
+  covariance = np.eye(3)
+  covariance[1:, 1:] = spread @ np.array([[1.0, together], [together, 1.0]]) @ spread
+  monkeypatch.setattr(doubts.intervals, "spread", lambda *_: covariance)
+  judged = SimpleNamespace(now=SimpleNamespace(settings=SETTINGS))
+  assert doubts._moment_shows(judged, SimpleNamespace(fit=fit), term) == shows
+  other = SimpleNamespace(kind="spring", names=("stiffness", "reference"))
+  assert not doubts._moment_shows(judged, SimpleNamespace(fit=fit), other)
