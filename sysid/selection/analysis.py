@@ -120,7 +120,7 @@ def _explained(
       alone(1.0, "what joints share beside what is their own")
       shared, changed = _reopened(model, shared, changed, settings, refuted)
       shared = scopes.with_twins(shared, changed)
-      changed = zeros.reread(model, changed, settings)
+      changed = changes.judge_together(zeros.reread(model, changed, settings), settings)
       changes.elaborate(changed)
       return shared, changed
     refuted |= {s.term.kind for s in needless}

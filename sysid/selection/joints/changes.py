@@ -65,16 +65,22 @@ def explain(subject: Subject, settings: Settings = SETTINGS) -> Changed:
 
 
 def _explained(subject: Subject, settings: Settings, also: Sequence[Scored] = ()) -> Changed:
-  now, before, usual = subject.now, subject.before, subject.usual
-  known, explainer = subject.known, subject.explainer
-  own = [t for t in known if t.names]
-  as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
+  explainer = subject.explainer
   anyway, left = remaining(subject, explainer.null)
   more_at_first = bool(np.any(settings.more**2 * anyway < left))
   if may_leave(subject, explainer.null, settings) or more_at_first:
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings), also=also)
   else:
     ranked = explainer.constants_alone()
+  return _judged(subject, ranked, settings)
+
+
+def _judged(subject: Subject, ranked: list[Scored], settings: Settings) -> Changed:
+  """Returns what of the ranked hypotheses stands."""
+  now, before, usual = subject.now, subject.before, subject.usual
+  known, explainer = subject.known, subject.explainer
+  own = [t for t in known if t.names]
+  as_it_was = now.residuals(own, np.concatenate([t.centre for t in own])[None])[0]
   baseline = now.squares(as_it_was)[0]
   found = conclude(now, ranked, subject.thresholds, baseline)
   ahead = [s for n in found.names for s in n.ahead[:_AHEAD]]
@@ -120,6 +126,22 @@ def _explained(subject: Subject, settings: Settings, also: Sequence[Scored] = ()
     more,
     off,
   )
+
+
+def judge_together(found: Sequence[Changed], settings: Settings = SETTINGS) -> list[Changed]:
+  """Returns findings whose names are judged at the level of all of the machine's together.
+
+  One name by chance among many is no more of them than none among few: the level is that of so many
+  joints as have a name (Benjamini and Hochberg 1995, from the clearest down), which is the same as
+  before where nothing or one joint has any.
+  """
+  result, count = list(found), 1
+  while (named := sum(any(k != CONSTANTS_OFF for k in c.named) for c in result)) > count:
+    count = named
+    for item in result:
+      item.subject.sharing = len(result) / count
+    result = [c if c.likelihood.follows else _judged(c.subject, c.ranked, settings) for c in result]
+  return result
 
 
 def elaborate(found: Sequence[Changed]) -> None:

@@ -67,14 +67,14 @@ class Explanation:
     return tuple(n.kind for n in self.names if n.certain)
 
 
-def thresholds(kinds: int, joints: int = 1, settings: Settings = SETTINGS) -> tuple[float, ...]:
+def thresholds(kinds: int, joints: float = 1, settings: Settings = SETTINGS) -> tuple[float, ...]:
   """Returns the standard errors that effects of a joint must be clear by, the clearest first.
 
   The n-th is found among all sets of n kinds (Bonferroni).
 
   Args:
     kinds: that are tried, at least as many as a joint may have.
-    joints: of the machine, which share the level.
+    joints: that share the level, for each that has a name.
     settings: level, and the most effects of a joint.
   """
   sets = [math.comb(kinds, n + 1) for n in range(settings.depth)]

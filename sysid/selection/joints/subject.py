@@ -53,8 +53,8 @@ class Subject:
   freed: Term
   """The constants, wider."""
   explainer: Explainer
-  thresholds: tuple[float, ...]
-  """Standard errors that count as clear, of one effect, of a second beside it and so on."""
+  sharing: float
+  """Joints over which the level of significance is shared, for each that has a name."""
   alone: bool
   """Whether the machine has no other joint, so that effects of the machine are its own."""
   before: JointLikelihood | None = None
@@ -63,6 +63,12 @@ class Subject:
   """The reference's best hypothesis."""
   paired: bool = False
   """Whether every log was driven by the same commands as a reference."""
+
+  @property
+  def thresholds(self) -> tuple[float, ...]:
+    """Standard errors that count as clear, of one effect, of a second beside it and so on."""
+    kinds = {t.kind for t in self.library} | set(WHOLE)
+    return thresholds(len(kinds), self.sharing, self.now.settings)
 
   @property
   def beyond(self) -> float:
@@ -132,8 +138,7 @@ def prepare(
   )
   assert now is not None
   library = own_library(now.plant, alone=tried == 1)
-  sure = thresholds(len({t.kind for t in library} | set(WHOLE)), tried, settings)
-  found = _subject(now, before, library, sure, alone=tried == 1)
+  found = _subject(now, before, library, tried, alone=tried == 1)
   apart = not (found.paired or before is None or _tells(before))
   return following(found) if apart or not now.plant.holds else found
 
@@ -146,7 +151,7 @@ def following(subject: Subject) -> Subject:
     for j in (subject.now, subject.before)
   )
   assert now is not None
-  found = _subject(now, before, subject.library, subject.thresholds, alone=subject.alone)
+  found = _subject(now, before, subject.library, subject.sharing, alone=subject.alone)
   for term in (t for t in subject.known if t.wider):
     found.take(term)
   if subject.usual is not None and subject.usual.names:
@@ -164,7 +169,7 @@ def _subject(
   now: JointLikelihood,
   before: JointLikelihood | None,
   library: list[Term],
-  sure: tuple[float, ...],
+  sharing: float,
   *,
   alone: bool,
 ) -> Subject:
@@ -173,12 +178,14 @@ def _subject(
     own = constants(now.plant, settings)
     freed = widened(own)
     explainer = _explainer(now, None, (own,), library, freed)
-    return Subject(joint, now, (own,), library, freed, explainer, sure, alone)
+    return Subject(joint, now, (own,), library, freed, explainer, sharing, alone)
   now.ahead = None if before.law is None else _ahead(before.law, settings)
   usual = reference_constants(before, settings)
   known, paired, freed = _shown(now, before, usual)
   explainer = _explainer(now, before, known, library, freed)
-  return Subject(joint, now, known, library, freed, explainer, sure, alone, before, usual, paired)
+  return Subject(
+    joint, now, known, library, freed, explainer, sharing, alone, before, usual, paired
+  )
 
 
 def _shown(

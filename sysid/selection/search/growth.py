@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
+from scipy.stats import norm
+
 from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size
 from nerf2real.sysid.selection.search.explain import Explainer
 from nerf2real.sysid.selection.search.rivals import beside_force, lacking, neutralise
@@ -21,7 +23,8 @@ def grow(
     explainer: of the joint, with its constants fitted.
     depth: effects at most; those of the settings for None.
     leaves: whether a hypothesis leaves more than a machine does anyway: then one more is tried as
-      long as it predicts what was left out better, too.
+      long as it predicts what was left out better, too. Where an effect's constants are strained,
+      as they take what another does, it need be clear at the level itself only.
     also: hypotheses of another explainer of the joint, which compete with what was grown.
   """
   s, limit = explainer.settings, depth or explainer.settings.depth
@@ -39,8 +42,9 @@ def grow(
         if item.terms != top.terms:
           explainer.refit(item, 3)
     grown = sorted(of_size(explainer.scored.values(), size + 1), key=lambda g: -g.evidence)
+    asked = float(norm.isf(s.level)) if grown[0].is_strained(s.level) else s.worth
     better = grown[0].evidence > best.evidence and leaves(best)
-    if clear(grown[0], best) < s.worth and not better:
+    if clear(grown[0], best) < asked and not better:
       break
     best = grown[0]
     parents = [g for g in grown[: s.parents] if clear(best, g) < s.worth]

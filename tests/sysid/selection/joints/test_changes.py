@@ -292,3 +292,36 @@ def test_values_stay_within_what_is_plausible_for_the_machine(limit, amplitude):
   term = plausible(waves, _Machine(limit))
   assert term.high == pytest.approx((amplitude, 125.0, 10.0))
   assert term.starts == ((0.1, 125.0, 0.0), (0.1, 40.0, 0.0))
+
+
+def _named(clear, calls):
+  """Returns a joint's finding that names what is clear by so many standard errors, and how anew."""
+
+  def judged(subject, *_):
+    calls.append(subject.sharing)
+    named = ("load_friction",) if clear > naming.thresholds(20, subject.sharing)[0] else ()
+    return SimpleNamespace(
+      subject=subject, named=named, ranked=[], likelihood=SimpleNamespace(follows=False), own=judged
+    )
+
+  return judged(SimpleNamespace(sharing=20.0))
+
+
+@pytest.mark.parametrize(
+  ("clear", "named"),
+  [
+    ([3.2] * 20, 0),  # none is clear among twenty joints
+    ([5.0] + [3.2] * 19, 1),  # one is as many as before
+    ([5.0, 5.0, 3.5, 3.2, 3.2] + [1.0] * 15, 3),  # two say that a third is none by chance
+    ([3.7, 3.7, 3.5, 3.4, 3.3, 3.25, 3.2] + [1.0] * 13, 7),
+  ],
+)
+def test_names_of_many_joints_are_judged_together(monkeypatch, clear, named):
+  calls: list[float] = []
+  found = [_named(z, calls) for z in clear]
+  by_subject = {id(c.subject): c.own for c in found}
+  monkeypatch.setattr(changes, "_judged", lambda subject, *_: by_subject[id(subject)](subject))
+  first = sum(bool(c.named) for c in found)
+  told = changes.judge_together(found)
+  assert sum(bool(c.named) for c in told) == named
+  assert first > 1 or set(calls) == {20.0}
