@@ -58,13 +58,13 @@ def _handed_over(parent: Scored, term: Term) -> list[Array]:
   at += constants.names.index(name)
   off = float(parent.fit.x[at] - parent.fit.layout.centre[at])
   plant = parent.joint.plant
-  unit = float(plant.declared[INDEX[name]]) if name in _SHARES else 1.0
-  values, handed = np.clip(unit * off, term.low, term.high), 0.0
   if term.kind == "payload":
-    mass, place = _carried(plant)
-    values = np.clip([off * mass, *place], term.low, term.high)
-    handed = float(values[0]) / mass
+    unit, place = _carried(plant)
+    values = np.clip([unit * off, *place], term.low, term.high)
+    handed = float(values[0]) / unit
   else:
+    unit = float(plant.declared[INDEX[name]]) if name in _SHARES else 1.0
+    values = np.clip(unit * off, term.low, term.high)
     handed = float(values.mean()) / unit
   if not handed:
     return []
