@@ -26,7 +26,7 @@ def explainer():
   effects = [
     Effect(str(h["kind"]), "joint", {k: v for k, v in h.items() if k != "kind"}) for h in _HIDDEN
   ]
-  logs = [log_of(PENDULUM, kind, effects, duration=5.0) for kind in ("sweep", "slow", "steps")]
+  logs = [log_of(PENDULUM, kind, effects, duration=10.0) for kind in ("sweep", "slow", "steps")]
   plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
   kinds = {h["kind"] for h in _HIDDEN}
   library = [t for t in candidates.library(plant) if t.kind in kinds]
