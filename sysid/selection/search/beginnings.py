@@ -64,6 +64,8 @@ def _handed_over(parent: Scored, term: Term) -> list[Array]:
     handed = float(values[0]) / unit
   else:
     unit = float(plant.declared[INDEX[name]]) if name in _SHARES else 1.0
+    if not unit:  # a share of nothing
+      return []
     values = np.clip(unit * off, term.low, term.high)
     handed = float(values.mean()) / unit
   if not handed:
