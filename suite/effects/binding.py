@@ -104,6 +104,11 @@ class Binding:
     """Which actuators act in MuJoCo [U]: the others' motors are an effect's."""
     self.last_force = np.zeros(num_actuators)
     """Force of every actuator in the last step [U]."""
+    self.reach = np.zeros(num_joints)
+    """By which contacts bend under the constant dry friction before they slide, rad; 0 for none."""
+    self.geared = np.zeros(num_joints, bool)
+    """Which joints have a motor of their own behind play: an effect's, as its friction is."""
+    self._diagonal = (model.M_rowadr + model.M_rownnz - 1)[self.dofs]
     self.data: Any = None
     """mujoco.MjData of the step."""
 
@@ -238,6 +243,11 @@ class Binding:
       slope[(force <= low) | (force >= high)] = 0.0
       force = np.minimum(np.maximum(force, low), high)
     return force, slope
+
+  def inertia(self) -> Array:
+    """Returns the inertia of every joint [J] with its armature in the last step, kg m^2."""
+    inertia = self.data.M[self._diagonal]
+    return np.where(inertia > 0, inertia, self.model.dof_M0[self.dofs])
 
   def restore(self) -> None:
     """Writes back every value noted when the binding was made."""

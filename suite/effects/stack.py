@@ -67,9 +67,9 @@ class EffectStack:
     self._observers = [op for op in operators if op.overrides("observe")]
     self._stamps = [op for op in operators if op.overrides("stamp")]
     acts = {op.kind.name: op.kind.acts for op in self._steps}
-    self._adds_friction = bool(acts.keys() & {"stribeck_friction", "load_friction"})
+    self._adds_friction = bool(acts.keys() & {"stribeck_friction", "load_friction", "presliding"})
     self._adds_force = any(op.kind.law for op in self._steps) or bool(
-      acts.keys() & {"asymmetric_friction", "cogging", "residual_force", "backlash"}
+      acts.keys() & {"asymmetric_friction", "presliding", "cogging", "residual_force", "backlash"}
     )
     self._scales = "actuator" in acts.values()
     self._shifts = "backlash" in acts

@@ -32,6 +32,10 @@ where the first are nearest."""
 _TEETH = 0.5
 """Share that the stiffness of teeth differs from what is usual; a gap and soft teeth are alike."""
 
+_BENDS = (0.0005, 0.002, 0.006)
+"""Of half the motion, where the search for presliding starts; chosen."""
+_MOST_BENT = 0.05  # of it, by the dry friction; chosen
+
 SHORTEST = 300.0
 """1/rad (1/m), of waves of torque over position that are looked for; chosen."""
 
@@ -224,6 +228,18 @@ def cogging(plant: JointPlant, waves: list[tuple[float, float, float]]) -> Term:
     tuple(waves),
     choices=max((SHORTEST - longest) * _reach(plant) / np.pi, 1.0),
   )
+
+
+def presliding(plant: JointPlant) -> Term | None:
+  """Returns contacts that bend before they slide: machines have such, and models leave them out.
+  None where a joint is declared without dry friction."""
+  if plant.declared[INDEX["friction"]] <= 0.0:
+    return None
+  reach = _reach(plant)
+  starts = tuple(share * reach for share in _BENDS)
+  most, scale = _MOST_BENT * reach, starts[0]
+  term = _one("presliding", plant.joint, "reach", 0.0, most, scale, starts)
+  return dataclasses.replace(term, prior=(_INF,), centre=(0.0,))
 
 
 def _play(plant: JointPlant, *, encoder_on_motor: bool) -> Term:

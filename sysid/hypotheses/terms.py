@@ -284,6 +284,7 @@ _APPLY = {
   "load_friction": _load,
   "asymmetric_friction": _asymmetric,
   "quadratic_drag": _adder(("coefficient", "drag")),
+  "presliding": _setter(("reach", "presliding")),
   "backlash": _backlash,
   "encoder_offset": _adder(("offset", "encoder_offset")),
   "motor_gain": _gain,

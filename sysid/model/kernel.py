@@ -62,6 +62,8 @@ NAMES = (
   "surroundings_delay",
   # whether the servo's damping acts at the speed before the step: Euler, MuJoCo's default
   "servo_explicit",
+  # by which contacts bend under the joint's dry friction before they slide; 0: rigid
+  "presliding",
 )
 INDEX = {name: index for index, name in enumerate(NAMES)}
 _RECORD = np.dtype([(name, np.float64) for name in NAMES])
@@ -206,6 +208,7 @@ def simulate(
   load_at_rest, load_velocity = p.load_at_rest, p.load_velocity
   tooth_stiffness, tooth_damping = p.tooth_stiffness, p.tooth_damping
   friction_on_link, explicit = p.friction_on_link, p.servo_explicit > 0.5
+  bends = p.presliding if friction > 0.0 else 0.0
   follow, follow_speed = p.follow, p.follow_speed
   sag_by_current, sag_pulsed = p.sag_back_emf > 0.5 and highest < math.inf, p.sag_pulsed > 0.5
   sag_limits, sag_tells = p.sag_scales_limit > 0.5, p.sag_tells > 0.5
@@ -247,6 +250,7 @@ def simulate(
     told = 0.0
     gap_offset = 0.0
     motor_speed = v
+    bent, was = 0.0, 0.0
     passed = 0.0
     cosine, sine = math.cos(q), math.sin(q)
     link_freely = 0.0  # acceleration of a link by all but the gear, in the last step
@@ -334,13 +338,22 @@ def simulate(
         link = inertia[i] + armature - min(rotor, armature)
         if n == first_n:
           gap_offset = half if torque >= 0.0 else -half
+          was = q + gap_offset
         on_motor_side = (1.0 - friction_on_link) * limit
+        turning = torque - back_emf * motor_speed
+        if bends > 0.0 and on_motor_side > 0.0:
+          of_constant = (1.0 - friction_on_link) * friction
+          contact = laws.contact_stiffness(bends, of_constant, motor, step)
+          bent = laws.bent_on(bent, q + gap_offset - was, contact, on_motor_side)
+          was = q + gap_offset
+          turning -= laws.presliding(bent, motor_speed, contact, on_motor_side, step)
+          on_motor_side = 0.0
         gap_offset, motor_speed, passed = gear_train.advance(
           gap_offset,
           motor_speed,
           v,
           link_freely,
-          torque - back_emf * motor_speed,
+          turning,
           damping - back_emf,
           on_motor_side,
           motor,
@@ -354,6 +367,12 @@ def simulate(
       else:
         mass, force, dry = inertia[i] + armature, torque + passive, limit
         slowed = damping
+        if bends > 0.0:
+          contact = laws.contact_stiffness(bends, friction, mass, step)
+          bent = laws.bent_on(bent, q - was if n > first_n else 0.0, contact, limit)
+          was = q
+          force -= laws.presliding(bent, v, contact, limit, step)
+          dry = 0.0
       # A step of velocity: the friction that stops it, then damping implicit.
       resist = slowed + drag * abs(v)
       slope_v = slowed + 2.0 * drag * abs(v)
@@ -382,6 +401,7 @@ def simulate(
         if s < end:
           when = sample_time[s] * true_time - late
       moved += follow * apart
+      was += follow * apart  # readings' noise bends no contact
       q += moved
       if hinge:
         cosine, sine = _turned(cosine, sine, q, moved)

@@ -4,7 +4,8 @@
   neighbouring commands, as `suite.effects` has it. Its buffer begins with commands of zero.
 - Stribeck friction is the LuGre law of a `dcmotor` without input, with all of the joint's dry
   friction: Canudas de Wit, Olsson, Astrom and Lischinsky 1995. Same curve in motion; at rest the
-  joint sits on a spring, as stiff as the time step allows, where the suite's constraint creeps.
+  joint sits on a spring, as stiff as the time step allows, where the suite's constraint creeps, or
+  as soft as contacts are that bend before they slide (presliding).
 - Cogging, and the constant part of a friction that differs by direction, are a `dcmotor`'s cogging.
 - Play is a second joint of the same body behind the motor's, limited to the gap; the limit's
   stiffness and damping are the teeth's. The servo reads its own joint, so play whose encoder is on
@@ -23,8 +24,8 @@ from nerf2real.suite.effects.kinds import backlash
 from nerf2real.suite.effects.registry import kind_of
 
 KINDS = (
-  *("command_delay", "stribeck_friction", "asymmetric_friction", "cogging", "backlash"),
-  "measurement_delay",
+  *("command_delay", "stribeck_friction", "presliding", "asymmetric_friction", "cogging"),
+  *("backlash", "measurement_delay"),
 )
 """Kinds that are written here, in this order: play takes what friction is on the joint by then."""
 
@@ -42,6 +43,7 @@ _NO_INPUT = 16  # mjINPUT_NONE, mjtype.h
 # Of the bristles' oscillation times the step; chosen: stiff, and well below 2, where it diverges.
 # The law's bristle damping is 0: MuJoCo integrates it as if it were inertia, step times damping.
 _RATE = 0.6
+_COULOMB, _STIFFNESS = 3, 5  # where the law's are in an actuator's biasprm and dynprm
 _LEAST = 1e-3  # Coulomb friction over breakaway where a joint has none: the law divides by it
 _IMPEDANCE = 0.999  # of stiff constraints, as in `suite.effects.kinds.friction`
 
@@ -89,6 +91,9 @@ def put(spec: mujoco.MjSpec, effect: Effect) -> None:
     case "stribeck_friction":
       for joint in joints_of(spec, effect):
         _stribeck(spec, joint, _value(effect, "breakaway"), _value(effect, "velocity"))
+    case "presliding":
+      for joint in joints_of(spec, effect):
+        _presliding(spec, joint, _value(effect, "reach"))
     case "asymmetric_friction":
       positive, negative = _value(effect, "positive"), _value(effect, "negative")
       for joint in joints_of(spec, effect):
@@ -144,11 +149,29 @@ def _stribeck(
   spec: mujoco.MjSpec, joint: mujoco.MjsJoint, breakaway: float, velocity: float
 ) -> None:
   coulomb = max(float(joint.frictionloss), _LEAST * breakaway)
-  inertia = _inertia(spec, joint)
-  stiffness = inertia * (_RATE / spec.option.timestep) ** 2
+  stiffness = _stiffest(spec, joint)
   joint.frictionloss = 0.0
   law = [stiffness, 0.0, coulomb, coulomb + breakaway, velocity]
   _passive(spec, joint, "friction", lugre=law)
+
+
+def _stiffest(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
+  """Returns the stiffness of bristles that the time step allows."""
+  return _inertia(spec, joint) * (_RATE / spec.option.timestep) ** 2
+
+
+def _presliding(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, reach: float) -> None:
+  """Makes the bristles of a joint as soft as its contacts, after Stribeck friction."""
+  there = spec.actuator(f"{joint.name}_friction")
+  coulomb = float(joint.frictionloss if there is None else there.biasprm[_COULOMB])
+  if reach <= 0 or coulomb <= 0:
+    return
+  stiffness = min(_stiffest(spec, joint), coulomb / reach)
+  if there is not None:
+    there.dynprm[_STIFFNESS] = min(there.dynprm[_STIFFNESS], stiffness)
+    return
+  joint.frictionloss = 0.0
+  _passive(spec, joint, "friction", lugre=[stiffness, 0.0, coulomb, coulomb, 1.0])
 
 
 def _play(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, effect: Effect) -> None:

@@ -16,7 +16,11 @@ import numpy as np
 
 from nerf2real.suite.effects.binding import Binding
 from nerf2real.suite.effects.effect import Array, Kind, Operator, Parameter
-from nerf2real.suite.effects.kinds import gear_train
+from nerf2real.suite.effects.kinds import gear_train, laws
+
+_STIFFNESS, _BENT_ON, _PRESLIDING = map(
+  laws.over, (laws.contact_stiffness, laws.bent_on, laws.presliding)
+)
 
 LINK_SHARE = 0.02  # of the armature, ours
 ROTOR_WITHOUT_ARMATURE = 0.05  # of the joint's inertia, ours, for a model that declares none
@@ -54,6 +58,13 @@ class Backlash(Operator):
     self._driven = np.array(driven, int)
     self._place = np.array([of_joint[int(binding.actuator_joint[u])] for u in driven], int)
     binding.simulated[self._driven] = False
+    binding.geared[geared] = True
+    self._bends = np.flatnonzero(binding.reach[geared] * self._friction_on_motor)  # of G
+    own = self._friction_on_motor * self._friction
+    reach = binding.reach[geared][self._bends]
+    parts = own[self._bends], self._rotor[self._bends], binding.timestep
+    self._contact = _STIFFNESS(reach, *parts) if len(self._bends) else reach
+    self._bent, self._was = np.zeros((2, len(geared)))
     self.offset, self._speed, self._passed = np.zeros((3, len(geared)))
     """`offset`: motor position minus link position [G] rad."""
     self._last_velocity = np.zeros(len(geared))
@@ -61,6 +72,7 @@ class Backlash(Operator):
 
   def reset(self) -> None:
     self.offset[:] = 0.0
+    self._bent[:] = 0.0
     self._started = False
 
   def step(self, binding: Binding) -> None:
@@ -89,14 +101,18 @@ class Backlash(Operator):
       self._started, mobility = True, self._mobility_at_first
       self.offset[:] = np.where(torque >= 0, self._half, -self._half)
       others = np.zeros(len(geared))
+      self._was[:] = binding.position[geared] + self.offset
     self._last_velocity = velocity
     friction = self._friction_on_motor * (self._friction + binding.friction[geared])
+    torque -= back_emf * self._speed
+    if len(self._bends):
+      self._bend(binding, torque, friction)
     gear_train.advance_joints(
       self.offset,
       self._speed,
       velocity,
       others,
-      torque - back_emf * self._speed,
+      torque,
       self._damping - back_emf,
       friction,
       self._rotor,
@@ -111,6 +127,16 @@ class Backlash(Operator):
     binding.force[geared] += self._passed
     binding.last_force[self._driven] = force[self._driven]
     binding.strength[self._driven] = 0.0
+
+  def _bend(self, binding: Binding, torque: Array, friction: Array) -> None:
+    """Takes what contacts that bend hold off the motors' torques [G], and their dry friction."""
+    at, stiffness = self._bends, self._contact
+    place = binding.position[self._geared][at] + self.offset[at]
+    self._bent[at] = _BENT_ON(self._bent[at], place - self._was[at], stiffness, friction[at])
+    self._was[at] = place
+    speed = self._speed[at]
+    torque[at] -= _PRESLIDING(self._bent[at], speed, stiffness, friction[at], binding.timestep)
+    friction[at] = 0.0
 
   def observe(self, channel: str, value: Array, time: float) -> Array:
     if channel != "joint_positions" or not self._on_motor.any():

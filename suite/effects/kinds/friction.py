@@ -17,6 +17,9 @@ _IMPEDANCE = 0.999  # ours, see above
 _STRIBECK, _LOAD_FRICTION, _GEAR_LOAD = map(
   laws.over, (laws.stribeck, laws.load_friction, laws.gear_load)
 )
+_STIFFNESS, _BENT_ON, _PRESLIDING = map(
+  laws.over, (laws.contact_stiffness, laws.bent_on, laws.presliding)
+)
 
 
 def _stick(binding: Binding, friction: Array) -> None:
@@ -104,6 +107,42 @@ class AsymmetricFriction(Operator):
 
   def step(self, binding: Binding) -> None:
     binding.force += self._offset
+
+
+class Presliding(Operator):
+  """Contacts that bend before they slide (`laws.bent_on`): friction is a spring at first, of the
+  joint's constant dry friction over `reach`; what friction is larger by at rest or under a load
+  bends them further. All dry friction of the joint is theirs and none MuJoCo's constraint's; a
+  joint without any is left as it is. Behind play they are on the motor's side, where `backlash`
+  bends them.
+  """
+
+  def bind(self, binding: Binding) -> None:
+    reach = self.per_joint(binding)["reach"]
+    self._friction = binding.model.dof_frictionloss[binding.dofs].copy()
+    bends = (reach > 0) & (self._friction > 0)
+    binding.reach[bends] = reach[bends]
+    self._bent, self._was = np.zeros((2, len(reach)))
+    self._started = False
+
+  def reset(self) -> None:
+    self._bent[:] = 0.0
+    self._started = False
+
+  def step(self, binding: Binding) -> None:
+    at = np.flatnonzero((binding.reach > 0) & ~binding.geared)
+    if not len(at):
+      return
+    position = binding.position[at]
+    if not self._started:
+      self._was[at], self._started = position, True
+    own, step = self._friction[at], binding.timestep
+    dry = own + binding.friction[at]
+    stiffness = _STIFFNESS(binding.reach[at], own, binding.inertia()[at], step)
+    self._bent[at] = _BENT_ON(self._bent[at], position - self._was[at], stiffness, dry)
+    self._was[at] = position
+    binding.force[at] -= _PRESLIDING(self._bent[at], binding.velocity[at], stiffness, dry, step)
+    binding.friction[at] = -own
 
 
 class QuadraticDrag(Operator):
@@ -220,5 +259,17 @@ KINDS = (
       ),
     ),
     QuadraticDrag,
+  ),
+  Kind(
+    "presliding",
+    "contacts that bend before they slide",
+    "joint",
+    "force",
+    (
+      Parameter(
+        "reach", "rad", 0.0, 0.0, 0.02, "constant dry friction over stiffness", minimum=0.0
+      ),
+    ),
+    Presliding,
   ),
 )

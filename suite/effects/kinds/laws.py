@@ -38,6 +38,40 @@ def stribeck(speed: float, breakaway: float, velocity: float) -> float:
 
 
 @law
+def contact_stiffness(reach: float, dry: float, inertia: float, step: float) -> float:
+  """Returns the stiffness of contacts that bend by a reach under a dry friction, in series with
+  what a step can hold: stable however stiff they are.
+
+  Args:
+    reach: rad, positive.
+    dry: N m, positive.
+    inertia: that they hold, kg m^2.
+    step: s.
+  """
+  return 1.0 / (reach / dry + step * step / inertia)
+
+
+@law
+def bent_on(bent: float, moved: float, stiffness: float, dry: float) -> float:
+  """Returns the deflection of contacts after a motion, which bend ever less as they slide: the law
+  of Dahl 1968, d bent = (1 - sign(v) bent / most) d position, solved for a constant friction.
+
+  MuJoCo has the same as the bristles of its `dcmotor`: a file can hold it.
+  """
+  most = dry / stiffness
+  if moved == 0.0:
+    return min(max(bent, -most), most)
+  end = most if moved > 0.0 else -most
+  return end + (bent - end) * math.exp(-abs(moved) / most)
+
+
+@law
+def presliding(bent: float, speed: float, stiffness: float, dry: float, step: float) -> float:
+  """Returns the friction of contacts at the end of a step, by the speed [rad/s] before it."""
+  return min(max(stiffness * (bent + step * speed), -dry), dry)
+
+
+@law
 def gear_load(carried: float, actuator: float, motor: float, link: float) -> float:
   """Returns the torque that loads a gear.
 

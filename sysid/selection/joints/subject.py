@@ -13,7 +13,7 @@ import numpy as np
 from nerf2real.sysid.fit import signatures
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
-from nerf2real.sysid.hypotheses.constants import constants, sticking, tolerant
+from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.hypotheses.plausible import plausible
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
@@ -26,6 +26,7 @@ from nerf2real.sysid.selection.joints.baseline import (
   widened,
 )
 from nerf2real.sysid.selection.joints.naming import conclude, thresholds
+from nerf2real.sysid.selection.joints.reference import reference_constants
 from nerf2real.sysid.selection.joints.remainder import structured
 from nerf2real.sysid.selection.search.evidence import Scored
 from nerf2real.sysid.selection.search.explain import Explainer
@@ -36,8 +37,6 @@ WHOLE = ("clock_drift", "supply_sag", "gravity_tilt")
 """Kinds that have no target: they concern all joints of a machine or none."""
 
 _SESSION = 3600.0  # s between recordings, chosen: a machine has cooled down and settled by then
-_WEIGHTED = 4  # fits of a reference's constants under weights of their priors, at most
-_SETTLED = 0.1  # share by which these weights differ at the end
 
 
 @dataclasses.dataclass
@@ -212,22 +211,6 @@ def _ahead(law: ServoLaw, settings: Settings) -> tuple[float, float]:
   return law.ahead - reach, law.ahead + reach
 
 
-def reference_constants(before: JointLikelihood, settings: Settings) -> Scored:
-  """Returns the constants that a reference shows, with a dry friction that holds at rest.
-
-  An effect of friction holds, too: it must not be judged by the difference to one that creeps.
-  """
-  own = constants(before.plant, settings, healthy=True)
-  known = [sticking(before.plant)]
-  found = Explainer(before, own, (), settings=settings, known=known).null
-  for _ in range(_WEIGHTED):
-    wider = tolerant(own, found.fit.values(found.terms[0]))
-    if np.allclose(wider.prior, found.terms[0].prior, rtol=_SETTLED):
-      break
-    found = Explainer(before, wider, (), settings=settings, known=known, start=found.fit.x).null
-  return found
-
-
 def explain_reference(subject: Subject, settings: Settings) -> None:
   """Finds the effects that a joint has anyway, where its reference leaves what is no noise."""
   before = subject.before
@@ -237,7 +220,8 @@ def explain_reference(subject: Subject, settings: Settings) -> None:
     return
   own = subject.usual.terms[0]
   library = own_library(before.plant, alone=subject.alone)
-  first = Explainer(before, own, library, settings=settings, known=[sticking(before.plant)])
+  known, x = subject.usual.terms[1:], subject.usual.fit.x
+  first = Explainer(before, own, library, settings=settings, known=known, start=x)
   usual = conclude(before, grow(first, settings.reference_depth), subject.thresholds).best
   known, subject.paired, subject.freed = _shown(subject.now, before, usual)
   shared = [t for t in subject.known if t.wider]

@@ -159,7 +159,7 @@ def test_registry_is_complete_and_consistent():
     stribeck_friction load_friction asymmetric_friction quadratic_drag backlash encoder_offset
     motor_gain supply_sag torque_limit thermal_derating payload spring cogging gravity_tilt
     parameter_error imu_bias imu_tilt imu_lag imu_scale camera_gain camera_latency camera_focal
-    floor_slope floor_friction rolling_resistance residual_force"""
+    floor_slope floor_friction rolling_resistance residual_force presliding"""
   assert set(issue.split()) == set(KINDS)
   for kind in KINDS.values():
     assert kind.target in _TARGETS

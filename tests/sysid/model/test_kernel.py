@@ -38,6 +38,7 @@ CASES = [
   ),
   ("asymmetric_friction", {"positive": 0.2, "negative": 0.05}, 1e-6),
   ("quadratic_drag", {"coefficient": 0.1}, 1e-6),
+  ("presliding", {"reach": 0.03}, 1e-5),
   ("encoder_offset", {"offset": 0.05}, 1e-6),
   ("motor_gain", {"gain": 0.7}, 1e-6),
   ("motor_gain", {"gain": 0.7, "scales_limit": 1.0}, 1e-6),
@@ -95,6 +96,29 @@ def test_kind_moves_the_joint_as_mujoco_does(kind: str, values: dict, tolerance:
   effect = float(np.sqrt(np.mean((bare - want) ** 2)))
   assert effect > 5 * tolerance, "the case must move the joint"
   assert difference < tolerance
+
+
+@pytest.mark.parametrize(
+  "effect",
+  [
+    Effect("stribeck_friction", "joint", {"breakaway": 0.2, "velocity": 0.3}),
+    Effect("backlash", "joint", {"gap": 0.03, "encoder_on_motor": 0.0}),
+  ],
+  ids=lambda effect: effect.kind,
+)
+def test_contacts_bend_beside_other_effects_as_in_mujoco(effect: Effect) -> None:
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log = log_of(PENDULUM, "steps", rounding=0.0, duration=4.0)
+  plant = JointModel(model, "joint", [log])
+  bends = Effect("presliding", "joint", {"reach": 0.01})
+  terms = [
+    Term(e.kind, e.target, (), (), (), (), ((),), fixed=tuple(e.parameters.items()))
+    for e in (effect, bends)
+  ]
+  want = evaluation.simulate(model, log, [effect, bends])[:, 0]
+  rigid = evaluation.simulate(model, log, [effect])[:, 0]
+  assert np.sqrt(np.mean((want - rigid) ** 2)) > 1e-3
+  assert np.sqrt(np.mean((_position(plant, terms) - want) ** 2)) < 1e-5
 
 
 _COMMON = ("supply_sag", "gravity_tilt", "clock_drift")

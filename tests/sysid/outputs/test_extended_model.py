@@ -78,6 +78,20 @@ def test_native_effects_move_as_the_suites(effect, commands, share, tmp_path):
   assert rms(natives(path, commands) - want) < share * changed
 
 
+@pytest.mark.parametrize("stribeck", [False, True])
+def test_contacts_that_bend_are_bristles(stribeck, tmp_path):
+  rigid = [Effect("coulomb_friction", "joint", {"torque": 0.3})]
+  if stribeck:
+    rigid.append(Effect("stribeck_friction", "joint", {"breakaway": 0.2, "velocity": 0.5}))
+  bends = [*rigid, Effect("presliding", "joint", {"reach": 0.02})]
+  path, left = written(tmp_path, PENDULUM, bends)
+  assert left == []
+  want = suites(PENDULUM, bends, SLOW)
+  changed = rms(want - suites(PENDULUM, rigid, SLOW))
+  assert changed > 2e-3
+  assert rms(natives(path, SLOW) - want) < 0.05 * changed
+
+
 def test_a_gain_of_position_alone_is_written_with_the_servos_own_damping(tmp_path):
   damped = PENDULUM.replace('kp="21"', 'kp="21" kv="0.8"')
   gain = Effect("motor_gain", "joint", {"gain": 0.6, "position_alone": 1.0})

@@ -7,7 +7,7 @@ import pytest
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.selection.joints import subject
+from nerf2real.sysid.selection.joints import reference
 from nerf2real.sysid.selection.joints.baseline import (
   changed_constants,
   differs,
@@ -39,7 +39,7 @@ def test_a_reference_tells_the_ratios_of_torques_and_masses(strength, mass, limi
   machine = machine.replace('"-4 4"', f'"{-limit} {limit}"')
   logs = [log_of(machine, kind, duration=6.0) for kind in ("sweep", "slow", "steps")]
   plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
-  usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
+  usual = reference.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
   values = usual.fit.values(usual.terms[0])
   gain, heavier = 1.0 + values["gain"], 1.0 + values["mass"]
   assert gain / heavier == pytest.approx(strength / mass, rel=0.03)
@@ -61,7 +61,7 @@ def test_a_machine_may_rub_far_more_than_declared_where_a_reference_shows_it():
 def test_more_friction_than_a_reference_has_is_an_effect_and_less_is_a_changed_constant():
   logs = [log_of(PENDULUM, kind, duration=5.0) for kind in ("sweep", "slow")]
   plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
-  usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
+  usual = reference.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
   known = known_terms(usual)[0]
   for freed in changed_constants(known):
     (at,) = np.flatnonzero(np.isinf(freed.prior))
@@ -78,7 +78,7 @@ def test_more_friction_than_a_reference_has_is_an_effect_and_less_is_a_changed_c
 def test_constants_of_another_session_may_differ_by_more():
   logs = [log_of(PENDULUM, kind, duration=5.0) for kind in ("sweep", "slow")]
   plant = JointModel(mujoco.MjModel.from_xml_string(PENDULUM), "joint", logs)
-  usual = subject.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
+  usual = reference.reference_constants(JointLikelihood(plant, settings=SETTINGS), SETTINGS)
   same, other = (known_terms(usual, another_session=apart)[0] for apart in (False, True))
   more = {n for n, a, b in zip(same.names, same.prior, other.prior, strict=True) if a < b}
   assert more == {"damping", "friction", "gain", "limit", "latency"}
