@@ -140,7 +140,7 @@ def _verdict(content: dict[str, Any], said: Sequence[str]) -> Section:
   usual, _ = _parameters(content["in_reference"])
   if usual:
     blocks += [Heading("In the reference, too: the model lacks them, nothing changed")]
-    blocks += [Table(_HEADER, usual)]
+    blocks += [Table(_HEADER[:-1], [row[:-1] for row in usual])]
   if alike:
     blocks += [Heading("One of these, the sensors cannot tell which"), Table(_HEADER, alike)]
   return Section(f"Verdict: {content['verdict']}", _VERDICTS[content["verdict"]], blocks)

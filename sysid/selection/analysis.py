@@ -255,7 +255,9 @@ def _write_down(result: Identified, item: Changed) -> None:
       result.objects.append(effect)
       result.nearest.append(row)
       continue
-    effect, row = claims.effect(item, term, _evidence(item, names.get(term.kind)))
+    # What the reference has, too, is in the baseline that evidence is counted from.
+    evidence = {} if term.known else _evidence(item, names.get(term.kind))
+    effect, row = claims.effect(item, term, evidence)
     effect = beside_machine(effect, best.terms)
     if term.kind == "encoder_offset":
       offset += float(effect.parameters["offset"])  # type: ignore[arg-type]
