@@ -50,7 +50,14 @@ class Expectation:
     """
     self.apart = apart
     self._times = [log.time for log in logs]
-    self._likes = [_smoothed(_since_command(stamps, baseline), rows) for (stamps, rows) in likes]
+    self._likes = [
+      [
+        (late, *_smoothed(_since_command(stamps, baseline, late), rows[part]))
+        for late, part in _READ_LATE.items()
+        if len(rows[part])
+      ]
+      for stamps, rows in likes
+    ]
     self._last: tuple[tuple[float, ...], Array] | None = None
 
   def under(self, p: Array) -> Array:
@@ -58,8 +65,12 @@ class Expectation:
     key = tuple(float(p[INDEX[n]]) for n in _CLOCKS)
     if self._last is None or self._last[0] != key:
       parts = [
-        [np.interp(_since_command(time, p), at, row) for row in rows]
-        for time, (at, rows) in zip(self._times, self._likes, strict=True)
+        [
+          np.interp(_since_command(time, p, late), at, row)
+          for late, at, rows in likes
+          for row in rows
+        ]
+        for time, likes in zip(self._times, self._likes, strict=True)
       ]
       self._last = key, np.concatenate([np.array(part) for part in parts], axis=1)
     return self._last[1]
@@ -93,10 +104,19 @@ def _smoothed(at: Array, rows: Array) -> tuple[Array, Array]:
   return when, values
 
 
-_CLOCKS = ("clock_rate", "measurement_delay", "command_delay")
+_READ_LATE = {"measurement_delay": slice(0, 1), "effort_delay": slice(1, None)}
+"""How late readings are of the course and of other channels: beside a late encoder efforts are read
+when they were."""
+_CLOCKS = ("clock_rate", *_READ_LATE, "command_delay")
 
 
-def _since_command(stamps: Array, p: Array) -> Array:
-  """Returns the time by the commands' clock of what readings with these stamps show."""
-  rate, late, delay = (float(p[INDEX[n]]) for n in _CLOCKS)
+def _since_command(stamps: Array, p: Array, read_late: str) -> Array:
+  """Returns the time by the commands' clock of what readings with these stamps show.
+
+  Args:
+    stamps: [S] s.
+    p: kernel parameters [P].
+    read_late: the one that says how late they are.
+  """
+  rate, late, delay = (float(p[INDEX[n]]) for n in ("clock_rate", read_late, "command_delay"))
   return stamps / (1.0 + rate) - late - delay

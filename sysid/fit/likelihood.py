@@ -206,8 +206,8 @@ class JointLikelihood:
       if self.law is not None:
         channels.append(self._duties(compose(self.plant, terms, x).p))
       elif self.effort is not None:
-        gain = float(compose(self.plant, terms, x).p[INDEX["gain"]])
-        channels.append(self._efforts([along for _, along in outputs], gain))
+        p = compose(self.plant, terms, x).p
+        channels.append(self._efforts([along for _, along in outputs], p))
       rows.append(channels)
     result = np.nan_to_num(np.array(rows), nan=1e3, posinf=1e3, neginf=-1e3)
     if self.expectation is not None:
@@ -319,31 +319,45 @@ class JointLikelihood:
     if self.effort is None or self.law is not None or self.follows:
       return None
     (outputs,) = self.simulate(terms, x[None])
-    return self._compared([along for _, along in outputs])[1]
+    p = compose(self.plant, terms, x).p
+    return self._compared([along for _, along in outputs], self._speed_of_efforts(p))[1]
 
-  def _efforts(self, along: Sequence[Simulated | None], gain: float) -> Array:
+  def _speed_of_efforts(self, p: Array) -> Array:
+    """Returns the speed [N] at the time that efforts show: what positions show that are as much
+    later as they are read later, under kernel parameters [P]."""
+    late = float(p[INDEX["measurement_delay"]] - p[INDEX["effort_delay"]])
+    if late == 0.0:
+      return self.speed
+    logs = self.plant.logs
+    return np.concatenate([np.interp(log.time + late, log.time, log.velocity) for log in logs])
+
+  def _efforts(self, along: Sequence[Simulated | None], p: Array) -> Array:
     """Returns measured effort minus simulated torque [N], in the readings' unit: without a
     reference all torques larger by one factor leave the same.
 
     Args:
       along: runs along the readings.
-      gain: of the motor, which a current may tell (a worn brush) or not (a weak magnet).
+      p: kernel parameters [P], with the motor's gain, which a current may tell (a worn brush) or
+        not (a weak magnet).
     """
     assert self.effort is not None
-    torque, factor = self._compared(along, gain)
+    speed = self._speed_of_efforts(p)
+    torque, factor = self._compared(along, speed, float(p[INDEX["gain"]]))
     left = np.concatenate(self.effort) - factor * torque
     # A current's torque lacks what the back-EMF takes.
-    seen = self.gain[1] ** 2 * self.speed
-    return left - float(left @ seen) / (float(seen @ self.speed) + 1e-12) * self.speed
+    seen = self.gain[1] ** 2 * speed
+    return left - float(left @ seen) / (float(seen @ speed) + 1e-12) * speed
 
-  def _compared(self, along: Sequence[Simulated | None], gain: float = 1.0) -> tuple[Array, float]:
+  def _compared(
+    self, along: Sequence[Simulated | None], speed: Array, gain: float = 1.0
+  ) -> tuple[Array, float]:
     """Returns simulated torque [N] and measured effort over it: within what torque constants leave
     open, or what it was in a reference."""
     assert self.effort is not None
     torque = np.concatenate([a.torque for a in along])  # type: ignore[union-attr]
     measured, both = (
       self.gain[1] * np.concatenate(self.effort),
-      self.gain[1] * np.array([torque, self.speed]),
+      self.gain[1] * np.array([torque, speed]),
     )
     scale = float(np.linalg.lstsq(both @ both.T, both @ measured, rcond=None)[0][0])
     units: tuple[float, ...] = (1.0,)

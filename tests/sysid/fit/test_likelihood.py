@@ -270,6 +270,35 @@ def test_what_a_reference_leaves_comes_as_late_as_what_it_goes_with(viscous, clo
   np.testing.assert_allclose(later[inner], shifted[inner], atol=3e-4)
 
 
+def test_a_late_encoder_makes_no_effort_late(viscous):
+  """Neither what a reference leaves of it, nor the speed that its back-EMF goes with."""
+  plant, _ = viscous
+  left = [(log.time, np.array([np.sin(3.0 * log.time)] * 2)) for log in plant.logs]
+  expected = Expectation(plant.logs, left, plant.declared)
+  late = plant.declared.copy()
+  late[kernel.INDEX["measurement_delay"]] += 0.03
+  course, effort = expected.under(late)
+  times = np.concatenate([log.time for log in plant.logs])
+  inner = np.concatenate([log.time > 0.05 for log in plant.logs])
+  np.testing.assert_allclose(course[inner], np.sin(3.0 * (times - 0.03))[inner], atol=3e-4)
+  np.testing.assert_allclose(effort, np.sin(3.0 * times), atol=1e-5)
+
+  delay = Effect("measurement_delay", "joint", {"delay": 0.03})
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  log, read = (
+    log_of(PENDULUM, "sweep", duration=5.0),
+    log_of(PENDULUM, "sweep", [delay], duration=5.0),
+  )
+  own = JointModel(model, "joint", [log])
+  torque = own.run(own.declared, (), 0, follow=True).torque - own.logs[0].velocity  # of a current
+  states = dataclasses.replace(read.states, effort=torque[:, None])
+  joint = JointLikelihood(JointModel(model, "joint", [dataclasses.replace(read, states=states)]))
+  term = next(t for t in candidates.library(joint.plant) if t.kind == "measurement_delay")
+  there, none = joint.residuals((term,), np.array([[0.03], [0.0]]))[:, 1]
+  assert np.std(there[50:-50]) < 0.1 * np.std(torque)
+  assert np.std(there[50:-50]) < 0.2 * np.std(none[50:-50])
+
+
 @pytest.mark.parametrize("later", [0.0, 0.25, 0.5])
 def test_expected_noise_is_the_same_wherever_between_readings_it_is_taken(viscous, later):
   """Else a delay of half a period would be likelier than one of a whole one."""
