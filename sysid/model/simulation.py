@@ -123,7 +123,7 @@ def simulate(
       data.time = first
       times = first + step * np.arange(count + 1)
       ctrl = told.mean(times[:-1], step, late_by)
-      data.act[model.actuator_actadr[filters]] = ctrl[0, filters]
+      data.act[model.actuator_actadr[filters]] = ctrl[0, model.actuator_ctrladr[filters]]
       history = np.vstack([data.qpos[qpos], _roll(stack, data, ctrl, qpos)])
       for j in range(len(ids)):
         stamps = time[start:end] / (1 + rate) - late[j]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from nerf2real.suite.effects import Effect, EffectStack
-from nerf2real.sysid.model.simulation import Clocks
+from nerf2real.sysid.model.simulation import Clocks, simulate
 from nerf2real.sysid.outputs import extended_model
-from tests.sysid.synthetic import ARM, PENDULUM
+from tests.sysid.synthetic import ARM, PENDULUM, log_of
 
 STEPS = 4000
 TIME = 1e-3 * np.arange(STEPS)
@@ -90,6 +90,25 @@ def test_contacts_that_bend_are_bristles(stribeck, tmp_path):
   changed = rms(want - suites(PENDULUM, rigid, SLOW))
   assert changed > 2e-3
   assert rms(natives(path, SLOW) - want) < 0.05 * changed
+
+
+def test_logs_are_simulated_in_the_file_as_in_the_suite(tmp_path):
+  # Bristles are actuators that take no command: there are more of them than commands.
+  effects = [
+    Effect("coulomb_friction", "joint", {"torque": 0.3}),
+    Effect("stribeck_friction", "joint", {"breakaway": 0.4, "velocity": 1.0}),
+    Effect("presliding", "joint", {"reach": 0.01}),
+  ]
+  filtered = PENDULUM.replace("<position ", '<position timeconst="0.01" ')
+  path, left = written(tmp_path, filtered, effects)
+  assert left == []
+  log = log_of(filtered, "slow", effects, duration=4.0, rounding=0.0)
+  got = simulate(mujoco.MjModel.from_xml_path(str(path)), log, [])
+  declared = simulate(mujoco.MjModel.from_xml_string(filtered), log, [])
+  want = log.states.position
+  changed = np.std(declared - want)
+  assert changed > 2e-3
+  assert np.std(got - want) < 0.02 * changed
 
 
 def test_a_gain_of_position_alone_is_written_with_the_servos_own_damping(tmp_path):
