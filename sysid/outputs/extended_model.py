@@ -1,10 +1,11 @@
 """model_extended.xml: the declared model with what MuJoCo itself can express put in.
 
 Constants are corrected; friction, drag, springs, gains, limits, offsets, payloads and tilts are
-written as attributes, a sloping floor is turned; delays, Stribeck friction, cogging, friction that
-differs by direction and play are native elements (`native_effects`). The file needs MuJoCo 3.7 or
-later and nothing of this project. What MJCF cannot hold (load friction, heat, supply, learned
-forces, sensors' errors) is listed in a comment of the file, and stays in effects.json.
+written as attributes, a sloping floor is turned; delays, Stribeck friction, contacts that bend,
+cogging, friction that differs by direction and play are native elements (`native_effects`). The
+file needs MuJoCo 3.7 or later and nothing of this project. What MJCF cannot hold (load friction,
+heat, supply, learned forces, sensors' errors) is listed in a comment of the file, and stays in
+effects.json.
 """
 
 from collections.abc import Mapping, Sequence

@@ -6,117 +6,44 @@ import pytest
 import scipy.integrate
 
 from nerf2real.suite.effects import Effect, EffectStack
-from tests.suite.effects.rolling import rollout
-
-_STEP = 1e-3
-_INERTIA = 0.01  # kg m^2 of the hinge below
-
-
-def _hinge(
-  actuator="motor", *, joint="", option='gravity="0 0 0"', inertia=_INERTIA, mass=1.0, com="0 0 0"
-):
-  """One hinge about y. With com at 0 the inertia about it is `inertia`."""
-  gain = 'kp="5"' if actuator == "position" else ""
-  return mujoco.MjModel.from_xml_string(f"""
-    <mujoco>
-      <option timestep="{_STEP}" integrator="implicitfast" {option}/>
-      <worldbody>
-        <body name="link" simple="false">
-          <joint name="hinge" axis="0 1 0" {joint}/>
-          <inertial pos="{com}" mass="{mass}" diaginertia="{inertia} {inertia} {inertia}"/>
-        </body>
-      </worldbody>
-      <actuator><{actuator} name="drive" joint="hinge" {gain}/></actuator>
-    </mujoco>""")
-
-
-def _run(model, effects, controls, *, velocity=0.0, position=0.0):
-  stack = EffectStack(effects).bind(model)
-  data = mujoco.MjData(model)
-  data.qvel[:], data.qpos[:] = velocity, position
-  controls = np.asarray(controls, float)
-  positions, velocities = rollout(stack, data, controls.reshape(len(controls), model.nu))
-  return positions[:, 0], velocities[:, 0], stack, data
+from tests.suite.effects.rolling import INERTIA, STEP, hinge, run
 
 
 def _times(count):
-  return _STEP * np.arange(1, count + 1)
+  return STEP * np.arange(1, count + 1)
 
 
 def test_coulomb_friction_takes_4_f_over_k_a_cycle():
-  model = _hinge(joint='stiffness="4"')
-  period = 2 * np.pi * np.sqrt(_INERTIA / 4)
-  q, _, _, _ = _run(
+  model = hinge(joint='stiffness="4"')
+  period = 2 * np.pi * np.sqrt(INERTIA / 4)
+  q, _, _, _ = run(
     model, [Effect("coulomb_friction", "hinge", {"torque": 0.05})], np.zeros(1300), position=1.0
   )
-  peaks = [q[round(n * period / _STEP) - 1] for n in (1, 2, 3, 4)]
+  peaks = [q[round(n * period / STEP) - 1] for n in (1, 2, 3, 4)]
   np.testing.assert_allclose(peaks, 1 - 4 * 0.05 / 4 * np.arange(1, 5), atol=4e-3)
 
 
 def test_coulomb_friction_holds_at_rest():
   effect = [Effect("coulomb_friction", "hinge", {"torque": 0.05})]
-  q, _, _, _ = _run(_hinge(), effect, np.full(1000, 0.045))
+  q, _, _, _ = run(hinge(), effect, np.full(1000, 0.045))
   assert abs(q[-1]) < 1e-4
-  q, _, _, _ = _run(_hinge(), effect, np.full(1000, 0.055))
+  q, _, _, _ = run(hinge(), effect, np.full(1000, 0.055))
   # The excess of 0.005 N m accelerates: 0.5 * 0.005 / 0.01 * t^2 after 1 s.
   assert q[-1] == pytest.approx(0.25, rel=0.01)
 
 
-def _bending(reach=0.01, friction=0.05):
-  return [
-    Effect("coulomb_friction", "hinge", {"torque": friction}),
-    Effect("presliding", "hinge", {"reach": reach}),
-  ]
-
-
-def test_contacts_bend_before_they_slide_as_dahl_has_it():
-  # From rest a share s of the friction is met where -log(1 - s) of the reach is bent; taken away,
-  # log(1 + s) of it comes back.
-  damped = _hinge(joint='damping="0.3"')
-  controls = np.r_[np.full(2000, 0.025), np.zeros(2000)]
-  q, _, _, _ = _run(damped, _bending(), controls)
-  assert q[1999] == pytest.approx(0.01 * np.log(2.0), rel=0.01)
-  assert q[-1] == pytest.approx(0.01 * np.log(2.0 / 1.5), rel=0.02)
-  controls = np.r_[np.full(500, 0.08), np.zeros(2500)]
-  q, _, _, _ = _run(damped, _bending(), controls)
-  assert q.max() > 0.03  # slid
-  assert q[-1] == pytest.approx(q.max() - 0.01 * np.log(2.0), abs=5e-4)
-
-
-def test_contacts_that_bend_lose_what_they_slide():
-  # From 1 to the next peak p a rigid friction f takes 2 f (1 + p). One that bends by r takes f r
-  # less as it begins, and 2 f r less after the turn.
-  model = _hinge(joint='stiffness="4"')
-  period = round(2 * np.pi * np.sqrt(_INERTIA / 4) / _STEP)
-  for reach in (1e-5, 0.1):
-    q, _, _, _ = _run(model, _bending(reach), np.zeros(400), position=1.0)
-    peak = q[period - 60 : period + 60].max()
-    lost = 0.05 * (2 * (1 + peak) - 3 * reach)
-    assert 0.5 * 4 * (1 - peak**2) == pytest.approx(lost, rel=0.02)
-
-
-def test_contacts_that_bend_start_anew_with_an_episode():
-  stack = EffectStack(_bending()).bind(_hinge(joint='damping="0.3"'))
-  paths = []
-  for _ in range(2):
-    stack.reset()
-    data = mujoco.MjData(stack.binding.model)
-    paths.append(rollout(stack, data, np.full((300, 1), 0.04))[0][:, 0])
-  np.testing.assert_array_equal(*paths)
-
-
 def test_viscous_friction_decays_exponentially():
   effect = Effect("viscous_friction", "hinge", {"coefficient": 0.02})
-  _, v, _, _ = _run(_hinge(), [effect], np.zeros(500), velocity=3.0)
-  np.testing.assert_allclose(v, 3 * np.exp(-0.02 / _INERTIA * _times(500)), rtol=2e-3)
+  _, v, _, _ = run(hinge(), [effect], np.zeros(500), velocity=3.0)
+  np.testing.assert_allclose(v, 3 * np.exp(-0.02 / INERTIA * _times(500)), rtol=2e-3)
 
 
 def test_quadratic_drag():
   # dv/dt = -(c / I) v^2: v = v0 / (1 + c v0 t / I), in both directions.
   effect = Effect("quadratic_drag", "hinge", {"coefficient": 0.01})
   for sign in (1, -1):
-    _, v, _, _ = _run(_hinge(), [effect], np.zeros(500), velocity=3.0 * sign)
-    np.testing.assert_allclose(v, sign * 3 / (1 + 0.01 * 3 / _INERTIA * _times(500)), rtol=4e-3)
+    _, v, _, _ = run(hinge(), [effect], np.zeros(500), velocity=3.0 * sign)
+    np.testing.assert_allclose(v, sign * 3 / (1 + 0.01 * 3 / INERTIA * _times(500)), rtol=4e-3)
 
 
 def test_stribeck_friction_breaks_away_and_falls():
@@ -124,15 +51,15 @@ def test_stribeck_friction_breaks_away_and_falls():
     Effect("coulomb_friction", "hinge", {"torque": 0.05}),
     Effect("stribeck_friction", "hinge", {"breakaway": 0.03, "velocity": 0.2}),
   ]
-  q, _, _, _ = _run(_hinge(), effects, np.full(500, 0.075))
+  q, _, _, _ = run(hinge(), effects, np.full(500, 0.075))
   assert abs(q[-1]) < 1e-4  # below 0.08 N m it stays
-  q, _, _, _ = _run(_hinge(), effects, np.full(500, 0.085))
+  q, _, _, _ = run(hinge(), effects, np.full(500, 0.085))
   assert q[-1] > 0.1  # above, it goes
 
   def decelerate(_, v):
-    return -(0.05 + 0.03 * np.exp(-((v / 0.2) ** 2))) / _INERTIA
+    return -(0.05 + 0.03 * np.exp(-((v / 0.2) ** 2))) / INERTIA
 
-  _, v, _, _ = _run(_hinge(), effects, np.zeros(150), velocity=1.0)
+  _, v, _, _ = run(hinge(), effects, np.zeros(150), velocity=1.0)
   times = _times(150)
   expected = scipy.integrate.solve_ivp(decelerate, (0, 0.15), [1.0], t_eval=times, rtol=1e-9).y[0]
   np.testing.assert_allclose(v, expected, atol=8e-3)
@@ -141,19 +68,19 @@ def test_stribeck_friction_breaks_away_and_falls():
 def test_load_friction_takes_its_share_of_the_torque():
   effect = Effect("load_friction", "hinge", {"coefficient": 0.3})
   for torque in (0.1, -0.2):
-    _, v, _, _ = _run(_hinge(), [effect], np.full(300, torque))
-    acceleration = (v[-1] - v[100]) / (199 * _STEP)
-    assert acceleration == pytest.approx(0.7 * torque / _INERTIA, rel=1e-3)
+    _, v, _, _ = run(hinge(), [effect], np.full(300, torque))
+    acceleration = (v[-1] - v[100]) / (199 * STEP)
+    assert acceleration == pytest.approx(0.7 * torque / INERTIA, rel=1e-3)
 
 
 def test_load_friction_may_grow_with_the_square_and_fall_with_speed():
   shape = {"coefficient": 0.1, "quadratic": 2.0, "rest": 0.5, "velocity": 0.5}
   for torque in (0.1, -0.2):
-    _, v, _, _ = _run(_hinge(), [Effect("load_friction", "hinge", shape)], np.full(300, torque))
+    _, v, _, _ = run(hinge(), [Effect("load_friction", "hinge", shape)], np.full(300, torque))
 
     def accelerate(_, v, torque=torque):
       friction = (0.1 + 2.0 * abs(torque)) * (1 + 0.5 * np.exp(-((v / 0.5) ** 2)))
-      return torque * (1 - friction) / _INERTIA
+      return torque * (1 - friction) / INERTIA
 
     times = _times(300)
     want = scipy.integrate.solve_ivp(accelerate, (0, 0.3), [0.0], t_eval=times, rtol=1e-9).y[0]
@@ -164,24 +91,24 @@ def test_load_friction_may_grow_with_the_square_and_fall_with_speed():
 def test_asymmetric_friction():
   effect = [Effect("asymmetric_friction", "hinge", {"positive": 0.06, "negative": 0.02})]
   for velocity, friction in ((2.0, 0.06), (-2.0, 0.02)):
-    _, v, _, _ = _run(_hinge(), effect, np.zeros(250), velocity=velocity)
-    slope = (v[200] - v[0]) / (200 * _STEP)
-    assert slope == pytest.approx(-np.sign(velocity) * friction / _INERTIA, rel=0.01)
+    _, v, _, _ = run(hinge(), effect, np.zeros(250), velocity=velocity)
+    slope = (v[200] - v[0]) / (200 * STEP)
+    assert slope == pytest.approx(-np.sign(velocity) * friction / INERTIA, rel=0.01)
   for torque, moves in ((0.055, False), (0.065, True), (-0.018, False), (-0.025, True)):
-    q, _, _, _ = _run(_hinge(), effect, np.full(600, torque))
+    q, _, _, _ = run(hinge(), effect, np.full(600, torque))
     assert (abs(q[-1]) > 0.02) == moves
 
 
 def test_command_delay_shifts_exactly():
   controls = np.random.default_rng(0).normal(size=400).cumsum() * 0.01
-  q, _, _, _ = _run(_hinge("position"), [Effect("command_delay", None, {"delay": 0.012})], controls)
+  q, _, _, _ = run(hinge("position"), [Effect("command_delay", None, {"delay": 0.012})], controls)
   late = np.concatenate([np.full(12, controls[0]), controls[:-12]])
-  expected, _, _, _ = _run(_hinge("position"), [], late)
+  expected, _, _, _ = run(hinge("position"), [], late)
   np.testing.assert_array_equal(q, expected)
 
 
 def test_command_delay_of_a_fraction_is_the_mean_over_the_step():
-  stack = EffectStack([Effect("command_delay", "hinge", {"delay": 0.0025})]).bind(_hinge())
+  stack = EffectStack([Effect("command_delay", "hinge", {"delay": 0.0025})]).bind(hinge())
   data = mujoco.MjData(stack.binding.model)
   seen = []
   for ctrl in (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0):
@@ -192,30 +119,30 @@ def test_command_delay_of_a_fraction_is_the_mean_over_the_step():
 
 def test_encoder_offset_moves_the_servo_and_the_reading():
   effect = Effect("encoder_offset", "hinge", {"offset": 0.1})
-  q, _, stack, data = _run(_hinge("position", joint='damping="0.3"'), [effect], np.full(3000, 0.5))
+  q, _, stack, data = run(hinge("position", joint='damping="0.3"'), [effect], np.full(3000, 0.5))
   assert q[-1] == pytest.approx(0.4, abs=1e-6)
   assert stack.observe("joint_positions", data.qpos, data.time)[0] == pytest.approx(0.5, abs=1e-6)
   assert stack.observe("joint_velocities", data.qvel, data.time) is data.qvel
 
 
 def test_motor_gain():
-  _, v, _, _ = _run(_hinge(), [Effect("motor_gain", "drive", {"gain": 0.7})], np.full(100, 0.1))
-  assert v[-1] == pytest.approx(0.7 * 0.1 / _INERTIA * 0.1, rel=1e-6)
+  _, v, _, _ = run(hinge(), [Effect("motor_gain", "drive", {"gain": 0.7})], np.full(100, 0.1))
+  assert v[-1] == pytest.approx(0.7 * 0.1 / INERTIA * 0.1, rel=1e-6)
   # A position servo is softer: gravity torque m g l sin(q) against 0.5 * 5 N m/rad.
-  model = _hinge("position", joint='damping="0.3"', option="", com="0.05 0 0")
-  q, _, _, _ = _run(model, [Effect("motor_gain", None, {"gain": 0.5})], np.zeros(4000))
+  model = hinge("position", joint='damping="0.3"', option="", com="0.05 0 0")
+  q, _, _, _ = run(model, [Effect("motor_gain", None, {"gain": 0.5})], np.zeros(4000))
   assert 2.5 * abs(q[-1]) == pytest.approx(9.81 * 0.05 * np.cos(q[-1]), rel=1e-4)
   # Where back-EMF follows, a weak motor turns as fast without load as a strong one.
   weak = {"gain": 0.2, "scales_damping": 1.0}
-  model = _hinge(joint='damping="0.3"')
-  _, v, _, _ = _run(model, [Effect("motor_gain", "drive", weak)], np.full(4000, 0.1))
+  model = hinge(joint='damping="0.3"')
+  _, v, _, _ = run(model, [Effect("motor_gain", "drive", weak)], np.full(4000, 0.1))
   assert v[-1] == pytest.approx(0.1 / 0.3, rel=1e-3)
 
 
 def test_torque_limit():
-  _, v, _, data = _run(_hinge(), [Effect("torque_limit", None, {"limit": 0.03})], np.full(100, 0.1))
+  _, v, _, data = run(hinge(), [Effect("torque_limit", None, {"limit": 0.03})], np.full(100, 0.1))
   assert data.actuator_force[0] == 0.03
-  assert v[-1] == pytest.approx(0.03 / _INERTIA * 0.1, rel=1e-6)
+  assert v[-1] == pytest.approx(0.03 / INERTIA * 0.1, rel=1e-6)
 
 
 def test_thermal_derating():
@@ -228,7 +155,7 @@ def test_thermal_derating():
   effect = Effect(
     "thermal_derating", None, {"heating": 20.0, "time_constant": 0.5, "derating": 0.05}
   )
-  _, _, stack, data = _run(_hinge(joint='frictionloss="5"'), [effect], np.full(1000, 0.5))
+  _, _, stack, data = run(hinge(joint='frictionloss="5"'), [effect], np.full(1000, 0.5))
   rise = scipy.integrate.solve_ivp(heat, (0, 1.0), [0.0], rtol=1e-9).y[0, -1]
   assert stack.operator("thermal_derating").temperature_rise[0] == pytest.approx(rise, rel=5e-3)
   assert data.actuator_force[0] == pytest.approx(0.5 * (1 - 0.05 * rise), rel=5e-3)
@@ -239,25 +166,25 @@ def test_thermal_derating():
 def test_supply_sag_settles_where_load_and_strength_agree():
   # s = 1 - 0.1 * s * 2 -> s = 1 / 1.2; plus a fade of 0.05 per second.
   effect = Effect("supply_sag", None, {"droop": 0.1})
-  _, _, _, data = _run(_hinge(joint='frictionloss="9"'), [effect], np.full(200, 2.0))
+  _, _, _, data = run(hinge(joint='frictionloss="9"'), [effect], np.full(200, 2.0))
   assert data.actuator_force[0] == pytest.approx(2 / 1.2, rel=1e-3)
   effect = Effect("supply_sag", None, {"fade": 0.5})
-  _, _, _, data = _run(_hinge(joint='frictionloss="9"'), [effect], np.full(201, 2.0))
+  _, _, _, data = run(hinge(joint='frictionloss="9"'), [effect], np.full(201, 2.0))
   assert data.actuator_force[0] == pytest.approx(2 * (1 - 0.5 * 0.2), rel=1e-6)
 
 
 @pytest.mark.parametrize(("pulsed", "strength"), [(0.0, 1 / 1.08), (1.0, 1 / 1.2)])
 def test_a_source_with_a_resistance_feeds_a_bridge(pulsed, strength):
   # Stalled at a duty of 2/5: in the mean 0.4 * 2 s are drawn, 2 s while the bridge is on.
-  model = _hinge(joint='frictionloss="9"')
+  model = hinge(joint='frictionloss="9"')
   model.actuator_forcelimited[:], model.actuator_forcerange[:] = 1, (-5, 5)
   values = {"droop": 0.1, "back_emf": 1.0, "pulsed": pulsed}
-  _, _, _, data = _run(model, [Effect("supply_sag", None, values)], np.full(200, 2.0))
+  _, _, _, data = run(model, [Effect("supply_sag", None, values)], np.full(200, 2.0))
   assert data.actuator_force[0] == pytest.approx(2 * strength, rel=1e-3)
 
 
 def test_limits_recover_with_the_supply():
-  model = _hinge()
+  model = hinge()
   model.actuator_forcelimited[:], model.actuator_forcerange[:] = 1, (-5, 5)
   values = {"droop": 0.1, "back_emf": 1.0, "pulsed": 1.0, "scales_limit": 1.0}
   stack = EffectStack([Effect("supply_sag", None, values)]).bind(model)
@@ -271,19 +198,19 @@ def test_limits_recover_with_the_supply():
 
 
 def test_spring_beside_a_spring():
-  model = _hinge(joint='damping="0.2" stiffness="1" springref="28.64788975654116"')  # 0.5 rad
+  model = hinge(joint='damping="0.2" stiffness="1" springref="28.64788975654116"')  # 0.5 rad
   effect = Effect("spring", "hinge", {"stiffness": 3.0, "reference": -0.1})
-  q, _, _, _ = _run(model, [effect], np.full(3000, 0.2))
+  q, _, _, _ = run(model, [effect], np.full(3000, 0.2))
   # 1 (0.5 - q) + 3 (-0.1 - q) + 0.2 = 0.
   assert q[-1] == pytest.approx(0.1, abs=1e-6)
 
 
 def test_cogging():
   def swing(_, state):
-    return state[1], 0.05 * np.sin(8 * state[0] + 0.5) / _INERTIA
+    return state[1], 0.05 * np.sin(8 * state[0] + 0.5) / INERTIA
 
   effect = Effect("cogging", "hinge", {"amplitude": 0.05, "periods": 8.0, "phase": 0.5})
-  q, _, _, _ = _run(_hinge(), [effect], np.zeros(500), velocity=2.0)
+  q, _, _, _ = run(hinge(), [effect], np.zeros(500), velocity=2.0)
   result = scipy.integrate.solve_ivp(
     swing, (0, 0.5), [0.0, 2.0], t_eval=_times(500), rtol=1e-9, atol=1e-11
   )
@@ -292,19 +219,19 @@ def test_cogging():
 
 def test_gravity_tilt_and_payload_on_a_pendulum():
   # Gravity turned about y by 0.2: the pendulum's rest turns with it.
-  model = _hinge(joint='damping="0.2"', option="", com="0 0 -0.1")
-  q, _, _, _ = _run(model, [Effect("gravity_tilt", None, {"y": 0.2})], np.zeros(3000))
+  model = hinge(joint='damping="0.2"', option="", com="0 0 -0.1")
+  q, _, _, _ = run(model, [Effect("gravity_tilt", None, {"y": 0.2})], np.zeros(3000))
   assert q[-1] == pytest.approx(0.2, abs=1e-6)
   # Half a kilogram at (0.1, 0, 0) on 1 kg at (0, 0, -0.1): rest at atan(0.5).
   for target in ("link", "hinge"):
-    model = _hinge(joint='damping="0.2"', option="", com="0 0 -0.1")
-    q, _, _, _ = _run(model, [Effect("payload", target, {"mass": 0.5, "x": 0.1})], np.zeros(4000))
+    model = hinge(joint='damping="0.2"', option="", com="0 0 -0.1")
+    q, _, _, _ = run(model, [Effect("payload", target, {"mass": 0.5, "x": 0.1})], np.zeros(4000))
     assert q[-1] == pytest.approx(np.arctan(0.5), abs=1e-6)
-    assert model.dof_M0[0] == pytest.approx(_INERTIA + 0.01 + 0.005)
+    assert model.dof_M0[0] == pytest.approx(INERTIA + 0.01 + 0.005)
 
 
 def test_parameter_error():
-  model = _hinge(joint='damping="0.1" armature="0.02" frictionloss="0.3"', com="0 0 -0.1")
+  model = hinge(joint='damping="0.1" armature="0.02" frictionloss="0.3"', com="0 0 -0.1")
   nominal = {name: getattr(model, name).copy() for name in ("dof_damping", "dof_frictionloss")}
   factors = {"damping": 1.1, "armature": 0.5, "friction": 0.8, "gain": 1.2, "mass": 2.0}
   stack = EffectStack([Effect("parameter_error", "hinge", factors)]).bind(model)
@@ -336,10 +263,10 @@ def test_residual_force_is_the_product_of_features_and_weights():
 
   def swing(_, state):
     force = bumps(state[0], -1, 1, 4) @ weights @ bumps(state[1], -2, 2, 3)
-    return state[1], force / _INERTIA
+    return state[1], force / INERTIA
 
   effect = Effect("residual_force", "hinge", {"weights": weights.ravel().tolist(), **grid})
-  q, _, _, _ = _run(_hinge(), [effect], np.zeros(500), velocity=1.0)
+  q, _, _, _ = run(hinge(), [effect], np.zeros(500), velocity=1.0)
   result = scipy.integrate.solve_ivp(swing, (0, 0.5), [0.0, 1.0], t_eval=_times(500), rtol=1e-9)
   np.testing.assert_allclose(q, result.y[0], atol=2e-3)
 
@@ -350,14 +277,14 @@ _TEETH = {"stiffness": 3000.0, "damping": 3.0}
 
 
 def _geared():
-  return _hinge(
+  return hinge(
     "position", joint='armature="0.004" damping="0.15" frictionloss="0.02"', inertia=0.006
   )
 
 
 def _two_masses(controls, *, encoder_on_motor, friction_on_link):
   """Motor and link joined by a stiff, damped spring with play; explicit, 20 steps a millisecond."""
-  step, stiffness, damping = _STEP / 20, _TEETH["stiffness"], _TEETH["damping"]
+  step, stiffness, damping = STEP / 20, _TEETH["stiffness"], _TEETH["damping"]
   motor = link = motor_speed = link_speed = 0.0
   result = []
   for ctrl in controls:
@@ -385,9 +312,9 @@ def test_backlash_hysteresis_is_as_wide_as_the_gap():
   effect = Effect(
     "backlash", "hinge", {"gap": _GAP, "encoder_on_motor": 1.0, "friction_on_link": 1.0}
   )
-  q, _, _, _ = _run(_geared(), [effect], np.tile(cycle, 2))
+  q, _, _, _ = run(_geared(), [effect], np.tile(cycle, 2))
   second = q[4000:]
-  nominal, _, _, _ = _run(_geared(), [], np.tile(cycle, 2))
+  nominal, _, _, _ = run(_geared(), [], np.tile(cycle, 2))
   second_nominal = nominal[4000:]
   # On the way up (400 to 600) and down (1400 to 1600, the same commands in reverse).
   width = second[1399:1599][::-1] - second[400:600]
@@ -401,9 +328,9 @@ def test_backlash_against_two_masses(encoder_on_motor, friction_on_link):
   controls = 0.4 * np.sin(2 * np.pi * 1.5 * _times(1000))
   sides = {"encoder_on_motor": encoder_on_motor, "friction_on_link": friction_on_link}
   effect = Effect("backlash", "hinge", {"gap": _GAP, **sides, **_TEETH})
-  q, _, stack, _ = _run(_geared(), [effect], controls)
+  q, _, stack, _ = run(_geared(), [effect], controls)
   expected = _two_masses(controls, **sides)
-  nominal, _, _, _ = _run(_geared(), [], controls)
+  nominal, _, _, _ = run(_geared(), [], controls)
   # The first cycle differs: these gears start in contact, the two masses in the middle of the gap.
   error, size = np.std((q - expected)[300:]), np.std((nominal - expected)[300:])
   assert error < min(0.05 * _GAP, 0.25 * size), (error, size)
