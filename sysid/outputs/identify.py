@@ -212,7 +212,8 @@ def _identify(
   if found.in_reference:
     counts = collections.Counter(row["kind"] for row in found.in_reference)
     kinds = ", ".join(f"{k} ({n} times)" if n > 1 else k for k, n in counts.items())
-    text = f"In the reference, too, so that nothing has changed: {kinds}. The model lacks it."
+    lacks = "it" if counts.total() == 1 else "them"
+    text = f"In the reference, too, so that nothing has changed: {kinds}. The model lacks {lacks}."
     content["notes"].append(text)
   if found.verdict == "partly":
     joints = ", ".join(item.joint for item in found.unexplained)
