@@ -19,15 +19,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import t as student
 
+from nerf2real.sysid.fit.efforts import Duties, Torques, efforts_of
 from nerf2real.sysid.fit.expectation import NOISE, Expectation
-from nerf2real.sysid.fit.noise import correlation_time, effort_noise, once, timing
+from nerf2real.sysid.fit.noise import correlation_time, once, timing
 from nerf2real.sysid.hypotheses.composition import compose
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.joint import JointModel
-from nerf2real.sysid.model.kernel import INDEX
 from nerf2real.sysid.model.measured import block_starts, same_commands
 from nerf2real.sysid.model.plant import Simulated
-from nerf2real.sysid.model.servo.duty import Asked, command_jump, duty_for
+from nerf2real.sysid.model.servo.law import ServoLaw
 from nerf2real.sysid.model.threads import at_once
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -53,54 +53,35 @@ class JointLikelihood:
     self.plant, self.settings, self.follows = plant, settings, follows
     self.position_noise, self.stamp_noise = timing(plant)
     logs = plant.logs
-    self.effort: list[Array] | None = None
-    self._asked = Asked(plant)
-    self.law = None if plant.law is None else plant.law[0]
-    self.ahead: tuple[float, float] | None = None
-    """Interval of the s that positions were ahead of duties in a reference: what is more now is a
-    late reading. Without one the law's own holds both."""
-    if self.law is not None:
-      self.effort = [log.duty for log in logs]  # type: ignore[misc]
-    elif all(log.effort is not None for log in logs) and plant.holds:
-      self.effort = [log.effort for log in logs]  # type: ignore[misc]
-    self.channels = ["course"] + (["effort"] if self.effort is not None else [])
-    self.floor = np.array(
-      [self.position_noise] + ([effort_noise(self.effort)] if self.effort else [])
-    )
+    self.effort = efforts_of(plant, settings)
+    """The second channel, if there is one."""
+    self.channels = ["course"]
+    self.floor = np.array([self.position_noise])
+    if self.effort is not None:
+      self.channels.append("effort")
+      self.floor = np.append(self.floor, self.effort.noise)
     self.mask = np.concatenate([log.valid for log in logs]).astype(float)
     self.speed = np.concatenate([log.velocity for log in logs])
     missed = np.concatenate([plant.reduction_error(i) for i in range(len(logs))])
     further = [(self.stamp_noise * self.speed) ** 2 + missed**2]
     if self.effort is not None:
-      further.append((0.25 * self._jumps()) ** 2)
+      further.append((0.25 * self.effort.jumps()) ** 2)
     self._further = np.array(further)
     """Variance [C, N] of samples beside the noise that all have."""
     self._once = np.ones((len(self.channels), len(self.mask)))
     self._once[0] = np.concatenate([once(log.position) for log in logs])
     self.gain = self.mask * np.sqrt(self._shares(np.zeros(len(self.channels))))
-    self.effort_unit: float | None = None
-    """Effort over torque in a reference: a sensor's unit stays. None where none shows it."""
     self._cut()
     self.expectation: Expectation | None = None
     self.scale = np.maximum(self.floor, 1e-12)
     self.observations = self.counts.copy()
     """Independent samples of blocks [C, B]."""
-    self._known = None if plant.law is None else self._measure(plant.law[1])
+    self._known = self._measure(self.effort) if isinstance(self.effort, Duties) else None
 
-  def _jumps(self) -> Array:
-    """Returns by how much efforts [N] jump near a sample: there they depend on microseconds. It is
-    where commands jump that the servo's law hears, or where efforts do from reading to reading."""
-    assert self.effort is not None
-    plant, within = self.plant, 2.0 * self.plant.step
-    if self.law is not None:
-      jumps = [
-        self.law.gain * command_jump(plant, i, within, delay=self.law.delay)
-        for i in range(len(plant.logs))
-      ]
-    else:
-      steps = [np.pad(np.abs(np.diff(effort)), 1) for effort in self.effort]
-      jumps = [np.maximum(step[1:], step[:-1]) for step in steps]
-    return np.concatenate(jumps)
+  @property
+  def law(self) -> ServoLaw | None:
+    """The law of the joint's servo, where logs hold its duty."""
+    return self.effort.law if isinstance(self.effort, Duties) else None
 
   def _shares(self, beyond: Array) -> Array:
     """Returns what part [C, N] the variance of the surest samples is of each one's, where mean
@@ -109,11 +90,10 @@ class JointLikelihood:
     shares: Array = usual / (usual + self._further)
     return shares
 
-  def _measure(self, left: Array) -> tuple[float, Array]:
-    """Returns scale and independent samples [B] of what a servo's law leaves of the duty [N]."""
-    assert self.law is not None and self.effort is not None
+  def _measure(self, duties: Duties) -> tuple[float, Array]:
+    """Returns scale and independent samples [B] of what a servo's law leaves of the duty."""
     rows = np.zeros((2, self.size))
-    rows[1] = left * self.gain[1]
+    rows[1] = duties.left_by_law * self.gain[1]
     scale, samples, times = self._scales(rows)
     return scale[1], samples[1] / times[1]
 
@@ -178,7 +158,7 @@ class JointLikelihood:
   ) -> list[list[tuple[Simulated, Simulated | None]]]:
     """Returns every log's open-loop run, and its run along the readings where torque is known."""
     chosen = list(range(len(self.plant.logs)) if logs is None else logs)
-    along = self.effort is not None and self.law is None and not self.follows
+    along = self.effort is not None and self.effort.along and not self.follows
     ways = [self.follows] + [True] * along
     runs = []
     for x in np.atleast_2d(xs):
@@ -203,11 +183,9 @@ class JointLikelihood:
         log.position - o.position for log, (o, _) in zip(self.plant.logs, outputs, strict=True)
       ]
       channels = [np.concatenate(course)]
-      if self.law is not None:
-        channels.append(self._duties(compose(self.plant, terms, x).p))
-      elif self.effort is not None:
+      if self.effort is not None:
         p = compose(self.plant, terms, x).p
-        channels.append(self._efforts([along for _, along in outputs], p))
+        channels.append(self.effort.left(p, self.gain[1], [along for _, along in outputs]))
       rows.append(channels)
     result = np.nan_to_num(np.array(rows), nan=1e3, posinf=1e3, neginf=-1e3)
     if self.expectation is not None:
@@ -279,94 +257,18 @@ class JointLikelihood:
   def _channels_of(self, other: "JointLikelihood", rows: Array) -> Array:
     """Returns other logs' rows [C', N'] as these logs' channels [C, N'], 0 where one lacks it."""
     result = np.zeros((len(self.channels), rows.shape[1]))
-    alike = (self.law is None) == (other.law is None)
-    count = min(len(self.channels), len(rows)) if alike else 1
+    count = len(rows) if type(self.effort) is type(other.effort) else 1
     result[:count] = rows[:count]
     return result
-
-  def _duties(self, p: Array) -> Array:
-    """Returns measured duty minus that of the law of kernel parameters [P].
-
-    A gain of the law within what a data sheet leaves open is taken for the declared one: of its
-    interval, as other latencies show other gains, the one that fits best. So it is with what
-    positions were ahead of duties in a reference.
-    """
-    assert self.effort is not None and self.law is not None
-    late = float(p[INDEX["measurement_delay"]] - p[INDEX["effort_delay"]])
-    ahead = self.law.ahead - late if self.ahead is None else float(np.mean(self.ahead))
-    measured = np.concatenate(self.effort)
-
-    def duties(ahead: float) -> Array:
-      return duty_for(self.plant, p, self._asked.torque(p, ahead))
-
-    law = duties(ahead)
-    free = self.gain[1] ** 2 * (np.abs(law) < self.settings.saturated * np.abs(law).max())
-    factor = float(free * law @ measured) / max(float(free * law @ law), 1e-12)
-    known = self.law.gain if self.law.is_off(self.settings.duty_scale) else 1.0
-    p = p.copy()
-    p[INDEX["gain"]] *= np.clip(factor, *(np.array(self.law.interval) / known))
-    law = duties(ahead)
-    if self.ahead is not None and self.ahead[1] > self.ahead[0]:
-      reach = 0.5 * (self.ahead[1] - self.ahead[0])
-      further = (duties(ahead + reach) - law) / reach
-      by = float(free * further @ (measured - law)) / max(float(free * further @ further), 1e-12)
-      law = duties(ahead + float(np.clip(by, -reach, reach)))
-    return measured - law
 
   def effort_factor(self, terms: Sequence[Term], x: Array) -> float | None:
     """Returns measured effort over a hypothesis' torque; None where efforts are not compared with
     torques."""
-    if self.effort is None or self.law is not None or self.follows:
+    if not isinstance(self.effort, Torques) or self.follows:
       return None
     (outputs,) = self.simulate(terms, x[None])
     p = compose(self.plant, terms, x).p
-    return self._compared([along for _, along in outputs], self._speed_of_efforts(p))[1]
-
-  def _speed_of_efforts(self, p: Array) -> Array:
-    """Returns the speed [N] at the time that efforts show: what positions show that are as much
-    later as they are read later, under kernel parameters [P]."""
-    late = float(p[INDEX["measurement_delay"]] - p[INDEX["effort_delay"]])
-    if late == 0.0:
-      return self.speed
-    logs = self.plant.logs
-    return np.concatenate([np.interp(log.time + late, log.time, log.velocity) for log in logs])
-
-  def _efforts(self, along: Sequence[Simulated | None], p: Array) -> Array:
-    """Returns measured effort minus simulated torque [N], in the readings' unit: without a
-    reference all torques larger by one factor leave the same.
-
-    Args:
-      along: runs along the readings.
-      p: kernel parameters [P], with the motor's gain, which a current may tell (a worn brush) or
-        not (a weak magnet).
-    """
-    assert self.effort is not None
-    speed = self._speed_of_efforts(p)
-    torque, factor = self._compared(along, speed, float(p[INDEX["gain"]]))
-    left = np.concatenate(self.effort) - factor * torque
-    # A current's torque lacks what the back-EMF takes.
-    seen = self.gain[1] ** 2 * speed
-    return left - float(left @ seen) / (float(seen @ speed) + 1e-12) * speed
-
-  def _compared(
-    self, along: Sequence[Simulated | None], speed: Array, gain: float = 1.0
-  ) -> tuple[Array, float]:
-    """Returns simulated torque [N] and measured effort over it: within what torque constants leave
-    open, or what it was in a reference."""
-    assert self.effort is not None
-    torque = np.concatenate([a.torque for a in along])  # type: ignore[union-attr]
-    measured, both = (
-      self.gain[1] * np.concatenate(self.effort),
-      self.gain[1] * np.array([torque, speed]),
-    )
-    scale = float(np.linalg.lstsq(both @ both.T, both @ measured, rcond=None)[0][0])
-    units: tuple[float, ...] = (1.0,)
-    spread = self.settings.effort_scale
-    if self.effort_unit is not None:
-      units = (self.effort_unit, self.effort_unit / gain)
-      spread = self.settings.effort_repeats
-    near = [float(np.clip(scale, u / (1.0 + spread), u * (1.0 + spread))) for u in units]
-    return torque, min(near, key=lambda factor: abs(factor - scale))
+    return self.effort.factor(p, self.gain[1], [along for _, along in outputs])
 
   def squares(self, residuals: Array) -> Array:
     """Returns mean squares of blocks [..., C, B]."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerf2real.sysid.fit import signatures
+from nerf2real.sysid.fit.efforts import Duties, Torques
 from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.constants import constants
@@ -97,7 +98,7 @@ class Subject:
   @property
   def state(self) -> tuple[Any, ...]:
     """What is known, the hypotheses that were scored, and the residual's scale."""
-    shown = self.now.expectation, self.now.effort_unit
+    shown = self.now.expectation, _unit(self.now)
     known = self.known, self.freed, self.usual, self.paired, shown
     scored = self.explainer, self.explainer.null, dict(self.explainer.scored)
     scales = [(j.scale, j.observations) for j in self._judged]
@@ -107,7 +108,9 @@ class Subject:
   def state(self, state: tuple[Any, ...]) -> None:
     known, scored, scales = state
     self.known, self.freed, self.usual, self.paired, shown = known
-    self.now.expectation, self.now.effort_unit = shown
+    self.now.expectation, unit = shown
+    if isinstance(self.now.effort, Torques):
+      self.now.effort.unit = unit
     for joint, (scale, observations) in zip(self._judged, scales, strict=True):
       joint.scale, joint.observations = scale, observations
     self.explainer, self.explainer.null, kept = scored
@@ -178,7 +181,8 @@ def _subject(
     freed = widened(own)
     explainer = _explainer(now, None, (own,), library, freed)
     return Subject(joint, now, (own,), library, freed, explainer, sharing, alone)
-  now.ahead = None if before.law is None else _ahead(before.law, settings)
+  if isinstance(now.effort, Duties):
+    now.effort.ahead = None if before.law is None else _ahead(before.law, settings)
   usual = reference_constants(before, settings)
   known, paired, freed = _shown(now, before, usual)
   explainer = _explainer(now, before, known, library, freed)
@@ -192,10 +196,16 @@ def _shown(
 ) -> tuple[tuple[Term, ...], bool, Term]:
   """Returns what a reference's hypothesis says of logs: what is known, whether every log has its
   like, and the constants, of which some may have changed."""
-  now.effort_unit = before.effort_factor(usual.terms, usual.fit.x)
+  if isinstance(now.effort, Torques):
+    now.effort.unit = before.effort_factor(usual.terms, usual.fit.x)
   known = known_terms(usual, now.settings, another_session=_apart(now, before))
   paired = now.expect(before, usual.fit.residuals[0], usual.terms, usual.fit.x)
   return known, paired, freed_constants(known[0])
+
+
+def _unit(joint: JointLikelihood) -> float | None:
+  """Returns the unit of a joint's efforts, None where none is known."""
+  return joint.effort.unit if isinstance(joint.effort, Torques) else None
 
 
 def _apart(now: JointLikelihood, before: JointLikelihood) -> bool:
