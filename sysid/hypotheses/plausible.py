@@ -18,6 +18,7 @@ _SERVO = 2.5
 
 _SIZE = 0.25
 """Power of torque with which a machine's lengths grow: weight goes with their cube."""
+_TORQUES = ("N m", "kg")  # what a load weighs, too
 _PER_TORQUE = {"1/(N m)": 1, "K/(s N^2 m^2)": 2}
 """Units by the power of torque that they are per."""
 
@@ -26,6 +27,12 @@ def ends(parameter: Parameter) -> tuple[float, float]:
   """Returns the least and the largest value that a parameter is looked for at."""
   low = parameter.low / _SLACK if parameter.low > 0 else parameter.low * _SLACK
   return low, parameter.high * _SLACK
+
+
+def power_of_torque(unit: str) -> int:
+  """Returns the power of torque that a parameter of a hinge goes with: all torques larger by one
+  factor, and masses, make the same motion where such parameters are larger by that power of it."""
+  return 1 if unit.startswith(_TORQUES) else -_PER_TORQUE.get(unit, 0)
 
 
 def plausible(term: Term, plant: JointPlant) -> Term:
@@ -45,7 +52,7 @@ def plausible(term: Term, plant: JointPlant) -> Term:
       continue
     parameter = kind_of(term.kind).parameter(name)
     lowest, highest = ends(parameter)
-    if parameter.unit.startswith(("N m", "kg")):
+    if parameter.unit.startswith(_TORQUES):
       lowest, highest = lowest * smaller, highest * larger
     elif parameter.unit == "m":
       lowest, highest = lowest * larger**_SIZE, highest * larger**_SIZE

@@ -74,7 +74,6 @@ def simulate(
   *,
   clocks: dict[str, Clocks] | None = None,
   window_s: float = 0.5,
-  restart: bool = False,
 ) -> Array:
   """Returns the positions [N, J] that a model with effects gives at the stamps of a log's states.
 
@@ -84,7 +83,6 @@ def simulate(
     effects: what the model lacks.
     clocks: by joint.
     window_s: length of windows where an actuator does not hold position.
-    restart: whether windows begin anew at the readings where actuators hold theirs, too.
   """
   clocks = clocks or {}
   measured = log.states.position
@@ -92,7 +90,7 @@ def simulate(
   ids = [model.joint(name).id for name in log.joints]
   qpos, dofs = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
   actuators = [actuator_of(model, name) for name in log.commands.joints]
-  holds = not restart and all(holds_position(model, u) for u in actuators)
+  holds = all(holds_position(model, u) for u in actuators)
   time = log.states.stamp
   motion = smooth_motion(log)
   starts = [0]
@@ -185,13 +183,10 @@ def error(
   *,
   clocks: dict[str, Clocks] | None = None,
   window_s: float = 0.5,
-  restart: bool = False,
 ) -> float:
   """Returns the RMSE of positions over logs and the joints that they command, rad (or m); readings
   that were repeated while the joint moved are left out: they measure nothing. See `simulate`."""
-  courses = [
-    simulate(model, log, effects, clocks=clocks, window_s=window_s, restart=restart) for log in logs
-  ]
+  courses = [simulate(model, log, effects, clocks=clocks, window_s=window_s) for log in logs]
   return _rmse(logs, courses)
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from nerf2real.suite.effects import Effect
 from nerf2real.suite.effects.registry import kind_of
 from nerf2real.sysid.fit import intervals
-from nerf2real.sysid.selection.findings import Identified, Zero, effects_of
+from nerf2real.sysid.selection.findings import Identified, Zero
+from nerf2real.sysid.selection.in_machine import effects_of
 from nerf2real.sysid.selection.joints.changes import Changed
 
 COUNT = 64

@@ -18,13 +18,14 @@ from nerf2real.sysid.model import chains
 from nerf2real.sysid.model.machine import Machine
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection import claims, whole_machine
-from nerf2real.sysid.selection.findings import Identified, Zero, beside_machine
+from nerf2real.sysid.selection.findings import Identified, Zero
+from nerf2real.sysid.selection.in_machine import in_machine
 from nerf2real.sysid.selection.joints import changes, doubts
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.joints.naming import Name
 from nerf2real.sysid.selection.joints.subject import WHOLE, Subject, explain_reference, prepare
 from nerf2real.sysid.selection.search.evidence import clear
-from nerf2real.sysid.selection.wider import scopes, wide, zeros
+from nerf2real.sysid.selection.wider import loads, scopes, wide, zeros
 from nerf2real.sysid.selection.wider.scopes import Shared
 from nerf2real.sysid.settings import SETTINGS, Settings
 
@@ -99,13 +100,20 @@ def _explained(
   """Returns what joints share and what each has of its own, until nothing shared is needless."""
   alone = part(progress, (_SHARED - _PREPARED) / (1.0 - _PREPARED), 1.0)
   before = [s.state for s in subjects]
+  shared: list[Shared] = []
+  changed: list[Changed] = []
   refuted: set[str] = set()
   certain: set[str] = set()
   while True:
-    shared: list[Shared] = []
+    known, after = shared, [s.state for s in subjects]
+    _set_states(subjects, before)
     if len(subjects) > 1:
       progress(0.0, "effects of bodies and of the whole machine")
       shared = scopes.shared_effects(model, subjects, settings, refuted=refuted, certain=certain)
+    if changed and [s.key for s in shared] == [s.key for s in known]:
+      shared = known  # what is certain of one joint changes nothing: the explanations stand
+      _set_states(subjects, after)
+      break
     for subject in subjects:
       if subject.alone or changes.leaves(subject, subject.explainer.null, settings):
         explain_reference(subject, settings)
@@ -114,19 +122,25 @@ def _explained(
       text = f"explaining {subject.joint}, {k + 1} of {len(subjects)} joints"
       alone(k / len(subjects), text)
       changed.append(changes.explain(subject, settings))
+    changed = loads.borne(model, changed, settings)
     needless = scopes.needless(shared, changed)
     fresh = scopes.open_scopes(changed) - certain - refuted
     if not needless and not fresh:
-      alone(1.0, "what joints share beside what is their own")
-      shared, changed = _reopened(model, shared, changed, settings, refuted)
-      shared = scopes.with_twins(shared, changed)
-      changed = changes.judge_together(zeros.reread(model, changed, settings), settings)
-      changes.elaborate(changed)
-      return shared, changed
+      break
     refuted |= {s.term.kind for s in needless}
     certain |= fresh
-    for subject, state in zip(subjects, before, strict=True):
-      subject.state = state
+  alone(1.0, "what joints share beside what is their own")
+  shared, changed = _reopened(model, shared, changed, settings, refuted)
+  shared = scopes.with_twins(shared, changed)
+  changed = changes.judge_together(zeros.reread(model, changed, settings), settings)
+  changes.elaborate(changed)
+  return shared, changed
+
+
+def _set_states(subjects: Sequence[Subject], states: Sequence[tuple[Any, ...]]) -> None:
+  """Sets what is known of each joint, and what was scored, to what it was."""
+  for subject, state in zip(subjects, states, strict=True):
+    subject.state = state
 
 
 def _reopened(
@@ -143,13 +157,14 @@ def _reopened(
   for instead in (None, *sorted(scopes.open_scopes(changed) - known)):
     further = scopes.found_beside(model, changed, settings, known=known, instead=instead)
     if further is not None:
-      again = _beside(shared, further, changed, settings, simpler=instead is not None)
+      again = _beside(model, shared, further, changed, settings, simpler=instead is not None)
       if again is not None:
         return [*shared, further], again
   return shared, changed
 
 
 def _beside(
+  model: mujoco.MjModel,
   shared: list[Shared],
   further: Shared,
   changed: list[Changed],
@@ -162,16 +177,15 @@ def _beside(
   before = [c.subject.state for c in changed]
   for member in further.members:
     member.take(further.held)
-  again = [changes.explain(c.subject, settings) for c in changed]
+  again = loads.borne(model, [changes.explain(c.subject, settings) for c in changed], settings)
   stands = not scopes.needless([*shared, further], again)
-  after = [c.subject.state for c in changed]
-  for item, state in zip(changed, before, strict=True):
-    item.subject.state = state
+  subjects = [c.subject for c in changed]
+  after = [s.state for s in subjects]
+  _set_states(subjects, before)
   worth = not scopes.better(changed, again) if simpler else scopes.better(again, changed)
   if not stands or not worth:
     return None
-  for item, state in zip(changed, after, strict=True):
-    item.subject.state = state
+  _set_states(subjects, after)
   return again
 
 
@@ -237,7 +251,8 @@ def _write_down(result: Identified, item: Changed) -> None:
     if term.kind == CONSTANTS:
       result.clocks[item.joint] = Clocks(values.get("skew", 0.0), values.get("latency", 0.0))
       effect = term.effect(np.array(list(values.values())))
-      result.calibration.append(dataclasses.replace(effect, target=item.joint))
+      effect = dataclasses.replace(effect, target=item.joint)
+      result.calibration.append(in_machine(effect, best))
       offset += values.get("zero", 0.0)
       if term.freed or item.constants_off:
         evidence = _evidence(item, names.get("parameter_error"))
@@ -252,17 +267,16 @@ def _write_down(result: Identified, item: Changed) -> None:
       continue
     if term.kind == FREE:
       effect, row = claims.free(item, term)
-      result.objects.append(effect)
+      result.objects.append(in_machine(effect, best))
       result.nearest.append(row)
       continue
     # What the reference has, too, is in the baseline that evidence is counted from.
     evidence = {} if term.known else _evidence(item, names.get(term.kind))
     effect, row = claims.effect(item, term, evidence)
-    effect = beside_machine(effect, best.terms)
     if term.kind == "encoder_offset":
       offset += float(effect.parameters["offset"])  # type: ignore[arg-type]
     else:
-      result.objects.append(effect)
+      result.objects.append(in_machine(effect, best))
     if term.known:
       if doubts.exceeds(item.subject, best, term):
         result.in_reference.append(row)

@@ -6,59 +6,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
-import numpy as np
 
 from nerf2real.core.robot_logs.reading import Log
 from nerf2real.suite.effects import Effect
-from nerf2real.sysid.fit.layout import CONSTANTS
-from nerf2real.sysid.hypotheses import free_force
-from nerf2real.sysid.hypotheses.terms import FREE, WEAK, Term
 from nerf2real.sysid.model.simulation import Clocks, Member
+from nerf2real.sysid.selection.in_machine import effects_of
 from nerf2real.sysid.selection.joints.changes import Changed
 from nerf2real.sysid.selection.search.evidence import Scored
-
-
-def effects_of(joint: str, item: Scored, *, offset: float = 0.0) -> tuple[list[Effect], Clocks]:
-  """Returns the effects of a joint's hypothesis that are its own, and its latencies; its zero is
-  shifted by an offset, rad, beside what the hypothesis says."""
-  effects, clocks = [], Clocks()
-  for term in item.terms:
-    values = item.fit.values(term)
-    x = np.array(list(values.values()))
-    if term.kind == CONSTANTS:
-      clocks = Clocks(values.get("skew", 0.0), values.get("latency", 0.0))
-      offset += values.get("zero", 0.0)
-      effects.append(dataclasses.replace(term.effect(x), target=joint))
-    elif term.kind == FREE:
-      effects.append(free_force.effect(term, x))
-    elif not term.names:  # of a wider scope
-      continue
-    elif term.kind == "encoder_offset":
-      offset += values["offset"]
-    else:
-      effects.append(beside_machine(term.effect(x), item.terms))
-  if offset:
-    effects.append(Effect("encoder_offset", joint, {"offset": offset}))
-  return effects, clocks
-
-
-def beside_machine(effect: Effect, terms: Sequence[Term]) -> Effect:
-  """Returns a joint's strength times what the whole machine has beside it, as it is written down:
-  of two effects of a kind the one that names the joint counts there.
-
-  Args:
-    effect: of a joint; one of another kind stays.
-    terms: of the joint's hypothesis.
-  """
-  factors = [dict(t.fixed)["gain"] for t in terms if t.wider and t.kind == WEAK == effect.kind]
-  if not factors:
-    return effect
-  factor = float(np.prod(factors))
-  gain = factor * float(effect.parameters["gain"])  # type: ignore[arg-type]
-  bounds = dict(effect.intervals)
-  if "gain" in bounds:
-    bounds["gain"] = factor * bounds["gain"][0], factor * bounds["gain"][1]
-  return dataclasses.replace(effect.replace(gain=gain), intervals=bounds)
 
 
 class Zero(NamedTuple):

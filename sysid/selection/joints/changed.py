@@ -8,7 +8,7 @@ from nerf2real.sysid.fit.likelihood import JointLikelihood
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.joints.naming import Explanation
 from nerf2real.sysid.selection.joints.subject import Subject
-from nerf2real.sysid.selection.search.evidence import Scored, clear
+from nerf2real.sysid.selection.search.evidence import Scored, more_likely
 
 Array = np.ndarray
 CONSTANTS_OFF = "parameter_error"
@@ -39,8 +39,9 @@ class Changed:
   @property
   def extended(self) -> Scored:
     """The hypothesis to simulate with: where more remains, the one of fewest effects that is not
-    clearly worse than what predicts left-out blocks best. What a further effect imitates here it
-    does elsewhere, too: a zero that is shifted in the air tilts a robot on its feet."""
+    less likely by one over the level, even without the block that says so most.
+    Names ask for more, as they are to hold of other motions. What a needless effect imitates here
+    it does elsewhere, too: a zero that is shifted in the air tilts a robot on its feet."""
     if self.verdict not in ("partly", "unexplained"):
       return self.found.best
     if self.elaborated:
@@ -49,8 +50,8 @@ class Changed:
     if not fitting:
       return self.found.best
     top = max(fitting, key=lambda s: s.evidence)
-    worth = self.likelihood.settings.worth
-    near = [s for s in fitting if clear(top, s) < worth]
+    level = self.likelihood.settings.level
+    near = [s for s in fitting if not more_likely(top.nats - s.nats, top.prior - s.prior, level)]
     return min(near, key=lambda s: (len(s.names) + s.beside_force, -s.evidence))
 
   @property

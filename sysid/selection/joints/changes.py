@@ -72,10 +72,10 @@ def _explained(subject: Subject, settings: Settings, also: Sequence[Scored] = ()
     ranked = grow(explainer, leaves=lambda item: leaves(subject, item, settings), also=also)
   else:
     ranked = explainer.constants_alone()
-  return _judged(subject, ranked, settings)
+  return judged(subject, ranked, settings)
 
 
-def _judged(subject: Subject, ranked: list[Scored], settings: Settings) -> Changed:
+def judged(subject: Subject, ranked: list[Scored], settings: Settings) -> Changed:
   """Returns what of the ranked hypotheses stands."""
   now, before, usual = subject.now, subject.before, subject.usual
   known, explainer = subject.known, subject.explainer
@@ -140,7 +140,7 @@ def judge_together(found: Sequence[Changed], settings: Settings = SETTINGS) -> l
     count = named
     for item in result:
       item.subject.sharing = len(result) / count
-    result = [c if c.likelihood.follows else _judged(c.subject, c.ranked, settings) for c in result]
+    result = [c if c.likelihood.follows else judged(c.subject, c.ranked, settings) for c in result]
   return result
 
 

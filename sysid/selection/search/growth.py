@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 from scipy.stats import norm
 
+from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.selection.search.evidence import Scored, clear, of_size
 from nerf2real.sysid.selection.search.explain import Explainer
 from nerf2real.sysid.selection.search.rivals import beside_force, lacking, neutralise
@@ -29,8 +30,10 @@ def grow(
   """
   s, limit = explainer.settings, depth or explainer.settings.depth
   parents, best = [explainer.null], explainer.null
+  extended = set[tuple[Term, ...]]()
   for size in range(limit):
     grown = [g for p in parents for g in explainer.extend(p, s.kept, forms=leaves(best))]
+    extended |= {p.terms for p in parents}
     if not grown:
       break
     top = max(grown, key=lambda g: g.evidence)
@@ -52,7 +55,7 @@ def grow(
     taken = explainer.take_over(item)
     if taken.evidence > best.evidence:
       best = explainer.adopt(taken)
-  best = _exchanged(explainer, best)
+  best = _exchanged(explainer, best, extended)
   for size in {len(item.names) for item in explainer.scored.values()}:
     same = of_size(explainer.scored.values(), size)
     if same:
@@ -62,16 +65,25 @@ def grow(
   return explainer.ranked()
 
 
-def _exchanged(explainer: Explainer, best: Scored) -> Scored:
+def _exchanged(explainer: Explainer, best: Scored, extended: set[tuple[Term, ...]]) -> Scored:
   """Returns a set of as many effects that is better, one of them in another's place, or the same.
 
   Effects that were added one by one were chosen where the others were missing yet (floating search,
   Pudil, Novovicova and Kittler 1994).
+
+  Args:
+    explainer: scores what has not been scored.
+    best: the set.
+    extended: hypotheses to which an effect has been added, of which all that lead are scored.
   """
   for _ in range(_EXCHANGES if len(best.names) > 1 else 0):
     begun = best
     for kind in sorted(begun.names):
-      grown = explainer.extend(lacking(explainer, begun, kind), explainer.settings.kept)
+      parent = lacking(explainer, begun, kind)
+      if parent.terms in extended:
+        continue
+      extended.add(parent.terms)
+      grown = explainer.extend(parent, explainer.settings.kept)
       top = max(grown, key=lambda g: g.evidence, default=best)
       if top.evidence > best.evidence:
         best = explainer.adopt(top)

@@ -57,6 +57,11 @@ class Shared:
   """Other effects of wider scope that predict the same motion, and their values [n]."""
 
   @property
+  def key(self) -> tuple[str, str | None]:
+    """What it claims: its kind and its body."""
+    return self.term.kind, self.term.target
+
+  @property
   def joints(self) -> list[str]:
     """Names of the joints that it concerns: how one is judged may have changed since."""
     return [m.joint for m in self.members]

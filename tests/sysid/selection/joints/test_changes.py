@@ -320,7 +320,7 @@ def test_names_of_many_joints_are_judged_together(monkeypatch, clear, named):
   calls: list[float] = []
   found = [_named(z, calls) for z in clear]
   by_subject = {id(c.subject): c.own for c in found}
-  monkeypatch.setattr(changes, "_judged", lambda subject, *_: by_subject[id(subject)](subject))
+  monkeypatch.setattr(changes, "judged", lambda subject, *_: by_subject[id(subject)](subject))
   first = sum(bool(c.named) for c in found)
   told = changes.judge_together(found)
   assert sum(bool(c.named) for c in told) == named

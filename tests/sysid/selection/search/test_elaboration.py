@@ -11,7 +11,7 @@ from nerf2real.sysid.fit.layout import Layout
 from nerf2real.sysid.hypotheses.constants import constants
 from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.simulation import Member
-from nerf2real.sysid.selection.findings import effects_of
+from nerf2real.sysid.selection.in_machine import effects_of
 from nerf2real.sysid.selection.joints.baseline import widened
 from nerf2real.sysid.selection.search.elaboration import _DRAWS, bases, elaborated
 from nerf2real.sysid.selection.search.evidence import kinds_of
