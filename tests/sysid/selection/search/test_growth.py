@@ -14,9 +14,16 @@ from nerf2real.sysid.settings import SETTINGS
 from tests.sysid.selection.search.explainers import explainer_of, fitted
 
 
+def _extended(explainer, item):
+  """Returns the hypotheses that lack one of the effects of another."""
+  return {rivals.lacking(explainer, item, kind).terms for kind in item.names}
+
+
 def test_an_effect_that_was_chosen_too_early_is_exchanged(explainer):
+  """Unless all that may stand in its place has been tried."""
   begun = fitted(explainer, "coulomb_friction", "viscous_friction")
-  found = growth._exchanged(explainer, begun)
+  assert growth._exchanged(explainer, begun, _extended(explainer, begun)) is begun
+  found = growth._exchanged(explainer, begun, set())
   assert found.names == {"coulomb_friction", "motor_gain"}
   left = [np.sqrt(np.median(s.fit.held[0][0])) for s in (found, begun)]
   assert left[0] < 0.5 * left[1]
@@ -26,7 +33,7 @@ def test_an_effect_that_was_chosen_too_early_is_exchanged(explainer):
 
 def test_one_effect_is_exchanged_for_none(explainer):
   single = fitted(explainer, "viscous_friction")
-  assert growth._exchanged(explainer, single) is single
+  assert growth._exchanged(explainer, single, set()) is single
 
 
 def test_what_a_rival_has_besides_is_tried_beside_the_best_hypothesis(explainer):
@@ -64,7 +71,8 @@ def test_a_form_that_is_worse_alone_is_found_beside_another_effect():
 
 
 def test_a_hypothesis_is_taken_over_with_its_values(explainer):
-  grown = growth._exchanged(explainer, fitted(explainer, "coulomb_friction", "viscous_friction"))
+  begun = fitted(explainer, "coulomb_friction", "viscous_friction")
+  grown = growth._exchanged(explainer, begun, set())
   plant = explainer.joint.plant
   other = Explainer(
     JointLikelihood(plant, settings=SETTINGS), explainer.constants, explainer.library

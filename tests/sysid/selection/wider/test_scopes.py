@@ -11,7 +11,8 @@ from nerf2real.suite.effects import Effect
 from nerf2real.sysid.hypotheses import candidates
 from nerf2real.sysid.hypotheses.terms import Term
 from nerf2real.sysid.model.machine import Machine
-from nerf2real.sysid.selection import analysis, findings
+from nerf2real.sysid.selection import analysis
+from nerf2real.sysid.selection.in_machine import in_machine
 from nerf2real.sysid.selection.joints import subject
 from nerf2real.sysid.selection.joints.leaving import may_leave
 from nerf2real.sysid.selection.search import rivals
@@ -340,11 +341,12 @@ def test_a_weak_joint_is_weak_beside_a_low_supply(weakened):
   tried = [t for terms, *_ in joint.explainer._candidates(joint.explainer.null) for t in terms]
   own = next(t for t in tried if t.kind == "motor_gain" and t.names)
   bounds = {"gain": (0.4, 0.6)}
-  found = findings.beside_machine(own.effect(np.array([0.5]), bounds), joint.known)
+  item = dataclasses.replace(joint.explainer.null, terms=joint.known)
+  found = in_machine(own.effect(np.array([0.5]), bounds), item)
   assert found.parameters["gain"] == pytest.approx(0.45)
   assert found.intervals["gain"] == pytest.approx((0.36, 0.54))
   other = Effect("viscous_friction", "elbow", {"coefficient": 0.5})
-  assert findings.beside_machine(other, joint.known) is other
+  assert in_machine(other, item) is other
 
 
 @pytest.mark.parametrize(("effects", "tried"), [([LATE], 1), ([], 2)])
