@@ -33,9 +33,10 @@ def carried(model: mujoco.MjModel, body: int) -> np.ndarray:
   return np.flatnonzero(below)
 
 
-def ancestors(model: mujoco.MjModel, body: int) -> list[str]:
-  """Returns the joints that carry a body, the nearest first."""
-  return [model.joint(k).name for k in reversed(carrying(model, body))]
+def ancestors(model: mujoco.MjModel, body: str) -> list[str]:
+  """Returns the joints that carry a body, the nearest first; none where no body has that name."""
+  index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
+  return [model.joint(k).name for k in reversed(carrying(model, index))]
 
 
 def along(model: mujoco.MjModel, joint: str) -> list[str]:

@@ -213,8 +213,8 @@ def _write_shared(result: Identified, shared: Shared, *, own_latency: bool) -> N
   slide = _slide(result.model, shared.joints)
   effect, row = claims.shared(shared.term, shared.x, bounds, evidence, slide=slide)
   if shared.term.kind == "payload":
-    body = result.model.body(str(shared.term.target)).id
-    row |= {"joint": chains.ancestors(result.model, body)[0], "body": shared.term.target}
+    carriers = chains.ancestors(result.model, str(shared.term.target))
+    row |= {"joint": carriers[0], "body": shared.term.target}
   result.objects.append(effect)
   result.effects.append(row)
   if shared.or_alone is not None:

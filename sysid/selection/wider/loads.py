@@ -40,7 +40,7 @@ def borne(model: mujoco.MjModel, changed: Sequence[Changed], settings: Settings)
     loads = [load for s in tried if (load := _load_of(s)) is not None]
     if not loads:
       continue
-    way = ancestors(model, model.body(str(loads[0].target)).id)
+    way = ancestors(model, str(loads[0].target))
     carriers = [c for c in result if c.joint in way and c.joint != item.joint]
     if not carriers or all(_felt(load, carriers).clear > -least for load in loads):
       continue

@@ -150,8 +150,7 @@ def hypotheses(
       if known is None or term.scale < known.scale:  # of the joint that bears most
         machine[term.kind, term.fixed] = term
     for term in (t for t in subject.library if t.kind == "payload"):
-      index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, str(term.target))
-      way = ancestors(model, index) if index >= 0 else []
+      way = ancestors(model, str(term.target))
       members = tuple(s for s in subjects if s.joint in way)
       if len(members) > 1:
         result.append((term, members))

@@ -23,6 +23,7 @@ MODEL = mujoco.MjModel.from_xml_string("""
   ("body", "joints"),
   [
     ("world", []),
+    ("nothing", []),
     ("upper", ["shoulder"]),
     ("lower", ["elbow", "shoulder"]),
     ("tool", ["elbow", "shoulder"]),
@@ -30,7 +31,7 @@ MODEL = mujoco.MjModel.from_xml_string("""
   ],
 )
 def test_a_body_is_carried_by_the_joints_on_its_way(body, joints):
-  assert chains.ancestors(MODEL, MODEL.body(body).id) == joints
+  assert chains.ancestors(MODEL, body) == joints
 
 
 @pytest.mark.parametrize(
