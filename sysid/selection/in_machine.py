@@ -2,8 +2,8 @@
 
 A joint is explained by itself: how large all of its torques are together no motion tells, and what
 it carries it may have heavier than declared. In the machine a body has one mass for all that carry
-it. So joints that carry other bodies have theirs as declared, and all torques over that: the same
-motion.
+it. So masses of chains are as declared there, and torques over what a joint has them off by: the
+same motion.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from nerf2real.sysid.fit.layout import CONSTANTS
 from nerf2real.sysid.hypotheses import free_force
 from nerf2real.sysid.hypotheses.plausible import power_of_torque
 from nerf2real.sysid.hypotheses.terms import FREE, WEAK, Term
-from nerf2real.sysid.model.chains import carried
+from nerf2real.sysid.model.chains import carried, carrying
 from nerf2real.sysid.model.simulation import Clocks
 from nerf2real.sysid.selection.search.evidence import Scored
 
@@ -61,13 +61,13 @@ def in_machine(effect: Effect, item: Scored) -> Effect:
 
 def _heavier(item: Scored) -> float:
   """Returns the factor by which a hypothesis has what a joint carries heavier than declared; 1 for
-  one body alone, whose own mass it is."""
-  plant = item.joint.plant
-  body = int(plant.model.jnt_bodyid[plant.model.joint(plant.joint).id])
-  constants = next((t for t in item.terms if t.kind == CONSTANTS), None)
-  if constants is None or len(carried(plant.model, body)) == 1:
+  one body that nothing else carries, whose own mass it is."""
+  model = item.joint.plant.model
+  body = int(model.jnt_bodyid[model.joint(item.joint.plant.joint).id])
+  if len(carried(model, body)) == len(carrying(model, body)) == 1:
     return 1.0
-  return 1.0 + item.fit.values(constants).get("mass", 0.0)
+  constants = next((t for t in item.terms if t.kind == CONSTANTS), None)
+  return 1.0 + (0.0 if constants is None else item.fit.values(constants).get("mass", 0.0))
 
 
 def _over_masses(effect: Effect, heavier: float) -> Effect:

@@ -13,7 +13,7 @@ from nerf2real.sysid.model import simulation
 from nerf2real.sysid.model.joint import JointModel
 from nerf2real.sysid.selection.in_machine import effects_of
 from tests.sysid.selection.wider.test_zeros import CHAIN
-from tests.sysid.synthetic import log_of
+from tests.sysid.synthetic import PENDULUM, log_of
 
 SPRING, HOT = {"stiffness": 0.5, "reference": 0.1}, {"heating": 0.6, "time_constant": 30.0}
 
@@ -23,9 +23,9 @@ def model():
   return mujoco.MjModel.from_xml_string(CHAIN)
 
 
-def _hypothesis(model, joint, factor):
+def _hypothesis(model, joint, factor, xml=CHAIN):
   """Returns a hypothesis of a joint with all that it carries, and all its torques, larger."""
-  plant = JointModel(model, joint, [log_of(CHAIN, "sweep", duration=1.0)])
+  plant = JointModel(model, joint, [log_of(xml, "sweep", duration=1.0)])
   own = constants(plant)
   spring, hot = (
     next(t for t in candidates.library(plant) if t.kind == kind)
@@ -44,9 +44,10 @@ def _hypothesis(model, joint, factor):
   return SimpleNamespace(joint=joint_of, terms=(own, spring, hot), fit=fit)
 
 
-def test_a_joint_that_carries_others_has_masses_as_declared_and_torques_over_them(model):
-  """What it has heavier, others carry, too."""
-  (own, spring, hot), _ = effects_of("shoulder", _hypothesis(model, "shoulder", 0.85))
+@pytest.mark.parametrize("joint", ["shoulder", "elbow"])
+def test_in_a_chain_masses_are_as_declared_and_torques_over_them(model, joint):
+  """What one joint has heavier, others carry, too."""
+  (own, spring, hot), _ = effects_of(joint, _hypothesis(model, joint, 0.85))
   limit = 1.0 / 0.85  # as declared, of torques that are larger
   expected = dict.fromkeys(own.parameters, 1.0) | {"limit": limit}
   assert own.parameters == pytest.approx(expected)
@@ -54,8 +55,9 @@ def test_a_joint_that_carries_others_has_masses_as_declared_and_torques_over_the
   assert {n: hot.parameters[n] for n in HOT} == pytest.approx(HOT)
 
 
-def test_a_body_that_one_joint_carries_alone_has_its_own_mass(model):
-  (own, spring, _), _ = effects_of("elbow", _hypothesis(model, "elbow", 0.85))
+def test_a_body_that_one_joint_alone_carries_has_its_own_mass():
+  model = mujoco.MjModel.from_xml_string(PENDULUM)
+  (own, spring, _), _ = effects_of("joint", _hypothesis(model, "joint", 0.85, PENDULUM))
   assert {own.parameters[n] for n in ("mass", "gain")} == {0.85}
   assert spring.parameters["stiffness"] == pytest.approx(0.85 * SPRING["stiffness"])
 
