@@ -27,11 +27,10 @@ def discard_refuted(found: Identified, settings: Settings) -> None:
     return
   if not is_worse({"before": left_by([]), "after": left_by(parts)}):
     return
-  claimed = {row["joint"] for row in found.effects}
   found.nearest += found.effects
   for rows in (found.calibration, found.objects, found.effects):
     rows.clear()
   for item in found.joints:
     item.elaborated = []
-    if item.joint in claimed and item.verdict in ("effects", "partly"):
+    if item.verdict in ("effects", "partly"):
       item.verdict = "unexplained"

@@ -1,5 +1,6 @@
 """Joints' hypotheses as effects of the whole machine's model."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import mujoco
@@ -74,6 +75,5 @@ def test_the_whole_machine_moves_as_the_joint_did_by_itself(model):
   found, _ = effects_of("shoulder", alone)
   left = simulation.error(model, [log], found)
   assert left < 0.02 * simulation.error(model, [log])
-  told = [own.effect(np.array(list(values.values()))).replace()]
-  told = [Effect(told[0].kind, "shoulder", told[0].parameters)]
-  assert simulation.error(model, [log], told) > 10.0 * left
+  told = dataclasses.replace(own.effect(np.array(list(values.values()))), target="shoulder")
+  assert simulation.error(model, [log], [told]) > 10.0 * left

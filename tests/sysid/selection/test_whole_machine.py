@@ -1,5 +1,6 @@
 """What the whole machine's error says of effects that were found joint by joint."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import mujoco
@@ -50,6 +51,14 @@ def test_nothing_is_claimed_where_it_leaves_more_than_the_declared_model(joints)
   assert found.nearest == (claimed if worse else [])
   after = ("unexplained", []) if worse else ("effects", ["a fit"])
   assert [(j.verdict, j.elaborated) for j in found.joints] == [after] * len(joints)
+
+
+def test_no_joint_keeps_an_effect_of_the_whole_machine_that_is_refuted() -> None:
+  found = _found()
+  found.objects[:] = [dataclasses.replace(_WRONG, target=name) for name in ("shoulder", "elbow")]
+  found.effects[:] = [_row(_WRONG, 9.0) | {"joint": None}]
+  discard_refuted(found, SETTINGS)
+  assert not found.effects and {j.verdict for j in found.joints} == {"unexplained"}
 
 
 def test_courses_that_do_not_repeat_refute_no_claim() -> None:
