@@ -22,9 +22,6 @@ from nerf2real.sysid.settings import Settings
 
 Array = np.ndarray
 
-_MOMENTS = {"payload": ("mass", ("x", "y", "z"))}
-"""Kinds of which products of a value with others show: these may be sure where none of them is."""
-
 _CLOCK = {"measurement_delay": "skew", "command_delay": "latency"}
 """Constants that do to positions what a kind does."""
 _AT_END = 1e-3  # of a range: a value as near to its end has been stopped there
@@ -111,8 +108,8 @@ def is_something(subject: Subject, best: Scored, kind: str) -> bool:
   """Tells whether an effect's sizes differ from those that do nothing, by their intervals.
 
   What healthy machines have of an effect is nothing, too: what else is off may show it where a
-  reference did not. So is what a constant differs by between two recordings. A payload's mass may
-  be open where its moment is sure.
+  reference did not. So is what a constant differs by between two recordings. A payload's mass and
+  place may be open where a moment of it is sure.
   """
   term = next(t for t in best.terms if t.name == kind)
   if term.freed and subject.before is not None:
@@ -141,21 +138,21 @@ def exceeds(subject: Subject, item: Scored, term: Term) -> bool:
 
 
 def _moment_shows(subject: Subject, item: Scored, term: Term) -> bool:
-  """Tells whether a product of an effect's values is surely not zero, if such show."""
-  size, arms = _MOMENTS.get(term.kind, ("", ()))
-  if size not in term.names:
+  """Tells whether a moment of a payload is surely not zero: what gravity takes of it, or what it
+  adds to an inertia about an axis of its body."""
+  if term.kind != "payload":
     return False
-  layout, first = item.fit.layout, term.names.index(size)
+  layout = item.fit.layout
   span = slice(*layout.spans[layout.terms.index(term)])
-  values = item.fit.x[span]
   covariance = intervals.spread(item.fit, [subject.now])[span, span]
-  for arm in (term.names.index(name) for name in arms if name in term.names):
-    slope = np.zeros(len(values))
-    slope[[first, arm]] = values[[arm, first]]
-    reach = subject.now.settings.sigmas * np.sqrt(slope @ covariance @ slope)
-    if abs(values[first] * values[arm]) > reach:
-      return True
-  return False
+  mass, *place = item.fit.x[span]
+  arms = np.array(place)
+  away = arms @ arms - arms**2  # from the body's axes, squared
+  first = np.column_stack([arms, mass * np.eye(3)])
+  second = np.column_stack([away, 2.0 * mass * (1.0 - np.eye(3)) * arms])
+  moments, slopes = mass * np.concatenate([arms, away]), np.concatenate([first, second])
+  sure = np.sqrt(np.einsum("ki,ij,kj->k", slopes, covariance, slopes))
+  return bool(np.any(np.abs(moments) > subject.now.settings.sigmas * sure))
 
 
 def _taken_back(subject: Subject, item: Scored, kind: str) -> float:

@@ -205,15 +205,24 @@ def test_what_a_healthy_mesh_of_gears_loses_is_no_effect(monkeypatch, low, refer
   assert doubts.is_something(joint, best, "load_friction") == something
 
 
-@pytest.mark.parametrize(("together", "shows"), [(-0.99, True), (0.0, False)])
-def test_a_load_is_something_where_its_moment_is_sure(monkeypatch, together, shows):
-  """Its mass may be open: half of it at twice the arm does the same."""
-  term = SimpleNamespace(kind="payload", names=("mass", "x"))
-  layout = SimpleNamespace(terms=[term], spans=[(1, 3)])
-  fit = SimpleNamespace(layout=layout, x=np.array([9.0, 0.3, 0.1]))
-  spread = np.diag([0.3, 0.1])
-  covariance = np.eye(3)
-  covariance[1:, 1:] = spread @ np.array([[1.0, together], [together, 1.0]]) @ spread
+@pytest.mark.parametrize(
+  ("mass", "arm", "together", "shows"),
+  [
+    (0.3, 0.1, -0.99, True),
+    (0.3, 0.1, 0.0, False),
+    (0.6, 0.1, -0.99, True),
+    (0.6, 0.1, 0.0, False),
+  ],
+)
+def test_a_load_is_something_where_a_moment_is_sure(monkeypatch, mass, arm, together, shows):
+  """Its mass may be open: half of it at twice the arm weighs the same, a quarter turns the same."""
+  term = SimpleNamespace(kind="payload", names=("mass", "x", "y", "z"))
+  layout = SimpleNamespace(terms=[term], spans=[(1, 5)])
+  fit = SimpleNamespace(layout=layout, x=np.array([9.0, 0.3, 0.1, 0.0, 0.0]))
+  spread = np.diag([1.0, mass, arm, arm, arm])
+  correlation = np.eye(5)
+  correlation[1, 2] = correlation[2, 1] = together
+  covariance = spread @ correlation @ spread
   monkeypatch.setattr(doubts.intervals, "spread", lambda *_: covariance)
   judged = SimpleNamespace(now=SimpleNamespace(settings=SETTINGS))
   assert doubts._moment_shows(judged, SimpleNamespace(fit=fit), term) == shows
