@@ -23,7 +23,8 @@ _SEEN = 2.0
 number."""
 
 _WIND_UP = 0.004
-"""rad; ours: about what a gear of metal gives way under the torque that it works at."""
+"""rad, of a slide of half its motion; ours: about what a gear of metal gives way under the torque
+that it works at."""
 
 _DELAYS = tuple(0.004 * 1.35**k for k in range(14))
 """s, to 0.2: close enough for one to be in the valley of the least error; ours, each a third later,
@@ -248,7 +249,7 @@ def _play(plant: JointPlant, *, encoder_on_motor: bool) -> Term:
   They are fitted beside the gap, which a soft gear widens.
   """
   reach = _reach(plant)
-  stiffness = typical_torque(plant) / _WIND_UP
+  stiffness = typical_torque(plant) / (_WIND_UP * (1.0 if plant.hinge else reach))
   inertia = float(np.mean([s.inertia.mean() for s in plant.surroundings]))
   armature = plant.declared[INDEX["armature"]]
   smaller = 1.0 / (1.0 / armature + 1.0 / inertia) if armature > 0 else 0.05 * inertia
@@ -262,7 +263,7 @@ def _play(plant: JointPlant, *, encoder_on_motor: bool) -> Term:
     (0.03 * reach, 0.3 * stiffness, 0.3 * damping),
     tuple(
       (gap * reach, stiffness, times * damping)
-      for gap, times in ((0.01, 1.0), (0.04, 1.0), (0.04, 3.0))
+      for gap, times in ((0.01, 1.0), (0.01, 3.0), (0.04, 1.0), (0.04, 3.0))
     ),
     (_INF, _TEETH * stiffness, 2.0 * _TEETH * damping),
     (0.0, stiffness, damping),
