@@ -37,6 +37,7 @@ from nerf2real.sysid.outputs.notes import (
   another_session,
   far,
   finer,
+  growing,
   long_step,
   not_judged,
   of_one,
@@ -191,6 +192,7 @@ def _identify(
     "notes": [
       *(capability.sentence(shown), *servo.notes(found), *map(of_one, found.scopes)),
       *still(found.still),
+      *growing(found.found),
       *doubts([*logs, *held, *reference], compiled),
       *not_judged(beyond),
       *on_stand(free=stand is not compiled),

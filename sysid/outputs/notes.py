@@ -22,6 +22,17 @@ def of_one(row: dict[str, Any]) -> str:
   )
 
 
+def growing(found: Sequence[Changed]) -> list[str]:
+  """Returns a sentence on what would be named and changes within a log; none where nothing does."""
+  grown = [f"{kind} at {item.joint}" for item in found for kind in item.growing]
+  if not grown:
+    return []
+  return [
+    f"Not named, as it grows or fades from a log's begin to its end, which that effect does not: "
+    f"{', '.join(grown)}."
+  ]
+
+
 def still(joints: Sequence[str]) -> list[str]:
   """Returns a sentence on joints that are commanded and do not move; none where there are none."""
   if not joints:

@@ -33,6 +33,8 @@ class Changed:
   """Whether that is more than the machine leaves anyway, by the limit of what counts as more."""
   constants_off: bool
   """Whether declared constants are off by more than machines of one kind differ."""
+  growing: tuple[str, ...] = ()
+  """Kinds that would be certain, and are not the same at a log's begin and end."""
   elaborated: list[Scored] = dataclasses.field(default_factory=list)
   """Draws from fits with richer friction, the likeliest first."""
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nerf2real.sysid.fit.constancy import is_constant
 from nerf2real.sysid.selection.joints.changed import CONSTANTS_OFF, Changed
 from nerf2real.sysid.selection.joints.doubts import (
   constants_off,
@@ -97,6 +98,11 @@ def judged(subject: Subject, ranked: list[Scored], settings: Settings) -> Change
   is_open = clearly and unusual and before is None
   lacking = is_open or (bool(something) and (clearly or unusual))
   named = () if pressed(found.best) else tuple(k for k in found.named if k in something)
+  terms = {t.name: t for t in found.best.terms}
+  growing = tuple(
+    k for k in named if not is_constant([now], found.best.fit, terms[k], subject.beyond)
+  )
+  named = tuple(k for k in named if k not in growing)
   anyway, left = remaining(subject, found.best)
   typical, few = settings.more**2 * anyway < left
   if named and (typical or few or nameless):
@@ -125,6 +131,7 @@ def judged(subject: Subject, ranked: list[Scored], settings: Settings) -> Change
     float(np.sqrt(left[1])),
     more,
     off,
+    growing,
   )
 
 

@@ -16,6 +16,7 @@ from scipy.stats import norm
 
 from nerf2real.suite.effects import kind_of
 from nerf2real.sysid.fit import intervals
+from nerf2real.sysid.fit.constancy import is_constant
 from nerf2real.sysid.hypotheses.terms import WEAK, Term
 from nerf2real.sysid.selection.joints.changes import Changed, may_leave
 from nerf2real.sysid.selection.joints.doubts import newness
@@ -240,6 +241,8 @@ def _best(
   reach = _reach(best)
   nothing = _is_nothing(best, reach, own_latency=own_latency)
   if clear < beyond or behind < 0.0 or nothing or not _is_new(best):
+    return None
+  if not is_constant([m.now for m in best.members], best.fit, best.term, beyond):
     return None
   origin = best.members[most]
   or_alone = (behind, single[most][1]) if behind < beyond else None
