@@ -112,7 +112,8 @@ def _cogging(m: Machine, h: Host, j: int, size: float, shape: Array) -> Broken:
 def _payload(m: Machine, h: Host, j: int, size: float, shape: Array) -> Broken:
   # On the line to the centre of mass, of the last body.
   place = m.links.centre[j] * (0.8 + 0.6 * shape[0])
-  mass = m.stall[j] * (0.02 + 0.2 * size) / (GRAVITY * np.linalg.norm(place))
+  lever = m.links.length.sum() + np.linalg.norm(place)  # of the first joint, about
+  mass = m.stall[j] * (0.02 + 0.2 * size) / (GRAVITY * lever)
   load, places = m.links.load.copy(), m.links.place.copy()
   load[j], places[j] = mass, place
   machine = dataclasses.replace(m, links=m.links._replace(load=load, place=places))
@@ -157,7 +158,7 @@ def _sag(m: Machine, h: Host, j: int, size: float, shape: Array) -> Broken:
 
 
 def _heat(m: Machine, h: Host, j: int, size: float, shape: Array) -> Broken:
-  heating, cooling = (20.0 + 130.0 * size) / m.stall[j] ** 2, 40.0 + 160.0 * shape[0]
+  heating, cooling = (20.0 + 280.0 * size**2) / m.stall[j] ** 2, 40.0 + 160.0 * shape[0]
   loss = 0.006 + 0.008 * shape[1]
   machine = _drive(m, j, heating=heating, cooling=cooling, foldback=loss)
   answer = {"heating": heating, "time_constant": cooling, "derating": loss}
