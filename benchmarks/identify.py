@@ -22,6 +22,7 @@ from typing import Any, Literal
 from benchmarks import harness
 from benchmarks.blind_sets import apparatus, scoring
 from benchmarks.drive_axes import plants as axes
+from benchmarks.hobby_joints import machines as hobby
 from benchmarks.independent_sets import apparatus as independent
 from benchmarks.ledger.records import ROOT
 from benchmarks.servo_bench import bench
@@ -30,7 +31,7 @@ from nerf2real.core import markdown
 RESULTS = ROOT / "benchmarks" / "results" / "analyser"
 FOLDERS = {
   **{"blind_sets": "first", "independent_sets": "second", "servo_bench": "third"},
-  "drive_axes": "fourth",
+  **{"drive_axes": "fourth", "hobby_joints": "fifth"},
 }
 """Folder of a generator's pages, there and in the records."""
 _PLANTS = {
@@ -38,6 +39,7 @@ _PLANTS = {
   "independent_sets": independent.KINDS,
   "servo_bench": bench.PLANTS,
   "drive_axes": axes.PLANTS,
+  "hobby_joints": hobby.PLANTS,
 }
 
 
@@ -53,7 +55,9 @@ class Settings:
   """Seed of the sets where they must be made."""
   count: int = 72
   """Number of sets where they must be made."""
-  generator: Literal["blind_sets", "independent_sets", "servo_bench", "drive_axes"] = "blind_sets"
+  generator: Literal[
+    "blind_sets", "independent_sets", "servo_bench", "drive_axes", "hobby_joints"
+  ] = "blind_sets"
   """Which package makes them."""
   references: bool = True
   """Give the analyser the reference logs that a set has."""

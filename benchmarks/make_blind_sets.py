@@ -1,11 +1,11 @@
 """Makes blind sets: `python benchmarks/make_blind_sets.py --out out/blind --seed 0 --count 20`.
 
 Each set is a folder with the declared `model.xml`, three logs to identify from and two held out;
-`answers.json` beside them holds what each machine has that its model lacks. Four generators that
+`answers.json` beside them holds what each machine has that its model lacks. Five generators that
 share no equations with each other or with the analyser: `blind_sets`; `independent_sets`, which has
-one log held out and always three of the healthy machine; `servo_bench`, one servo with an arm, and
-`drive_axes`, axes under cascaded control, which have those three, too. The same seed gives the
-same logs.
+one log held out and always three of the healthy machine; `servo_bench`, one servo with an arm,
+`drive_axes`, axes under cascaded control, and `hobby_joints`, joints of hobby servos, which have
+those three, too. The same seed gives the same logs.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from typing import Any, Literal
 from benchmarks import harness
 from benchmarks.blind_sets import sets
 from benchmarks.drive_axes import sets as drive_sets
+from benchmarks.hobby_joints import sets as hobby_sets
 from benchmarks.independent_sets import sets as independent_sets
 from benchmarks.servo_bench import sets as servo_sets
 
@@ -28,12 +29,13 @@ GENERATORS: dict[str, Callable[..., Any]] = {
   "independent_sets": independent_sets.make_set,
   "servo_bench": servo_sets.make_set,
   "drive_axes": drive_sets.make_set,
+  "hobby_joints": hobby_sets.make_set,
 }
 
-WITH_REFERENCES = ("independent_sets", "servo_bench", "drive_axes")
+WITH_REFERENCES = ("independent_sets", "servo_bench", "drive_axes", "hobby_joints")
 """Generators whose sets always have logs of the healthy machine."""
 
-WITH_DAYS = ("servo_bench", "drive_axes")
+WITH_DAYS = ("servo_bench", "drive_axes", "hobby_joints")
 """Generators whose references are of the same day or of another."""
 
 HALF_HEALTHY = (
@@ -55,22 +57,24 @@ class Settings:
   """Number of sets."""
   first: int = 0
   """Index of the first set; a set depends on seed and index alone."""
-  generator: Literal["blind_sets", "independent_sets", "servo_bench", "drive_axes"] = "blind_sets"
+  generator: Literal[
+    "blind_sets", "independent_sets", "servo_bench", "drive_axes", "hobby_joints"
+  ] = "blind_sets"
   """Which package makes them."""
   mix: Literal["single", "pair", "outside", "healthy", "all", "half"] = "all"
   """What the machines have: one effect, two, one that no library has, none, or all of these, drawn
   (all) or in turn with every second machine healthy (half)."""
   plants: tuple[str, ...] = ()
   """Kinds of apparatus: of pendulum, arm, op3; of slider, arm, wheel; of hanging, bent, level,
-  turntable; of lift, swing, planar; empty: all."""
+  turntable; of lift, swing, planar; of single, head, leg, finger; empty: all."""
   kinds: tuple[str, ...] = ()
   """Kinds of effect to draw from; empty: all."""
   reference: bool = False
   """Also write reference_*.mcap: the same machine without the effects; all but `blind_sets`
   always do."""
   same_day: bool = False
-  """References of the same day, so that only noise is another (`servo_bench`, `drive_axes`; of
-  `independent_sets` they always are)."""
+  """References of the same day, so that only noise is another (`servo_bench`, `drive_axes`,
+  `hobby_joints`; of `independent_sets` they always are)."""
   processes: int = 1
   """Sets made at the same time."""
 
