@@ -19,6 +19,9 @@ _MESH = 0.02
 """Of the torque that passes it, which a healthy mesh of spur gears loses; chosen: 1 to 2 % are
 usual."""
 
+_DRY = ("coulomb_friction", "asymmetric_friction")
+"""Kinds that add to the declared dry friction."""
+
 
 def own_size(
   plant: JointModel, kind: str, name: str, settings: Settings = SETTINGS, *, repeated: bool = False
@@ -26,7 +29,8 @@ def own_size(
   """Returns how much of an effect's parameter is no fault: models leave it out of all machines.
 
   A position servo's own damping is declared no better than a joint's, and no constant is it: its
-  gain alone is.
+  gain alone is. Dry friction is declared by no data sheet: where no reference shows it, what is
+  added may be what the declared one is off by.
 
   Args:
     plant: the joint.
@@ -39,6 +43,9 @@ def own_size(
     return _GAP if plant.hinge else 0.0
   if (kind, name) == ("load_friction", "coefficient"):
     return 0.0 if repeated else _MESH
+  if kind in _DRY and not repeated:
+    reach = settings.sigmas * dict(settings.tolerances)["friction"]
+    return reach * float(plant.declared[INDEX["friction"]])
   if (kind, name) == ("viscous_friction", "coefficient") and plant.holds:
     share = dict(settings.repeat if repeated else settings.tolerances)["damping"]
     return share * max(0.0, -float(plant.declared[INDEX["velocity"]]))
