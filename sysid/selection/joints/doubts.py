@@ -151,7 +151,7 @@ def _moment_shows(subject: Subject, item: Scored, term: Term) -> bool:
   first = np.column_stack([arms, mass * np.eye(3)])
   second = np.column_stack([away, 2.0 * mass * (1.0 - np.eye(3)) * arms])
   moments, slopes = mass * np.concatenate([arms, away]), np.concatenate([first, second])
-  sure = np.sqrt(np.einsum("ki,ij,kj->k", slopes, covariance, slopes))
+  sure = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slopes, covariance, slopes), 0.0))
   return bool(np.any(np.abs(moments) > subject.now.settings.sigmas * sure))
 
 

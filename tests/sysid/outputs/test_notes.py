@@ -9,7 +9,14 @@ import pytest
 
 from nerf2real.core.robot_logs.series import JointSeries
 from nerf2real.sysid.model.kernel import INDEX
-from nerf2real.sysid.outputs.notes import another_session, far, long_step, supply, unmeasured
+from nerf2real.sysid.outputs.notes import (
+  another_session,
+  far,
+  growing,
+  long_step,
+  supply,
+  unmeasured,
+)
 from tests.sysid.synthetic import ARM, log_of
 
 
@@ -22,6 +29,13 @@ def test_a_reference_of_another_session_is_said(paired, apart, said):
   notes = another_session(SimpleNamespace(joint="knee", subject=subject))  # type: ignore[arg-type]
   assert len(notes) == said
   assert all("reference of knee" in note and "friction by 15 %" in note for note in notes)
+
+
+def test_what_changes_within_a_log_is_said_with_its_joint():
+  found = [SimpleNamespace(joint=j, growing=g) for j, g in (("knee", ()), ("hip", ("spring",)))]
+  (note,) = growing(found)  # type: ignore[arg-type]
+  assert "spring at hip" in note and "knee" not in note
+  assert growing(found[:1]) == []  # type: ignore[arg-type]
 
 
 def test_a_step_that_is_long_for_a_joints_damping_is_said():
