@@ -122,7 +122,7 @@ def main(settings: Settings) -> None:
   folder.mkdir(parents=True, exist_ok=True)
   (folder / f"{page}.md").write_text(text)
   record = {
-    "sets": sorted(answers),
+    "sets": [row["set"] for row in rows],
     "figures": [dataclasses.asdict(row) for row in scoring.table([r["score"] for r in rows])],
     "scores": [{**row, "score": dataclasses.asdict(row["score"])} for row in rows],
     "answers": {name: answers[name] for name in names},

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.drive_axes import following, motions, plants, recording
+from benchmarks.drive_axes.choosing import choose
 from benchmarks.drive_axes.effects import LIBRARY, OUTSIDE, Broken, Kind
-from benchmarks.drive_axes.plants import Machine
+from benchmarks.drive_axes.plants import PLANTS, Machine
 from benchmarks.drive_axes.recording import Host, Recording
 from benchmarks.servo_bench.sets import LEAST_RATIO, MIXES, Truth
 
@@ -76,7 +77,7 @@ def make_set(
   random = np.random.default_rng([_STREAM, seed, index])
   if mix == "all":
     mix = str(random.choice(list(MIXES), p=list(MIXES.values())))
-  chosen, where = _choose(mix, plants, kinds, random)
+  chosen, where = choose(mix, LIBRARY, OUTSIDE, random, known=PLANTS, among=plants, kinds=kinds)
   for attempt in range(_ATTEMPTS):
     numbers = (_STREAM, seed, index, attempt)
     scene = draw_scene(str(random.choice(where)), random, numbers, same_day=same_day)
@@ -87,36 +88,6 @@ def make_set(
   errors = _write(pathlib.Path(folder), scene, faulty, start, 0 if same_day else _DAYS, reference)
   about = {"plant": scene.machine.plant, "effects": entries, "mix": mix}
   return Truth({**about, **errors, "below_floor": not seen})
-
-
-def _choose(
-  mix: str, among: Sequence[str] | None, kinds: Sequence[str] | None, random: Random
-) -> tuple[dict[str, Kind], list[str]]:
-  """Returns the kinds of a set's effects, by name, and the plants that may have them."""
-  among = list(among or plants.PLANTS)
-  unknown = set(among) - set(plants.PLANTS) | set(kinds or ()) - {*LIBRARY, *OUTSIDE}
-  if unknown:
-    known = f"plants of {plants.PLANTS} and kinds of {[*LIBRARY, *OUTSIDE]}"
-    raise ValueError(f"Found {sorted(unknown)}, expected {known}.")
-  if mix == "healthy":
-    return {}, among
-  source = OUTSIDE if mix == "outside" else LIBRARY
-  fitting = {
-    name: kind
-    for name, kind in source.items()
-    if (not kinds or name in kinds) and set(kind.plants) & set(among)
-  }
-  chosen: dict[str, Kind] = {}
-  for _ in range(2 if mix == "pair" else 1):
-    groups = {kind.group for kind in chosen.values()}
-    left = [name for name, kind in fitting.items() if not chosen or kind.group not in groups]
-    if not left:
-      raise ValueError(f"Found no kinds for the mix {mix!r} among {kinds} on {among}; name others.")
-    name = str(random.choice(left))
-    chosen[name] = fitting[name]
-    among = [plant for plant in among if plant in fitting[name].plants]
-    fitting = {n: kind for n, kind in fitting.items() if set(kind.plants) & set(among)}
-  return chosen, among
 
 
 def draw_scene(plant: str, random: Random, seed: tuple[int, ...], *, same_day: bool) -> Scene:

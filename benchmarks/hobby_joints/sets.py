@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.drive_axes.choosing import choose
 from benchmarks.hobby_joints import following, motions, recording
 from benchmarks.hobby_joints.effects import LAST, LIBRARY, OUTSIDE, Kind
 from benchmarks.hobby_joints.machines import DAYS, PLANTS, Machine, copy_of, declared, on_paper
@@ -76,7 +77,7 @@ def make_set(
   random = np.random.default_rng([_STREAM, seed, index])
   if mix == "all":
     mix = str(random.choice(list(MIXES), p=list(MIXES.values())))
-  chosen, where = _choose(mix, plants, kinds, random)
+  chosen, where = choose(mix, LIBRARY, OUTSIDE, random, known=PLANTS, among=plants, kinds=kinds)
   for attempt in range(_ATTEMPTS):
     numbers = (_STREAM, seed, index, attempt)
     scene = draw_scene(str(random.choice(where)), random, numbers, same_day=same_day)
@@ -88,32 +89,6 @@ def make_set(
   errors = _write(pathlib.Path(folder), scene, faulty, host, start, days, reference)
   about = {"plant": scene.machine.plant, "effects": entries, "mix": mix}
   return Truth({**about, **errors, "below_floor": not seen})
-
-
-def _choose(
-  mix: str, among: Sequence[str] | None, kinds: Sequence[str] | None, random: Random
-) -> tuple[dict[str, Kind], list[str]]:
-  """Returns a set's kinds by name, and the plants that may have them."""
-  where = list(among or PLANTS)
-  unknown = set(where) - set(PLANTS) | set(kinds or ()) - {*LIBRARY, *OUTSIDE}
-  if unknown:
-    known = f"plants of {PLANTS} and kinds of {[*LIBRARY, *OUTSIDE]}"
-    raise ValueError(f"Found {sorted(unknown)}, expected {known}.")
-  source = OUTSIDE if mix == "outside" else LIBRARY
-  chosen: dict[str, Kind] = {}
-  for _ in range({"healthy": 0, "pair": 2}.get(mix, 1)):
-    groups = {kind.group for kind in chosen.values()}
-    left = [
-      name
-      for name, kind in source.items()
-      if (not kinds or name in kinds) and kind.group not in groups and set(kind.plants) & set(where)
-    ]
-    if not left:
-      raise ValueError(f"Found no kinds for the mix {mix!r} among {kinds} on {where}; name others.")
-    name = str(random.choice(left))
-    chosen[name] = source[name]
-    where = [plant for plant in where if plant in source[name].plants]
-  return chosen, where
 
 
 def draw_scene(plant: str, random: Random, seed: tuple[int, ...], *, same_day: bool) -> Scene:

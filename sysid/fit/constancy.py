@@ -17,7 +17,9 @@ from nerf2real.sysid.hypotheses.terms import Term
 
 Array = np.ndarray
 
-_LEAST = 0.2  # share by which an effect grows that is another at a log's end; chosen
+_LEAST = 0.2
+"""Share by which an effect grows that is another at a log's end; chosen between what right names
+grow by (at most 0.06 in 29 blind sets) and the one zero that creeps among them (0.45)."""
 _OF_TIME = ("thermal_derating", "supply_sag")  # kinds whose laws go with time
 
 
