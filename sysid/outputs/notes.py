@@ -33,6 +33,22 @@ def growing(found: Sequence[Changed]) -> list[str]:
   ]
 
 
+def open_loads(effects: Sequence[Mapping[str, Any]]) -> list[str]:
+  """Returns a sentence on loads whose mass alone may be nothing; none where there are none.
+
+  Args:
+    effects: what is claimed, as the report has it.
+  """
+  loads = [e for e in effects if e["kind"] == "payload" and "body" in e]
+  unsure = [e["body"] for e in loads if e["parameters"]["mass"]["low"] == 0.0]
+  if not unsure:
+    return []
+  return [
+    f"Mass and place of the load on {', '.join(unsure)} are open each by itself: what is sure is a "
+    f"product of them, what gravity takes of it or what it adds to an inertia."
+  ]
+
+
 def still(joints: Sequence[str]) -> list[str]:
   """Returns a sentence on joints that are commanded and do not move; none where there are none."""
   if not joints:

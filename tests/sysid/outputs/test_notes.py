@@ -14,6 +14,7 @@ from nerf2real.sysid.outputs.notes import (
   far,
   growing,
   long_step,
+  open_loads,
   supply,
   unmeasured,
 )
@@ -36,6 +37,16 @@ def test_what_changes_within_a_log_is_said_with_its_joint():
   (note,) = growing(found)  # type: ignore[arg-type]
   assert "spring at hip" in note and "knee" not in note
   assert growing(found[:1]) == []  # type: ignore[arg-type]
+
+
+def test_a_load_whose_mass_may_be_nothing_is_said_to_be_open():
+  def load(body, low):
+    return {"kind": "payload", "body": body, "parameters": {"mass": {"low": low}}}
+
+  other = {"kind": "spring", "parameters": {"stiffness": {"low": 0.0}}}
+  (note,) = open_loads([load("hand", 0.0), load("foot", 0.1), other])
+  assert "hand" in note and "foot" not in note
+  assert open_loads([load("foot", 0.1), other]) == []
 
 
 def test_a_step_that_is_long_for_a_joints_damping_is_said():
